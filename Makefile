@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
+.PHONY: demo test quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -23,7 +23,7 @@ $(VENV)/.docs: $(VENV)/.run
 # The main job on a campaign of the twin: simulate, run, print the summary and the path of report.html.
 demo: $(VENV)/.run
 	rm -rf build/demo
-	$(BIN)/thermofuse simulate data/demo.toml --out build/demo/campaign
+	$(BIN)/thermofuse simulate demo --out build/demo/campaign
 	$(BIN)/thermofuse run build/demo/campaign/campaign.toml --out build/demo/results
 
 lint: $(VENV)/.test
@@ -34,6 +34,10 @@ lint: $(VENV)/.test
 # One process per core, each with one thread for linear algebra: more would only wait for one another.
 test: lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile
+
+# What shows within a minute whether a change broke something; `make test` runs everything.
+quick: $(VENV)/.test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m 'not slow and not chain and not browser' --numprocesses 2 --dist loadfile
 
 # The documentation site, tutorials run, in build/docs. Needs no network; measured files that cannot be had leave their page unexecuted, and it says so.
 docs: $(VENV)/.docs
@@ -58,8 +62,8 @@ speeds: $(VENV)/.test
 	$(BIN)/python tests/benchmarks/beside_earlier.py build/before
 
 # Share of small changes to a module (signs, limits, comparisons) that its tests notice, on a copy of what is staged or committed; fails
-# below 90 %. A sample takes some minutes: make mutants MODULE=fusion/attribution/two_sessions.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
-MODULE ?= fusion/loop/verdict.py
+# below 90 %. A sample takes some minutes: make mutants MODULE=fusion/analysis/attribution/two_sessions.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
+MODULE ?= fusion/analysis/drift_model/result.py
 SAMPLE ?= 60
 SEED ?= 1
 mutants: $(VENV)/.test
@@ -89,7 +93,7 @@ lock: $(VENV)/.run
 
 # Compiled kernels once as plain Python, where array bounds are checked and coverage counts their lines: those that are quick enough for it.
 kernels: $(VENV)/.test
-	NUMBA_DISABLE_JIT=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests/fusion/alignment/test_first_order_lag.py tests/thermography/io/test_png16.py \
+	NUMBA_DISABLE_JIT=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests/fusion/analysis/alignment/test_readings.py tests/thermography/io/test_png16.py \
 	  tests/interferometry/drift/test_kalman.py
 
 clean:

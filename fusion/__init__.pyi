@@ -1,26 +1,40 @@
-from .alignment.align import align
-from .attribution.attribute import correlate
+from .analysis.alignment.align import AxisGeometry, align, cycle_bounds
+from .analysis.alignment.readings import Readings
+from .analysis.attribution.correlate import correlate
+from .analysis.diagnosis.diagnose import diagnose
+from .analysis.drift_model.axis import LoopResult, close_loop
+from .analysis.effects.effect import Candidate, Effect
 from .campaign.config import load_campaign
-from .diagnosis.diagnose import diagnose
-from .effects.effect import Candidate, Effect
-from .errors import FusionError
-from .loop.axis import close_loop
+from .campaign.logs import read_drivers
+from .common import FusionError
+from .pipeline.remote import fetch_sample
 from .pipeline.run import run_campaign
-from .products.results import results_schema
 from .report.exports.export import export_results
-from .report.html import render_report
+from .report.page import render_report
+from .results.plots import plot_correlation, plot_loop
+from .results.results import Results, read_results, results_schema
 from .twin.instruments import simulate_campaign
 
 __all__ = [
+    "AxisGeometry",
     "Candidate",
     "Effect",
     "FusionError",
+    "LoopResult",
+    "Readings",
+    "Results",
     "align",
     "close_loop",
     "correlate",
+    "cycle_bounds",
     "diagnose",
     "export_results",
+    "fetch_sample",
     "load_campaign",
+    "plot_correlation",
+    "plot_loop",
+    "read_drivers",
+    "read_results",
     "render_report",
     "results_schema",
     "run_campaign",

@@ -1,8 +1,9 @@
-"""The command line, a function for each command. How it ends is in `fusion.endings`."""
+"""The command line, a function for each command. How it ends is in `fusion.messages`."""
 
 from __future__ import annotations
 
 import io
+import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -14,14 +15,23 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from fusion.beside import collect_garbage_less, second_process
-from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step, leave
-from fusion.terminal import Terminal, print_json, printable
+from fusion.messages import (
+    ExitCode,
+    Terminal,
+    answering,
+    failed_code,
+    interrupt_ends_step,
+    leave,
+    print_json,
+    printable,
+    stop_at_once,
+)
+from fusion.pipeline.workers import collect_garbage_less, second_process
 
 if TYPE_CHECKING:
-    from fusion.beside import Beside
-    from fusion.products.progress import Report
-    from fusion.products.results import Results
+    from fusion.pipeline.workers import Worker
+    from fusion.results.progress import Report
+    from fusion.results.results import Results
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -47,9 +57,25 @@ class ExportFormat(StrEnum):
     renishaw = "renishaw"
 
 
+#: Arguments and options that several commands have.
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+ResultsFolder = Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")]
+
+
 def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
-    """End a command as `fusion.endings` says; `folders` are those of its results."""
+    """End a command as `fusion.messages` says; `folders` are those of its results."""
     return answering(errors, kept=lambda: _kept(folders))
+
+
+def _print_lines(lines: Iterable[str]) -> None:
+    """Print lines that a terminal wraps."""
+    for line in lines:
+        console.print(line, soft_wrap=True)
+
+
+def _wide() -> Terminal:
+    """Return the console for a table of many columns: a file or a pipe, which has no width of its own, gets it on one line."""
+    return console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
 
 
 def _refuse(why: str) -> NoReturn:
@@ -62,15 +88,15 @@ def _kept(folders: Sequence[Path]) -> str:
     """Say what a stopped run leaves in its folders, and how to go on."""
     if not folders:
         return ""
-    from fusion.products.store import finished_stages
+    from fusion.results.store import finished_stages
 
     kept = [f"{folder} keeps {', '.join(finished_stages(folder)) or 'no finished stage'}" for folder in folders]
     return f"{'; '.join(kept)}; start the same command with --resume to go on"
 
 
-def _print_version(asked: bool) -> None:
+def _print_version(requested: bool) -> None:
     """Print name and version and stop, where asked."""
-    if asked:
+    if requested:
         console.print(f"thermofuse {metadata.version('thermofuse')}")
         raise typer.Exit
 
@@ -95,7 +121,7 @@ def run(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Results folder; left out: 'results' beside the campaign file, or here for an address."),
+        typer.Option(help="Results folder; left out: 'results' next to the campaign file, or here for an address."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a run that is in the results folder.")] = False,
     scheduler: Annotated[
@@ -113,14 +139,14 @@ def run(
     until_idle: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", min=0.0, help="With --watch: the test is over when nothing has come for so long."
+            metavar="SECONDS", min=0.0, help="With --watch: the test has ended when no data have arrived for this time."
         ),
     ] = None,
     wanted: Annotated[
         str, typer.Option(metavar="U", help="With --watch: wanted standard uncertainty of a position.")
     ] = "0.1 um",
     processes: Annotated[int, typer.Option(min=1, max=2, help="2: a second process shares the work.")] = 2,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but faults.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
 
@@ -134,11 +160,11 @@ def run(
     places = [_place(text) for text in campaigns]
     folders = _folders(places, out)
     if no_plugins:
-        from fusion.effects.plugins import leave_plugins_out
+        from fusion.analysis.effects.effect import leave_plugins_out
 
         leave_plugins_out()
     second = second_process(wanted=processes > 1 and not (resume or watch))
-    with _answering([folder for _, folder in folders]), second as beside:
+    with _answering([folder for _, folder in folders]), second as worker:
         # The libraries may take seconds to load: something is seen before that.
         with _progress(quiet=quiet) as report:
             report("start", 0, 1)
@@ -150,7 +176,7 @@ def run(
         join = _joining([_here(place, "two are joined from") for place in places]) if len(folders) == 2 else None
         for campaign, folder in folders:
             with _progress(quiet=quiet) as report:
-                results = _run_or_keep(campaign, folder, beside, resume=resume, scheduler=scheduler, report=report)
+                results = _run_or_keep(campaign, folder, worker, resume=resume, scheduler=scheduler, report=report)
             if not quiet:
                 console.print(summary_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
@@ -163,14 +189,14 @@ def run(
 def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bool) -> None:
     """Follow a test until it is over, a line per finished cycle."""
     from fusion.campaign.config import CampaignError, load_campaign
-    from fusion.campaign.quantities import read_option
+    from fusion.campaign.values import read_option
     from fusion.pipeline.watch import follow, live_line
 
     wanted_u_um = read_option("--wanted", wanted, "um")
     if not wanted_u_um > 0.0:
-        raise CampaignError(f'--wanted "{wanted}": the wanted uncertainty lies above 0; write for example "0.1 um"')
-    with interrupt_ends_step() as asked:
-        states = follow(load_campaign(campaign), until_idle_s=until_idle_s, wanted_u_um=wanted_u_um, stop=asked)
+        raise CampaignError(f'--wanted "{wanted}": the wanted uncertainty must be above 0; write for example "0.1 um"')
+    with interrupt_ends_step() as requested:
+        states = follow(load_campaign(campaign), until_idle_s=until_idle_s, wanted_u_um=wanted_u_um, stop=requested)
         for state in states:
             for warning in state.warnings:
                 errors.print(f"thermofuse: {warning}")
@@ -179,38 +205,33 @@ def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bo
 
 
 def _run_or_keep(
-    campaign: Path | str, folder: Path, beside: Beside, *, resume: bool, scheduler: str | None, report: Report
+    campaign: Path | str, folder: Path, worker: Worker, *, resume: bool, scheduler: str | None, report: Report
 ) -> Results:
     """Run a campaign, or read the results of a run that is whole, for which the libraries of the analysis are not loaded."""
     if resume and isinstance(campaign, Path):
         from fusion.campaign.config import load_campaign
-        from fusion.pipeline.provenance import kept_results
+        from fusion.pipeline.stages import kept_results
 
-        loaded = load_campaign(campaign)
-        kept = kept_results(loaded, folder)
+        kept = kept_results(load_campaign(campaign), folder)
         if kept is not None:
             report("run (kept)", 1, 1)
             return kept
-        from fusion.pipeline.run import run_loaded
-
-        return run_loaded(loaded, folder, resume=True, scheduler=scheduler, report=report, beside=beside)
     from fusion.pipeline.run import run_campaign
 
-    return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report, beside=beside)
+    return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report, worker=worker)
 
 
 def _joining(campaigns: list[Path]) -> Callable[[Sequence[Path], Path], Iterable[tuple[str, str]]]:
     """Return what joins the results of two campaigns, or of two records."""
-    from fusion.pipeline.joining.campaigns import join_campaigns
-    from fusion.pipeline.joining.records import join_records, of_one_kind
+    from fusion.pipeline.two_campaigns import are_records, compare_records, compare_runs
 
-    return join_records if of_one_kind(campaigns) else join_campaigns
+    return compare_records if are_records(campaigns) else compare_runs
 
 
 @contextmanager
 def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     """Show the progress of what is done within, or nothing."""
-    from fusion.products.progress import Reporter, silent
+    from fusion.results.progress import Reporter, silent
 
     if quiet:
         yield silent
@@ -227,7 +248,7 @@ def _place(text: str) -> Path | str:
 def _here(place: Path | str, what: str) -> Path:
     """Return a path; refuse an address, which `what` cannot use."""
     if isinstance(place, str):
-        from fusion.remote import RemoteError
+        from fusion.pipeline.remote import RemoteError
 
         raise RemoteError(f"{place}: {what} campaigns of this machine; name a path")
     return place
@@ -236,8 +257,8 @@ def _here(place: Path | str, what: str) -> Path:
 def _folders(campaigns: list[Path | str], out: Path | None) -> list[tuple[Path | str, Path]]:
     """Return each campaign with its results folder; two share `out` as subfolders named after the folders of their files."""
     if len(campaigns) == 1:
-        beside = Path() if isinstance(campaigns[0], str) else campaigns[0].parent
-        return [(campaigns[0], out or beside / "results")]
+        parent = Path() if isinstance(campaigns[0], str) else campaigns[0].parent
+        return [(campaigns[0], out or parent / "results")]
     names = [Path(path).absolute().parent.name for path in campaigns]
     unique = names if len(set(names)) == len(names) else [f"{name}_{k}" for k, name in enumerate(names, start=1)]
     base = out or Path("results")
@@ -261,16 +282,14 @@ def fleet(
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep campaigns that are finished and unchanged, continue the others.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but faults.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run many campaigns, one process for each.
 
     Writes fleet.json, fleet.csv and fleet.html with a row for each. One that fails does not stop the others; exit code 100 and the number
     that failed.
     """
-    from fusion.fleet.members import find_members
-    from fusion.fleet.run import run_fleet
-    from fusion.fleet.summary import Row, count_line, read_rows, summary_table
+    from fusion.pipeline.fleet import Row, count_line, find_members, read_rows, run_fleet, summary_table
 
     def kept() -> str:
         return f"{out}: {count_line([*read_rows(out).values()])}; start the same command with --resume to go on"
@@ -285,8 +304,7 @@ def fleet(
             said = (lambda row: say(row) if row.state == "failed" else None) if quiet else say
             rows = run_fleet(members, out, jobs=jobs, resume=resume, report=report, say=said)
         if not quiet:
-            wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
-            wide.print(summary_table(rows, count_line(rows)))
+            _wide().print(summary_table(rows, count_line(rows)))
             console.print(f"summary: {(out / 'fleet.html').resolve()}", soft_wrap=True)
         failed = sum(row.state == "failed" for row in rows)
         if failed:
@@ -298,16 +316,17 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with the files of one measurement.")],
     yes: Annotated[
         bool,
-        typer.Option("--yes", "-y", help="Ask nothing: leave marked lines to fill in for what the files cannot tell."),
+        typer.Option(
+            "--yes", "-y", help="Do not ask: leave marked lines to fill in for what the files do not contain."
+        ),
     ] = False,
 ) -> None:
     """Write a commented campaign file for a folder.
 
-    Its files are looked at, what they cannot tell is asked, and the result is checked. An existing campaign.toml is never replaced.
+    Its files are inspected, what they do not contain is asked for, and the result is checked. An existing campaign.toml is never replaced.
     """
-    from fusion.starting.check import check_campaign
-    from fusion.starting.draft import DraftError, unused_files, write_campaign
-    from fusion.starting.questions import Asker
+    from fusion.pipeline.check import check_campaign
+    from fusion.pipeline.draft import Asker, DraftError, unused_files, write_campaign
 
     with _answering():
         if not yes and not sys.stdin.isatty():
@@ -323,8 +342,7 @@ def init(
         console.print(f"campaign: {path.resolve()}", soft_wrap=True)
         lines = [f"not used: {line}" for line in unused_files(path)]
         lines += [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
-        for line in lines:
-            console.print(line, soft_wrap=True)
+        _print_lines(lines)
 
 
 @app.command("app")
@@ -363,16 +381,15 @@ def check(
 
     The file, the files that it names, clocks and overlap, the axis on the plan, a few frames; exit code 2 where run would refuse it.
     """
-    from fusion.starting.check import check_campaign
+    from fusion.pipeline.check import check_campaign
 
     with _answering():
-        place, told = _fetched(campaign, whole=True, quiet=quiet or as_json)
+        place, with_address = _fetched(campaign, whole=True, quiet=quiet or as_json)
         checked = check_campaign(place)
         if as_json:
-            print_json(checked.as_json(), told)
+            print_json(checked.as_json(), with_address)
         else:
-            for line in checked.lines(quiet=quiet):
-                console.print(told(line), soft_wrap=True)
+            _print_lines(map(with_address, checked.lines(quiet=quiet)))
         if checked.faults:
             raise typer.Exit(ExitCode.BAD_INPUT)
 
@@ -381,13 +398,13 @@ def _fetched(text: str, *, whole: bool, quiet: bool) -> tuple[Path, Callable[[st
     """Return a path as it is; of an address, the file that was fetched, or the `whole` campaign, and what puts the address in messages."""
     if "://" not in text:
         return Path(text), lambda line: line
-    from fusion.remote import fetch_campaign, fetch_file
+    from fusion.pipeline.remote import fetch_campaign, fetch_file
 
     with _progress(quiet=quiet) as report:
         mirror = (fetch_campaign if whole else fetch_file)(text, report=report)
     if not quiet:
         errors.print(mirror.line())
-    return mirror.path, mirror.told
+    return mirror.path, mirror.with_address
 
 
 @app.command()
@@ -401,28 +418,29 @@ def reproduce(
 
     Exit code 0 where they are, 1 where inputs or results differ.
     """
-    from fusion.products.progress import Reporter
-    from fusion.reproduction import reproduce as compute_again
+    from fusion.pipeline.reproduce import reproduce as compute_again
+    from fusion.results.progress import Reporter
 
     with _answering():
         with Reporter(console) as report:
             found = compute_again(results, campaign=None if campaign is None else _place(campaign), report=report)
-        for line in found.lines:
-            console.print(line, soft_wrap=True)
+        _print_lines(found.lines)
         if not found.equal:
             raise typer.Exit(ExitCode.DIFFERENT)
 
 
 @app.command()
 def simulate(
-    recipe: Annotated[Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does.")],
+    recipe: Annotated[
+        Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does; or demo, paper, record.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the campaign; must be empty or absent.")],
 ) -> None:
     """Simulate a campaign with known truth.
 
-    Writes the files that the instruments would write; the truth is kept beside the folder.
+    Writes the files that the instruments would write; the truth is kept next to the folder.
     """
-    from fusion.products.progress import Reporter
+    from fusion.results.progress import Reporter
     from fusion.twin.instruments import simulate_campaign
 
     with _answering(), Reporter(console) as report:
@@ -447,27 +465,25 @@ def inspect(
 
     A series of frames is summed up. A file that cannot be used is named and does not stop the others; the exit code is then 2.
     """
-    from fusion.starting.inspection import inspect_paths, write_thumbnails
+    from fusion.pipeline.inspect import inspect_paths, write_thumbnails
 
     with _answering():
         looked_into = []
         fetched = [_fetched(text, whole=False, quiet=quiet or as_json) for text in paths]
         places = [place for place, _ in fetched]
 
-        def told(line: str) -> str:
+        def with_address(line: str) -> str:
             return reduce(lambda text, name: name(text), (name for _, name in fetched), line)
 
         for one in inspect_paths(places):
             looked_into.append(one)
-            for line in [] if as_json else one.shown(quiet=quiet):
-                console.print(told(line), soft_wrap=True)
+            if not as_json:
+                _print_lines(map(with_address, one.shown(quiet=quiet)))
         if thumbnails is not None:
-            for picture in write_thumbnails(places, thumbnails):
-                if not (quiet or as_json):
-                    console.print(f"  thumbnail: {picture}", soft_wrap=True)
+            pictures = [f"  thumbnail: {picture}" for picture in write_thumbnails(places, thumbnails)]
+            _print_lines([] if quiet or as_json else pictures)
         if as_json:
-            files = [one.as_json() for one in looked_into]
-            print_json({"files": files}, told)
+            print_json({"files": [one.as_json() for one in looked_into]}, with_address)
         if any(one.fails for one in looked_into):
             raise typer.Exit(ExitCode.BAD_INPUT)
 
@@ -492,16 +508,9 @@ def iso230(
 
     A campaign file adds uncertainties, tolerances and the conditions of the test.
     """
-    from fusion.pipeline.iso230.files import read_test
-    from fusion.pipeline.provenance import versions
-    from fusion.report.iso230_page import (
-        NO_SCATTER,
-        iso230_csv,
-        iso230_json,
-        iso230_tables,
-        render_iso230,
-        write_iso230,
-    )
+    from fusion.common import versions
+    from fusion.pipeline.iso230 import read_test
+    from fusion.report.page import NO_SCATTER, iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
 
     with _answering():
         found = read_test(test, cycles)
@@ -510,12 +519,9 @@ def iso230(
         elif as_csv:
             sys.stdout.write(iso230_csv(found.part, found.dataset))
         else:
-            # Twelve columns: a file or a pipe, which has no width of its own, gets them on one line.
-            wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
             for table in iso230_tables(found.part, found.dataset, title=found.title):
-                wide.print(table)
-            for line in (*(() if found.part else (NO_SCATTER,)), *found.remarks):
-                console.print(line, soft_wrap=True)
+                _wide().print(table)
+            _print_lines((*(() if found.part else (NO_SCATTER,)), *found.remarks))
         if out is not None:
             page = render_iso230(found.title, found.part, found.dataset, remarks=found.remarks, versions=versions())
             write_iso230(out, page)
@@ -528,7 +534,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a file."""
     from fusion.campaign.config import campaign_schema
-    from fusion.products.results import results_schema
+    from fusion.results.results import results_schema
     from fusion.twin.recipe_file import recipe_schema
 
     schemas = {"results": results_schema, "campaign": campaign_schema, "recipe": recipe_schema}
@@ -539,7 +545,7 @@ def schema(
 
 @app.command()
 def export(
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")],
+    results: ResultsFolder,
     format: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
     out: Annotated[Path | None, typer.Option(help="Folder for the files; left out: RESULTS/export.")] = None,
     axis: Annotated[
@@ -553,7 +559,7 @@ def export(
     ] = None,
     fields: Annotated[bool, typer.Option("--fields", help="With csv: the fields too, a large file.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Write a compensation table although something speaks against it.")
+        bool, typer.Option("--force", help="Write a compensation table even if the results do not support it.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
@@ -562,7 +568,7 @@ def export(
     A compensation table is written where the drift is explained and the inputs are sound, with a header that says in which thermal
     state it holds and how to try it.
     """
-    from fusion.campaign.quantities import read_option
+    from fusion.campaign.values import read_option
     from fusion.report.exports.export import export_results
 
     with _answering():
@@ -579,13 +585,12 @@ def export(
         )
         for remark in exported.remarks:
             errors.print(f"thermofuse: {remark}")
-        for path in exported.files:
-            console.print(str(path), soft_wrap=True)
+        _print_lines(map(str, exported.files))
 
 
 @app.command()
 def report(
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")],
+    results: ResultsFolder,
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Print it to PDF with an installed Chrome, Chromium or Edge.")
     ] = False,
@@ -601,10 +606,9 @@ def report(
     ] = None,
 ) -> None:
     """Make the report of a finished run anew, or print it to PDF."""
-    from fusion.products.folder import claim_file
-    from fusion.products.store import write_text
-    from fusion.report.html import report_of
-    from fusion.report.pdf import print_pdf
+    from fusion.report.page import print_pdf, report_of
+    from fusion.results.folder import claim_file
+    from fusion.results.store import write_text
 
     with _answering():
         page = report_of(results)
@@ -627,29 +631,28 @@ def compare(
 
     Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first.
     """
-    from fusion.comparison.campaigns import compare_campaigns
-    from fusion.report.comparison_section import (
+    from fusion.analysis.comparison import compare_campaigns
+    from fusion.report.comparison import (
         campaign_names,
         changes_table,
         comparison_json,
         conclude_comparison,
         side_by_side,
     )
-    from fusion.report.tables import print_table
+    from fusion.report.wording import print_table
 
     with _answering():
         pairs = compare_campaigns(results)
         if as_json:
             print_json(comparison_json(pairs))
             return
-        wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
+        wide = _wide()
         wide.print(print_table(side_by_side(pairs), "Side by side"))
         names = campaign_names(pairs)
         for name, pair in zip(names[1:], pairs, strict=True):
             if pair.changes:
                 wide.print(print_table(changes_table(pair), f"{names[0]} -> {name}"))
-            for line in (*conclude_comparison(pair), *(f"Not compared: {lack}" for lack in pair.not_compared)):
-                console.print(line, soft_wrap=True)
+            _print_lines((*conclude_comparison(pair), *(f"Not compared: {lack}" for lack in pair.not_compared)))
 
 
 @app.command()
@@ -672,15 +675,16 @@ def plan(
 
     It separates heat sources that are collinear when they are switched together.
     """
-    from fusion.report.terminal import duty_lines
+    from fusion.pipeline.plan import duty_lines
 
     with _answering():
-        for line in duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed):
-            console.print(line, soft_wrap=True)
+        _print_lines(duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed))
 
 
 def main() -> None:
     """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop_at_once)
     collect_garbage_less()
     # A terminal or pipe of another encoding than UTF-8 shows what it has no character for as its number.
     for stream in (sys.stdout, sys.stderr):

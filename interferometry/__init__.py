@@ -6,7 +6,7 @@ neighbouring positions (:mod:`interferometry.neighbours`), ISO 230-2 (:mod:`inte
 
     deviations = read_deviations("laser.csv")
     drift = estimate_drift(deviations)
-    anomalies = detect_anomalies(drift, deviations)
+    anomalies = detect_anomalies(deviations, drift)
 """
 
 import lazy_loader as _lazy

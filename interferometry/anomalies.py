@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -24,11 +25,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import special
 
-from interferometry._typing import Array
-from interferometry.contract import check_dataset
-from interferometry.drift.gls import von_neumann_p_value
-from interferometry.drift.memory import typical_memory
-from interferometry.errors import InterferometryError
+from interferometry.common import Array, InterferometryError, check_dataset
+from interferometry.drift.gls import typical_memory, von_neumann_p_value
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
 WEIGHTS = {"scatter": 0.7, "slow": 0.1, "step": 0.1, "periodic": 0.1}
@@ -56,8 +54,6 @@ class Anomaly:
 
     Attributes
     ----------
-    target : int
-        Number of the position.
     direction : str
         "positive", "negative" or "both".
     kind : str
@@ -72,9 +68,9 @@ class Anomaly:
         Whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme Studentized
         deviate test at `ESD_LEVELS`).
     at_cycle : int or None
-        Number of the first cycle after a step; None for other kinds.
+        Number of the first cycle after a step.
     period_s : float or None
-        Period of a periodic motion, s; None for other kinds.
+        Period of a periodic motion, s.
     least_p_value : float
         Smallest p-value that the number of permutations can show; 0 of a periodic motion, whose p-value is calculated.
     """
@@ -92,16 +88,16 @@ class Anomaly:
 
 
 def detect_anomalies(
-    estimated: xr.Dataset, deviations: xr.Dataset, *, level: float = 0.05, permutations: int = 399, seed: int = 0
+    deviations: xr.Dataset, estimated: xr.Dataset, *, level: float = 0.05, permutations: int = 399, seed: int = 0
 ) -> list[Anomaly]:
     """Find positions that behave unlike the others.
 
     Parameters
     ----------
-    estimated : xarray.Dataset
-        What `estimate_drift` returns.
     deviations : xarray.Dataset
-        The deviations that it was estimated from (keeps ``contract.DEVIATIONS``).
+        Positioning deviations (cycle, direction, target) in um (keeps ``contract.DEVIATIONS``).
+    estimated : xarray.Dataset
+        What `estimate_drift` returns for them.
     level : float
         Probability of any false anomaly in a whole test, between 0 and 1 (both excluded).
     permutations : int
@@ -118,7 +114,7 @@ def detect_anomalies(
     Raises
     ------
     InterferometryError
-        A Dataset lacks a variable, ``level`` is no probability between 0 and 1, or ``permutations`` are too few to reach it in the kind
+        A Dataset lacks a variable, ``level`` is not a probability between 0 and 1, or ``permutations`` are too few to reach it in the kind
         with the smallest weight.
 
     Notes
@@ -140,13 +136,13 @@ def detect_anomalies(
     >>> deviation[:, :, 2] *= 3
     >>> time = np.datetime64("2026-03-09T06:30") + 8 * np.arange(deviation.size).reshape(deviation.shape) * np.timedelta64(1, "s")
     >>> test = build_deviations(range(1, 15), range(1, 17), 20.0 * np.arange(16), deviation, time)
-    >>> [(a.target, a.direction, a.kind, a.stands_out) for a in detect_anomalies(estimate_drift(test), test)]
+    >>> [(a.target, a.direction, a.kind, a.stands_out) for a in detect_anomalies(test, estimate_drift(test))]
     [(3, 'both', 'scatter', True)]
     """
-    check_dataset(estimated, "estimated")
     check_dataset(deviations, "deviations")
+    check_dataset(estimated, "estimated")
     if not 0 < level < 1:
-        raise InterferometryError(f"level={level} is no probability between 0 and 1; 0.05 is usual")
+        raise InterferometryError(f"level={level} is not a probability between 0 and 1; 0.05 is usual")
     needed = int(np.ceil(1.0 / (level * min(WEIGHTS.values()))))
     if permutations + 1 < needed:
         raise InterferometryError(f"permutations={permutations} cannot reach level={level}; use at least {needed - 1}")
@@ -209,11 +205,7 @@ def _stands_out(estimated: xr.Dataset, usable: NDArray[np.int64]) -> NDArray[np.
 
 
 def _scatter_test(z: Array, permutations: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return the excess of each target (target,), and the largest one of each permutation of targets within a pass (permutation,).
-
-    z (cycle, direction, target) holds standardised readings, NaN where missing. The excess of a target is the largest of both directions
-    together and of each direction alone.
-    """
+    """Return the excess of each target (target,), and the largest one of each permutation of targets within a pass (permutation,)."""
     present = np.isfinite(z)
     cycle, direction, target = np.nonzero(present)
     squares = np.minimum(z[present] ** 2, WINSOR**2)
@@ -287,8 +279,7 @@ def _scatter_of(estimated: xr.Dataset, target: int, direction: str) -> float:
     return float(estimated["scatter"].sel(direction=direction).values[target])
 
 
-@dataclass(frozen=True)
-class _Series:
+class _Series(NamedTuple):
     """Which series of standardised residuals per cycle: target index, and "positive", "negative" or "both"."""
 
     target: int
@@ -306,7 +297,14 @@ def _series_anomalies(
     memory = typical_memory(values[[label.direction != "both" for label in labels]])
     values = memory.innovations(values)
     moving = _permutation_tests(values, {"slow": _slowness, "step": _largest_step}, permutations, rng)
-    periodogram = _Periodogram(_cycle_seconds(deviations))
+    # Middle of each cycle, s since the first reading; a cycle without readings lies between its neighbours.
+    time = deviations["time"].values.astype("datetime64[ns]")
+    has_time = ~np.isnat(time)
+    first = time[has_time].min()
+    measured = has_time.any(axis=(1, 2))
+    seconds = np.where(has_time, (time - first).astype("f8") * 1e-9, 0.0)
+    middles = seconds.sum(axis=(1, 2))[measured] / has_time.sum(axis=(1, 2))[measured]
+    periodogram = _Periodogram(np.interp(np.arange(measured.size), np.flatnonzero(measured), middles))
     largest = periodogram.power(values).max(axis=-1)
     tests = {"periodic": (largest, periodogram.p_values(largest)), **moving}
     significant: dict[str, dict[int, tuple[float, int]]] = {}
@@ -321,9 +319,23 @@ def _series_anomalies(
     anomalies = []
     for kind, target in _one_kind_per_target(significant, values):
         p_value, row = significant[kind][target]
-        significance = (min(p_value, 1.0), target in apart[kind])
-        described = _describe_series(estimated, kind, labels[row], values[row], significance, periodogram)
-        anomalies.append(replace(described, least_p_value=_least_p_value(kind, permutations)))
+        size, at_cycle, period_s = _size_of_motion(estimated, kind, values[row], periodogram)
+        direction = labels[row].direction
+        scatter_um = _scatter_of(estimated, target, direction)
+        anomalies.append(
+            Anomaly(
+                target=int(estimated["target"].values[target]),
+                direction=direction,
+                kind=kind,
+                p_value=min(p_value, 1.0),
+                scatter_um=scatter_um,
+                extra_um=size * (scatter_um / (np.sqrt(2) if direction == "both" else 1.0)),
+                stands_out=target in apart[kind],
+                at_cycle=at_cycle,
+                period_s=period_s,
+                least_p_value=_least_p_value(kind, permutations),
+            )
+        )
     return anomalies
 
 
@@ -369,10 +381,7 @@ def _against_permuted(measured: Array, shuffled: Array) -> tuple[Array, Array]:
 
 
 def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
-    """Return the series of each target, per direction and for both together, and their labels.
-
-    Values (series, cycle) are standardised residuals, winsorised and centred, 0 where missing.
-    """
+    """Return the series of each target, per direction and for both together, and their labels."""
     z = np.clip(estimated["standardised"].values, -WINSOR, WINSOR)
     names = [str(name) for name in estimated["direction"].values]
     labels, rows = [], []
@@ -388,17 +397,6 @@ def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
             labels.append(_Series(target, "both"))
             rows.append((single[0] + single[1]) / np.sqrt(2))
     return labels, np.array(rows)
-
-
-def _cycle_seconds(deviations: xr.Dataset) -> Array:
-    """Return the middle of each cycle, s since the first reading; a cycle without readings lies between its neighbours."""
-    time = deviations["time"].values.astype("datetime64[ns]")
-    has_time = ~np.isnat(time)
-    first = time[has_time].min()
-    measured = has_time.any(axis=(1, 2))
-    seconds = np.where(has_time, (time - first).astype("f8") * 1e-9, 0.0)
-    middles = seconds.sum(axis=(1, 2))[measured] / has_time.sum(axis=(1, 2))[measured]
-    return np.interp(np.arange(measured.size), np.flatnonzero(measured), middles)
 
 
 def _slowness(values: Array) -> Array:
@@ -445,10 +443,7 @@ class _Periodogram:
         return np.asarray(energy * 2 / values.shape[-1] / values.var(axis=-1)[..., None])
 
     def p_values(self, largest: Array) -> Array:
-        """Return the p-value of each series' largest power, corrected for all frequencies and series (Bonferroni).
-
-        The power of a winsorised series without period follows chi-square with two degrees of freedom: no permutation needed.
-        """
+        """Return the p-value of each series' largest power, corrected for all frequencies and series (Bonferroni)."""
         return np.minimum(1.0, np.exp(-largest / 2) * self.frequency.size * largest.size)
 
 
@@ -470,67 +465,24 @@ def _one_kind_per_target(significant: dict[str, dict[int, tuple[float, int]]], v
     return chosen
 
 
-def _describe_series(
-    estimated: xr.Dataset,
-    kind: str,
-    label: _Series,
-    row: Array,
-    significance: tuple[float, bool],
-    periodogram: _Periodogram,
-) -> Anomaly:
-    """Return the anomaly of a series (cycle,); `significance` is its p-value and whether it stands out."""
-    p_value, stands_out = significance
-    scatter = _scatter_of(estimated, label.target, label.direction)
-    scale = scatter / (np.sqrt(2) if label.direction == "both" else 1.0)
-    at_cycle, period_s = None, None
+def _size_of_motion(
+    estimated: xr.Dataset, kind: str, row: Array, periodogram: _Periodogram
+) -> tuple[float, int | None, float | None]:
+    """Return the size of a motion in units of a series' (cycle,) standard deviation, the cycle after a step, and the period in s."""
     if kind == "step":
         step = _step_index(row)
-        extra = abs(float(row[step:].mean() - row[:step].mean())) * scale
-        at_cycle = int(estimated["cycle"].values[step])
-    elif kind == "periodic":
+        return abs(float(row[step:].mean() - row[:step].mean())), int(estimated["cycle"].values[step]), None
+    if kind == "periodic":
         power = periodogram.power(row)
         period_s = float(1 / periodogram.frequency[int(np.argmax(power))])
-        extra = float(np.sqrt(2 * power.max() * row.var() / row.size)) * scale
-    else:
-        n = row.size // BLOCK_CYCLES * BLOCK_CYCLES
-        blocks = row[:n].reshape(-1, BLOCK_CYCLES).mean(axis=1)
-        extra = float(np.sqrt(max(blocks.var() - row.var() / BLOCK_CYCLES, 0.0))) * scale
-    return Anomaly(
-        target=int(estimated["target"].values[label.target]),
-        direction=label.direction,
-        kind=kind,
-        p_value=p_value,
-        scatter_um=scatter,
-        extra_um=extra,
-        stands_out=stands_out,
-        at_cycle=at_cycle,
-        period_s=period_s,
-    )
+        return float(np.sqrt(2 * power.max() * row.var() / row.size)), None, period_s
+    n = row.size // BLOCK_CYCLES * BLOCK_CYCLES
+    blocks = row[:n].reshape(-1, BLOCK_CYCLES).mean(axis=1)
+    return float(np.sqrt(max(blocks.var() - row.var() / BLOCK_CYCLES, 0.0))), None, None
 
 
 def generalised_esd(values: Array, *, most: int, level: float = 0.05, high_only: bool = False) -> NDArray[np.bool_]:
-    """Mark outliers by the generalised extreme Studentized deviate test.
-
-    Parameters
-    ----------
-    values : (n,) ndarray
-        In any unit; approximately normal but for the outliers.
-    most : int
-        Largest number of outliers looked for.
-    level : float
-        Probability of any false outlier.
-    high_only : bool
-        Look for values that are too large only, and give the whole error probability to that side.
-
-    Returns
-    -------
-    (n,) ndarray of bool
-        True for an outlier.
-
-    References
-    ----------
-    Rosner (1983), Percentage points for a generalized ESD many-outlier procedure, Technometrics 25, 165.
-    """
+    """Mark outliers by the generalised extreme Studentized deviate test."""
     n = values.size
     remaining = np.ones(n, dtype=bool)
     removed: list[int] = []

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import ref_index
 
-from interferometry._typing import Array
-from interferometry.contract import check_dataset
-from interferometry.errors import InterferometryError
+from interferometry.common import Array, InterferometryError, check_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,27 +36,9 @@ class CompensationError(InterferometryError):
 
 @dataclass(frozen=True)
 class SensorUncertainty:
-    """Standard uncertainties (k = 1) of the inputs of the compensation.
+    """Standard uncertainties (k = 1) of the inputs of the compensation; ``formula_ppm`` is that of Ciddor's equation.
 
-    The defaults are those of an XL-80 with weather station, half its k = 2 specification.
-
-    Attributes
-    ----------
-    air_temperature_K, air_pressure_hPa, relative_humidity_percent : float
-        Of the logged air: K, hPa, % relative humidity.
-    material_temperature_K : float
-        Of the probe, or of the temperature that replaces it, K.
-    expansion_coefficient_ppm_per_K : float
-        Of the material, ppm/K.
-    formula_ppm : float
-        Of the equation for the index itself, ppm.
-    dead_path_mm : float
-        Of the length of the dead path, mm.
-
-    Raises
-    ------
-    CompensationError
-        One of them is negative.
+    The defaults are those of an XL-80 with weather station, half its k = 2 specification. A negative one raises `CompensationError`.
     """
 
     air_temperature_K: float = 0.1
@@ -82,29 +62,7 @@ def air_index(
     *,
     wavelength_nm: float = VACUUM_WAVELENGTH_NM,
 ) -> Array:
-    """Return the refractive index of air by Ciddor's equation.
-
-    Parameters
-    ----------
-    air_temperature_degC, air_pressure_hPa, relative_humidity_percent : array_like
-        Air temperature, degC; pressure, hPa; relative humidity, %. Broadcast against each other.
-    wavelength_nm : float
-        Vacuum wavelength, nm, 300 .. 1700.
-
-    Returns
-    -------
-    ndarray
-        Index (1), of the shape of the broadcast inputs; NaN where an input is.
-
-    References
-    ----------
-    Ciddor (1996), Applied Optics 35, 1566, in the form of the NIST Engineering Metrology Toolbox, with 450 ppm CO2.
-
-    Examples
-    --------
-    >>> f"{air_index(20.0, 1013.25, 50.0):.8f}"
-    '1.00027137'
-    """
+    """Return the refractive index of air by Ciddor's equation (1996, Applied Optics 35, 1566), with 450 ppm CO2; NaN where an input is."""
 
     def index(temperature_degC: float, pressure_hPa: float, humidity_percent: float) -> float:
         if np.isnan(temperature_degC + pressure_hPa + humidity_percent):
@@ -122,24 +80,7 @@ def environment_factor(
     expansion_coefficient_ppm_per_K: float = 0.0,
     wavelength_nm: float = VACUUM_WAVELENGTH_NM,
 ) -> Array:
-    """Return the environment factor: displacement per count of half a wavelength, lambda / (2 n (1 + alpha (T - 20 degC))).
-
-    Parameters
-    ----------
-    index : array_like
-        Refractive index of air (1).
-    material_temperature_degC : array_like
-        Temperature of the measured material, degC.
-    expansion_coefficient_ppm_per_K : float
-        Its expansion coefficient alpha, ppm/K; 0: lengths are not brought to 20 degC.
-    wavelength_nm : float
-        Vacuum wavelength, nm.
-
-    Returns
-    -------
-    ndarray
-        um per count, of the broadcast shape.
-    """
+    """Return the environment factor: displacement per count of half a wavelength, lambda / (2 n (1 + alpha (T - 20 degC)))."""
     stretch = _stretch(material_temperature_degC, expansion_coefficient_ppm_per_K)
     return wavelength_nm * 1e-3 / (2.0 * np.asarray(index) * stretch)
 
@@ -157,24 +98,7 @@ def implied_wavelength_nm(
     material_temperature_degC: Array | float,
     expansion_coefficient_ppm_per_K: float,
 ) -> Array:
-    """Return the vacuum wavelength that an instrument's environment factor implies: a check of file and sensors.
-
-    Parameters
-    ----------
-    factor_um : array_like
-        Environment factor of the instrument, um per count.
-    index : array_like
-        Refractive index of air at the same instants (1).
-    material_temperature_degC : array_like
-        Temperature of the measured material at the same instants, degC.
-    expansion_coefficient_ppm_per_K : float
-        That the instrument used, ppm/K.
-
-    Returns
-    -------
-    ndarray
-        nm, of the broadcast shape.
-    """
+    """Return the vacuum wavelength that an instrument's environment factor implies: a check of file and sensors."""
     unit = environment_factor(
         index,
         material_temperature_degC=material_temperature_degC,
@@ -185,22 +109,7 @@ def implied_wavelength_nm(
 
 
 def dead_path_error_um(index: Array, start_index: float, *, dead_path_mm: float) -> Array:
-    """Return the dead-path error: the change of the display, with nothing moving, since the index was that of the zeroing.
-
-    Parameters
-    ----------
-    index : (n,) ndarray
-        Refractive index of air at each reading (1).
-    start_index : float
-        Refractive index where the display was set to zero (1).
-    dead_path_mm : float
-        Distance from the interferometer to the reflector where the display was set to zero, mm.
-
-    Returns
-    -------
-    (n,) ndarray
-        um.
-    """
+    """Return the dead-path error: the change of the display, with nothing moving, since the index was that of the zeroing."""
     return dead_path_mm * 1e3 * (np.asarray(index) - start_index) / np.asarray(index)
 
 
@@ -209,37 +118,13 @@ def followed_factor_um(
     environment: xr.Dataset,
     *,
     expansion_coefficient_ppm_per_K: float,
-    wavelength_nm: float = VACUUM_WAVELENGTH_NM,
 ) -> Array:
-    """Return the environment factor of an instrument that followed the logged air and the logged probe.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    environment : xarray.Dataset
-        What `read_environment` returns.
-    expansion_coefficient_ppm_per_K : float
-        That the instrument used, ppm/K.
-    wavelength_nm : float
-        Vacuum wavelength, nm.
-
-    Returns
-    -------
-    (cycle, direction, target) ndarray
-        um per count at every reading; NaN where it has no time.
-
-    Raises
-    ------
-    CompensationError
-        No reading has a time, or one lies more than 15 minutes from any logged condition.
-    """
+    """Return the environment factor of an instrument that followed the logged air and the logged probe."""
     air, _ = _conditions_at(deviations, environment)
     return environment_factor(
-        _index_of(air, wavelength_nm),
+        _index_of(air, VACUUM_WAVELENGTH_NM),
         material_temperature_degC=air["material_temperature"],
         expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
-        wavelength_nm=wavelength_nm,
     )
 
 
@@ -359,7 +244,7 @@ def _check_numbers(**numbers: float) -> None:
         raise CompensationError(f"dead_path_mm={numbers['dead_path_mm']} is negative; give the distance, 0 or more")
     if not WAVELENGTHS_NM[0] <= numbers["wavelength_nm"] <= WAVELENGTHS_NM[1]:
         raise CompensationError(
-            f"wavelength_nm={numbers['wavelength_nm']} lies outside {WAVELENGTHS_NM[0]:g} .. {WAVELENGTHS_NM[1]:g}; "
+            f"wavelength_nm={numbers['wavelength_nm']} is outside {WAVELENGTHS_NM[0]:g} .. {WAVELENGTHS_NM[1]:g}; "
             f"a HeNe laser has {VACUUM_WAVELENGTH_NM} nm in vacuum"
         )
 
@@ -385,12 +270,16 @@ def _scale(deviations: xr.Dataset, wanted_um: Array, applied_um: tuple[float, fl
     """Return the relative correction of a displayed length (1), (cycle, direction, target)."""
     if applied_um is None:
         return np.zeros(wanted_um.shape)
-    applied = _interpolate_factor(deviations, applied_um) if isinstance(applied_um, tuple) else applied_um
+    applied = applied_um
+    if isinstance(applied_um, tuple):
+        seconds = _seconds(deviations)
+        length = max(float(np.nanmax(seconds)), 1e-9)
+        applied = applied_um[0] + (applied_um[1] - applied_um[0]) * seconds / length
     scale = wanted_um / applied - 1.0
     if np.nanmax(np.abs(scale)) > LARGEST_SCALE:
         raise CompensationError(
             f"the environment factor {float(np.nanmean(applied)):.6g} um differs by {np.nanmax(np.abs(scale)) * 1e6:.0f} ppm from "
-            f"the {float(np.nanmean(wanted_um)):.6f} um that these conditions ask for; give the factor in um of the file of this test"
+            f"the {float(np.nanmean(wanted_um)):.6f} um that these conditions require; give the factor in um of the file of this test"
         )
     return scale
 
@@ -427,12 +316,6 @@ def _conditions_at(deviations: xr.Dataset, environment: xr.Dataset) -> tuple[dic
     return {
         name: np.where(has_time, np.interp(instant, log, environment[name].values), np.nan) for name in names
     }, outside
-
-
-def _interpolate_factor(deviations: xr.Dataset, applied_factor_um: tuple[float, float]) -> Array:
-    seconds = _seconds(deviations)
-    length = max(float(np.nanmax(seconds)), 1e-9)
-    return applied_factor_um[0] + (applied_factor_um[1] - applied_factor_um[0]) * seconds / length
 
 
 def _air_ppm(air: dict[str, Array], sensors: SensorUncertainty, wavelength_nm: float) -> float:

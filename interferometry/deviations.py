@@ -3,45 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from interferometry.errors import InterferometryError
+from interferometry.common import DIRECTIONS, InterferometryError
 
 DIMS = ("cycle", "direction", "target")
-DIRECTIONS = ("positive", "negative")
 
 
-@dataclass(frozen=True)
-class Flag:
-    """One bit of ``quality_flag``: why a reading is missing or doubtful.
-
-    Attributes
-    ----------
-    mask : int
-        Value of the bit, a power of two.
-    name : str
-        As in the CF attribute ``flag_meanings``.
-    meaning : str
-        One sentence.
-    """
+class Flag(NamedTuple):
+    """One bit of ``quality_flag``: why a reading is missing or doubtful, with its name in the CF attribute ``flag_meanings``."""
 
     mask: int
     name: str
-    meaning: str
 
 
-MISSING = Flag(1, "missing", "The file holds no reading for this cycle, direction and target.")
-UNREADABLE = Flag(
-    2, "unreadable", "The file holds a line for it whose value, time, target or direction cannot be used."
-)
-DUPLICATE = Flag(4, "duplicate", "The file holds this reading more than once; the first one is kept.")
-OUT_OF_ORDER = Flag(
-    8, "out_of_order", "Its time does not lie in its pass between the readings of the neighbouring targets."
-)
-OUTLIER = Flag(16, "outlier", "It lies so far from the joint estimate that it was given little weight or none.")
+#: The file holds no reading for this cycle, direction and target.
+MISSING = Flag(1, "missing")
+#: The file holds a line for it whose value, time, target or direction cannot be used.
+UNREADABLE = Flag(2, "unreadable")
+#: The file holds this reading more than once; the first one is kept.
+DUPLICATE = Flag(4, "duplicate")
+#: Its time does not lie in its pass between the readings of the neighbouring targets.
+OUT_OF_ORDER = Flag(8, "out_of_order")
+#: It lies so far from the joint estimate that it was given little weight or none.
+OUTLIER = Flag(16, "outlier")
 
 #: Every flag, in the order of the bits.
 REGISTRY: tuple[Flag, ...] = (MISSING, UNREADABLE, DUPLICATE, OUT_OF_ORDER, OUTLIER)
@@ -113,39 +101,24 @@ def build_deviations(
                 np.asarray(position_mm, dtype="f8"),
                 {"units": "mm", "long_name": "programmed position"},
             ),
-            "quality_flag": (DIMS, missing, _flag_attributes()),
+            "quality_flag": (
+                DIMS,
+                missing,
+                {
+                    "units": "1",
+                    "standard_name": "quality_flag",
+                    "long_name": "why the reading is missing or doubtful",
+                    "flag_masks": np.array([flag.mask for flag in REGISTRY], dtype="u1"),
+                    "flag_meanings": " ".join(flag.name for flag in REGISTRY),
+                },
+            ),
         },
         coords={"cycle": list(cycles), "direction": list(DIRECTIONS), "target": list(targets)},
     )
 
 
-def _flag_attributes() -> dict[str, object]:
-    """Return the CF attributes that explain ``quality_flag``."""
-    return {
-        "units": "1",
-        "standard_name": "quality_flag",
-        "long_name": "why the reading is missing or doubtful",
-        "flag_masks": np.array([flag.mask for flag in REGISTRY], dtype="u1"),
-        "flag_meanings": " ".join(flag.name for flag in REGISTRY),
-    }
-
-
 def set_flag(deviations: xr.Dataset, flag: Flag, where: np.ndarray) -> xr.Dataset:
-    """Return a copy with one flag set where a mask is true.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    flag : Flag
-        A record of the registry.
-    where : (cycle, direction, target) ndarray of bool
-        True where the flag applies; elsewhere the bits stay as they are.
-
-    Returns
-    -------
-    xarray.Dataset
-    """
+    """Return a copy with one flag set where a mask is true."""
     marked = deviations.copy()
     bits = deviations["quality_flag"].values | np.where(where, np.uint8(flag.mask), np.uint8(0))
     marked["quality_flag"] = (deviations["quality_flag"].dims, bits.astype("u1"), deviations["quality_flag"].attrs)
@@ -153,19 +126,7 @@ def set_flag(deviations: xr.Dataset, flag: Flag, where: np.ndarray) -> xr.Datase
 
 
 def sort_readings(deviations: xr.Dataset) -> xr.Dataset:
-    """Return the readings as one series in the order in which they were measured.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-
-    Returns
-    -------
-    xarray.Dataset
-        Single dim "reading", sorted by time, without missing readings and readings without a time: ``deviation`` (um), ``time`` (UTC),
-        ``seconds`` (s since the first reading), ``cycle``, ``target``, ``sign`` (+1 positive, -1 negative), ``position`` (mm).
-    """
+    """Return the readings as one series in the order in which they were measured."""
     present = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
     cycle, direction, target = np.nonzero(present)
     time = deviations["time"].values[present].astype("datetime64[ns]")
@@ -187,21 +148,7 @@ def sort_readings(deviations: xr.Dataset) -> xr.Dataset:
 
 
 def detect_out_of_order(deviations: xr.Dataset) -> np.ndarray:
-    """Find readings whose time breaks the order of their pass.
-
-    In the positive direction times grow with position, in the negative direction they fall. A pass is compared with its longest run of
-    readings in order, so that one wrong time marks itself and not its neighbours.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-
-    Returns
-    -------
-    (cycle, direction, target) ndarray of bool
-        True where the time is out of order; False where there is none.
-    """
+    """Find readings whose time breaks the order of their pass."""
     along = np.argsort(deviations["position"].values, kind="stable")
     nanoseconds = deviations["time"].values.astype("datetime64[ns]").astype("i8")
     has_time = ~np.isnat(deviations["time"].values)

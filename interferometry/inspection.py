@@ -14,25 +14,12 @@ _WAVELENGTH_PPM = 0.3
 
 
 def describe_test(deviations: xr.Dataset) -> list[str]:
-    """Describe a positioning test as it was read.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        What `read_deviations` returns.
-
-    Returns
-    -------
-    list of str
-        One fact per line; lines that start with "warning" ask for action.
-    """
-    return [
-        *_missing(deviations),
-        *describe_notes(deviations),
-        *_times(deviations),
-        *_environment(deviations),
-        *_wavelength(deviations),
-    ]
+    """Describe a positioning test as it was read."""
+    lines = [*_missing(deviations), *describe_notes(deviations)]
+    if "time_u" in deviations:
+        u_s = float(deviations["time_u"])
+        lines.append(f"standard uncertainty of a reconstructed time {u_s:.1f} s; feed and dwell lower it")
+    return [*lines, *_environment(deviations), *_wavelength(deviations)]
 
 
 def _missing(deviations: xr.Dataset) -> list[str]:
@@ -51,29 +38,10 @@ def _missing(deviations: xr.Dataset) -> list[str]:
 
 
 def describe_notes(deviations: xr.Dataset) -> list[str]:
-    """Return what the reader assumed, and which columns it did not read.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        What `read_deviations` returns.
-
-    Returns
-    -------
-    list of str
-        Sentences; those that start with "warning" ask for action.
-    """
+    """Return what the reader assumed, and which columns it did not read."""
     ignored = json.loads(deviations.attrs.get("columns_ignored", "[]"))
     columns = [f"columns that were not read: {', '.join(ignored)}"] if ignored else []
     return json.loads(deviations.attrs.get("notes", "[]")) + columns
-
-
-def _times(deviations: xr.Dataset) -> list[str]:
-    if "time_u" not in deviations:
-        return []
-    return [
-        f"standard uncertainty of a reconstructed time {float(deviations['time_u']):.1f} s; feed and dwell lower it"
-    ]
 
 
 def _environment(deviations: xr.Dataset) -> list[str]:

@@ -1,8 +1,8 @@
-"""Differences of neighbouring positions, and the conventional evaluation beside them.
+"""Differences of neighbouring positions, and the conventional evaluation for comparison.
 
 Equations (1) to (10) and the deviation charts of the paper "Elimination of thermal drift in measuring the positioning accuracy of a
 three axis milling machine". What its equations (5) and (6) call a sample standard deviation divides by n (n - 1): it is the standard
-uncertainty of a mean, and has that name here, beside the sample standard deviation.
+uncertainty of a mean, and has that name here, next to the sample standard deviation.
 
 The chain of mean differences telescopes exactly to the mean profile: differencing removes the drift from the standard deviation, not
 from the mean. Equations are numbered as in the paper; see docs/method/differences.md.
@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from scipy import optimize, special
+from scipy import special
 
-from interferometry.contract import check_dataset
-from interferometry.errors import InterferometryError
+from interferometry.common import InterferometryError, check_dataset
 
 #: Probability that two standard deviations of a normal distribution cover; Student's t replaces the 2 below it.
 TWO_SIGMA_PROBABILITY = 0.9545
@@ -24,60 +23,15 @@ ENOUGH_REPETITIONS = 30
 DEFAULT_REFERENCE_S = 7200.0
 
 
-def place_targets(count: int, interval_mm: float, periodic_error_mm: float, rng: np.random.Generator) -> np.ndarray:
-    """Return target positions by equation (1): P_i = (i - 1) p + r.
-
-    Parameters
-    ----------
-    count : int
-        Number of targets.
-    interval_mm : float
-        Spacing p, mm.
-    periodic_error_mm : float
-        Amplitude of the random part r, mm: within the period of the expected error (for a screw, up to its lead).
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    (count,) ndarray
-        Positions, mm.
-    """
-    return np.arange(count) * interval_mm + rng.uniform(-periodic_error_mm, periodic_error_mm, count)
-
-
 def coverage_factor(repetitions: np.ndarray) -> np.ndarray:
-    """Return the coverage factor of borders: 2 from thirty repetitions, Student's t for the same probability (0.9545) below.
-
-    Parameters
-    ----------
-    repetitions : array_like of int
-        Number n of repetitions.
-
-    Returns
-    -------
-    ndarray
-        Of the same shape (1); NaN where n < 2.
-    """
+    """Return the coverage factor of borders: 2 from thirty repetitions, Student's t for the same probability (0.9545) below."""
     n = np.asarray(repetitions)
     student = special.stdtrit(np.maximum(n - 1, 1), 0.5 + TWO_SIGMA_PROBABILITY / 2)
     return np.where(n < 2, np.nan, np.where(n < ENOUGH_REPETITIONS, student, 2.0))
 
 
 def evaluate_conventional(deviations: xr.Dataset) -> xr.Dataset:
-    """Evaluate each position on its own, equations (2), (3) and (5).
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``; missing readings are skipped.
-
-    Returns
-    -------
-    xarray.Dataset
-        Per direction and target, in um: ``mean``; ``standard_deviation`` (n - 1); ``mean_u``, the standard uncertainty of the mean,
-        equation (5); ``lower`` and ``upper`` border, mean minus and plus k standard deviations, equations (2) and (3). ``count`` n and
-        ``coverage_factor`` k (1).
-    """
+    """Evaluate each position on its own, equations (2), (3) and (5)."""
     x = deviations["deviation"]
     count = x.count("cycle")
     spread = _standard_deviation(x, "cycle")
@@ -161,31 +115,7 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
 def build_chart(
     deviations: xr.Dataset, *, reference: str = "time", reference_s: float = DEFAULT_REFERENCE_S
 ) -> xr.Dataset:
-    """Build the deviation chart: a reference value at position 1, then the chain of mean differences.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    reference : {"time", "first_cycle"}
-        Where the value at position 1 is taken: in the first cycle that reaches ``reference_s``, or in the first cycle.
-    reference_s : float
-        Time since the first reading, s. The paper advises two hours, when changes have become slow. In a shorter test, and
-        without times, the last cycle is taken.
-
-    Returns
-    -------
-    xarray.Dataset
-        Per direction and target, in um: ``chart``; ``border_u``, k times equation (6); ``border_s``, k times the standard deviation of
-        the differences; ``chart_u``, the standard uncertainty of the chain from position 1 with the full covariance of its links.
-        Positions 1 and 2 have the same borders, as in the paper. ``reference_cycle`` (direction): number of the cycle that gave the
-        value at position 1; 0 where it was never read, and the chart is NaN.
-
-    Raises
-    ------
-    InterferometryError
-        An unknown reference, or fewer than two targets.
-    """
+    """Build the deviation chart: a reference value at position 1, then the chain of mean differences."""
     if reference not in ("time", "first_cycle"):
         raise InterferometryError(f"reference={reference!r} is neither 'time' nor 'first_cycle'")
     x = _along_axis(deviations)
@@ -266,85 +196,6 @@ def compare(deviations: xr.Dataset, estimated: xr.Dataset | None = None) -> xr.D
     return table if estimated is None else table.assign(joint=further(estimated["scatter"]))
 
 
-def telescoping_error(deviations: xr.Dataset) -> float:
-    """Return the largest difference between the chain of mean differences and the mean profile.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-
-    Returns
-    -------
-    float
-        Largest magnitude of (sum of the links up to i) - (mean_1 - mean_i) over directions and targets, um: rounding only where no
-        reading is missing.
-    """
-    x = _along_axis(deviations)
-    mean = x.mean("cycle").values
-    chain = np.cumsum(evaluate_neighbours(deviations)["mean_difference"].values, axis=-1)
-    return float(np.nanmax(np.abs(chain - (mean[:, :1] - mean[:, 1:]))))
-
-
-def resolve_links(pair_s_um: np.ndarray) -> np.ndarray:
-    """Resolve standard deviations of neighbour differences into those of positions.
-
-    A position with excess scatter raises both of its links.
-
-    Parameters
-    ----------
-    pair_s_um : (m - 1,) array_like
-        Standard deviation of the difference of each pair of neighbours, um.
-
-    Returns
-    -------
-    (m,) ndarray
-        Standard deviation of each position, um.
-
-    Notes
-    -----
-    s_link^2 = s_i^2 + s_(i+1)^2 is one equation fewer than positions. Of all non-negative solutions the one is taken in which fewest
-    positions differ from the typical one: least absolute differences by iteratively reweighted least squares.
-    """
-    variance = np.asarray(pair_s_um, float) ** 2
-    links = variance.size
-    sums = np.eye(links, links + 1) + np.eye(links, links + 1, 1)
-    typical = float(np.median(variance)) / 2
-    solution = np.full(links + 1, typical)
-    for _ in range(30):
-        weak = 0.3 * np.diag((np.maximum(np.abs(solution - typical) / typical, 0.02) / 0.02) ** -0.5)
-        solution, _ = optimize.nnls(
-            np.vstack([sums, weak]), np.concatenate([variance, weak @ np.full(links + 1, typical)])
-        )
-    return np.sqrt(solution)
-
-
-def simulate_derived_sequence(samples: int, rng: np.random.Generator) -> xr.Dataset:
-    """Repeat the Monte Carlo of equations (7) to (10): differences of successive normal values.
-
-    Parameters
-    ----------
-    samples : int
-        Length of the source sequence.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    xarray.Dataset
-        ``source`` (sample), standard normal; ``derived`` (derived_sample), its successive differences; ``ratio`` s_b / s_a of their
-        standard deviations, which tends to sqrt 2 (1.4076 in the paper, with 1,000 samples).
-    """
-    source = rng.standard_normal(samples)
-    derived = source[:-1] - source[1:]
-    return xr.Dataset(
-        {
-            "source": (("sample",), source),
-            "derived": (("derived_sample",), derived),
-            "ratio": ((), derived.std(ddof=1) / source.std(ddof=1)),
-        }
-    )
-
-
 def _along_axis(deviations: xr.Dataset) -> xr.DataArray:
     """Return deviations with targets in the order of their positions, so that neighbours are neighbours."""
     return deviations["deviation"].isel(target=np.argsort(deviations["position"].values, kind="stable"))
@@ -354,8 +205,7 @@ def _standard_deviation(x: xr.DataArray, dim: str) -> xr.DataArray:
     """Return the sample standard deviation; NaN, without a warning, where there are fewer than two values."""
     count = x.count(dim)
     squares = ((x - x.mean(dim)) ** 2).sum(dim)
-    spread: xr.DataArray = (squares / (count - 1).where(count > 1)) ** 0.5
-    return spread
+    return (squares / (count - 1).where(count > 1)) ** 0.5
 
 
 def _covariance_of_means(difference: xr.DataArray) -> xr.DataArray:

@@ -1,19 +1,16 @@
 """Fixtures shared by all tests: real measured files, and a fixed seed for every random generator."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fusion.sample_data import DatasetError, fetch
+from fusion.pipeline.remote import DatasetError, fetch_sample
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     """A generator with a fixed seed, so that every random test is repeatable."""
     return np.random.default_rng(20260309)
 
@@ -28,17 +25,17 @@ def _fetch_once(name: str) -> Path | str:
             (why for why in _fetched.values() if isinstance(why, str) and "could not be fetched" in why), None
         )
         try:
-            _fetched[name] = offline or fetch(name)
+            _fetched[name] = offline or fetch_sample(name)
         except DatasetError as fault:
             _fetched[name] = str(fault)
     return _fetched[name]
 
 
 @pytest.fixture
-def real_file() -> Callable[[str], Path]:
+def real_file():
     """Return a function from a registry name to the local path of that public measured file, or skip saying why."""
 
-    def find(name: str) -> Path:
+    def find(name):
         found = _fetch_once(name)
         if isinstance(found, Path):
             return found
@@ -47,3 +44,13 @@ def real_file() -> Callable[[str], Path]:
         pytest.skip(f"real data not reachable: {found}")
 
     return find
+
+
+def pytest_collection_modifyitems(items):
+    """Mark what reads the results of a whole run, starts the application or opens a browser."""
+    for item in items:
+        fixtures = set(getattr(item, "fixturenames", ()))
+        if fixtures & {"results_folder", "app", "states", "sound"}:
+            item.add_marker("chain")
+        if fixtures & {"new_page", "opened"}:
+            item.add_marker("browser")

@@ -45,7 +45,7 @@ _ALSO = {
         f"{_FIT}::test_held_out_readings_do_not_move_the_fit_and_are_predicted_in_open_loop",
         f"{_FIT}::test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra",
         f"{_FIT}::test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps",
-        "tests/interferometry/drift/test_state_space.py",
+        "tests/interferometry/drift/test_kalman.py",
     )
 }
 #: Decorators that change no value, only speed and form.

@@ -3,19 +3,20 @@
 A page quotes a constant as ``module.NAME = value``, the default of an argument as ``module.function(argument) = value``, both in backticks.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib
+import importlib.util
 import inspect
 import re
+from datetime import date
 from difflib import get_close_matches
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 
-from fusion.sample_data import read_registry
+from fusion.pipeline.remote import read_registry
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Without those that are written from the code when the site is built.
@@ -68,13 +69,13 @@ def equal(quoted: object, actual: object) -> bool:
 
 
 @pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_quoted_constant_has_the_value_of_the_code(document: Path) -> None:
+def test_every_quoted_constant_has_the_value_of_the_code(document):
     wrong = []
     for dotted, argument, text in QUOTED.findall(document.read_text(encoding="utf-8")):
         place = f"{dotted}({argument})" if argument else dotted
         try:
             found = resolve(dotted)
-            actual = inspect.signature(found).parameters[argument].default if argument else found  # type: ignore[arg-type]
+            actual = inspect.signature(found).parameters[argument].default if argument else found
         except (ModuleNotFoundError, AttributeError, KeyError):
             wrong.append(f"{place} does not exist{near(dotted)}")
             continue
@@ -84,7 +85,7 @@ def test_every_quoted_constant_has_the_value_of_the_code(document: Path) -> None
 
 
 @pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_module_named_in_a_page_exists(document: Path) -> None:
+def test_every_module_named_in_a_page_exists(document):
     missing = []
     for dotted in sorted(set(re.findall(rf"`({DOTTED})[`(]", document.read_text(encoding="utf-8")))):
         if dotted == "fusion.nc":  # a product
@@ -96,26 +97,32 @@ def test_every_module_named_in_a_page_exists(document: Path) -> None:
     assert not missing, f"{name_of(document)} names {', '.join(missing)}"
 
 
-@pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
-    text = document.read_text(encoding="utf-8")
+def missing_files(text: str) -> list[str]:
+    """The files and tests that a text names and that do not exist."""
     missing = []
     for name, test in re.findall(r"(?<![\w/])((?:tests|data|fusion|docs)/[\w./-]*\w)(?:::(\w+))?", text):
         path = ROOT / name
         if not path.exists() or (test and not re.search(rf"^def {test}\(", path.read_text(encoding="utf-8"), re.M)):
             missing.append(f"{name}::{test}" if test else name)
+    return missing
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    missing = missing_files(text)
     missing += [link for link in re.findall(r"\]\(([\w./-]+\.md)", text) if not (document.parent / link).exists()]
     assert not missing, f"{name_of(document)} names {', '.join(missing)}"
 
 
 @pytest.mark.parametrize("document", PAGES, ids=name_of)
-def test_every_measured_file_of_a_tutorial_is_listed(document: Path) -> None:
+def test_every_measured_file_of_a_tutorial_is_listed(document):
     _, _, head = document.read_text(encoding="utf-8").partition("measured_files:\n")
     names = re.findall(r"^  - (.*)$", head.partition("---")[0], re.M)
     assert set(names) <= set(read_registry())
 
 
-def test_every_page_and_test_cited_in_the_code_exists() -> None:
+def test_every_page_and_test_cited_in_the_code_exists():
     missing = []
     for folder in (*PACKAGES, "tests"):
         for source in sorted((ROOT / folder).rglob("*.py")):
@@ -124,6 +131,37 @@ def test_every_page_and_test_cited_in_the_code_exists() -> None:
     assert not missing, "; ".join(missing)
 
 
-def test_every_page_of_the_method_is_listed_in_its_index() -> None:
+def test_every_page_of_the_method_is_listed_in_its_index():
     listed = set(re.findall(r"\]\(([\w-]+\.md)\)", (ROOT / "docs/method/index.md").read_text(encoding="utf-8")))
     assert {page.name for page in (ROOT / "docs/method").glob("*.md")} == listed | {"index.md"}
+
+
+@pytest.fixture(scope="module")
+def pages() -> ModuleType:
+    """The extension of the site that makes the tables of measured figures."""
+    spec = importlib.util.spec_from_file_location("reference_pages", ROOT / "docs/_extensions/reference_pages.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_measured_figure_is_whole_and_its_command_names_tests_that_exist(pages: ModuleType) -> None:
+    rows = pages.measured_rows(ROOT / "docs/measured.csv")
+    assert len({(row["section"], row["figure"]) for row in rows}) == len(rows)
+    wrong = []
+    for row in rows:
+        if not row["value"] or date.fromisoformat(row["date"]).year < 2026 or max(map(len, row.values())) > 160:
+            wrong.append(row["figure"])
+        if not re.fullmatch(r"(?:[0-9a-f]{7}(?:, )?)*", row["commit"]):
+            wrong.append(f"{row['figure']}: commit {row['commit']}")
+        wrong += [f"{row['figure']} cites {name}" for name in missing_files(row["command"])]
+    assert not wrong, "; ".join(wrong)
+
+
+def test_the_page_of_measured_figures_is_made_from_them_and_is_short(pages: ModuleType) -> None:
+    text = (ROOT / "docs/measured.md").read_text(encoding="utf-8")
+    rows = pages.measured_rows(ROOT / "docs/measured.csv")
+    assert pages.measured_page(text, rows) == text, "make docs writes the tables anew"
+    assert {row["section"] for row in rows} == set(re.findall(r"^## (.*)", text, re.M))
+    assert len([word for word in text.split() if word.strip("|-")]) < 2100

@@ -3,8 +3,6 @@
 The pages of most modules and the runs of the tutorials are left out: `make docs` has them.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -21,7 +19,7 @@ LOADED = re.compile(
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """The site in a folder of its own; any warning of Sphinx fails here, as of pages without a place in the contents."""
     out = tmp_path_factory.mktemp("site")
     options = ["--fail-on-warning", "--keep-going", "--quiet", "--tag", "few_modules"]
@@ -41,7 +39,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "html"
 
 
-def test_nothing_is_loaded_from_a_network(site: Path) -> None:
+def test_nothing_is_loaded_from_a_network(site):
     outside = []
     for file in [*site.rglob("*.html"), *site.rglob("*.css")]:
         found = [name for names in LOADED.findall(file.read_text(encoding="utf-8")) for name in names]
@@ -49,7 +47,7 @@ def test_nothing_is_loaded_from_a_network(site: Path) -> None:
     assert not outside, outside[:10]
 
 
-def test_every_page_is_there_and_a_tutorial_that_was_not_run_says_so(site: Path) -> None:
+def test_every_page_is_there_and_a_tutorial_that_was_not_run_says_so(site):
     pages = {
         page.relative_to(ROOT / "docs").with_suffix(".html")
         for page in (ROOT / "docs").rglob("*.md")
@@ -62,14 +60,14 @@ def test_every_page_is_there_and_a_tutorial_that_was_not_run_says_so(site: Path)
         assert ("<strong>not executed</strong>" in text) is runs
 
 
-def test_equations_are_drawn_by_a_script_of_the_site(site: Path) -> None:
+def test_equations_are_drawn_by_a_script_of_the_site(site):
     page = (site / "method/radiometry.html").read_text(encoding="utf-8")
     assert r"\frac{R_1}" in page
     (script,) = re.findall(r'src="\.\./_static/(tex-svg\.js)', page)
     assert (site / "_static" / script).stat().st_size > 1e6
 
 
-def test_reference_comes_from_the_models_and_the_command(site: Path) -> None:
+def test_reference_comes_from_the_models_and_the_command(site):
     assert "camera_scale_u" in (site / "reference/campaign-file.html").read_text(encoding="utf-8")
     assert "held-out error" in (site / "start/reading-a-report.html").read_text(encoding="utf-8")
     assert "--no-plugins" in (site / "reference/command.html").read_text(encoding="utf-8")

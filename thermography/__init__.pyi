@@ -1,14 +1,13 @@
-from .errors import ThermographyError
-from .fields.hotspots import detect_hotspots
+from .common import ThermographyError
+from .fields.hotspots import detect_hotspots, region_series
 from .fields.moving import reduce_moving_frames
-from .fields.regions import region_series
 from .fields.still import reduce_frames
 from .inspection import inspect_file
 from .io.flir import index_frames, read_frame
 from .io.flir_writer import write_jpeg, write_sequence
 from .io.frame import CameraParameters
-from .io.frame_readers import index_recordings
-from .io.temperature_frames import StackOptions
+from .io.other_cameras import StackOptions, index_recordings
+from .plots import plot_field
 from .radiometry.planck import calibrate
 from .radiometry.uncertainty import temperature_uncertainty
 from .registration.plan import PlanGrid, read_fiducials
@@ -24,6 +23,7 @@ __all__ = [
     "index_frames",
     "index_recordings",
     "inspect_file",
+    "plot_field",
     "read_fiducials",
     "read_frame",
     "reduce_frames",

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 from thermography.io.flir import FlirFrameReference, FlirReader, index_frames, read_frame
-from thermography.io.frame import CameraParameters, FlirFormatError, Frame, FrameReference, RejectedFrame
-from thermography.io.frame_readers import START_BYTES, find_reader, plug_ins
-from thermography.io.temperature_frames import StackOptions, TemperatureReader
+from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame
+from thermography.io.other_cameras import START_BYTES, StackOptions, TemperatureReader, find_reader, plug_ins
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
@@ -30,21 +31,31 @@ _PIXELS_READ = _FRAMES_READ << 20
 #: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
 _THUMBNAIL_WIDTH = 320
+#: Code of a warning -> what to do about it.
+_REMEDIES = {
+    "frame_left_out": "Copy the file from the camera again if the frame matters.",
+    "no_time": "They cannot be matched with laser readings.",
+    "clock_not_set": "Set it, or give thermography.clock_offset in the campaign.",
+    "several_cameras": "Store the frames of each camera in a separate file.",
+    "several_lenses": "Use one lens: another one shows the table elsewhere and at another scale.",
+    "parameters_vary": "Override them if the scene did not change.",
+    "emissivity": "Give emissivity.",
+    "distance_zero": "Give object_distance.",
+    "humidity": "Give relative_humidity as a fraction.",
+    "humidity_percent": "It was divided by 100.",
+    "not_calibrated": "Only the counts can be used.",
+    "checksum": "The file was changed after the camera wrote it; compare it with the original.",
+    "saturated": "Select another range in the camera.",
+    "under_range": "Select another range in the camera.",
+    "outside_range": "Their temperatures are not calibrated.",
+    "no_content": "The shutter was closed, or the frame is damaged.",
+    "stored_transmission": "Give object_distance to calculate it instead.",
+}
 
 
 @dataclass(frozen=True)
 class FileWarning:
-    """An implausible or damaged part of a file.
-
-    Attributes
-    ----------
-    code : str
-        Identifier of the kind of warning, for example "saturated".
-    message : str
-        What was found, with its value.
-    remedy : str
-        What to do about it.
-    """
+    """An implausible or damaged part of a file: a code such as "saturated", what was found, and what to do about it."""
 
     code: str
     message: str
@@ -57,8 +68,6 @@ class FlirInspection:
 
     Attributes
     ----------
-    path : Path
-        The file.
     frames : tuple of FrameReference
         Usable frames in order of time.
     rejected : tuple of RejectedFrame
@@ -79,6 +88,9 @@ class FlirInspection:
     mean_degC: float
     frames_read: int
     warnings: tuple[FileWarning, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
 
     def lines(self) -> list[str]:
         """Return the content as lines of text, the warnings last."""
@@ -118,34 +130,18 @@ class FlirInspection:
 
 
 def is_flir_file(path: Path) -> bool:
-    """Return whether a run reads a file as one of FLIR: it starts as a JPEG or an FFF record, and no plug-in recognises it.
-
-    Parameters
-    ----------
-    path : Path
-        An existing file.
-
-    Returns
-    -------
-    bool
-        True for the first bytes of a JPEG or an FFF record; a JPEG need not be radiometric.
-
-    Raises
-    ------
-    FrameReaderError
-        A plug-in cannot be used.
-    """
+    """Return whether a run reads a file as one of FLIR: it starts as a JPEG or an FFF record, and no plug-in recognises it."""
     with Path(path).open("rb") as file:
         start = file.read(START_BYTES)
     return FlirReader().recognises(path, start) and not any(reader.recognises(path, start) for reader in plug_ins())
 
 
-def inspect_file(path: Path) -> FlirInspection:
+def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
     """Read the headers of a FLIR file and the pixels of up to 32 frames, and check them for implausible or damaged content.
 
     Parameters
     ----------
-    path : Path
+    path : str or path-like
         Radiometric JPEG, SEQ, CSQ or FFF file.
 
     Returns
@@ -168,6 +164,7 @@ def inspect_file(path: Path) -> FlirInspection:
     --------
     >>> from tempfile import TemporaryDirectory
     >>> from thermography.io.flir_writer import write_jpeg
+    >>> from thermography.io.frame import CameraParameters
     >>> sc660 = CameraParameters(
     ...     0.95, 0.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
     ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
@@ -184,45 +181,30 @@ def inspect_file(path: Path) -> FlirInspection:
         raise FlirFormatError(rejected[0].reason)
     count = max(1, min(_FRAMES_READ, _PIXELS_READ // int(references.shapes().prod(axis=1).max())))
     chosen = np.unique(np.linspace(0, len(references) - 1, count).round().astype(int))
-    frames, read = [], []
+    frames: list[Frame] = []
+    warnings: list[FileWarning] = []
     for index in chosen:
         try:
             frames.append(references[index].read())
-            read.append(references[index])
+            warnings += _check_checksums(references[index])
         except FlirFormatError as error:
             rejected.append(RejectedFrame(path, references[index].index, str(error)))
-    lowest, highest, mean = _temperature_range(frames)
     warnings = [
-        *_warn_rejected(rejected),
-        *_warn_times(references),
-        *_warn_parameters(references[0].parameters, references),
-        *_warn_checksums(read),
-        *_warn_pixels(frames),
-        *_warn_transmission(frames[:1]),
+        *(_warning("frame_left_out", f"{each.reason}.") for each in rejected),
+        *_check_times(references),
+        *_check_parameters(references, ()),
+        *warnings,
+        *_check_pixels(frames),
+        *(_check_transmission(frames[0]) if frames else ()),
     ]
-    return FlirInspection(path, tuple(references), tuple(rejected), lowest, highest, mean, len(frames), tuple(warnings))
+    return FlirInspection(path, tuple(references), tuple(rejected), *_range_degC(frames), len(frames), tuple(warnings))
 
 
 def describe_stack(path: Path) -> list[str]:
-    """Return the content of a file of temperatures as lines of text, and what must be said beside it.
-
-    Parameters
-    ----------
-    path : Path
-        File that a reader of temperatures recognises.
-
-    Returns
-    -------
-    list of str
-
-    Raises
-    ------
-    ThermographyError
-        Where the file is damaged, or holds no temperatures.
-    """
+    """Return the content of a file of temperatures as lines of text, and the remarks on it."""
     reader = find_reader(path)
     if not isinstance(reader, TemperatureReader):
-        raise ThermographyError(f"{path}: no file of temperatures that is read; docs/formats.md lists them")
+        raise ThermographyError(f"{path}: not a known file of temperatures; docs/formats.md lists them")
     # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
     stored = StackOptions(scale=np.nextafter(1.0, 2.0))
     contents = reader.frame_contents(path, stored)
@@ -236,7 +218,7 @@ def describe_stack(path: Path) -> list[str]:
         f"  values of the first frame {span} {contents.unit}".rstrip(),
     ]
     if finite.size < values.size:
-        lines.append(f"  {values.size - finite.size} of {values.size} pixels of the first frame hold no number")
+        lines.append(f"  {values.size - finite.size} of {values.size} pixels of the first frame are not numbers")
     if contents.times is not None:
         lines.append(f"  {contents.times[0]} to {contents.times[-1]} {'UTC' if contents.zoned else 'without zone'}")
     missing = [] if contents.unit else ["unit"]
@@ -245,223 +227,120 @@ def describe_stack(path: Path) -> list[str]:
 
 
 def thumbnail(path: Path) -> bytes:
-    """Return a small picture of the first frame.
-
-    Parameters
-    ----------
-    path : Path
-        Radiometric JPEG, SEQ, CSQ or FFF file.
-
-    Returns
-    -------
-    bytes
-        PNG of up to 320 pixels width in false colours, scaled from the 1st to the 99th percentile of the counts; dark is cold.
-
-    Raises
-    ------
-    FlirFormatError
-        Where the first frame cannot be read.
-    """
+    """Return a small picture of the first frame."""
     counts = read_frame(path).counts.astype(np.float32)
     low, high = np.percentile(counts, (1, 99))
     grey = np.clip((counts - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
     scale = min(1.0, _THUMBNAIL_WIDTH / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    encoded: bytes = cv2.imencode(".png", cv2.applyColorMap(small, cv2.COLORMAP_INFERNO))[1].tobytes()
-    return encoded
+    return cv2.imencode(".png", cv2.applyColorMap(small, cv2.COLORMAP_INFERNO))[1].tobytes()
 
 
-def _temperature_range(frames: Sequence[Frame]) -> tuple[float, float, float]:
+def _range_degC(frames: Sequence[Frame]) -> tuple[float, float, float]:
     """Return lowest, highest and mean temperature, degC; NaN where no frame gives a temperature."""
     ranges = []
     for frame in frames:
-        try:
+        with suppress(RadiometryError):
             temperature = calibrate(frame.counts, frame.parameters)
-        except RadiometryError:
-            continue
-        valid = temperature[np.isfinite(temperature)]
-        if valid.size:
-            ranges.append((valid.min(), valid.max(), valid.mean(dtype=np.float64)))
+            valid = temperature[np.isfinite(temperature)]
+            if valid.size:
+                ranges.append((valid.min(), valid.max(), valid.mean(dtype=np.float64)))
     if not ranges:
         return (float("nan"),) * 3
     low, high, mean = np.transpose(ranges)
     return float(low.min()), float(high.max()), float(mean.mean())
 
 
-def _warn_rejected(rejected: Sequence[RejectedFrame]) -> Iterator[FileWarning]:
-    """Warn about frames that cannot be used."""
-    for each in rejected:
-        yield FileWarning(
-            "frame_left_out", f"{each.reason}.", "Copy the file from the camera again if the frame matters."
-        )
-
-
-def _warn_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
-    """Warn about missing or implausible times, and about frames of several cameras or lenses."""
-    without = sum(bool(np.isnat(frame.time)) for frame in references)
-    if without:
-        yield FileWarning("no_time", f"{without} frames have no time.", "They cannot be matched with laser readings.")
-    first = references[0].time
-    if not np.isnat(first) and first < np.datetime64(f"{_OLDEST_YEAR}-01-01"):
-        yield FileWarning(
-            "clock_not_set",
-            f"the clock of the camera was at {first}.",
-            "Set it, or give thermography.clock_offset in the campaign.",
-        )
-    cameras = {(frame.camera.model, frame.camera.serial) for frame in references}
-    if len(cameras) > 1:
-        yield FileWarning(
-            "several_cameras",
-            f"the file holds frames of {len(cameras)} cameras.",
-            "Store the frames of each camera in a separate file.",
-        )
-        return
-    lenses = {
-        (camera.lens_model, camera.lens_part, camera.lens_serial, camera.field_of_view_deg)
-        for camera in (frame.camera for frame in references)
-    }
-    if len(lenses) > 1:
-        yield FileWarning(
-            "several_lenses",
-            f"the frames were taken through {len(lenses)} lenses.",
-            "Use one lens: another one shows the table elsewhere and at another scale.",
-        )
+def _warning(code: str, message: str) -> FileWarning:
+    return FileWarning(code, message, _REMEDIES[code])
 
 
 def check_series(references: Sequence[FrameReference], *, overridden: Collection[str] = ()) -> list[FileWarning]:
-    """Check the settings that the frames of one series store, without reading a pixel.
-
-    Parameters
-    ----------
-    references : sequence of FrameReference
-        Frames of one measurement.
-    overridden : collection of str
-        Names of the `CameraParameters` that are replaced anyway; what is stored of them does not matter.
-
-    Returns
-    -------
-    list of FileWarning
-        About frames of several cameras or lenses, parameters that vary within the series, and implausible parameters.
-
-    Notes
-    -----
-    Meaning of the parameters: docs/method/radiometry.md.
-    """
+    """Check the settings that the frames of one series store, without reading a pixel."""
     if not references:
         return []
-    cameras = [warning for warning in _warn_times(references) if warning.code in ("several_cameras", "several_lenses")]
-    return [*cameras, *_warn_parameters(references[0].parameters, references, overridden)]
+    cameras = [each for each in _check_times(references) if each.code in ("several_cameras", "several_lenses")]
+    return [*cameras, *_check_parameters(references, overridden)]
 
 
-def _warn_parameters(
-    p: CameraParameters, references: Sequence[FrameReference], overridden: Collection[str] = ()
-) -> Iterator[FileWarning]:
+def _check_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
+    """Warn about missing or implausible times, and about frames of several cameras or lenses."""
+    without = sum(bool(np.isnat(frame.time)) for frame in references)
+    if without:
+        yield _warning("no_time", f"{without} frames have no time.")
+    first = references[0].time
+    if not np.isnat(first) and first < np.datetime64(f"{_OLDEST_YEAR}-01-01"):
+        yield _warning("clock_not_set", f"the clock of the camera was at {first}.")
+    identities = {frame.camera for frame in references}
+    cameras = {(each.model, each.serial) for each in identities}
+    lenses = {(each.lens_model, each.lens_part, each.lens_serial, each.field_of_view_deg) for each in identities}
+    if len(cameras) > 1:
+        yield _warning("several_cameras", f"the file holds frames of {len(cameras)} cameras.")
+    elif len(lenses) > 1:
+        yield _warning("several_lenses", f"the frames were taken through {len(lenses)} lenses.")
+
+
+def _check_parameters(references: Sequence[FrameReference], overridden: Collection[str]) -> Iterator[FileWarning]:
     """Warn about implausible parameters that are not overridden."""
-    varying = [
-        each.name
-        for each in fields(p)
-        if each.name not in overridden and len({getattr(frame.parameters, each.name) for frame in references}) > 1
-    ]
+    p, sets = references[0].parameters, {frame.parameters for frame in references}
+    stored = [each.name for each in fields(p) if each.name not in overridden]
+    varying = [name for name in stored if len({getattr(each, name) for each in sets}) > 1]
     if varying:
-        yield FileWarning(
-            "parameters_vary",
-            f"parameters differ between the frames: {', '.join(varying)}.",
-            "Override them if the scene did not change.",
-        )
+        yield _warning("parameters_vary", f"parameters differ between the frames: {', '.join(varying)}.")
     for name in ("reflected_temperature_K", "atmospheric_temperature_K"):
+        value, key = getattr(p, name), name.removesuffix("_K")
+        quantity, celsius = key.replace("_", " "), value - ZERO_CELSIUS_K
         if name in overridden:
             continue
-        value, quantity = getattr(p, name), name.removesuffix("_K").replace("_", " ")
         if not value > 150:
-            yield FileWarning(
-                "celsius_as_kelvin",
-                f"{quantity} {value:g} K: probably degC stored as K.",
-                f"Give {quantity.replace(' ', '_')}.",
-            )
-        elif value - ZERO_CELSIUS_K > 150:
-            yield FileWarning(
-                "kelvin_as_celsius",
-                f"{quantity} {value - ZERO_CELSIUS_K:.0f} degC: probably K stored as degC.",
-                f"Give {quantity.replace(' ', '_')}.",
-            )
-    if "emissivity" not in overridden and not 0 < p.emissivity < 1:
-        yield FileWarning(
-            "emissivity", f"emissivity {p.emissivity:g} is not that of a real surface.", "Give emissivity."
-        )
-    if "object_distance_m" not in overridden and p.object_distance_m <= 0:
-        yield FileWarning(
-            "distance_zero",
-            f"distance {p.object_distance_m:g} m: the atmosphere is not corrected.",
-            "Give object_distance.",
-        )
-    if "relative_humidity" not in overridden and not 0 < p.relative_humidity <= 1:
-        yield FileWarning(
-            "humidity", f"relative humidity {p.relative_humidity:g}.", "Give relative_humidity as a fraction."
-        )
-    if references[0].notes and any("percent" in note for note in references[0].notes):
-        yield FileWarning("humidity_percent", "relative humidity was stored in percent.", "It was divided by 100.")
+            message = f"{quantity} {value:g} K: probably degC stored as K."
+            yield FileWarning("celsius_as_kelvin", message, f"Give {key}.")
+        elif celsius > 150:
+            message = f"{quantity} {celsius:.0f} degC: probably K stored as degC."
+            yield FileWarning("kelvin_as_celsius", message, f"Give {key}.")
+    if "emissivity" in stored and not 0 < p.emissivity < 1:
+        yield _warning("emissivity", f"emissivity {p.emissivity:g} is not physical.")
+    if "object_distance_m" in stored and p.object_distance_m <= 0:
+        yield _warning("distance_zero", f"distance {p.object_distance_m:g} m: the atmosphere is not corrected.")
+    if "relative_humidity" in stored and not 0 < p.relative_humidity <= 1:
+        yield _warning("humidity", f"relative humidity {p.relative_humidity:g}.")
+    if any("percent" in note for note in references[0].notes):
+        yield _warning("humidity_percent", "relative humidity was stored in percent.")
     if min(p.planck_r1, p.planck_b, p.planck_r2) <= 0:
-        yield FileWarning("not_calibrated", "the Planck constants are not positive.", "Only the counts can be used.")
+        yield _warning("not_calibrated", "the Planck constants are not positive.")
 
 
-def _warn_checksums(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
+def _check_checksums(frame: FrameReference) -> Iterator[FileWarning]:
     """Warn about records that differ from their checksum."""
-    for frame in references:
-        if kinds := frame.damaged_records():
-            names = ", ".join(f"0x{kind:02X}" for kind in kinds)
-            yield FileWarning(
-                "checksum",
-                f"frame {frame.index}: records {names} differ from their checksum.",
-                "The file was changed after the camera wrote it; compare it with the original.",
-            )
+    if kinds := frame.damaged_records():
+        names = ", ".join(f"0x{kind:02X}" for kind in kinds)
+        yield _warning("checksum", f"frame {frame.index}: records {names} differ from their checksum.")
 
 
-def _warn_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
+def _check_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
     """Warn about counts outside the calibrated range, and about frames of one constant value."""
-    for code, label in (("saturated", "at or above the upper limit"), ("under_range", "at or below the lower limit")):
-        shares = []
-        for frame in frames:
-            limits = frame.limits
-            limit = limits.raw_maximum if code == "saturated" else limits.raw_minimum
-            outside = frame.counts >= (limit or 65535) if code == "saturated" else frame.counts <= limit
-            shares.append(outside.mean())
-        if max(shares, default=0) > 0:
-            share = f"{max(shares):.2%}" if max(shares) >= 1e-4 else f"{max(shares):.1e}"
-            yield FileWarning(
-                code,
-                f"up to {share} of the pixels of a frame are {label} of the calibrated range of the camera.",
-                "Select another range in the camera.",
+    above = [np.mean(frame.counts >= (frame.limits.raw_maximum or 65535)) for frame in frames]
+    below = [np.mean(frame.counts <= frame.limits.raw_minimum) for frame in frames]
+    for code, limit, shares in (
+        ("saturated", "at or above the upper", above),
+        ("under_range", "at or below the lower", below),
+    ):
+        if (most := max(shares, default=0)) > 0:
+            share = f"{most:.2%}" if most >= 1e-4 else f"{most:.1e}"
+            yield _warning(
+                code, f"up to {share} of the pixels of a frame are {limit} limit of the calibrated range of the camera."
             )
     outside_share = max((share_outside_range(frame) for frame in frames), default=0.0)
     if outside_share > 0:
-        limits = frames[0].limits
-        yield FileWarning(
-            "outside_range",
-            f"up to {outside_share:.2%} of the pixels of a frame are outside the calibrated range of "
-            f"{limits.minimum_K - ZERO_CELSIUS_K:.0f} to {limits.maximum_K - ZERO_CELSIUS_K:.0f} degC.",
-            "Their temperatures are not calibrated.",
-        )
+        low, high = (limit - ZERO_CELSIUS_K for limit in (frames[0].limits.minimum_K, frames[0].limits.maximum_K))
+        of_pixels = f"up to {outside_share:.2%} of the pixels of a frame are outside the calibrated range of "
+        yield _warning("outside_range", f"{of_pixels}{low:.0f} to {high:.0f} degC.")
     if any(frame.counts.min() == frame.counts.max() for frame in frames):
-        yield FileWarning(
-            "no_content",
-            "a frame has the same count in all pixels.",
-            "The shutter was closed, or the frame is damaged.",
-        )
+        yield _warning("no_content", "a frame has the same count in all pixels.")
 
 
 def share_outside_range(frame: Frame) -> float:
-    """Share of the pixels outside the temperatures for which the camera is calibrated.
-
-    Parameters
-    ----------
-    frame : Frame
-        With the parameters and limits that it stores.
-
-    Returns
-    -------
-    float
-        0 where the file stores no limits or gives no temperature.
-    """
+    """Share of the pixels outside the temperatures for which the camera is calibrated."""
     limits = frame.limits
     if not limits.maximum_K > limits.minimum_K > 0:
         return 0.0
@@ -472,22 +351,17 @@ def share_outside_range(frame: Frame) -> float:
     return float(np.mean(~((kelvin >= limits.minimum_K) & (kelvin <= limits.maximum_K))))
 
 
-def _warn_transmission(frames: Sequence[Frame]) -> Iterator[FileWarning]:
+def _check_transmission(frame: Frame) -> Iterator[FileWarning]:
     """Warn where the stored transmission disagrees with distance, humidity and air temperature, and quantify its effect."""
-    for frame in frames:
-        p = frame.parameters
-        if p.stored_transmission <= 0:
-            continue
-        mean = frame.counts.mean()
-        try:
-            stored = float(temperature_from_counts(mean, p))
-            calculated = float(temperature_from_counts(mean, override(p, stored_transmission=0.0)))
-        except RadiometryError:
-            continue
+    p, mean = frame.parameters, frame.counts.mean()
+    if p.stored_transmission <= 0:
+        return
+    with suppress(RadiometryError):
+        stored = float(temperature_from_counts(mean, p))
+        calculated = float(temperature_from_counts(mean, override(p, stored_transmission=0.0)))
         if abs(stored - calculated) > 0.01:
-            yield FileWarning(
+            yield _warning(
                 "stored_transmission",
                 f"the file stores a transmission of {p.stored_transmission:.4f}, but distance and humidity give "
                 f"{path_transmission(p):.4f}; the stored one is used and changes the mean by {stored - calculated:+.2f} K.",
-                "Give object_distance to calculate it instead.",
             )

@@ -1,6 +1,6 @@
 """Tutorials on measured files: where a file cannot be had, the page is built without being run, and says so.
 
-Such a page lists its files in its front matter, under their names in `data/registry.csv`::
+Such a page lists its files in its front matter, under their names in `fusion/pipeline/registry.csv`::
 
     measured_files:
       - gtatters__Thermimage/inst/extdata/IR_2412.jpg
@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util import logging
 
-from fusion.sample_data import DatasetError, fetch
+from fusion.pipeline.remote import DatasetError, fetch_sample
 
 _logger = logging.getLogger(__name__)
 _NOTE = """
@@ -36,7 +36,7 @@ def why_not(text: str) -> str:
     """Say which file of a page cannot be had; empty where all can."""
     for name in front_matter(text).get("measured_files", []):  # type: ignore[attr-defined]
         try:
-            fetch(name)
+            fetch_sample(name)
         except DatasetError as error:
             _logger.info("not executed: %s", error)
             return f"`{name}` could not be had"

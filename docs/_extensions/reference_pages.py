@@ -1,7 +1,8 @@
-"""Pages of the reference that are written from the code: modules, command, campaign file, recipe and results."""
+"""Pages that are written from the code (modules, command, campaign file, recipe, results), and the tables of the measured figures."""
 
 from __future__ import annotations
 
+import csv
 import importlib
 import inspect
 import pkgutil
@@ -18,7 +19,7 @@ from sphinx.application import Sphinx
 import thermofuse
 from fusion import cli
 from fusion.campaign.config import campaign_schema
-from fusion.products.results import results_schema
+from fusion.results.results import results_schema
 from fusion.twin.recipe_file import recipe_schema
 
 PACKAGES = ("thermography", "interferometry", "fusion")
@@ -221,6 +222,33 @@ def command_page() -> str:
     return text.partition("\n")[2]
 
 
+def measured_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return the figures of one section that are shown in `measured.md`; the last column is the aim where any row has one."""
+    last = "aim" if any(row["aim"] for row in rows) else "n"
+    lines = [f"| figure | measured | {last} |", "|---|---|---|"]
+    for row in rows:
+        value = row["value"] if row["unit"] in ("1", "share") else f"{row['value']} {row['unit']}"
+        interval = f" ({row['interval']})" if row["interval"] else ""
+        lines.append(f"| {row['figure']} | {value}{interval} | {row[last]} |")
+    return "\n".join(lines) + "\n"
+
+
+def measured_page(text: str, rows: Sequence[Mapping[str, str]]) -> str:
+    """Return the text of `measured.md` with the table of each section made anew from the rows of `measured.csv`."""
+    parts = re.split(r"^(?=## )", text, flags=re.M)
+    for number, part in enumerate(parts):
+        title = part.partition("\n")[0].removeprefix("## ")
+        shown = [row for row in rows if row["section"] == title and row["page"]]
+        parts[number] = re.sub(r"^\|.*\n(?:\|.*\n)*", lambda _, shown=shown: measured_table(shown), part, flags=re.M)
+    return "".join(parts)
+
+
+def measured_rows(path: Path) -> list[dict[str, str]]:
+    """Return the measured figures of `measured.csv`, one a row."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def write_if_new(path: Path, text: str) -> None:
     """Write a page unless it says so already, so that it is not read again for nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -236,6 +264,8 @@ def write_pages(app: Sphinx) -> None:
     for stale in set((reference / "api").glob("*.rst")) - set(pages):
         stale.unlink()
     pages |= {generated / f"names_{package}.md": table for package, table in public_names()}
+    measured = Path(app.srcdir) / "measured.md"
+    pages[measured] = measured_page(measured.read_text(encoding="utf-8"), measured_rows(measured.with_suffix(".csv")))
     pages |= {
         generated / "command.md": command_page(),
         generated / "campaign.md": campaign_page(

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import date
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,13 +21,12 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic_core import ErrorDetails
 
-from fusion.campaign.messages import as_written, describe, find_line, first_faults, key_lines, near_file, suggest
-from fusion.campaign.needed_tables import check_tables
-from fusion.campaign.quantities import split_uncertainty
-from fusion.campaign.standard_test import AcceptanceTable, ReportTable, UncertaintyTable
-from fusion.campaign.value_types import (
+from fusion.analysis.effects.effect import Effect
+from fusion.analysis.effects.library import library
+from fusion.analysis.effects.thermal import QUASI_STATIC
+from fusion.campaign.values import (
     Celsius,
     Feed,
     Fraction,
@@ -32,40 +34,174 @@ from fusion.campaign.value_types import (
     KelvinU,
     Metres,
     MetresU,
+    MicrometresU,
     Millimetres,
     PartsPerMillion,
     PartsPerMillionU,
     PixelPatch,
     Pixels,
+    PositiveMicrometres,
     PositiveMillimetres,
     PositiveSeconds,
     Seconds,
+    ShareOfLengthU,
     TimeZone,
     area_mm2,
     check_pattern,
     corner_words,
     matching_files,
     not_a_file,
+    split_uncertainty,
 )
-from fusion.effects.effect import Effect
-from fusion.effects.library import library
-from fusion.effects.thermal import QUASI_STATIC
-from fusion.errors import FusionError
-from fusion.products.store import is_text
-from fusion.toml_file import TomlError, read_toml
+from fusion.common import FusionError, TomlError, describe, first_faults, place_in, read_toml, suggest
+from fusion.messages import near_file
+from fusion.results.store import is_text
+
+# Which tables a campaign file needs: any subset of the two instruments, with the plan where temperatures have places;
+# or a record.
+
+_REMEDY = 'write registration = "fiducials" with at least four places on the table that are known in mm'
+
+
+def contradictions(campaign: Campaign) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield key and fault of tables that cannot be combined, or that lack those they build on."""
+    tables = ("thermography", "plan", "interferometry", "sensors")
+    camera, plan, laser, sensors = (getattr(campaign, name) for name in tables)
+    if campaign.record is not None:
+        if others := "], [".join(name for name in tables if getattr(campaign, name) is not None):
+            fault = (
+                f"[record] cannot be combined with [{others}]; remove one or the other, a record is analysed on its own"
+            )
+            yield ("record",), fault
+    elif camera is None and laser is None:
+        fault = "there is no instrument; a campaign needs [interferometry], or [thermography] with [plan], or all three"
+        yield (), f"{fault}; or a [record] instead"
+    else:
+        if camera is not None and laser is not None and camera.window_s is not None:
+            fault = "thermography.window divides the frames where no laser gives cycles; here [interferometry] does"
+            yield ("thermography", "window"), f"{fault}: remove the key"
+        if plan is None:
+            if camera is not None or sensors is not None:
+                name = "sensors" if camera is None else "thermography"
+                yield (name,), f"[{name}] needs the table [plan], on which its temperatures are placed; add it"
+        elif plan.in_pixels:
+            yield from _against_pixels(campaign)
+        else:
+            # What a plan in millimetres lacks for the instruments that are there.
+            moving = camera is not None and camera.table == "moving"
+            needed = {
+                "size": plan.size_mm is None,
+                "cell_size": plan.cell_size_mm is None and camera is not None,
+                "fiducials": plan.fiducials is None and camera is not None,
+                "axis": plan.axis is None and (moving or (laser is not None and (camera or sensors) is not None)),
+            }
+            for name in (name for name, lacks in needed.items() if lacks):
+                yield ("plan",), f"[plan] lacks {name}; add it"
+
+
+def _against_pixels(campaign: Campaign) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield what has no place on a plan that is the picture itself, because it is in millimetres."""
+    camera = campaign.thermography
+    if camera is None:
+        fault = 'registration = "pixels" makes the picture of a camera the plan, and there is no [thermography]'
+        yield ("plan", "registration"), f"{fault}; write size and axis in mm instead"
+        return
+    conflicts = {
+        ("interferometry",): (campaign.interferometry, "[interferometry] needs the measured line on the plan, in mm"),
+        ("sensors",): (campaign.sensors, "[sensors] needs the places of the sensors on the plan, in mm"),
+        ("thermography", "lens"): (camera.lens, "a lens calibration is used only with a plan in mm"),
+        ("thermography", "region"): (camera.region, "the corners of a region are in mm"),
+        ("thermography", "table"): (camera.table == "moving", 'it holds for a table at rest, and table = "moving"'),
+    }
+    for key, (given, why) in conflicts.items():
+        if given:
+            yield key, f'plan.registration = "pixels", but {why}; {_REMEDY}, or remove {".".join(key)}'
+
+
+# What a campaign file says of the positioning test as a test by ISO 230-2: uncertainties, tolerances, and the
+# conditions of the test.
+
+#: Unit at the end of an attribute, which the key in the file does not have.
+_UNIT = re.compile(r"_(mm|m|um|degC|K|s|ppm|ppm_per_K|mm_per_min)$")
+
+
+class Table(BaseModel):
+    """Base of all tables of a campaign file: an unknown key is a fault, and a key is the attribute without its unit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", alias_generator=lambda name: _UNIT.sub("", name))
+
+
+class UncertaintyTable(Table):
+    """``[interferometry.uncertainty]``: standard uncertainties (k = 1) of ISO 230-2:2014 Annex A; left out: assumed, and said so."""
+
+    device_ppm: ShareOfLengthU | None = None
+    alignment_ppm: ShareOfLengthU | None = None
+    material_temperature_K: KelvinU | None = None
+    expansion_coefficient_ppm_per_K: PartsPerMillionU | None = None
+    environmental_variation_um: MicrometresU | None = None
+
+
+class AcceptanceTable(Table):
+    """``[acceptance]``: tolerances of the axis; a quantity without one is not judged."""
+
+    A_um: PositiveMicrometres | None = None
+    R_um: PositiveMicrometres | None = None
+    E_um: PositiveMicrometres | None = None
+    M_um: PositiveMicrometres | None = None
+    B_um: PositiveMicrometres | None = None
+    A_unidirectional_um: PositiveMicrometres | None = None
+    R_unidirectional_um: PositiveMicrometres | None = None
+    E_unidirectional_um: PositiveMicrometres | None = None
+
+    def limits(self) -> dict[str, float]:
+        """Return the tolerances that are stated, um, by the symbol of their quantity."""
+        stated = {name.removesuffix("_um"): value for name, value in self}
+        return {symbol: float(value) for symbol, value in stated.items() if value is not None}
+
+
+class InstrumentTable(Table):
+    """``[[report.instrument]]``: an instrument of the test."""
+
+    name: str = Field(min_length=1)
+    serial_number: str = ""
+    calibrated: date | None = None
+    certificate: str = ""
+
+
+class ReportTable(Table):
+    """``[report]``: conditions of the test as ISO 230-2 asks for them; every key may be left out, the page then says "not stated"."""
+
+    machine: str = ""
+    machine_serial_number: str = ""
+    control: str = ""
+    location: str = ""
+    operator: str = ""
+    customer: str = ""
+    axis_travel_mm: PositiveMillimetres | None = None
+    screw_lead_mm: PositiveMillimetres | None = None
+    feed_mm_per_min: Feed | None = None
+    dwell_s: PositiveSeconds | None = None
+    warm_up: str = ""
+    machine_compensation: str = ""
+    air_temperature_before_degC: Celsius | None = None
+    air_temperature_after_degC: Celsius | None = None
+    material_temperature_before_degC: Celsius | None = None
+    material_temperature_after_degC: Celsius | None = None
+    sensor_places: str = ""
+    remarks: str = ""
+    instrument: tuple[InstrumentTable, ...] = ()
+
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
 RECORD_EFFECTS = (QUASI_STATIC,)
 #: Effects that need positions along an axis; a record that declares them is run without, and the results say so.
 _ALONG_AN_AXIS = ("axis_expansion", "table_offset")
-#: Attribute of ``[thermography]`` -> its key, of what files of temperatures are corrected for already.
-_CORRECTED_BY_THE_CAMERA = {
-    "atmospheric_temperature_degC": "atmospheric_temperature",
-    "relative_humidity": "relative_humidity",
-    "object_distance_m": "object_distance",
-    "window_transmission": "window_transmission",
-    "window_temperature_degC": "window_temperature",
-}
+#: What a plan of pixels does not have.
+_IN_MILLIMETRES = ("size_mm", "cell_size_mm", "fiducials", "regions", "axis")
+#: What files of temperatures are corrected for already.
+_CORRECTED_BY_THE_CAMERA = (
+    "atmospheric_temperature_degC", "relative_humidity", "object_distance_m", "window_transmission", "window_temperature_degC",
+)  # fmt: skip
 
 
 class CampaignError(FusionError):
@@ -86,43 +222,33 @@ def _existing(name: str, info: ValidationInfo) -> str:
     """Accept the name of a file that exists."""
     if isinstance(info.context, _Surroundings):
         path = info.context.folder / name
-        path = path if "\0" in name else Path(os.path.realpath(path))
         if text := not_a_file(path):
-            raise PydanticCustomError("file", "{text}", {"text": text})
-        if not os.path.isfile(path):  # noqa: PTH113 - a name that is too long raises there, and is told here
-            text = f"no such file {path}; {near_file(path)}paths are relative to the campaign file"
-            raise PydanticCustomError("file", "{text}", {"text": text})
+            raise ValueError(text)
+        if not os.path.isfile(path):  # noqa: PTH113 - no file has a name that is too long, or with a NUL
+            raise ValueError(f"no such file {path}; {near_file(path)}paths are relative to the campaign file")
     return name
 
 
 def _matching(pattern: str, info: ValidationInfo) -> str:
     """Accept a pattern that matches at least one file."""
     if isinstance(info.context, _Surroundings):
-        check_pattern(info.context.folder, pattern)
-        found = matching_files(info.context.folder, pattern)
-        # Every link, and one file of each folder: where that is a part of the system, all are.
-        doubtful = {path if path.is_symlink() else path.parent: path for path in found}.values()
-        lost = [path for path in doubtful if not path.exists()]
-        strange = next((text for path in doubtful if (text := not_a_file(path))), "")
-        unnamed = [path for path in found if not is_text(str(path).removeprefix(str(info.context.folder)))]
-        if lost:
-            text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link"
-        elif strange:
-            text = strange
-        elif unnamed:
-            text = f"{str(unnamed[0])!a} has a name that is no text in UTF-8; rename it"
-        elif not found:
-            text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
-        else:
-            return pattern
-        raise PydanticCustomError("pattern", "{text}", {"text": text})
+        folder = info.context.folder
+        check_pattern(folder, pattern)
+        found = matching_files(folder, pattern)
+        if not found:
+            raise ValueError(f"matches no file in {folder}; paths are relative to the campaign file")
+        for path in found:
+            if path.is_symlink() and not path.exists():
+                raise ValueError(f"{path} is a link to a file that does not exist; restore the file or remove the link")
+            if not is_text(str(path).removeprefix(str(folder))):
+                raise ValueError(f"{str(path)!a} has a name that is not valid UTF-8; rename it")
     return pattern
 
 
 def _filled(patterns: tuple[str, ...]) -> tuple[str, ...]:
     """Accept a list that is not empty; `min_length` would count a pattern without a match as absent."""
     if not patterns:
-        raise PydanticCustomError("too_short", "this list is empty")
+        raise ValueError("this list is empty; fill it in")
     return patterns
 
 
@@ -130,68 +256,51 @@ def _declarable(name: str, info: ValidationInfo) -> str:
     """Accept an effect that can be declared for this kind of campaign: one whose columns are known before the readings."""
     if not isinstance(info.context, _Surroundings):
         return name
-    effects = info.context.effects
-    if info.context.record:
-        allowed: tuple[str, ...] = RECORD_EFFECTS
-        accepted = name in (*allowed, *_ALONG_AN_AXIS)
-    else:
-        allowed = tuple(
-            effect.name
-            for effect in effects.values()
-            if effect.declarable and (info.context.temperatures or not effect.follows_field)
-        )
-        accepted = name in allowed
-    if accepted:
+    effects, record, warmth = info.context.effects, info.context.record, info.context.temperatures
+    known = [one.name for one in effects.values() if one.declarable and (warmth or not one.follows_field)]
+    allowed = RECORD_EFFECTS if record else tuple(known)
+    if name in (*allowed, *(_ALONG_AN_AXIS if record else ())):
         return name
     choice = f"can be declared here: {', '.join(allowed)}"
-    unmeasured = name in effects and effects[name].declarable and effects[name].follows_field
-    if unmeasured and not info.context.record:
+    if not record and name in effects and effects[name].declarable:
         text = (
             "this effect follows the temperature of the table, which this campaign does not measure; add [thermography] with [plan], or "
             f"[sensors], or remove the effect; {choice}"
         )
     elif name in effects and not effects[name].declarable:
-        lacking = (
-            "the columns of this effect need a fitted model"
-            if effects[name].errs_camera
-            else "the parameters of this effect are not known beforehand"
-        )
+        lacking = "the parameters of this effect are not known beforehand"
+        if effects[name].errs_camera:
+            lacking = "the columns of this effect need a fitted model"
         text = f"{lacking}; remove it, the closed loop tries it anyway; {choice}"
     elif name in (*effects, *RECORD_EFFECTS):
-        text = f"this effect has no meaning for a {'record' if info.context.record else 'campaign with positions'}; {choice}"
+        text = f"this effect does not apply to a {'record' if record else 'campaign with positions'}; {choice}"
     else:
         text = f"unknown effect; {suggest(name, (*effects, *RECORD_EFFECTS))}{choice}"
-    raise PydanticCustomError("effect", "{text}", {"text": text})
+    raise ValueError(text)
 
 
 def _each_once(names: tuple[str, ...]) -> tuple[str, ...]:
     """Accept a list that names everything once."""
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        text = f"{', '.join(repeated)} named more than once; name each effect once"
-        raise PydanticCustomError("repeated", "{text}", {"text": text})
+        raise ValueError(f"{', '.join(repeated)} named more than once; name each effect once")
     return names
 
 
 ExistingFile = Annotated[str, AfterValidator(_existing)]
-FramePatterns = Annotated[
-    tuple[Annotated[str, AfterValidator(_matching)], ...],
-    AfterValidator(_filled),
-    Field(json_schema_extra={"minItems": 1}),
-]
+_Patterns = tuple[Annotated[str, AfterValidator(_matching)], ...]
+FramePatterns = Annotated[_Patterns, AfterValidator(_filled), Field(json_schema_extra={"minItems": 1})]
 #: Names or patterns of the runs of a record, a single one without brackets too.
-RunPatterns = Annotated[
-    tuple[Annotated[str, AfterValidator(_matching)], ...],
-    BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
-]
+RunPatterns = Annotated[_Patterns, BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)]
 DeclaredEffects = Annotated[tuple[Annotated[str, AfterValidator(_declarable)], ...], AfterValidator(_each_once)]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+def _key(table: Table, name: str) -> str:
+    """Return the key of an attribute as the file writes it."""
+    return type(table).model_fields[name].alias or name
 
 
-class CampaignTable(_Table):
+class CampaignTable(Table):
     """``[campaign]``: what was measured."""
 
     title: str = Field(min_length=1)
@@ -201,19 +310,12 @@ class CampaignTable(_Table):
 
 #: Keys that may be written with their standard uncertainty, ``"0.97 +- 0.01"``; it is kept under the name with ``_u``.
 _WITH_UNCERTAINTY = (
-    "emissivity",
-    "reflected_temperature",
-    "atmospheric_temperature",
-    "relative_humidity",
-    "object_distance",
-    "window_transmission",
-    "window_temperature",
-    "temperature",
-    "expansion_coefficient",
-)
+    "emissivity", "reflected_temperature", "atmospheric_temperature", "relative_humidity", "object_distance", "window_transmission",
+    "window_temperature", "temperature", "expansion_coefficient",
+)  # fmt: skip
 
 
-class _Measured(_Table):
+class _Measured(Table):
     """A table in which a value may be written with its standard uncertainty."""
 
     @model_validator(mode="before")
@@ -235,18 +337,16 @@ class StateTable(_Measured):
     """One of ``states`` of a region: a cycle in which a contact sensor measured the region's temperature."""
 
     cycle: int = Field(ge=1)
-    temperature_degC: Celsius = Field(alias="temperature")
-    temperature_u_K: KelvinU = Field(default=0.1, alias="temperature_u")
+    temperature_degC: Celsius
+    temperature_u_K: KelvinU = 0.1
 
 
 class SurfaceTable(_Measured):
     """``[[thermography.region]]``: a part of the table with an emissivity of its own, given or from two states."""
 
     name: str = Field(min_length=1)
-    rectangle_mm: tuple[tuple[Millimetres, Millimetres], tuple[Millimetres, Millimetres]] | None = Field(
-        default=None, alias="rectangle"
-    )
-    polygon_mm: tuple[tuple[Millimetres, Millimetres], ...] | None = Field(default=None, alias="polygon")
+    rectangle_mm: tuple[tuple[Millimetres, Millimetres], tuple[Millimetres, Millimetres]] | None = None
+    polygon_mm: tuple[tuple[Millimetres, Millimetres], ...] | None = None
     emissivity: Fraction | None = None
     emissivity_u: FractionU | None = None
     states: tuple[StateTable, StateTable] | None = None
@@ -254,23 +354,26 @@ class SurfaceTable(_Measured):
     @model_validator(mode="after")
     def _is_whole(self) -> SurfaceTable:
         if (self.rectangle_mm is None) == (self.polygon_mm is None):
-            text = f"region {self.name} needs either rectangle (two opposite corners) or polygon (its corners in order)"
-            raise PydanticCustomError("region", "{text}", {"text": text})
+            raise ValueError(
+                f"region {self.name} needs either rectangle (two opposite corners) or polygon (its corners in order)"
+            )
         if self.polygon_mm is not None and len(self.polygon_mm) < 3:
-            text = f"the polygon of region {self.name} has {len(self.polygon_mm)} corners; it needs at least 3"
-            raise PydanticCustomError("region", "{text}", {"text": text})
+            raise ValueError(
+                f"the polygon of region {self.name} has {len(self.polygon_mm)} corners; it needs at least 3"
+            )
         if (self.emissivity is None) == (self.states is None):
-            text = f'region {self.name} needs either emissivity, for example "0.35 +- 0.05", or states (two cycles of known temperature)'
-            raise PydanticCustomError("region", "{text}", {"text": text})
+            raise ValueError(
+                f'region {self.name} needs either emissivity, for example "0.35 +- 0.05", or states (two cycles of known temperature)'
+            )
         if area_mm2(self.corners_mm) == 0.0:
-            text = f"region {self.name} with the corners {corner_words(self.corners_mm)} has no area; give corners that enclose one"
-            raise PydanticCustomError("region", "{text}", {"text": text})
+            raise ValueError(
+                f"region {self.name} with the corners {corner_words(self.corners_mm)} has no area; give corners that enclose one"
+            )
         if self.states is not None and self.states[0].cycle == self.states[1].cycle:
-            text = (
+            raise ValueError(
                 f"both states of region {self.name} are cycle {self.states[0].cycle}; name two cycles in which its temperature differs, as "
                 "one state cannot tell emissivity and reflection apart"
             )
-            raise PydanticCustomError("region", "{text}", {"text": text})
         return self
 
     @property
@@ -283,7 +386,7 @@ class SurfaceTable(_Measured):
         return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
 
 
-class StackTable(_Table):
+class StackTable(Table):
     """``[thermography.stack]``: what files of temperatures of other cameras do not hold themselves."""
 
     unit: Literal["degC", "K"] | None = None
@@ -293,17 +396,16 @@ class StackTable(_Table):
     time_in_name: str | None = None
     times: ExistingFile | None = None
     start: str | None = None
-    interval_s: PositiveSeconds | None = Field(default=None, alias="interval")
+    interval_s: PositiveSeconds | None = None
     time_zone: TimeZone = "UTC"
     emissivity: Fraction | None = None
-    reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
+    reflected_temperature_degC: Celsius | None = None
 
     @model_validator(mode="after")
     def _says_times_once(self) -> StackTable:
         given = [name for name in ("time_in_name", "times", "start") if getattr(self, name) is not None]
         if len(given) > 1:
-            text = f"{' and '.join(given)} each say when the frames were taken; keep one"
-            raise PydanticCustomError("times", "{text}", {"text": text})
+            raise ValueError(f"{' and '.join(given)} each say when the frames were taken; keep one")
         return self
 
 
@@ -313,24 +415,24 @@ class ThermographyTable(_Measured):
     frames: FramePatterns
     emissivity: Fraction | None = None
     emissivity_u: FractionU | None = None
-    reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
-    reflected_temperature_u_K: KelvinU | None = Field(default=None, alias="reflected_temperature_u")
-    atmospheric_temperature_degC: Celsius | None = Field(default=None, alias="atmospheric_temperature")
-    atmospheric_temperature_u_K: KelvinU | None = Field(default=None, alias="atmospheric_temperature_u")
+    reflected_temperature_degC: Celsius | None = None
+    reflected_temperature_u_K: KelvinU | None = None
+    atmospheric_temperature_degC: Celsius | None = None
+    atmospheric_temperature_u_K: KelvinU | None = None
     relative_humidity: Fraction | None = None
     relative_humidity_u: FractionU | None = None
-    object_distance_m: Metres | None = Field(default=None, alias="object_distance")
-    object_distance_u_m: MetresU | None = Field(default=None, alias="object_distance_u")
+    object_distance_m: Metres | None = None
+    object_distance_u_m: MetresU | None = None
     window_transmission: Fraction | None = None
     window_transmission_u: FractionU | None = None
-    window_temperature_degC: Celsius | None = Field(default=None, alias="window_temperature")
-    window_temperature_u_K: KelvinU | None = Field(default=None, alias="window_temperature_u")
-    camera_offset_u_K: KelvinU | None = Field(default=None, alias="camera_offset_u")
+    window_temperature_degC: Celsius | None = None
+    window_temperature_u_K: KelvinU | None = None
+    camera_offset_u_K: KelvinU | None = None
     camera_scale_u: FractionU | None = None
-    camera_drift_u_K: KelvinU | None = Field(default=None, alias="camera_drift_u")
+    camera_drift_u_K: KelvinU | None = None
     region: tuple[SurfaceTable, ...] = ()
-    clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
-    window_s: PositiveSeconds | None = Field(default=None, alias="window")
+    clock_offset_s: Seconds | None = None
+    window_s: PositiveSeconds | None = None
     table: Literal["still", "moving"] = "still"
     reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
     lens: ExistingFile | None = None
@@ -340,38 +442,38 @@ class ThermographyTable(_Measured):
     def _recalculates_what_is_known(self) -> ThermographyTable:
         if self.stack is None:
             return self
-        corrected = [name for name in _CORRECTED_BY_THE_CAMERA if getattr(self, name) is not None]
+        corrected = [_key(self, name) for name in _CORRECTED_BY_THE_CAMERA if getattr(self, name) is not None]
         if corrected:
-            text = f"{_CORRECTED_BY_THE_CAMERA[corrected[0]]} is corrected in temperatures already; set it in the camera's program"
-            raise PydanticCustomError("stack", "{text}", {"text": text})
+            raise ValueError(
+                f"{corrected[0]} is already corrected for in temperatures; set it in the camera's software"
+            )
         if self.emissivity is not None and self.stack.emissivity is None:
-            text = (
-                "another emissivity can only be calculated from the one that the camera's program used: write that as emissivity under "
+            raise ValueError(
+                "another emissivity can only be calculated from the one that the camera's software used: write that as emissivity under "
                 "[thermography.stack]"
             )
-            raise PydanticCustomError("stack", "{text}", {"text": text})
         return self
 
 
-class AxisTable(_Table):
+class AxisTable(Table):
     """``[plan.axis]``: where the measured line lies on the plan."""
 
-    origin_mm: tuple[Millimetres, Millimetres] = Field(alias="origin")
+    origin_mm: tuple[Millimetres, Millimetres]
     direction: tuple[float, float]
 
     @model_validator(mode="after")
     def _has_length(self) -> AxisTable:
         if self.direction == (0.0, 0.0):
-            raise PydanticCustomError("direction", "the direction [0, 0] points nowhere; write for example [-1, 0]")
+            raise ValueError("the direction [0, 0] has no length; write for example [-1, 0]")
         return self
 
 
-class PlanTable(_Table):
+class PlanTable(Table):
     """``[plan]``: the table plan in millimetres and its fiducials; or, by ``registration = "pixels"``, the picture itself."""
 
     registration: Literal["fiducials", "pixels"] = "fiducials"
-    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] | None = Field(default=None, alias="size")
-    cell_size_mm: PositiveMillimetres | None = Field(default=None, alias="cell_size")
+    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] | None = None
+    cell_size_mm: PositiveMillimetres | None = None
     cell_px: Pixels | None = None
     fiducials: ExistingFile | None = None
     regions: ExistingFile | None = None
@@ -383,33 +485,40 @@ class PlanTable(_Table):
         return self.registration == "pixels"
 
     @model_validator(mode="after")
+    def _has_one_unit(self) -> PlanTable:
+        if self.in_pixels:
+            given = [_key(self, name) for name in _IN_MILLIMETRES if getattr(self, name) is not None]
+            if given:
+                raise ValueError(
+                    f'{", ".join(given)} in millimetres cannot be combined with registration = "pixels", where the picture is the plan and '
+                    'cell_px = "4 px" its cell; remove one of them'
+                )
+        elif self.cell_px is not None:
+            raise ValueError('cell_px belongs to a plan of pixels; write registration = "pixels", or cell_size in mm')
+        return self
+
+    @model_validator(mode="after")
     def _cells_fit(self) -> PlanTable:
         if self.cell_size_mm is None or self.size_mm is None:
             return self
         along = [length / self.cell_size_mm for length in self.size_mm]
-        cells = along[0] * along[1]
+        cells, sides = along[0] * along[1], f"a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm"
         if any(abs(count - round(count)) > 1e-6 for count in along):
-            text = (
-                f"cell_size {self.cell_size_mm:g} mm does not divide a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm; "
-                "choose one that divides both sides"
-            )
-            raise PydanticCustomError("cells", "{text}", {"text": text})
+            fault = f"does not divide {sides}; choose one that divides both sides"
+            raise ValueError(f"cell_size {self.cell_size_mm:g} mm {fault}")
         if min(self.size_mm) < 2 * self.cell_size_mm or cells > 4e6:
-            text = (
-                f"cell_size {self.cell_size_mm:g} mm on a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm "
-                f"makes {cells:.0f} cells; choose it for at least 2 cells per side and at most 4 million in all"
-            )
-            raise PydanticCustomError("cells", "{text}", {"text": text})
+            fault = f"makes {cells:.0f} cells; choose it for at least 2 cells per side and at most 4 million in all"
+            raise ValueError(f"cell_size {self.cell_size_mm:g} mm on {sides} {fault}")
         return self
 
 
-class SensorsTable(_Table):
+class SensorsTable(Table):
     """``[sensors]``: temperatures of contact sensors over time, and the places of the sensors on the plan."""
 
     file: ExistingFile
     places: ExistingFile
     time_zone: TimeZone | None = None
-    temperature_u_K: KelvinU = Field(default=0.2, alias="temperature_u")
+    temperature_u_K: KelvinU = 0.2
 
 
 class InterferometryTable(_Measured):
@@ -419,27 +528,25 @@ class InterferometryTable(_Measured):
     sheet: str | None = None
     environment: ExistingFile | None = None
     time_zone: TimeZone | None = None
-    dead_path_mm: Millimetres = Field(default=0.0, alias="dead_path")
-    expansion_coefficient_ppm_per_K: PartsPerMillion = Field(default=11.7, alias="expansion_coefficient")
-    expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = Field(default=None, alias="expansion_coefficient_u")
-    feed_mm_per_min: Feed | None = Field(default=None, alias="feed")
-    dwell_s: PositiveSeconds | None = Field(default=None, alias="dwell")
+    dead_path_mm: Millimetres = 0.0
+    expansion_coefficient_ppm_per_K: PartsPerMillion = 11.7
+    expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = None
+    feed_mm_per_min: Feed | None = None
+    dwell_s: PositiveSeconds | None = None
     compensation: Literal["as recorded", "redo"] = "as recorded"
     material_temperature: Literal["logged", "camera"] = "logged"
-    material_sensor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="material_sensor")
-    environment_factor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="environment_factor")
+    material_sensor_mm: tuple[Millimetres, Millimetres] | None = None
+    environment_factor_mm: tuple[Millimetres, Millimetres] | None = None
     uncertainty: UncertaintyTable = UncertaintyTable()
 
     @model_validator(mode="after")
-    def _redo_is_asked_for(self) -> InterferometryTable:
+    def _redo_is_requested(self) -> InterferometryTable:
         """Refuse keys that say how a compensation is done again where none is."""
         given = ['material_temperature = "camera"'] if self.material_temperature == "camera" else []
         given += ["environment_factor"] if self.environment_factor_mm is not None else []
+        named = " and ".join(given)
         if given and self.compensation != "redo":
-            text = (
-                f'{" and ".join(given)} without compensation = "redo", to which it belongs; add that, or leave it out'
-            )
-            raise PydanticCustomError("compensation", "{text}", {"text": text})
+            raise ValueError(f'{named} without compensation = "redo", to which it belongs; add that, or leave it out')
         return self
 
     @model_validator(mode="after")
@@ -447,38 +554,39 @@ class InterferometryTable(_Measured):
         """Refuse two standard uncertainties of one coefficient."""
         one, other = self.expansion_coefficient_u_ppm_per_K, self.uncertainty.expansion_coefficient_ppm_per_K
         if one is not None and other is not None and one != other:
-            text = (
-                f"the standard uncertainty of the expansion coefficient is {one:g} ppm/K beside the coefficient and {other:g} ppm/K under "
+            raise ValueError(
+                f"the standard uncertainty of the expansion coefficient is {one:g} ppm/K with the coefficient and {other:g} ppm/K under "
                 "[interferometry.uncertainty]; state it once"
             )
-            raise PydanticCustomError("twice", "{text}", {"text": text})
         return self
 
 
-class DriversTable(_Table):
+class DriversTable(Table):
     """``[drivers]``: other logged quantities, and the law by which some of them were switched at random."""
 
     file: ExistingFile
     time_zone: TimeZone | None = None
     randomised: tuple[str, ...] = ()
-    mean_dwell_s: PositiveSeconds | None = Field(default=None, alias="mean_dwell")
-    least_dwell_s: Seconds = Field(default=0.0, alias="least_dwell")
+    mean_dwell_s: PositiveSeconds | None = None
+    least_dwell_s: Seconds = 0.0
 
     @model_validator(mode="after")
     def _law_is_whole(self) -> DriversTable:
         if bool(self.randomised) != (self.mean_dwell_s is not None):
-            text = "randomised and mean_dwell belong together: which columns were switched at random, and the mean time between"
-            raise PydanticCustomError("law", text)
+            raise ValueError(
+                "randomised and mean_dwell belong together: which columns were switched at random, and the mean time between"
+            )
         if self.mean_dwell_s is not None and not 0.0 <= self.least_dwell_s < self.mean_dwell_s:
-            text = f"least_dwell {self.least_dwell_s:g} s must be shorter than mean_dwell {self.mean_dwell_s:g} s, and not negative"
-            raise PydanticCustomError("law", "{text}", {"text": text})
+            raise ValueError(
+                f"least_dwell {self.least_dwell_s:g} s must be shorter than mean_dwell {self.mean_dwell_s:g} s, and not negative"
+            )
         return self
 
 
-class RecordTable(_Table):
+class RecordTable(Table):
     """``[record]``: temperature sensors and displacement channels over time, in one table per run (CSV or XLSX).
 
-    Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` stands for any text. ``test`` names the runs
+    Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` matches any text. ``test`` names the runs
     that are held out; left out: the last one.
     """
 
@@ -496,36 +604,38 @@ class RecordTable(_Table):
     @model_validator(mode="after")
     def _runs_are_whole(self, info: ValidationInfo) -> RecordTable:
         if (self.file is None) == (not self.files):
-            text = 'write either file = "run.csv", or files = ["run_*.csv"] (names or patterns) for several runs of one test'
-            raise PydanticCustomError("runs", "{text}", {"text": text})
+            raise ValueError(
+                'write either file = "run.csv", or files = ["run_*.csv"] (names or patterns) for several runs of one test'
+            )
         if self.test and not self.files:
-            text = "test names runs among files; write files = [...] instead of file, or leave test out: the last fifth is held out"
-            raise PydanticCustomError("runs", "{text}", {"text": text})
+            raise ValueError(
+                "test names runs among files; write files = [...] instead of file, or leave test out: the last fifth is held out"
+            )
         if isinstance(info.context, _Surroundings) and self.test:
             runs, test = (_each_match(info.context.folder, patterns) for patterns in (self.files, self.test))
             strange = [path.name for path in test if path not in runs]
             if strange:
-                text = f"test names {', '.join(strange)}, which files does not; the runs are {', '.join(path.name for path in runs)}"
-                raise PydanticCustomError("runs", "{text}", {"text": text})
+                raise ValueError(
+                    f"test names {', '.join(strange)}, which files does not; the runs are {', '.join(path.name for path in runs)}"
+                )
             if len(test) == len(runs):
-                text = f"test names all {len(runs)} runs, which leaves none to learn from; name fewer"
-                raise PydanticCustomError("runs", "{text}", {"text": text})
+                raise ValueError(f"test names all {len(runs)} runs, which leaves none for training; name fewer")
         return self
 
 
-class ModelTable(_Table):
+class ModelTable(Table):
     """``[model]``: the effects that are known to act."""
 
     declared: DeclaredEffects = ("axis_expansion", "table_offset")
 
 
-class AcceptTable(_Table):
+class AcceptTable(Table):
     """``[accept]``: what the user knows of the inputs, so that it is no doubt any more."""
 
     doubts: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ()
 
 
-class Campaign(_Table):
+class Campaign(Table):
     """A checked campaign file. Paths are absolute; every number is in the unit that its name states."""
 
     path: Path = Field(exclude=True)
@@ -563,21 +673,15 @@ class Campaign(_Table):
 
     def frame_paths(self) -> tuple[Path, ...]:
         """Return the thermal files that the glob patterns match, each once, sorted by name."""
-        if self.thermography is None:
-            return ()
-        return tuple(
-            sorted({path for pattern in self.thermography.frames for path in matching_files(self.folder, pattern)})
-        )
+        patterns = () if self.thermography is None else self.thermography.frames
+        return tuple(sorted({path for pattern in patterns for path in matching_files(self.folder, pattern)}))
 
     def record_paths(self) -> tuple[Path, ...]:
         """Return the tables of the record's runs, each once, in the order in which the campaign file names them."""
         if self.record is None:
             return ()
-        return (
-            _each_match(self.folder, self.record.files)
-            if self.record.file is None
-            else (self.resolve(self.record.file),)
-        )
+        file, patterns = self.record.file, self.record.files
+        return _each_match(self.folder, patterns) if file is None else (self.resolve(file),)
 
     def test_paths(self) -> tuple[Path, ...]:
         """Return the tables of the runs that the campaign file holds out; empty where it names none."""
@@ -592,18 +696,13 @@ class Campaign(_Table):
 
     def files_of(self, table: str) -> dict[str, Path]:
         """Return the files that one table of the campaign names, keyed by their path relative to the campaign file."""
-        names: list[str | None] = []
-        if table == "plan" and self.plan is not None:
-            names = [self.plan.fiducials, self.plan.regions]
-        elif table == "interferometry" and self.interferometry is not None:
-            names = [self.interferometry.deviations, self.interferometry.environment]
-        elif table == "sensors" and self.sensors is not None:
-            names = [self.sensors.file, self.sensors.places]
-        elif table == "drivers" and self.drivers is not None:
-            names = [self.drivers.file]
-        elif table == "thermography" and self.thermography is not None:
-            stack = self.thermography.stack
-            names = [self.thermography.lens, None if stack is None else stack.times]
+        stated = getattr(self, table)
+        if stated is None:
+            return {}
+        keys = ("fiducials", "regions", "deviations", "environment", "file", "places", "lens")
+        names = [getattr(stated, key, None) for key in keys if table != "record"]
+        if table == "thermography" and self.thermography is not None and self.thermography.stack is not None:
+            names.append(self.thermography.stack.times)
         paths = list({"thermography": self.frame_paths, "record": self.record_paths}.get(table, tuple)())
         paths += [self.resolve(name) for name in names if name is not None]
         return {relative_name(path, self.folder): path for path in paths}
@@ -618,15 +717,7 @@ def campaign_schema() -> dict[str, Any]:
 
 
 def relative_name(path: Path, folder: Path) -> str:
-    """Return `path` as seen from `folder`, with forward slashes, or its bare name where it lies elsewhere.
-
-    Parameters
-    ----------
-    path : Path
-        Absolute path.
-    folder : Path
-        Folder of the campaign file.
-    """
+    """Return `path` as seen from `folder`, with forward slashes, or its bare name where it lies elsewhere."""
     try:
         return path.relative_to(folder).as_posix()
     except ValueError:
@@ -675,24 +766,34 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
         raise CampaignError(f"{path}: byte {error.start} is not UTF-8; save the campaign file as UTF-8 text") from None
     except TomlError as error:
         raise CampaignError(f"{path}: this is not TOML: {error}; see the campaign file in the README") from None
-    lines = key_lines(text)
-
-    def place(key: tuple[str, ...]) -> str:
-        return f"{path}, line {find_line(lines, key)}"
-
-    faults = check_tables(content, place)
-    content.pop("path", None)
+    place = place_in(path, text)
+    if "path" in content:
+        raise CampaignError(f"{place(('path',))}: unknown key path; remove it")
     measured = "thermography" in content or "sensors" in content
     surroundings = _Surroundings(path.parent, library() if effects is None else effects, "record" in content, measured)
     try:
         campaign = Campaign.model_validate({**content, "path": path}, context=surroundings)
     except ValidationError as error:
         ordered = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
-        details = [item for item in ordered if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
-        faults += [describe(as_written(item, content), Campaign, place) for item in details]
+        faults = [describe(_as_written(item, content), Campaign, place) for item in ordered]
+    else:
+        faults = [f"{place(key)}: {fault}" for key, fault in contradictions(campaign)]
     if faults:
-        raise CampaignError("\n".join(first_faults(faults, path)))
+        raise CampaignError(first_faults(faults, path))
     return campaign
+
+
+def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
+    """Return the fault of an uncertainty under the key that states it: ``emissivity = "0.97 +- 2"`` has no line ``emissivity_u``."""
+    *outer, name = item["loc"] or ("",)
+    if not str(name).endswith("_u"):
+        return item
+    written = str(name).removesuffix("_u")
+    try:
+        table: Any = reduce(lambda within, part: within[part], outer, content)  # type: ignore[index]
+        return item if name in table else {**item, "loc": (*outer, written), "input": table[written]}
+    except (KeyError, IndexError, TypeError):
+        return item
 
 
 def _each_match(folder: Path, patterns: tuple[str, ...]) -> tuple[Path, ...]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,42 +15,261 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from fusion.alignment.align import AlignmentError, AxisGeometry, MeasuredLine, camera_on_laser_clock
-from fusion.alignment.zone_shift import covered_share, likely_zone_shift
-from fusion.attribution.randomised_duty import DutyLaw, read_duty
-from fusion.attribution.thermal_modes import read_regions
-from fusion.campaign.config import Campaign, relative_name
-from fusion.campaign.frame_stacks import camera_accuracy_notices, stack_options
-from fusion.campaign.logged_tables import read_drivers, split_heading
-from fusion.campaign.messages import naming
-from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
-from fusion.campaign.sensors import read_sensors
-from fusion.campaign.sources import (
-    CameraInputs,
-    Cycles,
-    Inputs,
-    LaserInputs,
-    Source,
-    cycles_of_frames,
-    cycles_of_readings,
-    usual_window_s,
+from fusion.analysis.alignment.align import (
+    AlignmentError,
+    AxisGeometry,
+    MeasuredLine,
+    camera_on_laser_clock,
+    covered_share,
+    cycle_bounds,
+    likely_zone_shift,
 )
+from fusion.analysis.attribution.duty import DutyLaw, read_duty
+from fusion.analysis.attribution.modes import Region, read_regions
+from fusion.campaign.config import (
+    Campaign,
+    CampaignError,
+    InterferometryTable,
+    PlanTable,
+    StackTable,
+    ThermographyTable,
+    relative_name,
+)
+from fusion.campaign.logs import (
+    NO_START,
+    ContactSensors,
+    TableError,
+    read_drivers,
+    read_run,
+    read_sensors,
+    split_heading,
+)
+from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
-from fusion.campaign.value_types import matching_pipes
-from fusion.errors import FusionError
-from fusion.products.contracts import check
-from fusion.products.notices import counted, left_out_notices, listed
-from fusion.products.results import Notice
-from interferometry.contract import DEVIATIONS
-from interferometry.io.readers import read_deviations, read_environment
-from thermography.errors import ThermographyError
+from fusion.campaign.values import matching_pipes
+from fusion.common import FusionError
+from fusion.messages import naming
+from fusion.results.progress import counted, left_out_notices, listed
+from fusion.results.results import Notice
+from fusion.results.store import check
+from interferometry.common import DEVIATIONS
+from interferometry.io.faults import BadReading
+from interferometry.io.readings import read_deviations, read_environment
+from interferometry.io.tables import DateOrder, parse_time, read_table
+from thermography.common import ThermographyError
 from thermography.io.frame import FrameReference
-from thermography.io.frame_index.frame_list import FrameList, frame_times
-from thermography.io.frame_readers import index_recordings
-from thermography.registration.lens import read_lens
-from thermography.registration.picture import picture_grid
-from thermography.registration.plan import PlanGrid, read_fiducials
-from thermography.registration.polygon import Polygon, PolygonError
+from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
+from thermography.io.sequence import FrameList, frame_times
+from thermography.registration.plan import Fiducial, PlanGrid, Polygon, PolygonError, read_fiducials
+from thermography.registration.projection import Lens, read_lens
+from thermography.registration.register import picture_grid
+
+# Files of temperatures of other cameras in a campaign: what ``[thermography.stack]`` says of them, and what it leaves
+# open.
+
+_ZERO_CELSIUS_K = 273.15
+
+
+def stack_options(campaign: Campaign) -> StackOptions:
+    """Return what a campaign file says of files of temperatures."""
+    table = None if campaign.thermography is None else campaign.thermography.stack
+    if table is None:
+        return StackOptions()
+    reflected = table.reflected_temperature_degC
+    same = ("scale", "offset", "variable", "time_in_name", "interval_s", "time_zone")
+    return StackOptions(
+        **{name: getattr(table, name) for name in same},
+        unit=table.unit or "",
+        times=None if table.times is None else _read_times(campaign.resolve(table.times), table),
+        start=None if table.start is None else _instant(campaign.path, table.start, table.time_zone),
+        emissivity=1.0 if table.emissivity is None else table.emissivity,
+        reflected_temperature_K=(20.0 if reflected is None else reflected) + _ZERO_CELSIUS_K,
+    )
+
+
+def _instant(path: Path, text: str, zone: str, order: DateOrder | None = None) -> np.datetime64:
+    try:
+        time, given = parse_time(text, order)
+    except BadReading as fault:
+        raise CampaignError(f"{path}: the time {text!r} of a frame {fault.reason}") from None
+    return time if given else to_utc(path, time.astype("datetime64[us]").item(), zone)
+
+
+def _read_times(path: Path, table: StackTable) -> dict[tuple[str, int], np.datetime64]:
+    """Return UTC by file name and frame from a table with the columns file, time and, for files of several frames, frame (from 0)."""
+    read = read_table(path, ("file", "time"))
+    rows = [(line, fields) for line, fields in read.records() if fields is not None]
+    order = DateOrder.of(path, [(line, fields["time"]) for line, fields in rows])
+    times: dict[tuple[str, int], np.datetime64] = {}
+    for line, fields in rows:
+        index = fields.get("frame", "0") or "0"
+        if not index.isdecimal():
+            raise CampaignError(
+                f"{path}, line {line}: frame {index!r} is not a whole number; frames of a file are counted from 0"
+            )
+        times[Path(fields["file"]).name, int(index)] = _instant(path, fields["time"], table.time_zone, order)
+    return times
+
+
+def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameReference]) -> list[Notice]:
+    """Return notices of what was assumed of a camera whose files hold temperatures."""
+    if not any(isinstance(frame, TemperatureFrame) for frame in frames):
+        return []
+    accuracy = Notice(
+        "camera_accuracy_assumed",
+        "The files hold temperatures and not what camera took them: the accuracy of an uncooled camera was assumed.",
+        'Write the accuracy of its data sheet under [thermography], for example camera_offset_u = "1 K" and camera_scale_u = 0.01.',
+    )
+    emissivity = Notice(
+        "stack_emissivity_unknown",
+        "The emissivity with which the camera's program calculated the temperatures is not stated; they are taken as they are.",
+        "Write emissivity and reflected_temperature under [thermography.stack] as they were set in the camera.",
+    )
+    unstated = table.stack is None or table.stack.emissivity is None
+    return [*([accuracy] if table.camera_offset_u_K is None else []), *([emissivity] if unstated else [])]
+
+
+# What a campaign was read into, before anything is calculated: the inputs of either instrument, or of both.
+
+#: Lengths of the windows that serve as cycles where no laser gives them, s: what a clock shows, from 10 s to a day.
+_WINDOWS_S = (10.0, 30.0, *(60.0 * m for m in (1, 2, 5, 10, 15, 30)), *(3600.0 * h for h in (1, 2, 4, 8, 24)))
+#: Lengths for a recording that is shorter than that, s.
+_SHORT_WINDOWS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+#: So many windows a recording is divided into at most: as many maps as a reader pages through.
+_MOST_WINDOWS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Cycles:
+    """Cycles by number (n,), counted from 1 with gaps, and their bounds (n, 2), each from its first instant to that of the time after it.
+
+    On the laser's clock, or on the camera's where there is no laser.
+    """
+
+    number: NDArray[np.int64]
+    bounds: NDArray[np.datetime64]
+
+
+def cycles_of_readings(deviations: xr.Dataset) -> Cycles:
+    """Return the cycles of a laser test."""
+    return Cycles(deviations["cycle"].values, cycle_bounds(deviations))
+
+
+def cycles_of_frames(times: NDArray[np.datetime64], window_s: float) -> Cycles:
+    """Return consecutive windows of equal length that serve as cycles, from the first frame on; windows without a frame are left out.
+
+    Parameters
+    ----------
+    times : (frames,) ndarray of datetime64
+        Times of the frames, sorted.
+    window_s : float, s
+        Length of a window.
+
+    Examples
+    --------
+    >>> minutes = np.datetime64("2026-03-09T08:00", "ns") + 60 * np.arange(12) * np.timedelta64(1, "s")
+    >>> cycles_of_frames(minutes, 300.0).number.tolist()
+    [1, 2, 3]
+    """
+    length = np.timedelta64(round(window_s * 1e9), "ns")
+    start = times.astype("datetime64[ns]")[0]
+    number = np.unique((times.astype("datetime64[ns]") - start) // length).astype(np.int64)
+    first = start + number * length
+    return Cycles(number + 1, np.stack([first, first + length], axis=1))
+
+
+def usual_window_s(times: NDArray[np.datetime64]) -> float:
+    """Return the length of the windows where the campaign file states none, s."""
+    length_s = float((times[-1] - times[0]) / np.timedelta64(1, "s"))
+    between_s = float(np.median(np.diff(times) / np.timedelta64(1, "s"))) if times.size > 1 else 0.0
+    least_s = max(between_s, length_s / _MOST_WINDOWS)
+    if 0.0 < length_s < _WINDOWS_S[0]:
+        short = [window for window in _SHORT_WINDOWS_S if window <= length_s] or [length_s]
+        return next((window for window in short if window >= least_s), short[-1])
+    return next((window for window in _WINDOWS_S if window >= least_s), _WINDOWS_S[-1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What every campaign with an instrument has: logs along ``time`` (UTC), contact sensors, and notices of everything left out.
+
+    ``duty`` holds randomised loads over time and the law that they were drawn from.
+    """
+
+    campaign: Campaign
+    environment: xr.Dataset | None = None
+    drivers: xr.Dataset | None = None
+    sensors: ContactSensors | None = None
+    duty: tuple[xr.DataArray, DutyLaw] | None = None
+    notices: list[Notice] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaserInputs(Inputs):
+    """Inputs of a campaign with the laser; ``deviations`` keep ``interferometry.common.DEVIATIONS``."""
+
+    interferometry: InterferometryTable
+    deviations: xr.Dataset
+    iso_budget: StatedBudget
+
+    @property
+    def is_recompensated(self) -> bool:
+        """Whether the environment log entered the readings: compensated again, or corrected for a dead path."""
+        return self.interferometry.compensation == "redo" or self.interferometry.dead_path_mm != 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraInputs(Inputs):
+    """Inputs of a campaign with the camera.
+
+    ``frames`` are the usable thermograms sorted by time, ``frames_rejected`` file, index and reason of the others; ``cycles`` are those of
+    the laser, or windows of the camera's time.
+    """
+
+    thermography: ThermographyTable
+    plan: PlanTable
+    grid: PlanGrid
+    fiducials: list[Fiducial]
+    fiducials_file: str
+    frames: Sequence[FrameReference]
+    frames_rejected: list[dict[str, Any]]
+    cycles: Cycles
+    regions: list[Region] = field(default_factory=list)
+    lens: Lens | None = None
+
+    @property
+    def frame_times(self) -> np.ndarray:
+        """Times of the usable frames on the camera's clock, (n,) datetime64[ns]."""
+        return frame_times(self.frames)
+
+    @property
+    def direction(self) -> tuple[float, float]:
+        """Direction in which a moving table goes over the plan as the axis position grows."""
+        assert self.plan.axis is not None
+        return self.plan.axis.direction
+
+    @property
+    def travel_mm(self) -> float:
+        """Largest distance of the table from where the plan holds, mm: without a laser, up to the length of the plan."""
+        return max(self.grid.width_mm, self.grid.height_mm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source(CameraInputs, LaserInputs):
+    """Inputs of a campaign with both instruments; ``axis`` says where the measured line lies on the plan."""
+
+    axis: AxisGeometry
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether the readings are compensated again with the temperature from the camera."""
+        return self.interferometry.material_temperature == "camera"
+
+    @property
+    def travel_mm(self) -> float:
+        """Largest distance of a target from axis position 0, mm."""
+        return float(np.abs(self.deviations["position"].values).max())
+
 
 #: Words of the reason why a frame of another size is left out.
 _OTHER_SIZE = "pixels among frames"
@@ -58,110 +278,71 @@ _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
 
 def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
-    """Read readings, logs, fiducials and the frames' headers of a campaign, with every check that needs no calculation.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        A checked campaign with an instrument.
-
-    Returns
-    -------
-    LaserInputs, CameraInputs or Source
-        What was read, with a notice for everything that was left out: a `Source` where both instruments are there.
-
-    Raises
-    ------
-    ValueError
-        A subclass of the instruments' packages or of this one: a file that cannot be used, cycles that overlap, clocks that never meet.
-    """
+    """Read readings, logs, fiducials and the frames' headers of a campaign, with every check that needs no calculation."""
     with naming(campaign.path):
-        return _read_instruments(campaign)
+        common: dict[str, Any] = {"campaign": campaign, **_read_drivers(campaign), "sensors": read_sensors(campaign)}
+        if campaign.interferometry is not None:
+            common |= read_laser(campaign)
+        _refuse_mixed_logs(campaign, common)
+        if campaign.thermography is None:
+            laser = LaserInputs(**common)
+            laser.notices[:0] = _laser_notices(laser)
+            return laser
+        if campaign.interferometry is None:
+            camera = CameraInputs(**common, **_read_camera(campaign, None))
+            camera.notices[:0] = [*_camera_notices(camera), *_log_notices(camera), _window_notice(camera)]
+            return camera
+        source = _read_both(campaign, common)
+        source.notices[:0] = [*_camera_notices(source), *_laser_notices(source)]
+        return source
 
 
-def _read_instruments(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
-    """Read what the campaign names, of the instruments that it has."""
-    common: dict[str, Any] = {"campaign": campaign, "drivers": _read_drivers(campaign)}
-    common["duty"] = _randomised(campaign, common["drivers"])
-    common["sensors"] = read_sensors(campaign)
-    if campaign.interferometry is not None:
-        common |= read_laser(campaign)
-    _refuse_mixed_zones(campaign, common)
-    _refuse_two_of_one_name(campaign, common)
-    if campaign.thermography is None:
-        laser = LaserInputs(**common)
-        laser.notices[:0] = _laser_notices(laser)
-        return laser
-    if campaign.interferometry is None:
-        camera = CameraInputs(**common, **_read_camera(campaign, None))
-        camera.notices[:0] = [*_camera_notices(camera), *_log_notices(camera), _window_notice(camera)]
-        return camera
-    source = _read_both(campaign, common)
-    source.notices[:0] = [*_camera_notices(source), *_laser_notices(source)]
-    return source
+def _read_drivers(campaign: Campaign) -> dict[str, Any]:
+    """Read the logged drivers, and the randomised loads among them with the law that they were drawn from."""
+    table = campaign.drivers
+    if table is None:
+        return {}
+    path = campaign.resolve(table.file)
+    drivers = bring_to_utc(read_drivers(path), campaign.zone_of("drivers"), file=table.file)
+    if table.mean_dwell_s is None:
+        return {"drivers": drivers}
+    law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
+    names = [split_heading(path, heading)[0] for heading in table.randomised]
+    return {"drivers": drivers, "duty": (read_duty(drivers, names, law, source=table.file), law)}
 
 
 def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
-    """Read the frames of a campaign beside its readings, and refuse clocks that cannot both be right."""
+    """Read the frames of a campaign with readings, and refuse clocks that cannot both be right."""
     plan = campaign.plan
     assert plan is not None and plan.axis is not None
     if not _is_timed(common["deviations"]):
         assert campaign.interferometry is not None
         raise AlignmentError(
-            f"{campaign.interferometry.deviations}: no reading has a time, so readings and frames cannot be brought together; give a table "
+            f"{campaign.interferometry.deviations}: no reading has a time, so readings and frames cannot be synchronised; give a table "
             "with times, or leave [thermography] out: the readings alone are evaluated by ISO 230-2"
         )
     axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
     cycles = cycles_of_readings(common["deviations"])
     source = Source(**common, **_read_camera(campaign, cycles), axis=axis)
     _raise_if_no_rise(campaign, source.frames, source.frames_rejected)
-    _raise_if_line_leaves_plan(source)
-    _raise_if_clocks_disagree(
-        source.deviations,
-        source.frame_times,
-        clock_offset_s=source.thermography.clock_offset_s,
-        source=str(campaign.path),
-    )
+    # A line or a target that leaves the plan would end the long work.
+    cells = xr.Dataset(coords={"x": source.grid.x_mm, "y": source.grid.y_mm})
+    try:
+        MeasuredLine(cells, axis, source.deviations["position"].values)
+    except AlignmentError as error:
+        raise AlignmentError(f"{campaign.path}: plan.axis: {error}") from error
+    _raise_if_clocks_disagree(source)
     return source
 
 
-def _read_drivers(campaign: Campaign) -> xr.Dataset | None:
-    """Read the logged drivers; None where the campaign has none."""
-    if campaign.drivers is None:
-        return None
-    drivers = read_drivers(campaign.resolve(campaign.drivers.file))
-    return bring_to_utc(drivers, campaign.zone_of("drivers"), file=campaign.drivers.file)
-
-
 def read_laser(campaign: Campaign) -> dict[str, Any]:
-    """Read what `LaserInputs` holds: readings, compensated where the campaign asks for it, and the environment log.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        With ``[interferometry]``.
-
-    Returns
-    -------
-    dict
-        ``interferometry``, ``deviations``, ``environment``, ``iso_budget`` and ``notices``, as in `LaserInputs`.
-
-    Raises
-    ------
-    ValueError
-        A subclass of the instruments' packages or of this one: a file that cannot be used.
-    """
+    """Read what `LaserInputs` holds: readings, compensated where the campaign asks for it, and the environment log."""
     interferometry = campaign.interferometry
     assert interferometry is not None
     laser = campaign.resolve(interferometry.deviations)
-    deviations = read_deviations(
-        laser,
-        feed_mm_per_min=interferometry.feed_mm_per_min,
-        dwell_s=interferometry.dwell_s,
-        sheet=interferometry.sheet,
-    )
+    how = {name: getattr(interferometry, name) for name in ("feed_mm_per_min", "dwell_s", "sheet")}
     zone = campaign.zone_of("interferometry")
-    deviations = bring_to_utc(deviations, zone, file=interferometry.deviations)
+    deviations = bring_to_utc(read_deviations(laser, **how), zone, file=interferometry.deviations)
     check(deviations, DEVIATIONS, name=laser.name)
     deviations, notices = _timed_cycles(deviations, file=interferometry.deviations)
     _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations)
@@ -173,24 +354,19 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
         environment = bring_to_utc(environment, zone, file=interferometry.environment)
     with naming(campaign.resolve(interferometry.environment or interferometry.deviations)):
         compensated = compensate_readings(deviations, environment, interferometry)
-    read = {"interferometry": interferometry, "environment": environment}
     if interferometry.material_temperature == "logged":
-        return {
-            **read,
-            "deviations": compensated.deviations,
-            "iso_budget": compensated.budget,
-            "notices": [*notices, *compensated.notices],
-        }
-    if campaign.thermography is None:
+        deviations, notices = compensated.deviations, [*notices, *compensated.notices]
+    elif campaign.thermography is None:
         raise RecompensationError(
             f'{campaign.path}: interferometry.material_temperature = "camera", but this campaign has no [thermography]; '
             'write "logged", or add the frames'
         )
-    return {**read, "deviations": deviations, "iso_budget": compensated.budget, "notices": notices}
+    read = {"interferometry": interferometry, "environment": environment, "deviations": deviations}
+    return {**read, "iso_budget": compensated.budget, "notices": notices}
 
 
 def _timed_cycles(deviations: xr.Dataset, *, file: str) -> tuple[xr.Dataset, list[Notice]]:
-    """Leave out cycles of which no reading has a time, where others have: nothing can be set beside them."""
+    """Leave out cycles of which no reading has a time, where others have: nothing can be aligned with them."""
     cycle = deviations["cycle"].values
     timed = ~np.isnat(deviations["time"].values).reshape(cycle.size, -1).all(axis=1)
     if timed.all() or not timed.any():
@@ -199,7 +375,7 @@ def _timed_cycles(deviations: xr.Dataset, *, file: str) -> tuple[xr.Dataset, lis
     return deviations.isel(cycle=timed), [
         Notice(
             "cycles_left_out",
-            f"{counted(int((~timed).sum()), 'cycle')} of {cycle.size} in {file} left out, without a reading that has a time: {numbers}.",
+            f"{counted(int((~timed).sum()), 'cycle')} of {cycle.size} in {file} left out, as none of their readings has a time: {numbers}.",
             "Give the times of their readings, or measure them again; the estimates allow for the gaps.",
         )
     ]
@@ -210,42 +386,46 @@ def _is_timed(deviations: xr.Dataset) -> bool:
     return not bool(np.isnat(deviations["time"].values).all())
 
 
-def _refuse_mixed_zones(campaign: Campaign, read: Mapping[str, Any]) -> None:
-    """Refuse logs of which some give times with a zone and others without one."""
-    interferometry, drivers = campaign.interferometry, campaign.drivers
-    files = {
-        "deviations": interferometry and interferometry.deviations,
-        "environment": interferometry and interferometry.environment,
-        "drivers": drivers and drivers.file,
-    }
-    logs = {str(file): read[name] for name, file in files.items() if read.get(name) is not None}
+def _refuse_mixed_logs(campaign: Campaign, read: Mapping[str, Any]) -> None:
+    """Refuse logs of which some give times with a zone and others without one, or of which two hold a quantity of one name."""
+    laser, drivers = campaign.interferometry, campaign.drivers
+    logs: dict[str, xr.Dataset] = {}
+    if laser is not None:
+        logs[laser.deviations] = read["deviations"]
+        if laser.environment is not None:
+            logs[laser.environment] = read["environment"]
+    if drivers is not None:
+        logs[drivers.file] = read["drivers"]
     if campaign.sensors is not None and read["sensors"] is not None:
         logs[campaign.sensors.file] = read["sensors"].temperature.to_dataset(name="temperature")
     refuse_mixed_zones(logs, source=str(campaign.path))
-
-
-def _refuse_two_of_one_name(campaign: Campaign, read: Mapping[str, Any]) -> None:
-    """Refuse a driver with the name of a quantity of the environment log, in whose place it would stand."""
-    drivers, environment = read.get("drivers"), read.get("environment")
-    if drivers is None or environment is None:
-        return
-    both = sorted({str(name) for name in drivers.data_vars} & {str(name) for name in environment.data_vars})
-    if both:
-        assert campaign.drivers is not None and campaign.interferometry is not None
-        raise SourceError(
-            f"{campaign.drivers.file}: the driver {both[0]!r} is logged in {campaign.interferometry.environment} too; rename its column"
-        )
+    if drivers is not None and laser is not None and laser.environment is not None:
+        both = sorted({*map(str, read["drivers"].data_vars)} & {*map(str, read["environment"].data_vars)})
+        if both:
+            raise SourceError(
+                f"{drivers.file}: the driver {both[0]!r} is logged in {laser.environment} too; rename its column"
+            )
 
 
 def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
-    """Read what `CameraInputs` holds; without cycles of a laser, windows of the camera's time stand for them."""
+    """Read what `CameraInputs` holds; without cycles of a laser, windows of the camera's time replace them."""
     thermography, plan = campaign.thermography, campaign.plan
     assert thermography is not None and plan is not None
     frames, rejected = _read_frames(campaign)
+    if cycles is None or plan.in_pixels:
+        _raise_if_no_rise(campaign, frames, rejected)
+    if plan.in_pixels:
+        try:
+            grid = picture_grid(frames[0].shape, plan.cell_px)
+        except ThermographyError as error:
+            raise SourceError(f"{campaign.path}: plan.{error}") from None
+    else:
+        assert plan.size_mm is not None and plan.cell_size_mm is not None
+        grid = PlanGrid(*plan.size_mm, plan.cell_size_mm)
     camera: dict[str, Any] = {
         "thermography": thermography,
         "plan": plan,
-        "grid": _grid(campaign, frames, rejected),
+        "grid": grid,
         "fiducials": [] if plan.fiducials is None else read_fiducials(campaign.resolve(plan.fiducials)),
         "fiducials_file": plan.fiducials or "",
         "frames": frames,
@@ -255,24 +435,9 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
         "lens": None if thermography.lens is None else read_lens(campaign.resolve(thermography.lens)),
     }
     if cycles is None:
-        _raise_if_no_rise(campaign, frames, rejected)
         times = camera_on_laser_clock(frame_times(frames), thermography.clock_offset_s or 0.0)
         camera["cycles"] = cycles_of_frames(times, thermography.window_s or usual_window_s(times))
     return camera
-
-
-def _grid(campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[Mapping[str, Any]]) -> PlanGrid:
-    """The cells of the plan: as the campaign states them in mm, or in pixels of the frames."""
-    plan = campaign.plan
-    assert plan is not None
-    if plan.in_pixels:
-        _raise_if_no_rise(campaign, frames, rejected)
-        try:
-            return picture_grid(frames[0].shape, plan.cell_px)
-        except ThermographyError as error:
-            raise SourceError(f"{campaign.path}: plan.{error}") from None
-    assert plan.size_mm is not None and plan.cell_size_mm is not None
-    return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 
 
 def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
@@ -280,9 +445,11 @@ def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
     frames, rejected = index_recordings(campaign.frame_paths(), stack_options(campaign))
     has_time = ~np.isnat(frames.times)
     timed, odd = _of_one_size(frames.choose(has_time))
-    left_out = [(frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected]
-    left_out += [(frame, "the frame has no time") for frame in frames.choose(~has_time)]  # type: ignore[misc]
-    left_out += odd  # type: ignore[arg-type]
+    left_out: list[tuple[Any, str]] = [
+        *((frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected),
+        *((frame, "the frame has no time") for frame in frames.choose(~has_time)),
+        *odd,
+    ]
     return timed, [
         {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
         for frame, reason in left_out
@@ -306,22 +473,7 @@ def _of_one_size(frames: FrameList) -> tuple[FrameList, list[tuple[FrameReferenc
 
 
 def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, list[Notice]]:
-    """Compensate the readings again with the temperature that the camera measured along the axis, where the campaign asks for it.
-
-    Parameters
-    ----------
-    source : Source
-        Inputs of the campaign.
-    fields : Dataset
-        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
-
-    Returns
-    -------
-    Source
-        With the compensated readings and their ISO 230-2 budget.
-    list of Notice
-        What was done.
-    """
+    """Compensate the readings again with the temperature that the camera measured along the axis, where the campaign asks for it."""
     if not source.needs_camera:
         return source, []
     material = see_material(fields, source.axis, source.deviations)
@@ -331,67 +483,39 @@ def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, li
     return replace(source, deviations=redone.deviations, iso_budget=redone.budget), redone.notices
 
 
-def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.DataArray, DutyLaw] | None:
-    """Return the randomised loads and the law that they were drawn from; None where no load was randomised."""
-    table = campaign.drivers
-    if table is None or drivers is None or table.mean_dwell_s is None:
-        return None
-    law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
-    names = [split_heading(campaign.resolve(table.file), heading)[0] for heading in table.randomised]
-    return read_duty(drivers, names, law, source=table.file), law
-
-
 def _camera_notices(source: CameraInputs) -> list[Notice]:
     """Return a notice for every kind of frame that is left out, and refuse what cannot be used."""
     _raise_if_patch_outside(source)
     _raise_if_regions_unusable(source)
-    return [
-        *frames_notices(source.frames_rejected),
-        *pipe_notices(source.campaign),
-        *_remark_notices(source.frames),
-        *camera_accuracy_notices(source.thermography, source.frames),
-    ]
+    notices = [*frames_notices(source.frames_rejected), *pipe_notices(source.campaign)]
+    if remarks := Counter(note for frame in source.frames for note in frame.notes):
+        named = [f"{note} ({counted(count, 'frame')})" for note, count in remarks.items()]
+        notices.append(Notice("frames_read_with_remarks", f"Remarks of the reader of the frames: {listed(named)}.", ""))
+    return [*notices, *camera_accuracy_notices(source.thermography, source.frames)]
 
 
 def _window_notice(source: CameraInputs) -> Notice:
-    """Return the notice that says what stands for cycles."""
+    """Return the notice that says what is used as cycles."""
     bounds, stated = source.cycles.bounds, source.thermography.window_s is not None
     seconds = float((bounds[0, 1] - bounds[0, 0]) / np.timedelta64(1, "s"))
     length = f"{seconds / 60.0:g} min" if seconds >= 60.0 else f"{seconds:g} s"
     windows = int(source.cycles.number[-1])
-    empty = windows - len(bounds)
-    return Notice(
-        "cycles_from_windows",
-        f"No laser gives cycles: the frames are divided into {counted(windows, 'window')} of {length}"
-        f"{', as thermography.window states' if stated else ', a usual length here (thermography.window sets another)'}; "
-        + (
-            "each counts as a cycle."
-            if not empty
-            else f"each of the {len(bounds)} that hold a frame counts as a cycle."
-        ),
-        "",
-    )
-
-
-def _sensor_notices(source: Inputs) -> list[Notice]:
-    """Return a notice for the contact sensors that are left out."""
-    sensors = source.sensors
-    if sensors is None or not sensors.faults:
-        return []
-    named = "; ".join(f"{sensors.logged['sensor'].values[fault.sensor]} {fault.words}" for fault in sensors.faults)
-    return [
-        Notice(
-            "sensors_left_out",
-            f"Faulty contact sensors of {sensors.file}: {named}. They are left out of all that is calculated, also before the fault, so "
-            "that one set of sensors serves the whole test and the fault is no step of the table.",
-            "Look at contact and cable.",
-        )
-    ]
+    told = "as thermography.window states" if stated else "a usual length here (thermography.window sets another)"
+    each = "each" if windows == len(bounds) else f"each of the {len(bounds)} that hold a frame"
+    divided = f"the frames are divided into {counted(windows, 'window')} of {length}, {told}"
+    return Notice("cycles_from_windows", f"No laser gives cycles: {divided}; {each} counts as a cycle.", "")
 
 
 def _log_notices(source: Inputs) -> list[Notice]:
-    """Return a notice for the lines of the logs and the contact sensors that are left out."""
-    notices = _sensor_notices(source)
+    """Return a notice for the contact sensors and the lines of the logs that are left out."""
+    notices, sensors = [], source.sensors
+    if sensors is not None and sensors.faults:
+        named = "; ".join(f"{sensors.logged['sensor'].values[fault.sensor]} {fault.words}" for fault in sensors.faults)
+        message = (
+            f"Faulty contact sensors of {sensors.file}: {named}. They are left out of all that is calculated, also before the fault, "
+            "so that one set of sensors serves the whole test and the fault is no step of the table."
+        )
+        notices.append(Notice("sensors_left_out", message, "Look at contact and cable."))
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
             notices += left_out_notices(table, code)
@@ -400,28 +524,22 @@ def _log_notices(source: Inputs) -> list[Notice]:
 
 def _laser_notices(source: LaserInputs) -> list[Notice]:
     """Return a notice for everything that is left out of the readings and the logs, or missing from them."""
-    notices = [
-        *left_out_notices(source.deviations, "readings_left_out"),
-        *_as_read_notices(source),
-        *_log_notices(source),
-    ]
+    notices = left_out_notices(source.deviations, "readings_left_out")
+    if notes := json.loads(source.deviations.attrs.get("notes", "[]")):
+        said = "; ".join(note.removeprefix("warning: ") for note in notes)
+        message = f"{source.interferometry.deviations} was interpreted as follows: {said}."
+        notices.append(Notice("readings_as_read", message, "Compare with the protocol of the test."))
+    notices += _log_notices(source)
     if not _is_timed(source.deviations):
-        notices.append(
-            Notice(
-                "no_times",
-                f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
-                "that stand out and causes need the time of every reading, and no log can be set beside them.",
-                "Export one reading per line with its time.",
-            )
+        message = (
+            f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
+            "that stand out and causes need the time of every reading, and no log can be set beside them."
         )
+        notices.append(Notice("no_times", message, "Export one reading per line with its time."))
     elif source.environment is None:
-        notices.append(
-            Notice(
-                "no_environment",
-                "No environment was logged, so effects of the air and of the material compensation cannot be separated from the drift.",
-                "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment.",
-            )
-        )
+        message = "No environment was logged, so effects of the air and of the material compensation cannot be separated from the drift."
+        remedy = "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment."
+        notices.append(Notice("no_environment", message, remedy))
     return notices
 
 
@@ -431,24 +549,9 @@ def _raise_if_too_few_readings(deviations: xr.Dataset, left_out: Sequence[Notice
     if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
         raise SourceError(
             f"{file}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
-            f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets; measure more, or look at the readings "
+            f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets; measure more, or evaluate the readings "
             f"with thermofuse iso230 {file}{'.' if said else ''}{said}"
         )
-
-
-def _as_read_notices(source: LaserInputs) -> list[Notice]:
-    """Return the notice that says how the reader understood the laser file, where it had to choose."""
-    notes = json.loads(source.deviations.attrs.get("notes", "[]"))
-    if not notes:
-        return []
-    said = "; ".join(note.removeprefix("warning: ") for note in notes)
-    return [
-        Notice(
-            "readings_as_read",
-            f"{source.interferometry.deviations} was read so: {said}.",
-            "Compare with the protocol of the test.",
-        )
-    ]
 
 
 def _raise_if_no_rise(
@@ -500,52 +603,23 @@ def _raise_if_regions_unusable(source: CameraInputs) -> None:
                 )
 
 
-def _raise_if_line_leaves_plan(source: Source) -> None:
-    """Raise if axis position 0 or a target lies beside the plan, where the long work would end."""
-    plan = xr.Dataset(coords={"x": source.grid.x_mm, "y": source.grid.y_mm})
-    try:
-        MeasuredLine(plan, source.axis, source.deviations["position"].values)
-    except AlignmentError as error:
-        raise AlignmentError(f"{source.campaign.path}: plan.axis: {error}") from error
-
-
 class SourceError(FusionError):
     """The inputs of a campaign cannot be used together; the message says which and what to do."""
 
 
 def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_rejected") -> list[Notice]:
-    """Return one notice that counts frames that were left out and lists the first of them.
-
-    Parameters
-    ----------
-    rejected : sequence of mapping
-        ``file``, ``index`` and ``reason`` of every frame.
-    code : str
-        Code of the notice.
-    """
+    """Return one notice that counts frames that were left out and lists the first of them."""
     if not rejected:
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
-    other_size = all(_OTHER_SIZE in _reason(item) for item in rejected)
-    return [
-        Notice(
-            code,
-            f"{counted(len(rejected), 'frame')} left out: {listed(named)}.",
-            "Name the frames of one camera and one size only in thermography.frames."
-            if other_size
-            else "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
-        )
-    ]
+    remedy = "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours."
+    if all(_OTHER_SIZE in _reason(item) for item in rejected):
+        remedy = "Name the frames of one camera and one size only in thermography.frames."
+    return [Notice(code, f"{counted(len(rejected), 'frame')} left out: {listed(named)}.", remedy)]
 
 
 def pipe_notices(campaign: Campaign) -> list[Notice]:
-    """Return one notice that counts what patterns of the campaign file match and no run reads: pipes, sockets and devices.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        With frames, a record or neither.
-    """
+    """Return one notice that counts what patterns of the campaign file match and no run reads: pipes, sockets and devices."""
     patterns = {
         "thermography.frames": () if campaign.thermography is None else campaign.thermography.frames,
         "record.files": () if campaign.record is None else campaign.record.files,
@@ -554,24 +628,12 @@ def pipe_notices(campaign: Campaign) -> list[Notice]:
     for key, named in patterns.items():
         pipes = sorted({path for pattern in named for path in matching_pipes(campaign.folder, pattern)})
         if pipes:
-            what = (
-                "1 pipe, socket or device, which is"
-                if len(pipes) == 1
-                else f"{len(pipes)} pipes, sockets or devices, which are"
-            )
+            several = f"{len(pipes)} pipes, sockets or devices, which are"
+            what = "1 pipe, socket or device, which is" if len(pipes) == 1 else several
             names = listed(relative_name(path, campaign.folder) for path in pipes)
-            remedy = f"Write a pattern in {key} that matches measured files alone, or move away what is none."
+            remedy = f"Write a pattern in {key} that matches measured files only, or move the others away."
             notices.append(Notice("pipes_left_out", f"{key} also matches {what} left out: {names}.", remedy))
     return notices
-
-
-def _remark_notices(frames: Sequence[FrameReference]) -> list[Notice]:
-    """Return one notice for everything that the reader corrected or skipped in frames that are used."""
-    remarks = Counter(note for frame in frames for note in frame.notes)
-    if not remarks:
-        return []
-    named = [f"{note} ({counted(count, 'frame')})" for note, count in remarks.items()]
-    return [Notice("frames_read_with_remarks", f"Remarks of the reader of the frames: {listed(named)}.", "")]
 
 
 def _reason(item: Mapping[str, Any]) -> str:
@@ -584,45 +646,24 @@ def _reason(item: Mapping[str, Any]) -> str:
 _COVERED_NOW = 0.6
 
 
-def _raise_if_clocks_disagree(
-    deviations: xr.Dataset, frame_time: NDArray[np.datetime64], *, clock_offset_s: float | None, source: str
-) -> None:
-    """Raise if the recordings do not overlap in time or their clocks differ by a time zone.
-
-    Parameters
-    ----------
-    deviations : Dataset
-        Keeps ``interferometry.contract.DEVIATIONS``.
-    frame_time : (n,) datetime64
-        Times of the frames on the camera's clock, sorted.
-    clock_offset_s : float or None
-        Camera clock minus laser clock from the campaign file, None where it is left out.
-    source : str
-        Campaign file, for the message.
-
-    Raises
-    ------
-    AlignmentError
-        If frames and readings never meet, or would meet after a shift by whole quarter hours.
-    """
-    readings = deviations["time"].values
-    readings = readings[~np.isnat(readings)]
-    if readings.size == 0:
-        raise AlignmentError(f"{source}: no reading has a time; readings and frames cannot be brought together")
-    frames = camera_on_laser_clock(frame_time, clock_offset_s or 0.0)
+def _raise_if_clocks_disagree(source: Source) -> None:
+    """Raise if the recordings do not overlap in time or their clocks differ by a time zone."""
+    readings, path = source.deviations["time"].values, source.campaign.path
+    readings, offset_s = readings[~np.isnat(readings)], source.thermography.clock_offset_s or 0.0
+    frames = camera_on_laser_clock(source.frame_times, offset_s)
     covered = covered_share(readings, frames)
     shift = likely_zone_shift(readings, frames)
-    laser = f"readings of {deviations.attrs.get('source', 'the laser')}"
+    laser = f"readings of {source.deviations.attrs.get('source', 'the laser')}"
     span = f"frames {_shown(frames[0])} to {_shown(frames[-1])}, {laser} {_shown(readings.min())} to {_shown(readings.max())}"
     if covered < _COVERED_NOW and shift is not None:
         raise AlignmentError(
-            f"{source}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
-            f'between frames); write thermography.clock_offset = "{(clock_offset_s or 0.0) + shift:g} s" (camera clock minus laser '
+            f"{path}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
+            f'between frames); write thermography.clock_offset = "{offset_s + shift:g} s" (camera clock minus laser '
             "clock) if so, or give the times of both with their zone"
         )
     if covered == 0.0:
         raise AlignmentError(
-            f"{source}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
+            f"{path}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
             "or check that both folders belong to the same test"
         )
 
@@ -630,3 +671,83 @@ def _raise_if_clocks_disagree(
 def _shown(time: np.datetime64) -> str:
     """Return a time to the second with its zone."""
     return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
+# A record of one run or of several: every table read, the runs in the order of their times, held to the same columns.
+
+#: Time between runs that each count their seconds from zero, so that they can be laid one after the other: one day.
+_BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
+#: A run counts from its own zero where its first time is at most this share of its length.
+_OWN_ZERO = 0.01
+
+
+def read_record(campaign: Campaign) -> xr.Dataset:
+    """Read a ``[record]``, all of its runs."""
+    paths = campaign.record_paths()
+    if len(paths) == 1:
+        return read_run(campaign, paths[0])
+    tables = {path: read_run(campaign, path) for path in paths}
+    _refuse_different_columns(tables)
+    refuse_mixed_zones({path.name: table for path, table in tables.items()}, source=str(campaign.path))
+    # Every run gives seconds since its own zero, and nothing says when that was.
+    times = [table["time"].values for table in tables.values()]
+    own_zero = all(NO_START <= time[0] <= NO_START + _OWN_ZERO * (time[-1] - time[0]) for time in times)
+    if own_zero:
+        start = NO_START
+        for path, table in tables.items():
+            moved = table["time"].values + (start - table["time"].values[0])
+            tables[path] = table.assign_coords(time=("time", moved, table["time"].attrs))
+            start = moved[-1] + _BETWEEN
+    else:
+        tables = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
+        _refuse_overlap(tables)
+    test = set(campaign.test_paths()) or {list(tables)[-1]}
+    numbered = [
+        table.assign_coords(run=("time", np.full(table.sizes["time"], k))) for k, table in enumerate(tables.values())
+    ]
+    joined = xr.concat(numbered, "time", data_vars="minimal", coords="minimal", compat="override", join="exact")
+    # A name that occurs twice is given with its folder.
+    names = [path.name for path in tables]
+    runs = [path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}" for path in tables]
+    left_out = [line for table in tables.values() for line in json.loads(table.attrs["left_out"])]
+    return joined.assign_attrs(
+        source=", ".join(path.name for path in tables),
+        left_out=json.dumps(left_out),
+        runs=json.dumps(runs),
+        test=json.dumps([number for number, path in enumerate(tables) if path in test]),
+        own_zero=int(own_zero),
+    )
+
+
+def _refuse_different_columns(tables: dict[Path, xr.Dataset]) -> None:
+    """Refuse runs that do not hold the same sensors, channels and drivers, a driver in the same unit."""
+    (first, reference), *others = tables.items()
+    for path, table in others:
+        for coordinate in ("sensor", "channel", "driver_name"):
+            here, there = (set(one[coordinate].values.tolist()) for one in (table, reference))
+            if here != there:
+                differing = ", ".join(sorted(map(str, here ^ there)))
+                raise TableError(
+                    f"{path}: the columns differ from those of {first.name}: {differing} is not in both; all runs of a record need the "
+                    "same columns, name those that all of them have"
+                )
+        units, wanted = (
+            dict(zip(one["driver_name"].values.tolist(), one["driver_units"].values.tolist(), strict=True))
+            for one in (table, reference)
+        )
+        for name, unit in units.items():
+            if unit != wanted[name]:
+                raise TableError(
+                    f'{path}: the driver "{name}" is in {unit}, in {first.name} in {wanted[name]}; write it in one unit in all runs'
+                )
+
+
+def _refuse_overlap(tables: dict[Path, xr.Dataset]) -> None:
+    """Refuse runs of which one begins before the other has ended."""
+    for (before, earlier), (path, later) in pairwise(tables.items()):
+        first, last = later["time"].values[0], earlier["time"].values[-1]
+        if first <= last:
+            raise TableError(
+                f"{path}: the run begins at {np.datetime_as_string(first, unit='s')}, before {before.name} has ended "
+                f"({np.datetime_as_string(last, unit='s')}); name every run once, and correct its times or record.start"
+            )

@@ -2,22 +2,77 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 
-from fusion.alignment.align import AxisGeometry, MeasuredLine, interpolate_series
+from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, interpolate_series
 from fusion.campaign.config import CampaignError, InterferometryTable
-from fusion.campaign.iso_budget import StatedBudget, state_budget
-from fusion.products.results import Notice
-from interferometry.compensation import (
-    SensorUncertainty,
-    air_index,
-    compensate,
-    dead_path_error_um,
-    followed_factor_um,
-)
+from fusion.results.results import Notice
+from interferometry.compensation import SensorUncertainty, air_index, compensate, dead_path_error_um, followed_factor_um
+from interferometry.iso230 import Iso230Budget
+
+# The uncertainty budget of a campaign's ISO 230-2 values: what is stated, what was measured, what is assumed.
+
+Origin = Literal["stated", "assumed", "from the camera", "not of a rotary axis"]
+
+
+@dataclass(frozen=True)
+class StatedBudget:
+    """A budget of standard uncertainties and the origin of each of its entries."""
+
+    budget: Iso230Budget
+    origins: Mapping[str, Origin]
+
+
+def state_budget(table: InterferometryTable, *, camera_u_K: float | None = None) -> StatedBudget:
+    """Return the budget of a campaign, the same for readings as recorded and for those that are compensated again."""
+    stated = table.uncertainty
+    coefficient_u = stated.expansion_coefficient_ppm_per_K
+    if coefficient_u is None:
+        coefficient_u = table.expansion_coefficient_u_ppm_per_K
+    given = {
+        "device": ("device_ppm", stated.device_ppm),
+        "alignment": ("alignment_ppm", stated.alignment_ppm),
+        "material_temperature": ("material_temperature_K", stated.material_temperature_K),
+        "expansion_coefficient": ("expansion_coefficient_ppm_per_K", coefficient_u),
+    }
+    origins: dict[str, Origin] = {name: "assumed" if value is None else "stated" for name, (_, value) in given.items()}
+    known = {key: value for key, value in given.values() if value is not None}
+    if camera_u_K is not None and stated.material_temperature_K is None:
+        known["material_temperature_K"] = camera_u_K
+        origins["material_temperature"] = "from the camera"
+    if stated.environmental_variation_um is not None:
+        known["environmental_variation_um"] = stated.environmental_variation_um
+        origins["environmental_variation"] = "stated"
+    nominal = table.expansion_coefficient_ppm_per_K
+    return StatedBudget(Iso230Budget(**known, nominal_expansion_ppm_per_K=nominal), origins)
+
+
+def material_by_cycle(deviations: xr.Dataset, environment: xr.Dataset | None) -> xr.DataArray | None:
+    """Return the logged temperature of the material in the middle of each cycle, degC."""
+    numbers = deviations["cycle"].values
+    if environment is not None:
+        log = environment[["material_temperature"]].dropna("time")
+        time = deviations["time"].values.astype("datetime64[ns]")
+        if log.sizes["time"] == 0 or np.isnat(time).all():
+            return None
+        start = log["time"].values[0]
+        log_s = (log["time"].values - start) / np.timedelta64(1, "s")
+        readings_s = np.where(np.isnat(time), np.nan, (time - start) / np.timedelta64(1, "s"))
+        timed = np.isfinite(readings_s).any(axis=(1, 2))
+        middle_s = np.nanmean(readings_s[timed], axis=(1, 2))
+        values = np.full(numbers.size, np.nan)
+        values[timed] = np.interp(middle_s, log_s, log["material_temperature"].values)
+    elif "material_temperature" in deviations and np.isfinite(deviations["material_temperature"]).any():
+        values = np.full(numbers.size, float(deviations["material_temperature"].mean()))
+    else:
+        return None
+    return xr.DataArray(values, dims="cycle", coords={"cycle": numbers})
+
 
 _NO_LOG = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
 
@@ -28,17 +83,7 @@ class RecompensationError(CampaignError):
 
 @dataclass(frozen=True)
 class Compensated:
-    """Readings as they are to be evaluated.
-
-    Attributes
-    ----------
-    deviations : Dataset
-        Keeps ``interferometry.contract.DEVIATIONS``.
-    budget : StatedBudget
-        Uncertainty contributions to ISO 230-2 values.
-    notices : list of Notice
-        What was done, or could not be done.
-    """
+    """Readings as they are to be evaluated, their uncertainty contributions, and what was done or could not be done."""
 
     deviations: xr.Dataset
     budget: StatedBudget
@@ -47,15 +92,7 @@ class Compensated:
 
 @dataclass(frozen=True)
 class SeenMaterial:
-    """Temperature of the measured length from the camera.
-
-    Attributes
-    ----------
-    temperature : (cycle, direction, target) DataArray
-        Mean between axis position 0 and the target at the time of the reading, degC.
-    u_K : float
-        Standard uncertainty, K.
-    """
+    """Temperature from the camera between axis position 0 and the target (cycle, direction, target), degC; standard uncertainty, K."""
 
     temperature: xr.DataArray
     u_K: float
@@ -68,31 +105,7 @@ def compensate_readings(
     *,
     material: SeenMaterial | None = None,
 ) -> Compensated:
-    """Leave the readings as the instrument compensated them, apart from a stated dead path; or compensate them again.
-
-    Parameters
-    ----------
-    deviations : Dataset
-        Keeps ``interferometry.contract.DEVIATIONS``.
-    environment : Dataset or None
-        Log of air and material along ``time``; None where it was not logged.
-    table : InterferometryTable
-        ``[interferometry]`` of the campaign.
-    material : SeenMaterial, optional
-        Temperature of the measured length in place of the logged probe.
-
-    Returns
-    -------
-    Compensated
-        New readings; the given ones are not changed.
-
-    Raises
-    ------
-    RecompensationError
-        If the air was not logged or keys of the campaign contradict each other.
-    CompensationError
-        If the log does not cover the readings or the stated environment factor is impossible.
-    """
+    """Leave the readings as the instrument compensated them, apart from a stated dead path; or compensate them again."""
     if table.compensation == "as recorded":
         corrected, notices = _correct_dead_path(deviations, environment, table.dead_path_mm)
         return Compensated(corrected, state_budget(table), notices)
@@ -133,16 +146,11 @@ def _stated_factor_um(deviations: xr.Dataset, table: InterferometryTable) -> tup
 def _redone(redone: xr.Dataset, stated: bool, material: SeenMaterial | None) -> Notice:
     """Return the notice that says what the new compensation replaced, and by how much it moved the readings."""
     added = redone["correction_scale"] + redone["correction_dead_path"]
-    undone = (
-        "the environment factor that the instrument applied"
-        if stated
-        else "a compensation that followed the logged air and the logged probe"
-    )
-    probe = (
-        "the logged probe"
-        if material is None
-        else f"the temperature that the camera measured along the axis (u {material.u_K:.2g} K)"
-    )
+    undone, probe = "a compensation that followed the logged air and the logged probe", "the logged probe"
+    if stated:
+        undone = "the environment factor that the instrument applied"
+    if material is not None:
+        probe = f"the temperature that the camera measured along the axis (u {material.u_K:.2g} K)"
     u = float(redone["compensation_u"].max())
     return Notice(
         "compensation_redone",
@@ -155,20 +163,7 @@ def _redone(redone: xr.Dataset, stated: bool, material: SeenMaterial | None) -> 
 
 
 def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset) -> SeenMaterial:
-    """Return the mean temperature that the camera measured between axis position 0 and each target, at the time of each reading.
-
-    Readings before the first or after the last frame take the temperature of that frame. Emissivity and
-    accuracy of the camera are common errors of all frames and places: they do not average out along the axis, but cause no drift.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
-    axis : AxisGeometry
-        Where the measured line lies on the plan.
-    deviations : Dataset
-        Keeps ``interferometry.contract.DEVIATIONS``.
-    """
+    """Return the mean temperature that the camera measured between axis position 0 and each target, at the time of each reading."""
     position = deviations["position"].values
     line = MeasuredLine(fields, axis, position)
     samples = line.sample(fields["frame_temperature"])
@@ -184,10 +179,7 @@ def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset)
 def _correct_dead_path(
     deviations: xr.Dataset, environment: xr.Dataset | None, dead_path_mm: float
 ) -> tuple[xr.Dataset, list[Notice]]:
-    """Subtract the error of the air in a known dead path, for a reflector that moves away from the laser.
-
-    The measured path is left as the instrument compensated it.
-    """
+    """Subtract the error of the air in a known dead path, for a reflector that moves away from the laser."""
     if dead_path_mm == 0.0:
         return deviations, []
     if environment is None:
@@ -204,7 +196,7 @@ def _correct_dead_path(
     first = float(index.ravel()[np.nanargmin(readings_s)])
     error = dead_path_error_um(index, first, dead_path_mm=dead_path_mm)
     size = float(np.nanmax(error) - np.nanmin(error))
-    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} µm from least to most."
+    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} µm over the test."
     corrected = deviations.assign(deviation=deviations["deviation"] - error)
     corrected["deviation"].attrs.update(deviations["deviation"].attrs)
     remedy = "Give the dead path a minus sign if the reflector moves towards the laser."

@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from fusion.campaign.config import CampaignError
-from interferometry.io.dates import NO_ZONE
+from interferometry.io.tables import NO_ZONE
 
 
 def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Dataset:
@@ -56,39 +56,17 @@ def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Datase
         )
     utc = placed.tz_convert(None).values.astype("datetime64[ns]").reshape(local.shape)
     attributes = {**table["time"].attrs, "reference": f"converted to UTC from {zone}"}
-    return (
-        table.assign_coords(time=("time", utc, attributes))
-        if "time" in table.dims
-        else table.assign(time=(table["time"].dims, utc, attributes))
-    )
+    place = table.assign_coords if "time" in table.dims else table.assign
+    return place(time=(table["time"].dims, utc, attributes))
 
 
 def lacks_zone(table: xr.Dataset) -> bool:
-    """Return whether the times of a table come from a file that gives no zone.
-
-    Parameters
-    ----------
-    table : Dataset
-        With ``time``.
-    """
+    """Return whether the times of a table come from a file that gives no zone."""
     return table["time"].attrs.get("reference") == NO_ZONE
 
 
 def refuse_mixed_zones(tables: Mapping[str, xr.Dataset], *, source: str) -> None:
-    """Refuse logs of which some give times with a zone and others without one.
-
-    Parameters
-    ----------
-    tables : mapping of str to Dataset
-        Logs by file, after `bring_to_utc`; those without any time say nothing.
-    source : str
-        Campaign file, for the message.
-
-    Raises
-    ------
-    CampaignError
-        If both kinds are there. Where no log gives a zone, all count as one clock; the frames' clock is tied to it by ``clock_offset``.
-    """
+    """Refuse logs of which some give times with a zone and others without one."""
     timed = {file: table for file, table in tables.items() if not np.isnat(table["time"].values).all()}
     without = [file for file, table in timed.items() if lacks_zone(table)]
     zoned = [file for file in timed if file not in without]

@@ -3,72 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from fusion.attribution.areas import Area, area_of, mode_cells
-from fusion.attribution.attribute import correlate
-from fusion.attribution.contact_sensors import SensorChoice, choose_sensors
-from fusion.attribution.family_wise import LEVEL
-from fusion.attribution.leading_source import LeadingSource, find_source, recommend_measurement
-from fusion.attribution.randomised_duty import randomisation_test
-from fusion.attribution.thermal_modes import Region, cluster_cells, disc
-from fusion.campaign.sources import Source
-from fusion.pipeline.rise_scale import place_scale_u, scaled
-from fusion.pipeline.sizes import average_cycles
-from fusion.products.progress import Report
-from fusion.products.results import Outcome
+from fusion.analysis.attribution.correlate import (
+    area_of,
+    coarsen_field,
+    correlate,
+    find_source,
+    mode_cells,
+    recommend_measurement,
+)
+from fusion.analysis.attribution.duty import randomisation_test
+from fusion.analysis.attribution.modes import Region, cluster_cells, disc
+from fusion.analysis.attribution.sensors import SensorChoice, choose_sensors
+from fusion.analysis.attribution.significance import LEVEL
+from fusion.campaign.inputs import Source
+from fusion.pipeline.drift_model import place_scale_u, scaled
+from fusion.pipeline.positioning import average_cycles
+from fusion.results.axis import SourcePart
+from fusion.results.parts import AreaPart
+from fusion.results.progress import Report
+from fusion.results.results import Outcome
 from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.hotspots import Hotspot, detect_hotspots
-from thermography.fields.tasks.pieces import piece_slices
 
-_CORRELATION_CELL_MM = 10.0
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
 _SEEN_SHARE = 0.8
+#: What is said of a hotspot where no drift was measured, or too little of it.
+_UNTESTED: dict[str, Any] = {"targets": [], "p_value": None, "lag_s": None}
 
 
 def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, report: Report) -> Outcome[xr.DataTree]:
-    """Run the correlation stage.
-
-    Parameters
-    ----------
-    source : Source
-        Regions and randomised duty of the campaign.
-    fields : Dataset
-        ``frame_temperature`` (time, y, x) in degC and ``temperature_rise`` (cycle, y, x) in K on the plan (mm).
-    fused : Dataset
-        Aligned readings, as from `fusion.alignment.align.align`.
-    report : callable
-        ``report(label, done, total)``, for progress.
-
-    Returns
-    -------
-    Outcome
-        The tree of `fusion.attribution.attribute.correlate` with groups ``clusters``, ``sensors`` and, where loads were switched at
-        random, ``duty``; and the parts ``hotspots`` and ``correlation`` of results.json.
-
-    Notes
-    -----
-    Cells are averaged to about 10 mm first: within one cycle heat spreads further than that in steel, so that only noise and computing
-    time are reduced.
-    """
-    field = _coarse(fields)
+    """Run the correlation stage."""
+    field = coarsen_field(fields)
     # What the parts of results.json say of targets needs all readings as they are.
     readings = fused
     fused, field, averaged = average_cycles(fused, field)
     spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
     report("correlation", 0, 100)
     regions = [*source.regions, *_hotspot_regions(spots, field)]
-    maps = correlate(
-        fused,
-        field,
-        regions=regions,
-        per_target=True,
-        progress=lambda part: report("correlation", round(100 * part), 100),
-    )
+
+    def progress(part: float) -> None:
+        report("correlation", round(100 * part), 100)
+
+    maps = correlate(fused, field, regions=regions, per_target=True, progress=progress)
     report("correlation", 100, 100)
     report("sensor places", 0, 1)
     maps["clusters"] = xr.DataTree(cluster_cells(field))
@@ -77,7 +58,8 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     if source.duty is not None:
         schedule, law = source.duty
         maps["duty"] = xr.DataTree(randomisation_test(fused, schedule, law))
-    areas = _region_areas(regions, field)
+    plan, shape = field.to_dataset(name="field"), (field.sizes["y"], field.sizes["x"])
+    areas = {region.name: area_of(region.cells(field).reshape(shape), plan) for region in regions}
     named = {f"hotspot {k}": spot for k, spot in enumerate(spots, start=1)}
     parts = {
         "hotspots": [_hotspot_part(name, spot, maps, readings, fields) for name, spot in named.items()],
@@ -86,53 +68,26 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     return Outcome(maps, parts, tuple(averaged))
 
 
-def _coarse(fields: xr.Dataset) -> xr.DataArray:
-    """The field of every frame on cells of about 10 mm; frames are averaged some at a time, as there may be very many."""
-    frames = fields["frame_temperature"]
-    block = max(1, int(_CORRELATION_CELL_MM / float(np.median(np.diff(fields["x"])))))
-    parts = [frames[some].coarsen(x=block, y=block, boundary="trim").mean() for some in piece_slices(frames.shape)]
-    return xr.concat(parts, "time")
-
-
 def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Keeps ``thermography.contract.FIELDS``.
-    """
-    spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
-    return [
-        {**_peak_part(f"hotspot {k}", spot, fields), "targets": [], "p_value": None, "lag_s": None}
-        for k, spot in enumerate(spots, start=1)
-    ]
+    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested."""
+    spots = enumerate(detect_hotspots(fields["temperature_rise"].isel(cycle=-1)), start=1)
+    return [{**_peak_part(f"hotspot {k}", spot, fields), **_UNTESTED} for k, spot in spots]
 
 
 def _peak_part(name: str, spot: Hotspot, fields: xr.Dataset) -> dict[str, Any]:
     """Place, area and rise of a hotspot."""
     u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
     rise = {"name": name, "peak_rise_K": spot.peak_rise_K, "peak_rise_u_K": float(u)}
-    if plan_unit(fields) == "px":
-        low_x, high_x, low_y, high_y = spot.extent_mm
-        return {
-            **rise,
-            "x_mm": None,
-            "y_mm": None,
-            "x_px": spot.x_mm,
-            "y_px": spot.y_mm,
-            "centroid_x_px": spot.centroid_x_mm,
-            "centroid_y_px": spot.centroid_y_mm,
-            "area_px": {"x_low_px": low_x, "x_high_px": high_x, "y_low_px": low_y, "y_high_px": high_y},
-        }
-    return {
-        **rise,
-        "x_mm": spot.x_mm,
-        "y_mm": spot.y_mm,
-        "centroid_x_mm": spot.centroid_x_mm,
-        "centroid_y_mm": spot.centroid_y_mm,
-        "area": area_json(Area(*spot.extent_mm)),
+    unit = plan_unit(fields)
+    area = dict(zip(("x_low", "x_high", "y_low", "y_high"), spot.extent_mm, strict=True))
+    part = {
+        f"x_{unit}": spot.x_mm,
+        f"y_{unit}": spot.y_mm,
+        f"centroid_x_{unit}": spot.centroid_x_mm,
+        f"centroid_y_{unit}": spot.centroid_y_mm,
+        "area" if unit == "mm" else "area_px": {f"{end}_{unit}": at for end, at in area.items()},
     }
+    return {"x_mm": None, "y_mm": None, **rise, **part}
 
 
 def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Region]:
@@ -146,12 +101,6 @@ def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Regi
         if (region.cells(field) & seen).any():
             regions.append(region)
     return regions
-
-
-def _region_areas(regions: Sequence[Region], field: xr.DataArray) -> dict[str, Area | None]:
-    """The part of the plan that every region covers, by its name."""
-    plan, shape = field.to_dataset(name="field"), (field.sizes["y"], field.sizes["x"])
-    return {region.name: area_of(region.cells(field).reshape(shape), plan) for region in regions}
 
 
 def _describe_sensors(choice: SensorChoice) -> xr.Dataset:
@@ -176,34 +125,25 @@ def _describe_sensors(choice: SensorChoice) -> xr.Dataset:
 
 
 def _correlation_part(
-    maps: xr.DataTree, source: LeadingSource, fields: xr.Dataset, regions: Mapping[str, Area | None]
+    maps: xr.DataTree, source: SourcePart, fields: xr.Dataset, regions: Mapping[str, AreaPart | None]
 ) -> dict[str, Any]:
     """The part ``correlation`` of results.json."""
     session = maps.to_dataset()
-    area = regions[source.name] if source.kind == "region" else source.area
     drift = session["unexplained_drift"]
     return {
-        "least_p": 1.0 / (int(maps.attrs["draws"]) + 1),
-        "verdict": source.verdict,
+        "p_resolution": 1.0 / (int(maps.attrs["draws"]) + 1),
+        "verdict": str(maps.attrs["verdict"]),
         "excitation": str(maps.attrs["excitation"]),
         "false_alarm_rate": float(session["false_alarm_rate"]),
         "source": {
-            "kind": source.kind,
-            "name": source.name,
-            "part": source.channel,
-            "x_mm": source.x_mm,
-            "y_mm": source.y_mm,
-            "area": area_json(area),
-            "p_value": source.p_value,
+            **source.model_dump(exclude_unset=True),
+            "area": _rectangle(regions[source.name] if source.kind == "region" else source.area),
             "sensitivity_um_per_K": scaled(
-                {"value": source.sensitivity_um_per_K, "u": source.sensitivity_u_um_per_K},
-                place_scale_u(fields, source.x_mm, source.y_mm),
+                source.sensitivity_um_per_K.model_dump(exclude_unset=True),
+                place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float)),
             ),
-            "lag_s": source.lag_s,
-            "detectable_um_per_K": source.detectable_um_per_K,
-            "equal_places_mm": [list(place) for place in source.others_mm],
         },
-        "would_tell": recommend_measurement(maps, source),
+        "recommended_test": recommend_measurement(maps, source),
         "unexplained_drift_um_per_h": {
             str(name): float(drift.sel(channel=name)) for name in drift["channel"].values if name != "joint"
         },
@@ -216,31 +156,21 @@ def _correlation_part(
 
 def _duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
     """What the randomisation test found for every switched source."""
-    switched = ((str(name), duty.sel(source=name)) for name in duty["source"].values)
-    return [
-        {
-            "name": name,
-            "cause": bool(load["p_value"] <= LEVEL),
-            "p_value": float(load["p_value"]),
-            "drift_at_full_duty_um": {"value": float(load["sensitivity"]), "u": float(load["sensitivity_u"])},
-            "time_constants_s": [float(load["time_constant"]), float(load["second_time_constant"])],
-        }
-        for name, load in switched
-    ]
+    found = []
+    for name in duty["source"].values:
+        load = duty.sel(source=name)
+        drift = {"value": float(load["sensitivity"]), "u": float(load["sensitivity_u"])}
+        constants = [float(load["time_constant"]), float(load["second_time_constant"])]
+        tested = {"cause": bool(load["p_value"] <= LEVEL), "p_value": float(load["p_value"])}
+        found.append({"name": str(name), **tested, "drift_at_full_duty_um": drift, "time_constants_s": constants})
+    return found
 
 
-def area_json(area: Area | None) -> dict[str, float] | None:
-    """An area of the plan for results.json.
-
-    Parameters
-    ----------
-    area : Area or None
-        None of a place without cells.
-    """
-    return None if area is None else asdict(area)
+def _rectangle(area: AreaPart | None) -> dict[str, float] | None:
+    return None if area is None else area.model_dump()
 
 
-def _mode_areas(maps: xr.DataTree) -> dict[str, Area | None]:
+def _mode_areas(maps: xr.DataTree) -> dict[str, AreaPart | None]:
     """The area of every thermal mode, by its name."""
     if "modes" not in maps.children:
         return {}
@@ -253,7 +183,7 @@ def _mode_areas(maps: xr.DataTree) -> dict[str, Area | None]:
 
 
 def _candidate_parts(
-    maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset, areas: Mapping[str, Area | None]
+    maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset, areas: Mapping[str, AreaPart | None]
 ) -> list[dict[str, Any]]:
     """Modes or regions with their areas and their results for every part of the drift."""
     if name not in maps.children:
@@ -266,37 +196,31 @@ def _candidate_parts(
         scale_u = place_scale_u(fields, float(candidate["at_x"]), float(candidate["at_y"]))
         for channel in map(str, group["channel"].values):
             found = candidate.sel(channel=channel)
+            sensitivity = {"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}
             parts[channel] = {
                 "p_value": float(found["p_value"]),
-                "sensitivity_um_per_K": scaled(
-                    {"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}, scale_u
-                ),
+                "sensitivity_um_per_K": scaled(sensitivity, scale_u),
                 "lag_s": float(found["lag"]),
                 "detectable_um_per_K": float(found["detectable_sensitivity"]),
             }
             if kind == "mode":
-                parts[channel]["p_beside_leader"] = float(found["p_beside"])
+                parts[channel]["p_given_leading_mode"] = float(found["p_beside"])
         label = f"mode {candidate[kind].item()}" if kind == "mode" else str(candidate[kind].item())
-        place = {"x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "area": area_json(areas[label])}
+        place = {"x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "area": _rectangle(areas[label])}
         listed.append({"name": label, **place, "parts": parts})
     return listed
 
 
 def _sensor_part(sensors: xr.Dataset) -> dict[str, Any]:
     """The contact sensors in place of the camera."""
+    keys = {"x_mm": "at_x", "y_mm": "at_y", "loss_um": "loss", "loss_upper_limit_um": "loss_at_most"}
     chosen = (sensors.isel(sensor=k) for k in range(sensors.sizes["sensor"]))
     return {
-        "within_s": float(sensors["run_length"]),
-        "camera_gain_um": float(sensors["camera_gain"]),
-        "camera_gain_decided": bool(sensors["camera_decided"]),
+        "block_length_s": float(sensors["run_length"]),
+        "camera_reduction_um": float(sensors["camera_gain"]),
+        "camera_reduction_significant": bool(sensors["camera_decided"]),
         "sets": [
-            {
-                "x_mm": float(sensor["at_x"]),
-                "y_mm": float(sensor["at_y"]),
-                "loss_um": float(sensor["loss"]),
-                "loss_at_most_um": float(sensor["loss_at_most"]),
-                "decided": bool(sensor["decided"]),
-            }
+            {**{key: float(sensor[name]) for key, name in keys.items()}, "significant": bool(sensor["decided"])}
             for sensor in chosen
         ],
     }
@@ -304,25 +228,19 @@ def _sensor_part(sensors: xr.Dataset) -> dict[str, Any]:
 
 def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset, fields: xr.Dataset) -> dict[str, Any]:
     """One entry of ``hotspots`` in results.json: the part of the drift that it goes with most, and the targets that it drives."""
-    tested: dict[str, Any] = {"targets": [], "p_value": None, "lag_s": None}
+    tested: dict[str, Any] = _UNTESTED
     regions = maps.children["regions"].to_dataset() if "regions" in maps.children else None
     if regions is not None and name in regions["region"].values:
         region = regions.sel(region=name)
         ratio = (region["statistic"] / region["threshold"]).fillna(0.0).values
         best = region.isel(channel=int(np.lexsort((-ratio, region["p_value"].fillna(1.0).values))[0]))
-        tested = {
-            "targets": _driven_targets(maps, fused, name, best),
-            "p_value": float(best["p_value"]),
-            "lag_s": float(best["lag"]),
-        }
+        driven = _driven_targets(maps, fused, name, best)
+        tested = {"targets": driven, "p_value": float(best["p_value"]), "lag_s": float(best["lag"])}
     return {**_peak_part(name, spot, fields), **tested}
 
 
 def _driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:
-    """Targets that a region drives: none unless the session is attributable and the region passes.
-
-    Through a shift it drives all, through a stretch those away from the zero of the laser, and any target that follows it by itself.
-    """
+    """Targets that a region drives: none unless the session is attributable and the region passes."""
     if maps.attrs["verdict"] != "attributable":
         return []
     driven = np.zeros(fused.sizes["target"], bool)

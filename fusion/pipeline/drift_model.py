@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -10,34 +10,115 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.alignment.align import align
-from fusion.alignment.readings import Readings, read_fused
-from fusion.campaign.sources import Inputs, LaserInputs, Source
-from fusion.consistency.axis_line import compare_lines
-from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
-from fusion.effects.effect import Effect, Prior
-from fusion.effects.library import library
-from fusion.effects.thermal import EXPANSION_U_PPM_PER_K
-from fusion.loop.axis import close_loop, on_corrected_fields, set_aside_sites
-from fusion.loop.camera_correction import FieldFault, correct_fields, corrected_variables, find_field_errors
-from fusion.loop.result import LoopResult
-from fusion.model.fit import ModelFit, fit_model
-from fusion.pipeline.interferometry import utc
-from fusion.pipeline.positions import judge_positions, sites_of
-from fusion.pipeline.rise_scale import axis_scale_u, plan_scale_u, scale_coefficients, scale_evidence
-from fusion.products import store
-from fusion.products.grouped import joined
-from fusion.products.notices import counted
-from fusion.products.progress import Report
-from fusion.products.results import Notice, Outcome
+from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
+from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.consistency.model import compare_lines
+from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
+from fusion.analysis.drift_model.axis import (
+    FieldFault,
+    LoopResult,
+    close_loop,
+    correct_fields,
+    corrected_variables,
+    find_field_errors,
+    on_corrected_fields,
+    set_aside_sites,
+)
+from fusion.analysis.drift_model.fit import ModelFit, fit_model
+from fusion.analysis.effects.effect import Effect, Prior
+from fusion.analysis.effects.library import library
+from fusion.analysis.effects.thermal import EXPANSION_U_PPM_PER_K
+from fusion.campaign.inputs import Inputs, LaserInputs, Source
+from fusion.pipeline.positioning import diagnose_positions, sites_of, utc
+from fusion.results import store
+from fusion.results.loop import ResidualTestsPart
+from fusion.results.progress import Report, counted
+from fusion.results.results import Notice, Outcome
+from fusion.results.store import joined
+from thermography.fields.cycle_fields import cycles_with_field
+
+# The scale of the rise in what is fitted to it: an error of the rise by one percent is one of every coefficient per
+# kelvin.
+
+
+def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
+    """Return the relative standard uncertainty of the rise along the measured line."""
+    along = MeasuredLine(fields, axis, position_mm).sample(np.stack(_last_rise(fields)))
+    return _weighted(along[0], along[1])
+
+
+def plan_scale_u(fields: xr.Dataset) -> float:
+    """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
+    return _weighted(*_last_rise(fields))
+
+
+def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:
+    """Return the relative standard uncertainty of the rise at a place of the plan, the mean of the plan where it is not seen there."""
+    if np.isfinite([x_mm, y_mm]).all():
+        share = float(fields["rise_scale_u"].sel(x=x_mm, y=y_mm, method="nearest"))
+        if np.isfinite(share):
+            return share
+    return plan_scale_u(fields)
+
+
+def scaled(entry: Mapping[str, Any], scale_u: float) -> dict[str, Any]:
+    """Return a quantity per kelvin of the rise with both parts of its uncertainty."""
+    value, u = entry["value"], entry["u"]
+    expected = 0.0 if entry.get("prior") is None else entry["prior"] * u**2 / entry["prior_u"] ** 2
+    u_scale = abs(value - expected) * scale_u
+    return {**entry, "u": float(np.hypot(u, u_scale)), "u_fit": u, "u_scale": u_scale}
+
+
+def scale_coefficients(
+    loop: dict[str, Any], effects: Mapping[str, Effect], *, axis_u: float, plan_u: float
+) -> dict[str, Any]:
+    """Return the part ``loop`` of results.json with the scale of the rise in every coefficient per kelvin of it."""
+
+    def completed(entry: Mapping[str, Any], effect: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        of_rise = parameters.get("follows") == "mean_rise" or (effect in effects and effects[effect].follows_field)
+        if not of_rise:
+            return dict(entry)
+        return scaled(entry, axis_u if entry["unit"] == "ppm/K" else plan_u)
+
+    declared = [completed(entry, entry["effect"], {}) for entry in loop["declared_coefficients"]]
+    steps = []
+    for step in loop["steps"]:
+        coefficients = [completed(entry, step["effect"], step["parameters"]) for entry in step["coefficients"]]
+        steps.append({**step, "coefficients": coefficients})
+    return {**loop, "declared_coefficients": declared, "steps": steps}
+
+
+def scale_evidence(
+    anomaly: dict[str, Any], axis: AxisGeometry, fields: xr.Dataset, position_mm: xr.DataArray
+) -> dict[str, Any]:
+    """Return an entry of ``anomalies`` with the scale of the rise in its displacement per local rise."""
+    evidence = anomaly["evidence"]
+    if evidence.get("temperature_um_per_K") is None:
+        return anomaly
+    x, y = axis.points(position_mm.sel(target=[anomaly["target"]]).values)
+    entry = {"value": evidence["temperature_um_per_K"], "u": evidence["temperature_u_um_per_K"]}
+    both = scaled(entry, place_scale_u(fields, float(x[0]), float(y[0])))
+    numbers = {"temperature_u_um_per_K": both["u"], "temperature_scale_u_um_per_K": both["u_scale"]}
+    return {**anomaly, "evidence": {**evidence, **numbers}}
+
+
+def _last_rise(fields: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Rise of the last cycle with a field, and the relative uncertainty of its scale, (y, x)."""
+    rise = fields["temperature_rise"]
+    last = int(np.flatnonzero(cycles_with_field(rise))[-1])
+    return rise[last].values.astype(float), fields["rise_scale_u"].values.astype(float)
+
+
+def _weighted(rise: np.ndarray, share: np.ndarray) -> float:
+    """Mean share, weighted by the size of the rise; plain where nothing rose."""
+    seen = np.isfinite(share) & np.isfinite(rise)
+    weight = np.abs(rise[seen])
+    return float(np.average(share[seen], weights=weight if weight.sum() > 0 else None))
+
 
 _READING = ("cycle", "direction", "target")
 #: Predictions of the hold-out cycles whose errors are kept reading by reading, in words.
-_PREDICTIONS = {
-    "declared": "declared model",
-    "final": "with the added effects",
-    "last_value": "last value repeated",
-}
+_PREDICTIONS = {"declared": "declared model", "final": "with the added effects", "last_value": "last value repeated"}
 
 
 @dataclass(frozen=True)
@@ -51,23 +132,7 @@ class CorrectedCamera:
 def model_drift(
     source: LaserInputs, fields: xr.Dataset | None, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report
 ) -> Outcome:
-    """Close the loop, then judge the positions that stand out from what the model explains.
-
-    Where the camera erred, the fields are corrected and the model is fitted again to them.
-
-    Parameters
-    ----------
-    source : the campaign as read
-    fields : keeps ``thermography.contract.FIELDS``; None where there is no camera
-    fused : readings with what was seen and logged, on one clock
-    deviations : keeps ``interferometry.contract.DEVIATIONS``
-    report : called with the stage, steps done and steps in total
-
-    Returns
-    -------
-    Outcome
-        Residuals, contributions and tests at every reading; the parts ``anomalies`` and ``loop`` of results.json; notices.
-    """
+    """Close the loop, then judge the positions that stand out from what the model explains."""
     readings = read_fused(fused)
     effects = library_for(source)
     result = close_loop(
@@ -89,13 +154,15 @@ def model_drift(
         {**prediction_variables(fused, result), **correction_variables(corrected, fields, fused)}
     )
     report("anomalies", 0, 1)
-    positions = judge_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
+    positions = diagnose_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
     result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
     anomalies, line = [position.as_json() for position in positions], None
-    loop: dict[str, Any] = result.as_json()
     if isinstance(source, Source) and fields is not None:
         line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
+    described = result.described(ResidualTestsPart(**tests), field_corrections=errors, axis_line=line)
+    loop = described.model_dump(exclude_unset=True)
+    if isinstance(source, Source) and fields is not None:
         anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
         axis_u = axis_scale_u(fields, source.axis, deviations["position"].values)
         loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields))
@@ -106,13 +173,7 @@ def model_drift(
         "anomalies": [
             {**one, "position_mm": float(deviations["position"].sel(target=one["target"]))} for one in anomalies
         ],
-        "loop": {
-            **loop,
-            "steps": with_event_times(loop["steps"], result, fused),
-            "field_corrections": [error.as_json() for error in errors],
-            "residual_tests": {name: examined.as_json() for name, examined in tests.items()},
-            "axis_line": None if line is None else line.as_json(),
-        },
+        "loop": {**loop, "steps": with_event_times(loop["steps"], result, fused)},
     }
     return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))
 
@@ -120,55 +181,26 @@ def model_drift(
 def correct_camera(
     source: Source, result: LoopResult, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset
 ) -> CorrectedCamera | None:
-    """Take the camera's errors that entered the model out of the fields, and align both recordings again.
-
-    Parameters
-    ----------
-    source, fields, fused, deviations : as for :func:`model_drift`
-    result : of the loop on the fields as they came
-
-    Returns
-    -------
-    CorrectedCamera or None
-        None where the camera did not err.
-    """
+    """Take the camera's errors that entered the model out of the fields, and align both recordings again."""
     errors = find_field_errors(result, fields, fused)
     if not errors:
         return None
     # Errors of reading that were left out stay out.
     used = deviations.assign(deviation=deviations["deviation"].where(fused["deviation"].notnull()))
-    aligned = align(
-        used,
-        correct_fields(fields, errors),
-        source.axis,
-        environment=source.environment,
-        drivers=source.drivers,
-    )
+    corrected = correct_fields(fields, errors)
+    aligned = align(used, corrected, source.axis, environment=source.environment, drivers=source.drivers)
     return CorrectedCamera(errors, aligned)
 
 
 def both_models(result: LoopResult) -> dict[str, ModelFit]:
-    """The declared and the final model, each fitted to all readings.
-
-    The declared model is shown on the fields as they came, also where they were corrected afterwards.
-
-    Parameters
-    ----------
-    result : of the loop
-    """
+    """The declared and the final model, each fitted to all readings."""
     return {"declared": fit_model(result.before.readings, result.before.terms), "final": result.after}
 
 
 def correction_variables(
     corrected: CorrectedCamera | None, fields: xr.Dataset | None, fused: xr.Dataset
 ) -> dict[str, xr.Variable | xr.DataArray]:
-    """The correction of the fields and what it changes, for fusion.nc; empty where the camera did not err.
-
-    Parameters
-    ----------
-    corrected : of :func:`correct_camera`
-    fields, fused : before the correction
-    """
+    """The correction of the fields and what it changes, for fusion.nc; empty where the camera did not err."""
     if corrected is None or fields is None:
         return {}
     names = ("mean_rise", "axis_integral", "local_rise")
@@ -178,14 +210,8 @@ def correction_variables(
     }
 
 
-def gap_notices(readings: Readings) -> list[Notice]:
-    """Notices of gaps in the logged series, one for all that have the same gaps.
-
-    Parameters
-    ----------
-    readings : with the series, which are interpolated linearly across gaps
-    """
-    notices = []
+def gap_notices(readings: Readings) -> Iterator[Notice]:
+    """Notices of gaps in the logged series, one for all that have the same gaps."""
     gaps = readings.gaps()
     names_by_gaps: dict[tuple[tuple[float, float], ...], list[str]] = {}
     for name in dict.fromkeys(gap.series for gap in gaps):
@@ -196,27 +222,21 @@ def gap_notices(readings: Readings) -> list[Notice]:
         name, have = ", ".join(names), "has" if len(names) == 1 else "each have"
         minutes = sum(end_s - start_s for start_s, end_s in own) / 60.0
         first = own[0][0] / 60.0
-        notices.append(
-            Notice(
-                "series_gap",
-                f"{name} {have} {counted(len(own), 'gap')}, {minutes:.0f} min together, the first {first:.0f} min after the first reading; "
-                "taken as a straight line there, so that an effect that follows it is seen too weak.",
-                f"Log {name} without a break, at least once a minute.",
-            )
+        yield Notice(
+            "series_gap",
+            f"{name} {have} {counted(len(own), 'gap')}, {minutes:.0f} min together, the first {first:.0f} min after the first reading; "
+            "taken as a straight line there, so that an effect that follows it is underestimated.",
+            f"Log {name} without a break, at least once a minute.",
         )
-    return notices
 
 
 def library_for(source: Inputs) -> dict[str, Effect]:
-    """The library with what the campaign file says of the machine: the expansion coefficient that is expected, and how well it is known.
-
-    Parameters
-    ----------
-    source : the campaign as read
-    """
+    """The library with what the campaign file says of the machine: the expansion coefficient that is expected, and how well it is known."""
     effects, table = library(), source.campaign.interferometry
     if source.campaign.thermography is None:
-        effects = {name: _without_camera(effect) if effect.errs_camera else effect for name, effect in effects.items()}
+        for name, effect in effects.items():
+            if effect.errs_camera:
+                effects = {**effects, name: replace(effect, needs=lambda readings: "the campaign has no camera")}
     if table is None:
         return effects
     stated_u = table.expansion_coefficient_u_ppm_per_K
@@ -224,41 +244,21 @@ def library_for(source: Inputs) -> dict[str, Effect]:
     return {**effects, "axis_expansion": replace(effects["axis_expansion"], prior=expected)}
 
 
-def _without_camera(effect: Effect) -> Effect:
-    """An error of the camera where there is none: told as not available."""
-    return replace(effect, needs=lambda readings: "the campaign has no camera")
-
-
-def field_notices(errors: Sequence[FieldFault]) -> list[Notice]:
-    """Notices of camera errors that were taken out of the fields.
-
-    Parameters
-    ----------
-    errors : of :func:`fusion.loop.camera_correction.find_field_errors`
-    """
-    return [
-        Notice(
+def field_notices(errors: Sequence[FieldFault]) -> Iterator[Notice]:
+    """Notices of camera errors that were taken out of the fields."""
+    for one in errors:
+        yield Notice(
             f"field_corrected_{one.effect}",
-            f"{one.text[0].upper()}{one.text[1:]}: taken out of the frames, and the model was fitted again to the corrected fields. "
-            "Maps and correlation show the fields as the camera gave them.",
+            f"{one.text[0].upper()}{one.text[1:]}: removed from the frames, and the model was fitted again to the corrected fields. "
+            "Maps and correlation show the uncorrected fields.",
             "Give the camera a reference patch, or shield it from warm bodies; the correction is loop_field_correction in fusion.nc.",
         )
-        for one in errors
-    ]
 
 
 def join_fusion(
-    fused: xr.Dataset, modelled: xr.Dataset, maps: xr.DataTree | None, loop: xr.Dataset | None
+    fused: xr.Dataset, modelled: xr.Dataset | None, maps: xr.DataTree | None, loop: xr.Dataset | None
 ) -> xr.DataTree:
-    """Everything that joins both recordings, for fusion.nc: readings and loop at the root, the attribution in its own groups.
-
-    Parameters
-    ----------
-    fused : readings with what was seen and logged, on one clock
-    modelled : the same at the targets that take part in attribution and loop
-    maps : of the attribution; None where it was not possible
-    loop : of the closed loop; None where it was not possible
-    """
+    """Everything that joins both recordings, for fusion.nc: readings and loop at the root, the attribution in its own groups."""
     root = fused if loop is None else joined(fused, loop=_over_all_targets(loop, fused, modelled))
     if maps is None:
         return xr.DataTree(root)
@@ -268,27 +268,15 @@ def join_fusion(
     return xr.DataTree(root, children={"correlation": correlation})
 
 
-def _over_all_targets(found: xr.Dataset, fused: xr.Dataset, modelled: xr.Dataset) -> xr.Dataset:
+def _over_all_targets(found: xr.Dataset, fused: xr.Dataset, modelled: xr.Dataset | None) -> xr.Dataset:
     """What was found at some of the targets, laid out over all of them; NaN at those that did not take part."""
-    if "target" not in found.dims or found.sizes["target"] == fused.sizes["target"]:
+    if modelled is None or "target" not in found.dims or found.sizes["target"] == fused.sizes["target"]:
         return found
     return found.assign_coords(target=modelled["target"].values).reindex(target=fused["target"].values)
 
 
 def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Mapping[str, ResidualTests]) -> xr.Dataset:
-    """Lay residuals, spectra and contributions of the effects out by cycle, direction and target.
-
-    Parameters
-    ----------
-    fused : both recordings on one clock
-    models : the ``declared`` and the ``final`` model
-    tests : of the residual of each
-
-    Returns
-    -------
-    Dataset
-        Residuals and contributions in um, innovations in standard deviations; NaN where there is no reading.
-    """
+    """Lay residuals, spectra and contributions of the effects out by cycle, direction and target."""
     final = models["final"]
     spread = partial(lay_out, fused, final.readings)
     shape = tuple(fused.sizes[name] for name in _READING)
@@ -296,51 +284,23 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
     names = [term.effect for term in terms]
     unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
     contribution = np.array([spread(final.series(term)[0]) for term in terms]).reshape(len(terms), *shape)
-    um = {"units": "um"}
-    return xr.Dataset(
-        {
-            **{f"residual_{name}": (_READING, spread(_centred(model)), um) for name, model in models.items()},
-            "contribution": (("effect", *_READING), contribution, um),
-            **{
-                f"innovation_{name}": (
-                    _READING,
-                    spread(one.innovations),
-                    {
-                        "units": "1",
-                        "long_name": "reading against its prediction from those before it, over its standard deviation",
-                    },
-                )
-                for name, one in tests.items()
-            },
-            **{
-                f"periodogram_{name}": (
-                    "period",
-                    one.power,
-                    {
-                        "units": "1",
-                        "long_name": "power of the innovations over that of noise",
-                        "limit": one.power_limit,
-                    },
-                )
-                for name, one in tests.items()
-            },
-        },
-        coords={
-            "effect": unique,
-            "period": ("period", tests["final"].periods_min, {"units": "min", "long_name": "period"}),
-        },
-    )
+    um, pure = {"units": "um"}, {"units": "1"}
+    against = {**pure, "long_name": "reading against its prediction from those before it, over its standard deviation"}
+    power = {**pure, "long_name": "power of the innovations over that of noise"}
+    variables: dict[str, Any] = {"contribution": (("effect", *_READING), contribution, um)}
+    for name, model in models.items():
+        residual = model.fit.residual()
+        # Profile and effects taken out, the unexplained drift left in, with mean zero.
+        variables[f"residual_{name}"] = (_READING, spread(residual - residual.mean()), um)
+    for name, one in tests.items():
+        variables[f"innovation_{name}"] = (_READING, spread(one.innovations), against)
+        variables[f"periodogram_{name}"] = ("period", one.power, {**power, "limit": one.power_limit})
+    period = ("period", tests["final"].periods_min, {"units": "min", "long_name": "period"})
+    return xr.Dataset(variables, coords={"effect": unique, "period": period})
 
 
 def with_event_times(steps: Sequence[Mapping[str, Any]], result: LoopResult, fused: xr.Dataset) -> list[dict[str, Any]]:
-    """Entries of ``loop.steps`` with the time of day of every event.
-
-    Parameters
-    ----------
-    steps : as in results.json
-    result : of the loop, with the same steps
-    fused : both recordings on one clock; the times of the loop count from its first reading
-    """
+    """Entries of ``loop.steps`` with the time of day of every event."""
     start = fused["time"].values[fused["deviation"].notnull().values].min()
     events_s = [term.candidate.event_s for term in result.state.added]
     return [
@@ -350,20 +310,7 @@ def with_event_times(steps: Sequence[Mapping[str, Any]], result: LoopResult, fus
 
 
 def prediction_variables(fused: xr.Dataset, result: LoopResult) -> dict[str, xr.Variable]:
-    """Lay the errors that the loop reports out by cycle, direction and target: those on the hold-out cycles, and of left-out blocks.
-
-    Parameters
-    ----------
-    fused : both recordings on one clock
-    result : of the loop
-
-    Returns
-    -------
-    dict of Variable
-        Measured minus predicted, um, NaN where nothing was predicted. Of the hold-out: ``held_out_error_declared`` and ``..._final``, and
-        ``..._last_value`` of repeating the last value. Of every step: ``block_error_before`` and ``block_error_after`` (step, ...), without
-        it and with it. The root mean square of each is the error in results.json.
-    """
+    """Lay the errors that the loop reports out by cycle, direction and target: those on the hold-out cycles, and of left-out blocks."""
     held_out = result.before.readings.subset(~result.before.used)
     variables = {
         f"held_out_error_{name}": xr.Variable(
@@ -387,26 +334,8 @@ def prediction_variables(fused: xr.Dataset, result: LoopResult) -> dict[str, xr.
 
 
 def lay_out(fused: xr.Dataset, readings: Readings, values: np.ndarray) -> np.ndarray:
-    """Lay values of readings out by cycle, direction and target.
-
-    Parameters
-    ----------
-    fused : both recordings on one clock
-    readings : n of its readings
-    values : (n,) in any unit
-
-    Returns
-    -------
-    (cycle, direction, target) ndarray
-        NaN where there is none of these readings.
-    """
+    """Lay values of readings out by cycle, direction and target."""
     laid = np.full(tuple(fused.sizes[name] for name in _READING), np.nan)
     place = np.searchsorted(fused["cycle"].values, readings.cycle)
     laid[place, np.where(readings.sign > 0, 0, 1), readings.target_index] = values
     return laid
-
-
-def _centred(fit: ModelFit) -> np.ndarray:
-    """Return the readings minus profile and effects, the unexplained drift left in, with mean zero, (n,)."""
-    residual = fit.fit.residual()
-    return residual - residual.mean()

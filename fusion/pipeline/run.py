@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import partial, reduce
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from fusion.alignment.contact_log import describe_sensors, join_sensors
-from fusion.beside import Beside, InTurn
+from fusion.analysis.alignment.align import describe_sensors, join_sensors
+from fusion.analysis.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
+from fusion.analysis.effects.effect import plugins
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import compensate_by_camera, read_source
-from fusion.campaign.messages import naming
-from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs, Source
-from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
-from fusion.effects.plugins import plugins
-from fusion.pipeline import attribution, drift_model, interferometry, thermal
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source, compensate_by_camera, read_source
+from fusion.messages import naming
+from fusion.pipeline import attribution, drift_model, thermal
+from fusion.pipeline import positioning as interferometry
 from fusion.pipeline import record as record_stage
-from fusion.pipeline.camera import camera_corrected
-from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
-from fusion.pipeline.iso230.sheet import complete_sheet
-from fusion.pipeline.provenance import (
-    FileState,
+from fusion.pipeline.checks import check_fields, check_fields_alone, check_loop, check_plan, check_source
+from fusion.pipeline.iso230 import complete_sheet
+from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
+from fusion.pipeline.remote import fetched_campaign, is_address, require_outside_cache
+from fusion.pipeline.stages import (
+    STAGES,
+    Run,
     describe_run,
     forget_run,
     hash_files,
@@ -37,31 +38,22 @@ from fusion.pipeline.provenance import (
     refuse_other_campaign,
     stamp_run,
 )
-from fusion.pipeline.radiometry import describe_field
-from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_for_model
-from fusion.pipeline.stages import FILES, Run, Stage
-from fusion.products.folder import claim, discard, open_folder, read_manifest
-from fusion.products.progress import Report, silent
-from fusion.products.results import Outcome, Results, assemble
-from fusion.products.store import (
-    StageStamps,
-    is_large,
-    open_dataset,
-    read_dataset,
-    read_tree,
-    write_dataset,
-    write_json,
-    write_text,
-)
-from fusion.remote import fetched_campaign, is_address, require_outside_cache
+from fusion.pipeline.thermal import camera_corrected, describe_field
+from fusion.pipeline.workers import Worker
+from fusion.results.folder import claim, discard, open_folder, read_manifest
+from fusion.results.progress import Report, silent
+from fusion.results.results import Outcome, Results, assemble
+from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
 
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
 
-AnyLaser = TypeVar("AnyLaser", bound=LaserInputs)
-
+#: A product that a campaign may not have.
+Maybe: TypeAlias = xr.Dataset | None
 #: The contact sensors, made from the logs in a moment.
 _SENSORS = "sensors.nc"
+#: What the report is made from.
+_DATASETS = ("fields", "deviations", "fusion", "sensors", "record")
 #: Fields above this size are not sent to a second process, which would hold them once more, bytes.
 _MOST_SENT = 200e6
 #: What a run writes last.
@@ -75,7 +67,7 @@ def run_campaign(
     resume: bool = False,
     scheduler: str | None = None,
     report: Report = silent,
-    beside: Beside | None = None,
+    worker: Worker | None = None,
 ) -> Results:
     """Run the whole pipeline on a campaign file and write its products.
 
@@ -90,9 +82,9 @@ def run_campaign(
     scheduler : str, optional
         Address of a dask scheduler for the per-frame work.
     report : callable
-        ``report(label, done, total)``, for progress; with `beside` it is called from another thread too.
-    beside : Beside, optional
-        Second process that takes a part of the work, from `fusion.beside.second_process`; left out: all is done in this one.
+        ``report(label, done, total)``, for progress; with `worker` it is called from another thread too.
+    worker : Worker, optional
+        Second process that takes a part of the work, from `fusion.pipeline.workers.second_process`; left out: all is done in this one.
 
     Returns
     -------
@@ -114,300 +106,281 @@ def run_campaign(
         results = run_campaign("campaign.toml", "results")
         accuracy, verdict = results.iso230.A_um, results.loop.verdict
     """
+    how = (resume, scheduler, report, worker or Worker())
     if is_address(path):
         require_outside_cache(Path(out))
         with fetched_campaign(str(path), report=report) as mirror:
-            return _run_file(
-                mirror.path, Path(out), str(path), resume=resume, scheduler=scheduler, report=report, beside=beside
-            )
-    return _run_file(Path(path), Path(out), None, resume=resume, scheduler=scheduler, report=report, beside=beside)
-
-
-def _run_file(
-    path: Path,
-    folder: Path,
-    address: str | None,
-    *,
-    resume: bool,
-    scheduler: str | None,
-    report: Report,
-    beside: Beside | None,
-) -> Results:
-    """Run a campaign file of this machine, which may have been fetched from an address; keep a run that is whole."""
-    campaign = load_campaign(path)
-    if resume and (kept := kept_results(campaign, folder)) is not None:
-        report("run (kept)", 1, 1)
-        return kept
-    return run_loaded(campaign, folder, address, resume=resume, scheduler=scheduler, report=report, beside=beside)
+            return _run_loaded(load_campaign(mirror.path), Path(out), str(path), *how)
+    return _run_loaded(load_campaign(path), Path(out), None, *how)
 
 
 # One thread for linear algebra: several give other last digits, and are many times slower on matrices of a hundred columns.
 @threadpool_limits.wrap(limits=1, user_api="blas")
-def run_loaded(
+def _run_loaded(
     campaign: Campaign,
     folder: Path,
-    address: str | None = None,
-    *,
-    resume: bool = False,
-    scheduler: str | None = None,
-    report: Report = silent,
-    beside: Beside | None = None,
+    address: str | None,
+    resume: bool,
+    scheduler: str | None,
+    report: Report,
+    worker: Worker,
 ) -> Results:
-    """Run a campaign that was read, of which no whole run is in the folder, see `run_campaign`.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign file.
-    folder : Path
-        Results folder.
-    address : str, optional
-        Where the campaign file was fetched from.
-    resume, scheduler, report, beside
-        As for `run_campaign`.
-    """
+    """Run a campaign file that was read, or read the results of a whole run of it where `resume` allows that; see `run_campaign`."""
+    if resume and (kept := kept_results(campaign, folder)) is not None:
+        report("run (kept)", 1, 1)
+        return kept
     seen = input_states(campaign)
     report("reading and checking", 0, 1)
+    made: dict[str, Any] = {"scheduler": scheduler}
+    checks: list[Check] = []
+    laser = campaign.interferometry
     if campaign.record is not None:
         with naming(campaign.path):
-            record = record_stage.read_source(campaign)
-        report("reading and checking", 1, 1)
-        with open_folder(folder, resume=resume), naming(campaign.path):
-            return _run_record(_start_run(campaign, folder, seen, report, address, beside or InTurn()), record)
-    source = read_source(campaign)
-    checks = check_source(source)
-    with naming(campaign.path):
-        refuse_contradictions(checks)
+            made["record_source"] = record_stage.read_source(campaign)
+    else:
+        source = read_source(campaign)
+        checks = check_source(source)
+        with naming(campaign.path):
+            refuse_contradictions(checks)
+        made["source"] = source
+        made |= {"camera": source} if isinstance(source, CameraInputs) else {}
+        made |= {"laser": source} if isinstance(source, LaserInputs) else {}
     report("reading and checking", 1, 1)
-    laser = campaign.interferometry
+
     readings = None if laser is None else campaign.resolve(laser.deviations)
-    with open_folder(folder, resume=resume), naming(campaign.path, readings=readings), _leaving(beside):
-        run = _start_run(campaign, folder, seen, report, address, beside or InTurn())
-        return _run_instruments(run, source, checks, scheduler=scheduler)
+    with open_folder(folder, resume=resume), naming(campaign.path, readings=readings):
+        try:
+            started = datetime.now(UTC)
+            inputs = hash_files(campaign.input_files(), report=report)
+            if address is None:
+                refuse_other_campaign(folder, campaign, inputs)
+            claim(folder, *(stage.file for stage in STAGES.values() if not stage.file.startswith(".")), *PAGES)
+            stamps = StageStamps(folder)
+            forget_run(stamps)
+            run = Run(campaign, folder, report, stamps, inputs, seen, started, address, worker)
+            run.notices.extend(made["source"].notices if "source" in made else ())
+            run_stages(run, RUN, made)
+            if "source" in made:
+                checks += made["checks"]
+                run.notices = [*doubt_notices(checks, campaign.accept.doubts), *run.notices]
+                run.parts["inputs"] = inputs_part(
+                    checks,
+                    campaign.accept.doubts,
+                    corrected="camera" in run.parts and camera_corrected(run.parts["camera"]),
+                    recompensated=isinstance(source, LaserInputs) and source.is_recompensated,
+                )
+            return _finish(run, made)
+        except BaseException:
+            # Nobody is left behind who writes into the folder.
+            worker.end()
+            raise
 
 
-@contextmanager
-def _leaving(beside: Beside | None) -> Iterator[None]:
-    """Let a run that fails leave nobody behind who writes into its folder."""
-    try:
-        yield
-    except BaseException:
-        if beside is not None:
-            beside.end()
-        raise
+def run_stages(run: Run, stages: Mapping[str, Callable[..., Any]], made: dict[str, Any]) -> None:
+    """Run every stage for which there is what it needs, in their order; `made` holds what was read, and takes what they make.
+
+    A stage takes what was read, or what earlier ones made, by the names of its parameters; it is left out where one without a default is
+    lacking, as of an instrument that a campaign does not have.
+    """
+    for makes, stage in stages.items():
+        parameters = [one for one in signature(stage).parameters.values() if one.name != "run"]
+        if all(one.default is None or made.get(one.name) is not None for one in parameters):
+            made[makes] = stage(run, **{one.name: made.get(one.name) for one in parameters})
 
 
-def _start_run(
-    campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report, address: str | None, beside: Beside
-) -> Run:
-    """Start a run in the folder that it holds: claim the products, and note what they are made from."""
-    started = datetime.now(UTC)
-    inputs = hash_files(campaign.input_files(), report=report)
-    if address is None:
-        refuse_other_campaign(folder, campaign, inputs)
-    products = [name for name in FILES.values() if not name.startswith(".")]
-    claim(folder, *products, *PAGES)
-    stamps = StageStamps(folder)
-    forget_run(stamps)
-    return Run(campaign, folder, report, stamps, inputs, seen, started, address, beside)
+def _begin_evaluation(run: Run, laser: LaserInputs, camera: CameraInputs) -> Callable[[], xr.Dataset] | None:
+    """Begin to evaluate the readings while the frames are reduced, unless the camera is needed to compensate them."""
+    if isinstance(laser, Source) and laser.needs_camera:
+        return None
+    return run.begin("deviations", partial(interferometry.evaluate_interferometry, _without_frames(laser)))
 
 
-def _run_instruments(
-    run: Run, source: LaserInputs | CameraInputs | Source, checks: Sequence[Check], *, scheduler: str | None
-) -> Results:
-    """Run a campaign with the instruments that it has, stage after stage."""
-    run.notices.extend(source.notices)
-    if isinstance(source, Source):
-        datasets, found = _run_both(run, source, scheduler=scheduler)
-    elif isinstance(source, CameraInputs):
-        datasets, found = _run_camera(run, source, scheduler=scheduler)
-    else:
-        datasets, found = _run_laser(run, source)
-    datasets |= _join_sensors(run, source, datasets.get("fields"))
-    accepted = run.campaign.accept.doubts
-    checks = [*checks, *found]
-    run.parts["inputs"] = inputs_part(
-        checks,
-        accepted,
-        corrected="camera" in run.parts and camera_corrected(run.parts["camera"]),
-        recompensated=isinstance(source, LaserInputs) and source.is_recompensated,
-    )
-    run.notices = [*doubt_notices(checks, accepted), *run.notices]
-    return _finish(run, datasets)
-
-
-def _join_sensors(run: Run, source: Inputs, fields: xr.Dataset | None) -> dict[str, xr.Dataset]:
-    """Write sensors.nc: the contact sensors, and the camera at their places."""
-    sensors = source.sensors
-    if sensors is None:
-        return {}
-    joined = join_sensors(sensors.logged, sensors.logged_x_mm, sensors.logged_y_mm, sensors.faults, fields)
-    run.parts["sensors"] = describe_sensors(joined, file=sensors.file)
-    joined = run.described(joined)
-    claim(run.folder, _SENSORS)
-    run.products.append(write_dataset(run.folder / _SENSORS, joined))
-    return {"sensors": joined}
-
-
-def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:
-    """Fields, deviations, and what both show together."""
-    evaluated = None if source.needs_camera else run.begin(_evaluation(source, after=()))
-    fields = _reduce(run, source, ("thermography", "plan", "interferometry"), scheduler=scheduler)
-    source, redone = compensate_by_camera(source, fields)
-    run.notices.extend(redone)
-    deviations = _evaluate(run, source, evaluated or partial(run.stage, _evaluation(source, after=("fields",))))
-    fused, outside = interferometry.align_recordings(source, fields, deviations)
-    run.notices.extend(outside)
-    too_small = [*lacks_for_model(deviations), *lacks_for_correlation(fields)]
-    modelled, left_out = choose_targets(fused)
-    run.notices.extend(too_small or left_out)
-    draw = partial(_draw_attributed, fused, modelled)
-    correlated = None if too_small else run.begin(_correlation(source, fields, modelled), draw)
-    run.draw(partial(_draw_measured, fields, deviations, fused))
-    checked = run.beside.start(partial(check_fields, _without_frames(source), fields, fused))
-    written = _write_maps(run, fields)
-    model = None
-    if correlated is None:
-        run.parts["hotspots"] = attribution.describe_hotspots(fields)
-    else:
-        model = _model(run, source, fields, modelled, deviations, after=("fields", "deviations"))
-    _draw_model(run, deviations, fused, modelled, model)
-    maps = None if correlated is None else correlated()
-    fusion = _write_fusion(run, fused, modelled, maps, model)
-    written()
-    checks = [*check_plan(source, run.parts["registration"]), *checked()]
-    checks += [] if model is None else check_loop(run.parts["loop"], source)
-    return {"fields": fields, "deviations": deviations, "fusion": fusion}, checks
-
-
-def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:
-    """Fields and hotspots, by windows of time in place of cycles."""
-    fields = _reduce(run, source, ("thermography", "plan"), scheduler=scheduler)
-    run.parts["hotspots"] = attribution.describe_hotspots(fields)
-    run.draw(partial(_draw_measured, fields, None, None))
-    _write_maps(run, fields)()
-    checks = [*check_plan(source, run.parts["registration"]), *check_fields_alone(source, fields)]
-    return {"fields": fields}, checks
-
-
-def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Check]]:
-    """Deviations, and the model of the drift from what was logged."""
-    deviations = _evaluate(run, source, partial(run.stage, _evaluation(source, after=())))
-    if "drift" not in run.parts:
-        # Readings without times: nothing can be set beside them.
-        run.draw(partial(_draw_measured, None, deviations, None))
-        return {"deviations": deviations}, []
-    fused, outside = interferometry.align_with_logs(source, deviations)
-    run.draw(partial(_draw_measured, None, deviations, fused))
-    too_small = lacks_for_model(deviations)
-    modelled, left_out = choose_targets(fused)
-    run.notices.extend([*outside, *(too_small or left_out)])
-    model = None if too_small else _model(run, source, None, modelled, deviations, after=("deviations",))
-    _draw_model(run, deviations, fused, modelled, model)
-    fusion = _write_fusion(run, fused, modelled, None, model)
-    checks = [] if model is None else check_loop(run.parts["loop"], source)
-    return {"deviations": deviations, "fusion": fusion}, checks
-
-
-def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, scheduler: str | None) -> xr.Dataset:
-    """The stage of the fields."""
-    stage = Stage("fields", tables, (), partial(thermal.reduce_thermography, source, scheduler=scheduler), open_dataset)
-    checkpoint = run.checkpoint(run.key_of(stage))
-    fields = run.stage(replace(stage, compute=partial(stage.compute, checkpoint=checkpoint)))
+def _reduce(run: Run, camera: CameraInputs, scheduler: str | None = None) -> xr.Dataset:
+    """The fields of all cycles, or of windows of time where there is no laser."""
+    compute = partial(thermal.reduce_thermography, camera, scheduler=scheduler, checkpoint=run.checkpoint("fields"))
+    fields: xr.Dataset = run.stage("fields", compute)
     if is_large(fields):
-        fields = open_dataset(run.folder / FILES["fields"])
+        fields = open_dataset(run.folder / STAGES["fields"].file)
     if fields.nbytes > _MOST_SENT:
-        run.beside = InTurn(run.beside.faults)
+        run.worker = Worker(run.worker.faults)
     run.parts["field"] = describe_field(fields, run.parts["radiometry"])
     return fields
 
 
-def _without_frames(source: AnyLaser) -> AnyLaser:
-    """Return inputs as another process needs them where it reads no frame: there may be very many."""
-    return replace(source, frames=()) if isinstance(source, Source) else source
+def _compensate(run: Run, laser: LaserInputs, fields: xr.Dataset) -> LaserInputs:
+    """The readings, compensated by the temperature that the camera saw where the campaign asks for it."""
+    assert isinstance(laser, Source)
+    compensated, notices = compensate_by_camera(laser, fields)
+    run.notices.extend(notices)
+    return compensated
 
 
-def _evaluation(source: LaserInputs, *, after: tuple[str, ...]) -> Stage[xr.Dataset]:
-    """The stage of the deviations."""
-    evaluate = partial(interferometry.evaluate_interferometry, _without_frames(source))
-    return Stage("deviations", ("interferometry",), after, evaluate, read_dataset)
-
-
-def _evaluate(run: Run, source: LaserInputs, evaluated: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """Return the deviations, and tell what is stated of the test."""
-    deviations = evaluated()
+def _evaluate(run: Run, laser: LaserInputs, evaluation: Callable[[], xr.Dataset] | None = None) -> xr.Dataset:
+    """The deviations, and what is stated of the test."""
+    evaluate = partial(interferometry.evaluate_interferometry, _without_frames(laser))
+    deviations: xr.Dataset = run.stage("deviations", evaluate) if evaluation is None else evaluation()
     # What is stated of the test is no input of the stage: a corrected serial number computes nothing again.
     run.parts["iso230"] = complete_sheet(
-        run.parts["iso230"], deviations, campaign=run.campaign, environment=source.environment
+        run.parts["iso230"], deviations, campaign=run.campaign, environment=laser.environment
     )
     return deviations
 
 
-def _correlation(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> Stage[xr.DataTree]:
-    """The stage of the correlation."""
-    return Stage(
-        "correlation",
-        ("plan", "interferometry", "drivers"),
-        ("fields", "deviations"),
-        partial(attribution.correlate_field, _without_frames(source), fields, fused),
-        read_tree,
-    )
+def _align(run: Run, laser: LaserInputs, deviations: xr.Dataset, fields: Maybe = None) -> Maybe:
+    """Readings, fields and logs on one clock; None where the readings have no times."""
+    if "drift" not in run.parts:
+        return None
+    if fields is None:
+        fused, notices = interferometry.align_with_logs(laser, deviations)
+    else:
+        assert isinstance(laser, Source)
+        fused, notices = interferometry.align_recordings(laser, fields, deviations)
+    run.notices.extend(notices)
+    return fused
 
 
-def _model(
-    run: Run,
-    source: LaserInputs,
-    fields: xr.Dataset | None,
-    fused: xr.Dataset,
-    deviations: xr.Dataset,
-    *,
-    after: tuple[str, ...],
-) -> xr.Dataset:
-    """The stage of the model: closed loop, and positions that stand out."""
-    modelled = deviations.sel(target=fused["target"].values)
-    return run.stage(
-        Stage(
-            "model",
-            ("plan", "interferometry", "sensors", "drivers", "model"),
-            after,
-            partial(drift_model.model_drift, source, fields, fused, modelled),
-            read_dataset,
-        )
-    )
+def _choose(run: Run, deviations: xr.Dataset, fused: xr.Dataset, fields: Maybe = None) -> Maybe:
+    """The readings that are modelled; None where they are too few."""
+    too_small = [*insufficient_for_model(deviations), *([] if fields is None else insufficient_for_correlation(fields))]
+    modelled, notices = choose_targets(fused)
+    run.notices.extend(too_small or notices)
+    return None if too_small else modelled
 
 
-def _draw_model(
-    run: Run, deviations: xr.Dataset, fused: xr.Dataset, modelled: xr.Dataset, model: xr.Dataset | None
+def _begin_correlation(
+    run: Run, laser: LaserInputs, fields: xr.Dataset, fused: xr.Dataset, modelled: xr.Dataset
+) -> Callable[[], xr.DataTree]:
+    """Begin to correlate drift and field."""
+    correlate = partial(attribution.correlate_field, _without_frames(laser), fields, modelled)
+    return run.begin("correlation", correlate, partial(_draw_attributed, fused, modelled))
+
+
+def _begin_charts(
+    run: Run, source: Inputs, fields: Maybe = None, deviations: Maybe = None, fused: Maybe = None
 ) -> None:
-    """Begin to draw what the model found, while the rest is written."""
-    found = drift_model.join_fusion(fused, modelled, None, model).to_dataset()
-    standing_out = {anomaly["target"] for anomaly in run.parts.get("anomalies") or ()}
-    run.draw(partial(_draw_modelled, deviations, found, standing_out))
+    """Begin to draw what was measured."""
+    run.draw(partial(_draw, "measured", fields, deviations, fused))
 
 
-def _write_maps(run: Run, fields: xr.Dataset) -> Callable[[], object]:
+def _begin_checks(run: Run, camera: CameraInputs, fields: xr.Dataset, fused: Maybe = None) -> Callable[[], list[Check]]:
+    """Begin to check the fields."""
+    if isinstance(camera, Source) and fused is not None:
+        return run.worker.submit(partial(check_fields, _without_frames(camera), fields, fused))
+    return partial(check_fields_alone, camera, fields)
+
+
+def _begin_maps(run: Run, fields: xr.Dataset) -> Callable[[], object]:
     """Begin to write the maps of every cycle as OpenEXR; return what waits for them."""
     names = [f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values]
     claim(run.folder, *names)
     run.products.extend(run.folder / name for name in names)
-    return run.beside.start(partial(thermal.write_exr, run.folder / "maps", fields), run.report)
+    return run.worker.submit(partial(thermal.write_exr, run.folder / "maps", fields), run.report)
+
+
+def _model(
+    run: Run, laser: LaserInputs, deviations: xr.Dataset, modelled: xr.Dataset, fields: Maybe = None
+) -> xr.Dataset:
+    """Closed loop, and positions that stand out."""
+    of_model = deviations.sel(target=modelled["target"].values)
+    model: xr.Dataset = run.stage("model", partial(drift_model.model_drift, laser, fields, modelled, of_model))
+    return model
+
+
+def _begin_charts_of_model(
+    run: Run, deviations: xr.Dataset, fused: xr.Dataset, modelled: Maybe = None, model: Maybe = None
+) -> None:
+    """Begin to draw what the model found, while the rest is written."""
+    found = drift_model.join_fusion(fused, modelled, None, model).to_dataset()
+    standing_out = {anomaly["target"] for anomaly in run.parts.get("anomalies") or ()}
+    run.draw(partial(_draw, "modelled", deviations, found, standing_out))
+
+
+def _find_hotspots(
+    run: Run, fields: xr.Dataset, correlation: Callable[[], xr.DataTree] | None = None
+) -> xr.DataTree | None:
+    """Wait for the correlation, which tests the hotspots; describe them where there is none."""
+    if correlation is not None:
+        return correlation()
+    run.parts["hotspots"] = attribution.describe_hotspots(fields)
+    return None
 
 
 def _write_fusion(
-    run: Run, fused: xr.Dataset, modelled: xr.Dataset, maps: xr.DataTree | None, model: xr.Dataset | None
+    run: Run,
+    fused: xr.Dataset,
+    modelled: Maybe = None,
+    maps: xr.DataTree | None = None,
+    model: Maybe = None,
 ) -> xr.DataTree:
-    """Write fusion.nc: the readings on one clock, with what was found beside them."""
+    """Write fusion.nc: the readings on one clock, with the results."""
     fusion = run.described(drift_model.join_fusion(fused, modelled, maps, model))
     run.products.append(write_dataset(run.folder / "fusion.nc", fusion))
     return fusion
 
 
-def _run_record(run: Run, source: record_stage.RecordSource) -> Results:
-    """Run a record: one table, one stage."""
-    record = run.stage(
-        Stage("record", ("record", "model"), (), partial(record_stage.model_record, source), read_dataset)
-    )
-    return _finish(run, {"record": record})
+def _check(
+    run: Run,
+    source: Inputs,
+    field_checks: Callable[[], list[Check]] | None = None,
+    maps_written: Callable[[], object] | None = None,
+    model: Maybe = None,
+) -> list[Check]:
+    """What the checks of registration, fields and model found; the maps are written by then."""
+    checks: list[Check] = []
+    if field_checks is not None and maps_written is not None:
+        maps_written()
+        assert isinstance(source, CameraInputs)
+        checks += [*check_plan(source, run.parts["registration"]), *field_checks()]
+    if model is not None:
+        assert isinstance(source, LaserInputs)
+        checks += check_loop(run.parts["loop"], source)
+    return checks
+
+
+def _join_sensors(run: Run, source: Inputs, fields: Maybe = None) -> Maybe:
+    """Write sensors.nc: the contact sensors, and the camera at their places."""
+    sensors = source.sensors
+    if sensors is None:
+        return None
+    joined = join_sensors(sensors.logged, sensors.logged_x_mm, sensors.logged_y_mm, sensors.faults, fields)
+    run.parts["sensors"] = describe_sensors(joined, file=sensors.file)
+    joined = run.described(joined)
+    claim(run.folder, _SENSORS)
+    run.products.append(write_dataset(run.folder / _SENSORS, joined))
+    return joined
+
+
+def _model_record(run: Run, record_source: record_stage.RecordSource) -> xr.Dataset:
+    """The loop of a record."""
+    record: xr.Dataset = run.stage("record", partial(record_stage.model_record, record_source))
+    return record
+
+
+#: A run: what each stage makes. What the next ones do not wait for is begun first and waited for last.
+RUN: Mapping[str, Callable[..., Any]] = {
+    "evaluation": _begin_evaluation,
+    "fields": _reduce,
+    "laser": _compensate,
+    "deviations": _evaluate,
+    "fused": _align,
+    "modelled": _choose,
+    "correlation": _begin_correlation,
+    "charts": _begin_charts,
+    "field_checks": _begin_checks,
+    "maps_written": _begin_maps,
+    "model": _model,
+    "charts_of_model": _begin_charts_of_model,
+    "maps": _find_hotspots,
+    "fusion": _write_fusion,
+    "checks": _check,
+    "sensors": _join_sensors,
+    "record": _model_record,
+}
+
+
+def _without_frames(source: Any) -> Any:
+    """Return inputs as another process needs them where it reads no frame: there may be very many."""
+    return replace(source, frames=()) if isinstance(source, Source) else source
 
 
 def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
@@ -424,58 +397,34 @@ def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
         run.stamps.forget(name)
 
 
-def _draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fused: xr.Dataset | None) -> Drawn:
-    """The charts of what was measured; their library takes a third of a second to import, which may be done beside the run."""
-    from fusion.report.charts.campaign import draw_measured
-
-    return draw_measured(fields, deviations, fused)
-
-
 def _draw_attributed(fused: xr.Dataset, modelled: xr.Dataset, outcome: Outcome[xr.DataTree]) -> Drawn:
     """The charts of where drift and field agree."""
     from fusion.report.charts.campaign import draw_attributed
 
     correlation = outcome.parts["correlation"]
     joined = drift_model.join_fusion(fused, modelled, outcome.dataset, None)
-    return draw_attributed(joined, correlation["source"]["part"], correlation["least_p"])
+    return draw_attributed(joined, correlation["source"]["part"], correlation["p_resolution"])
 
 
-def _draw_modelled(deviations: xr.Dataset, fused: xr.Dataset, standing_out: Set[int]) -> Drawn:
-    """The charts of what the model found."""
-    from fusion.report.charts.campaign import draw_modelled
+def _draw(part: str, *found: Any) -> Drawn:
+    """Draw a part of the charts; their library takes a third of a second to import, which may be done in the second process."""
+    from fusion.report.charts import campaign as charts
 
-    return draw_modelled(deviations, fused, standing_out)
-
-
-def _draw_placed(
-    results: Results, fields: xr.Dataset | None, position: xr.DataArray | None, logged: xr.Dataset | None
-) -> Drawn:
-    """The map of the places that were found."""
-    from fusion.report.charts.campaign import draw_placed
-
-    return draw_placed(results, fields, position, logged)
-
-
-def _together(parts: Sequence[Callable[[], Drawn]]) -> Drawn:
-    """Wait for all charts."""
-    drawn = parts[0]()
-    for part in parts[1:]:
-        drawn = drawn.with_more(part())
+    drawn: Drawn = getattr(charts, f"draw_{part}")(*found)
     return drawn
 
 
-def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
+def _finish(run: Run, made: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
+    datasets = {name: made[name] for name in _DATASETS if made.get(name) is not None}
     _discard_stale(run, datasets)
-    run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
+    run.parts["plugins"] = [plugin.model_dump() for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     run.report("report", 0, 1)
-    drawn = None
     if run.drawn:
         position = datasets["deviations"]["position"] if "deviations" in datasets else None
-        run.draw(partial(_draw_placed, results, datasets.get("fields"), position, datasets.get("sensors")))
-        drawn = partial(_together, run.drawn)
+        run.draw(partial(_draw, "placed", results, datasets.get("fields"), position, datasets.get("sensors")))
     content = write_json(run.folder / "results.json", results.as_json())
     provenance = describe_run(
         run.campaign,
@@ -486,12 +435,15 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
         products=[content, *(path for path in run.products if path.parent != run.folder / ".stages")],
         address=run.address,
     )
-    from fusion.report.html import render_report
+    from fusion.report.page import render_report
 
-    page = render_report(results, provenance, datasets, drawn=drawn)
+    def drawn() -> Drawn:
+        return reduce(lambda known, part: known.with_more(part()), run.drawn[1:], run.drawn[0]())
+
+    page = render_report(results, provenance, datasets, drawn=drawn if run.drawn else None)
     # The charts are the last that a second process may not have done.
-    if run.beside.faults:
-        provenance["second_process_faults"] = run.beside.faults
+    if run.worker.faults:
+        provenance["second_process_faults"] = run.worker.faults
     write_json(run.folder / "provenance.json", provenance)
     write_text(run.folder / "report.html", page)
     stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])

@@ -4,69 +4,238 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import os
 import shutil
+import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any
 
-from fusion.beside import Beside, InTurn
+from fusion.analysis.effects.effect import GROUP, describe_code, plugins
 from fusion.campaign.config import Campaign
-from fusion.pipeline.provenance import FileState, dependencies, versions
-from fusion.products.progress import Report
-from fusion.products.results import Notice, Outcome
-from fusion.products.store import Product, StageStamps, annotate, digest, write_dataset
+from fusion.common import versions
+from fusion.pipeline.workers import Worker
+from fusion.results.progress import Report, silent
+from fusion.results.results import Notice, Outcome, Results, read_results
+from fusion.results.store import (
+    OutputError,
+    Product,
+    StageStamps,
+    annotate,
+    digest,
+    file_sha256,
+    is_file_list,
+    open_dataset,
+    plain,
+    read_dataset,
+    read_json_object,
+    read_tree,
+    write_dataset,
+)
+from thermography.io.other_cameras import ENTRY_POINT_GROUP
 
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
 
-_log = logging.getLogger(__name__)
 
-#: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
-FILES = {
-    "fields": "fields.nc",
-    "deviations": "deviations.nc",
-    "correlation": ".stages/correlation.nc",
-    "model": ".stages/model.nc",
-    "record": "fusion.nc",
-}
-#: What each stage is called in progress and provenance.
-LABELS = {
-    "fields": "thermal fields",
-    "deviations": "deviations",
-    "correlation": "correlation",
-    "model": "anomalies and closed loop",
-    "record": "closed loop on the record",
-}
+# Provenance of a run: versions, inputs with their SHA-256, parameters, times, and the command; and whether a run is
+# there already.
+
+#: Number of the products' layout: stages that were kept in another one are computed again.
+PRODUCT_LAYOUT = 5
+#: The stamp of a whole run, which its last stage gets.
+_REPORT = "report"
+
+
+def hash_files(files: Mapping[str, Path], *, report: Report = silent) -> dict[str, dict[str, Any]]:
+    """Return size and SHA-256 of each file."""
+    hashed = {}
+    for done, (name, path) in enumerate(files.items()):
+        report("input files", done, len(files))
+        hashed[name] = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+    report("input files", len(files), len(files))
+    return hashed
+
+
+def dependencies() -> tuple[int, dict[str, str], list[dict[str, Any]]]:
+    """Return what every product depends on besides campaign and files: its layout, the versions, and the plug-ins with their code."""
+    groups = [*([GROUP] if plugins() else []), ENTRY_POINT_GROUP]
+    added = [plugin for group in groups for plugin in describe_code(group)]
+    for plugin in added:
+        plugin["code"] = [file_sha256(path) for path in plugin["code"]]
+    return PRODUCT_LAYOUT, versions(), added
+
+
+def stamp_run(
+    stamps: StageStamps, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]], products: Sequence[Path]
+) -> None:
+    """Stamp that a run is whole, so that `kept_results` knows it again."""
+    stamps.record(_REPORT, _run_key(campaign), products, {"inputs": inputs})
+
+
+def kept_results(campaign: Campaign, folder: Path) -> Results | None:
+    """Return the results of a whole run of the same campaign from the same input, or None where anything has to be done."""
+    stamps = StageStamps(folder)
+    if not stamps.done(_REPORT, _run_key(campaign)):
+        return None
+    noted, files = stamps.note(_REPORT)["inputs"], campaign.input_files()
+    sizes = {name: path.stat().st_size for name, path in files.items() if path.is_file()}
+    if sizes != {name: known["bytes"] for name, known in noted.items()} or hash_files(files) != noted:
+        return None
+    return read_results(folder)
+
+
+def forget_run(stamps: StageStamps) -> None:
+    """Take the stamp of a whole run away, before its products are written anew."""
+    stamps.forget(_REPORT)
+
+
+def _run_key(campaign: Campaign) -> str:
+    return digest(_REPORT, dependencies(), campaign.model_dump(mode="json", exclude={"path"}))
 
 
 @dataclass(frozen=True)
-class Stage(Generic[Product]):
-    """A stage of a run.
+class FileState:
+    """What tells without reading a file whether it was changed: its size, bytes, and the time of its last change, ns."""
+
+    size: int
+    changed_ns: int
+
+
+def input_states(campaign: Campaign) -> dict[str, FileState]:
+    """Return size and time of change of every input that there is, keyed by its name relative to the campaign file."""
+    states = {}
+    for name, path in campaign.input_files().items():
+        try:
+            found = path.stat()
+        except FileNotFoundError:
+            continue
+        states[name] = FileState(found.st_size, found.st_mtime_ns)
+    return states
+
+
+def note_changes(before: Mapping[str, FileState], after: Mapping[str, FileState]) -> Iterator[Notice]:
+    """Return a notice of the inputs that were added, removed or changed while a run read them, or none."""
+    parts = {
+        "changed": [name for name in before if name in after and before[name] != after[name]],
+        "removed": [name for name in before if name not in after],
+        "added": [name for name in after if name not in before],
+    }
+    words = [
+        f"{len(names)} {what} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
+        for what, names in parts.items()
+        if names
+    ]
+    if not words:
+        return
+    message = (
+        f"Input files were altered while the run read them: {'; '.join(words)}. The products may mix both versions."
+    )
+    yield Notice("inputs_changed", message, "Wait until the recording has ended and run again.")
+
+
+def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse a results folder that holds the results of another campaign: a run that goes on there would replace them."""
+    known = read_json_object(folder / "provenance.json")
+    here, there = _place_from(folder, campaign.path), known.get("campaign_file")
+    if not is_file_list(known.get("inputs")) or not isinstance(there, str) or here in (None, there):
+        return
+    tables = ("thermography", "interferometry", "record")
+    recordings = {inputs[name]["sha256"] for table in tables for name in campaign.files_of(table) if name in inputs}
+    if recordings & {one["sha256"] for one in known["inputs"].values()}:
+        return
+    stated = known.get("parameters")
+    about = stated.get("campaign") if isinstance(stated, dict) else None
+    named = f'"{about.get("title")}", {there}' if isinstance(about, dict) else there
+    raise OutputError(
+        f"{folder} holds the results of another campaign ({named}), which --resume would replace by those of "
+        f'{campaign.path} ("{campaign.campaign.title}"); name another folder with --out, or remove this one first'
+    )
+
+
+def describe_run(
+    campaign: Campaign,
+    inputs: Mapping[str, Mapping[str, Any]],
+    folder: Path,
+    *,
+    started: datetime,
+    seconds: Mapping[str, float],
+    products: Iterable[Path] = (),
+    address: str | None = None,
+) -> dict[str, Any]:
+    """Return the provenance of a run, without names of machine or user."""
+    named = {path.relative_to(folder).as_posix(): path for path in products}
+    return {
+        "software": "thermofuse",
+        "versions": versions(),
+        "command": [Path(sys.argv[0]).stem, *(_without_folder(argument) for argument in sys.argv[1:])],
+        "campaign_file": _place_from(folder, campaign.path) if address is None else None,
+        **({} if address is None else {"campaign_address": address}),
+        "started": started.isoformat(timespec="seconds"),
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "stage_seconds": {name: round(value, 2) for name, value in seconds.items()},
+        "parameters": campaign.model_dump(mode="json", exclude={"path"}, exclude_none=True),
+        "inputs": dict(inputs),
+        "products": hash_files(named),
+    }
+
+
+def _place_from(folder: Path, campaign: Path) -> str | None:
+    """Return the campaign file as seen from the results folder, or None where the way would name folders of the user."""
+    try:
+        way = Path(os.path.relpath(campaign, folder.resolve()))
+    except ValueError:  # another drive
+        return None
+    return way.as_posix() if way.parts.count("..") <= 1 and len(way.parts) <= 3 else None
+
+
+def _without_folder(argument: str) -> str:
+    """Return a command-line argument without the folders of an absolute path, which belong to one machine only."""
+    return Path(argument).name if Path(argument).is_absolute() else argument
+
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of a run whose product is kept.
 
     Attributes
     ----------
-    name : str
-        Name of the stage.
+    label : str
+        What it is called in progress.
+    file : str
+        Its product; what ends up in fusion.nc is kept apart while it may have to be resumed.
     tables : tuple of str
         Tables of the campaign file that its result depends on, with the files that they name.
     after : tuple of str
-        Stages that its result depends on; it is computed again whenever one of them is.
-    compute : callable
-        ``compute(report=report)`` computes the stage.
+        Stages that its result depends on where the run made them before; it is computed again whenever one of them is.
     read : callable
-        Reads the product that a kept stage has written.
+        Reads the product.
     """
 
-    name: str
+    label: str
+    file: str
     tables: tuple[str, ...]
     after: tuple[str, ...]
-    compute: Callable[..., Outcome[Product]]
-    read: Callable[[Path], Product]
+    read: Callable[[Path], Any]
+
+
+_CORRELATED = ("plan", "interferometry", "drivers")
+_MODELLED = ("plan", "interferometry", "sensors", "drivers", "model")
+STAGES = {
+    "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan", "interferometry"), (), open_dataset),
+    "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), read_dataset),
+    "correlation": Stage("correlation", ".stages/correlation.nc", _CORRELATED, ("fields", "deviations"), read_tree),
+    "model": Stage("anomalies and closed loop", ".stages/model.nc", _MODELLED, ("fields", "deviations"), read_dataset),
+    "record": Stage("closed loop on the record", "fusion.nc", ("record", "model"), (), read_dataset),
+}
 
 
 def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple[Outcome[Product], float]:
@@ -99,14 +268,6 @@ class Run:
 
     Attributes
     ----------
-    campaign : Campaign
-        The checked campaign file.
-    folder : Path
-        Results folder.
-    report : callable
-        ``report(label, done, total)``, for progress.
-    stamps : StageStamps
-        Stages that are done.
     inputs : mapping
         Size and SHA-256 of each input.
     seen : mapping
@@ -115,10 +276,10 @@ class Run:
         Start of the run, UTC.
     address : str or None
         Where the campaign file was fetched from.
-    beside : Beside
+    worker : Worker
         Takes stages that the next one does not wait for.
     depends : tuple
-        What every stage depends on beside campaign and files, as it was at the start.
+        What every stage depends on besides campaign and files, as it was at the start.
     drawn : list of callable
         Each waits for a part of the charts and returns it.
     parts, notices : dict, list
@@ -137,7 +298,7 @@ class Run:
     seen: Mapping[str, FileState]
     started: datetime
     address: str | None = None
-    beside: Beside = field(default_factory=InTurn)
+    worker: Worker = field(default_factory=Worker)
     depends: tuple[Any, ...] = field(default_factory=dependencies)
     drawn: list[Callable[[], Drawn]] = field(default_factory=list)
     parts: dict[str, Any] = field(default_factory=dict)
@@ -146,95 +307,75 @@ class Run:
     keys: dict[str, str] = field(default_factory=dict)
     products: list[Path] = field(default_factory=list)
 
-    def stage(self, stage: Stage[Product]) -> Product:
-        """Return the product of a stage: computed and stamped, or kept where its input has not changed.
-
-        Parameters
-        ----------
-        stage : Stage
-            What is to be done.
-        """
-        return self._finish(stage, partial(_timed, stage.compute, report=self.report))
+    def stage(self, name: str, compute: Callable[..., Outcome[Any]]) -> Any:
+        """Return the product of a stage: computed and stamped, or kept where its input has not changed."""
+        return self._finish(name, self._key(name), partial(_timed, compute, report=self.report))
 
     def begin(
-        self, stage: Stage[Product], draw: Callable[[Outcome[Product]], Drawn] | None = None
-    ) -> Callable[[], Product]:
-        """Begin a stage beside what follows, where it is not kept; return what waits for it and gives its product, as `stage` does.
-
-        Parameters
-        ----------
-        stage : Stage
-            Its work can be pickled.
-        draw : callable, optional
-            Draws what the stage found, for `drawn`; it can be pickled too.
-        """
-        if self.stamps.done(stage.name, self.key_of(stage)):
+        self, name: str, compute: Callable[..., Outcome[Any]], draw: Callable[[Outcome[Any]], Drawn] | None = None
+    ) -> Callable[[], Any]:
+        """Begin a stage in the second process, where it is not kept; return what waits for it and gives its product, as `stage` does."""
+        key = self._key(name)
+        if self.stamps.done(name, key):
             if draw is not None:
-                self.draw(partial(draw, self._kept(stage)))
-            return partial(self.stage, stage)
+                self.draw(partial(draw, self._kept(name)))
+            return partial(self._finish, name, key, None)
         if draw is None:
-            return partial(self._finish, stage, self.beside.start(partial(_timed, stage.compute), self.report))
-        both = cache(self.beside.start(partial(_timed_and_drawn, stage.compute, draw), self.report))
+            return partial(self._finish, name, key, self.worker.submit(partial(_timed, compute), self.report))
+        both = cache(self.worker.submit(partial(_timed_and_drawn, compute, draw), self.report))
 
         def drawn() -> Drawn:
             (outcome, _), charts = both()
             return draw(outcome) if charts is None else charts
 
         self.drawn.append(drawn)
-        return partial(self._finish, stage, lambda: both()[0])
+        return partial(self._finish, name, key, lambda: both()[0])
 
     def draw(self, work: Callable[[], Drawn]) -> None:
-        """Begin to draw a part of the charts.
+        """Begin to draw a part of the charts."""
+        self.drawn.append(self.worker.submit(work))
 
-        Parameters
-        ----------
-        work : callable
-            It can be pickled.
-        """
-        self.drawn.append(self.beside.start(work))
-
-    def _kept(self, stage: Stage[Product]) -> Outcome[Product]:
+    def _kept(self, name: str) -> Outcome[Any]:
         """Return what is kept of a stage."""
-        note = self.stamps.note(stage.name)
+        note = self.stamps.note(name)
         notices = tuple(Notice(**item) for item in note["notices"])
-        return Outcome(stage.read(self.folder / FILES[stage.name]), note["parts"], notices)
+        return Outcome(STAGES[name].read(self.folder / STAGES[name].file), note["parts"], notices)
 
-    def _finish(self, stage: Stage[Product], compute: Callable[[], tuple[Outcome[Product], float]]) -> Product:
+    def _finish(self, name: str, key: str, compute: Callable[[], tuple[Outcome[Any], float]] | None) -> Any:
         """Write and stamp what a stage computes in so many seconds, or read what is kept of it."""
-        name, key = stage.name, self.key_of(stage)
-        path = self.folder / FILES[name]
-        kept = self.stamps.done(name, key)
+        path = self.folder / STAGES[name].file
         _return_freed_memory()
-        computed, spent_s = (None, 0.0) if kept else compute()
-        begun = time.monotonic()
-        if computed is None:
-            outcome = self._kept(stage)
-            self.report(f"{LABELS[name]} (kept)", 1, 1)
+        if compute is None or self.stamps.done(name, key):
+            spent_s, begun = 0.0, time.monotonic()
+            outcome = self._kept(name)
+            self.report(f"{STAGES[name].label} (kept)", 1, 1)
         else:
+            computed, spent_s = compute()
+            begun = time.monotonic()
             outcome = replace(computed, dataset=self.described(computed.dataset))
             write_dataset(path, outcome.dataset)
-            self.stamps.record(
-                name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
-            )
+            found = {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
+            self.stamps.record(name, key, [path], found)
             del computed
         _return_freed_memory()
         self.keys[name] = key
         self.products.append(path)
-        self.parts.update(outcome.parts)
+        self.parts.update(plain(outcome.parts))
         self.notices.extend(outcome.notices)
         self.seconds[name] = spent_s + time.monotonic() - begun
         return outcome.dataset
 
-    def key_of(self, stage: Stage[Any]) -> str:
+    def _key(self, name: str) -> str:
         """Return a digest of everything that the result of a stage depends on."""
-        asked = self.campaign.model_dump(mode="json", include=set(stage.tables))
+        stage = STAGES[name]
+        settings = self.campaign.model_dump(mode="json", include=set(stage.tables))
         files = {file: self.inputs[file] for table in stage.tables for file in self.campaign.files_of(table)}
-        zone = self.campaign.campaign.time_zone
-        return digest(stage.name, *self.depends, zone, asked, files, [self.keys[earlier] for earlier in stage.after])
+        earlier = [self.keys[one] for one in stage.after if one in self.keys]
+        return digest(name, *self.depends, self.campaign.campaign.time_zone, settings, files, earlier)
 
-    def checkpoint(self, key: str) -> Path:
+    def checkpoint(self, name: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
-        chosen = self.folder / ".stages" / f"cycles_{key[:16]}"
+        chosen = self.folder / ".stages" / f"cycles_{self._key(name)[:16]}"
         for stale in chosen.parent.glob("cycles_*"):
             if stale != chosen:
                 shutil.rmtree(stale)

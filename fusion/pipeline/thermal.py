@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -11,30 +12,533 @@ from typing import Any
 import cv2
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from fusion.alignment.align import camera_on_laser_clock
-from fusion.campaign.sources import CameraInputs, Source
-from fusion.pipeline.camera import CameraState, clear_frames, examine_camera, survey_campaign
-from fusion.pipeline.radiometry import complete_fields, overridden_parameters
-from fusion.products.contracts import check
-from fusion.products.notices import counted, listed
-from fusion.products.progress import Report
-from fusion.products.results import Notice, Outcome
-from fusion.products.store import write_atomically
-from thermography.contract import FIELDS
-from thermography.fields.cycle_fields import in_pixels, plan_unit
+from fusion.analysis.alignment.align import camera_on_laser_clock
+from fusion.campaign.config import SurfaceTable, ThermographyTable, relative_name
+from fusion.campaign.inputs import CameraInputs, Source, SourceError, frames_notices
+from fusion.common import Array
+from fusion.results.progress import Report, counted, listed
+from fusion.results.results import Notice, Outcome
+from fusion.results.store import check, write_atomically
+from thermography.common import FIELDS, ThermographyError
+from thermography.fields.cycle_fields import cycles_with_field, in_pixels, plan_unit, reference_cycle
+from thermography.fields.large_arrays import in_pieces, piece_slices
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
-from thermography.fields.tasks.pieces import piece_slices
-from thermography.io.openexr import write_maps
-from thermography.radiometry.camera_artefacts import DEAD, NOISY, OFFSET, find_bad_pixels
-from thermography.radiometry.overrides import Overrides
-from thermography.radiometry.planck import calibrate
+from thermography.fields.survey import (
+    LEAST_SURROUNDING_BLOCKS,
+    Blocks,
+    Survey,
+    disturbed_frames,
+    locate_blocks,
+    survey_frames,
+)
+from thermography.fields.total_uncertainty import (
+    EmissivityRegion,
+    Surface,
+    calibrate_surfaces,
+    compare_with_monte_carlo,
+    evaluate_uncertainty,
+    find_range,
+    find_surfaces,
+    measure_emissivity,
+)
+from thermography.io.files import write_maps
+from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
+from thermography.radiometry.camera import (
+    DEAD,
+    NOISY,
+    OFFSET,
+    CameraCorrection,
+    LevelSeries,
+    estimate_correction,
+    find_bad_pixels,
+    find_repeats,
+    hold_constant,
+    room_temperatures,
+)
+from thermography.radiometry.planck import ZERO_CELSIUS_K, Overrides, calibrate, override, signal_slope
+from thermography.radiometry.uncertainty import InputUncertainty, common_contributions, rise_scale_contributions
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
-from thermography.registration.evidence import RegistrationError
-from thermography.registration.picture import register_picture
-from thermography.registration.plan import PlanGrid
-from thermography.registration.register import Registration, register
+from thermography.registration.plan import Polygon
+from thermography.registration.register import Registration, RegistrationError, register, register_picture
+
+# The camera before the fields are made: damaged frames are left out, steps and drift of its zero are taken out.
+
+#: Uncertainty of the camera's zero from which it is named, K: as large as the steps that many cameras make.
+_NAMED_U_K = 0.1
+#: Largest number of positions at which a moving table is laid out.
+_POSITIONS = 21
+
+
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """What the usable frames of a campaign show of their camera.
+
+    Attributes
+    ----------
+    correction_K : (frames,) ndarray, K, or None
+        To be added to the temperature of every usable frame; None where nothing is corrected.
+    u_K : (frames,) ndarray, K
+        Standard uncertainty of the camera's zero since the first frame, common to the whole frame; 0 where only the table is in view.
+    part, notices
+        Part ``camera`` of results.json, and what was left out, corrected, or cannot be distinguished.
+    """
+
+    source: CameraInputs
+    correction_K: Array | None
+    u_K: Array
+    part: dict[str, Any]
+    notices: list[Notice]
+
+    def per_cycle(self, bounds: Array) -> xr.Dataset:
+        """Mean correction and uncertainty of every cycle, its bounds (cycles, 2) on the camera's clock."""
+        times = self.source.frame_times
+        correction = np.zeros(len(times)) if self.correction_K is None else self.correction_K
+        values = np.full((2, len(bounds)), np.nan)
+        for cycle, (start, end) in enumerate(bounds):
+            inside = (times >= start) & (times < end)
+            if inside.any():
+                values[:, cycle] = correction[inside].mean(), np.sqrt(np.mean(self.u_K[inside] ** 2))
+        kelvin = {"units": "K", "units_metadata": "temperature: difference"}
+        named = "camera's zero since the first frame"
+        correction_of = {"long_name": f"correction of the {named}, contained in the temperatures", **kelvin}
+        correction_of["ancillary_variables"] = "camera_correction_u"
+        u_of = {"long_name": f"standard uncertainty of the {named} after the correction", **kelvin}
+        u_of["comment"] = "common to all cells of a frame"
+        return xr.Dataset(
+            {
+                "camera_correction": ("cycle", values[0], correction_of),
+                "camera_correction_u": ("cycle", values[1], u_of),
+            }
+        )
+
+
+def counter(report: Report, label: str, total: int) -> Callable[[int], None]:
+    """Report the beginning of a step; return what counts its parts and reports them."""
+    done = 0
+
+    def count(more: int) -> None:
+        nonlocal done
+        done += more
+        report(label, done, total)
+
+    count(0)
+    return count
+
+
+def survey_campaign(source: CameraInputs, override: Overrides, *, report: Report) -> Survey:
+    """Read all frames of a campaign once."""
+    total = len(source.frames)
+    patch = source.thermography.reference_patch_px
+    survey = survey_frames(
+        source.frames,
+        override,
+        still=source.thermography.table == "still",
+        patch=None if patch is None else (slice(patch[1], patch[1] + patch[3]), slice(patch[0], patch[0] + patch[2])),
+        progress=counter(report, "camera check", total),
+    )
+    if not survey.frames:
+        raise ThermographyError(
+            f"the pixels of all {total} frames are damaged ({survey.damaged[0].reason}); copy the files again from the camera"
+        )
+    return survey
+
+
+def clear_frames(survey: Survey, most: int) -> list[FrameReference]:
+    """First frames that nothing tells from those before and after them."""
+    clear = [frame for index, frame in enumerate(survey.frames) if index not in survey.off]
+    return (clear or survey.frames)[:most]
+
+
+def examine_camera(source: CameraInputs, survey: Survey, registration: Registration) -> CameraState:
+    """Leave damaged frames out, and estimate what the camera adds to all pixels alike."""
+    shifts = np.zeros((0, 2))
+    if source.thermography.table == "moving":
+        # Places between which a moving table travels, mm on the plan.
+        travel = np.linspace(-source.travel_mm, source.travel_mm, _POSITIONS)
+        shifts = travel[:, None] * np.array(source.direction)
+    blocks = locate_blocks(survey, registration, source.grid, shifts)
+    _refuse_patch_on_plan(source, blocks)
+    # What changes fast in a picture of which nothing is known may be what was to be seen: only a table is known to change slowly.
+    disturbed = (
+        {} if registration.is_picture else disturbed_frames(survey, blocks, still=source.thermography.table == "still")
+    )
+    left_out = [
+        *survey.damaged,
+        *(RejectedFrame(survey.frames[i].path, survey.frames[i].index, reason) for i, reason in disturbed.items()),
+    ]
+    kept = np.array([index not in disturbed for index in range(len(survey.frames))])
+    frames = [frame for frame, keep in zip(survey.frames, kept, strict=True) if keep]
+    folder = source.campaign.folder
+    rejected = [
+        {"file": relative_name(item.path, folder), "index": item.index, "reason": item.reason.replace(f"{folder}/", "")}
+        for item in left_out
+    ]
+    usable = replace(source, frames=frames, frames_rejected=[*source.frames_rejected, *rejected])
+    notices = [*frames_notices(rejected, "frames_damaged"), *_repeat_notices(survey)]
+    levels = _levels(survey, blocks, kept)
+    part: dict[str, Any] = {"frames_checked": len(source.frames), "frames_damaged": rejected, "steps": ()}
+    if levels is None:
+        part |= {"drift_K": 0.0, "largest_correction_K": 0.0, "largest_u_K": None}
+        notice = _NO_SURROUNDINGS_IN_A_PICTURE if registration.is_picture else _NO_SURROUNDINGS
+        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, notice])
+    background, table, spread = levels
+    if survey.patch is not None:
+        background = survey.patch[kept]
+        correction = hold_constant(background)
+    else:
+        correction = estimate_correction(_series(usable, background, table))
+    # The camera errs in counts: by less kelvin where the table is warmer than what lies beside it.
+    parameters = frames[0].parameters
+    at_table = signal_slope(table + ZERO_CELSIUS_K, parameters)
+    share = signal_slope(background + ZERO_CELSIUS_K, parameters) / at_table
+    uneven = np.abs(signal_slope(table + spread + ZERO_CELSIUS_K, parameters) / at_table - 1.0)
+    u_K = share * np.hypot(correction.u_K, uneven * correction.correction_K)
+    steps = [(_time(frames[step.index]), {"value": step.value_K, "u": step.u_K}) for step in correction.steps]
+    correction_K, largest_u_K = share * correction.correction_K, float(u_K.max())
+    part |= {
+        "steps": [{"time": time, "step_K": size} for time, size in steps],
+        "drift_K": float(np.ptp(correction.drift_K)),
+        "largest_correction_K": float(np.abs(correction_K).max()),
+        "largest_u_K": largest_u_K,
+    }
+    notices += _correction_notices(correction, frames, largest_u_K)
+    return CameraState(usable, correction_K if correction.corrects else None, u_K, part, notices)
+
+
+def camera_corrected(part: Mapping[str, Any]) -> bool:
+    """Whether thermograms were left out or corrected."""
+    return bool(part["frames_damaged"] or part["steps"] or part["drift_K"])
+
+
+def _refuse_patch_on_plan(source: CameraInputs, blocks: Blocks) -> None:
+    """Refuse a reference patch that shows the plan: what warms there is the table, not the camera."""
+    patch = source.thermography.reference_patch_px
+    if patch is None:
+        return
+    column, row, columns, rows = patch
+    share = float(blocks.plan_px[row : row + rows, column : column + columns].mean())
+    if share > 0.0:
+        raise SourceError(
+            f"{source.campaign.path}: thermography.reference_patch = {list(patch)}: {100.0 * share:.0f} % of its pixels show the plan in "
+            "some frame, so that the warming of the table would be taken for a drift of the camera; choose a surface of constant "
+            "temperature outside the plan, or leave the key out"
+        )
+
+
+def _levels(survey: Survey, blocks: Blocks, kept: Array) -> tuple[Array, Array, Array] | None:
+    """Level of the surroundings of the table, mean and spread of the table, (frames,) degC and K; None where they are not in view."""
+    surroundings = survey.levels[kept][:, blocks.surroundings].astype(float)
+    surroundings = surroundings[:, np.isfinite(surroundings).all(axis=0)]
+    if surroundings.shape[1] < LEAST_SURROUNDING_BLOCKS:
+        return None
+    middle = np.median(surroundings, axis=0)
+    # People and warm parts move in some of the blocks; the quieter half shows the room and the camera.
+    variability = np.median(np.abs(surroundings - middle), axis=0)
+    quiet = variability <= np.median(variability)
+    background = np.median(surroundings[:, quiet] - middle[quiet], axis=1) + float(np.median(middle[quiet]))
+    chosen = blocks.table if blocks.table.any() else ~blocks.surroundings
+    table = survey.levels[kept][:, chosen].astype(float)
+    return background, np.nanmean(table, axis=1), np.nanstd(table, axis=1)
+
+
+def _series(source: CameraInputs, background: Array, table: Array) -> LevelSeries:
+    """The levels with the temperatures inside the camera and of the room."""
+    frames, times = source.frames, source.frame_times
+    seconds = (times - times[0]) / np.timedelta64(1, "s")
+    sensors = [name for name in frames[0].housekeeping if all(name in frame.housekeeping for frame in frames)]
+    housing = np.array([[frame.housekeeping[name] for name in sensors] for frame in frames], float)
+    room = np.zeros((len(frames), 0))
+    if source.environment is not None and "air_temperature" in source.environment:
+        log = source.environment
+        # The log is on the laser's clock; the room changes too slowly for a clock that is still to be found to matter.
+        on_laser = camera_on_laser_clock(times, source.thermography.clock_offset_s or 0.0)
+        logged = (log["time"].values - on_laser[0]) / np.timedelta64(1, "s")
+        air = log["air_temperature"].values
+        room = room_temperatures((on_laser - on_laser[0]) / np.timedelta64(1, "s"), logged, air)
+    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), room)
+
+
+def _repeat_notices(survey: Survey) -> Iterator[Notice]:
+    """Return one notice for frames that the camera wrote twice."""
+    flags = find_repeats(survey.repeated, np.array([frame.time for frame in survey.frames], "datetime64[ms]"))
+    if not flags:
+        return
+    named = [f"{np.datetime_as_string(flag.time, unit='s')}Z: {flag.message}" for flag in flags]
+    yield Notice(
+        "frames_repeated",
+        f"The camera wrote frames more than once: {listed(named)}.",
+        "Compare the times of the frames with the camera's own list; a frozen output shows no change of temperature.",
+    )
+
+
+_NO_SURROUNDINGS = Notice(
+    "camera_unchecked",
+    "Only the table is in view, so that steps and drift of the camera's zero cannot be distinguished from its warming.",
+    "Leave a margin around the table in view.",
+)
+
+
+_NO_SURROUNDINGS_IN_A_PICTURE = Notice(
+    "camera_unchecked",
+    "The whole picture is the plan, so that there are no surroundings to show steps and drift of the camera's zero, which look like a "
+    "rise of the whole picture.",
+    'State the drift as thermography.camera_drift_u = "0.2 K", or give a plan in mm that leaves a margin of the picture.',
+)
+
+
+def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameReference], u_K: float) -> Iterator[Notice]:
+    """Return one notice each for steps, for a drift, and for what cannot be distinguished."""
+    if correction.steps:
+        named = [f"{step.value_K:+.2f} K at {_time(frames[step.index])}" for step in correction.steps]
+        yield Notice(
+            "camera_steps_corrected",
+            f"{counted(len(correction.steps), 'step')} of the camera's zero (flat-field correction, FFC) removed from all later "
+            f"frames: {listed(named)}. The correction is uncertain by up to {u_K:.2g} K.",
+            "Let the camera warm up before the test, and make its flat-field corrections between the cycles.",
+        )
+    if correction.drift_K.any():
+        yield Notice(
+            "camera_drift_corrected",
+            f"A drift of the camera's zero of {np.ptp(correction.drift_K):.2f} K, as the reference patch or the temperature of the "
+            "housing shows it, was removed.",
+            "Switch the camera on an hour before the test.",
+        )
+    unexplained = float(np.abs(correction.unexplained_K).max())
+    if u_K > _NAMED_U_K:
+        yield Notice(
+            "camera_drift_undetermined",
+            f"The surroundings of the table changed by {unexplained:.2f} K, which neither a logged air temperature nor "
+            "the camera explains. A drift of the camera of this size cannot be distinguished from warming; rises are uncertain by up to "
+            f"{u_K:.2g} K.",
+            "Log the air temperature, and keep a surface of constant temperature in view.",
+        )
+
+
+def _time(frame: FrameReference) -> str:
+    """Time of a frame to the second, UTC."""
+    return f"{np.datetime_as_string(frame.time, unit='s')}Z"
+
+
+# Radiometry of a campaign: parameters and their uncertainties, surfaces with an emissivity of their own, total
+# uncertainty.
+
+#: Attribute of `InputUncertainty` -> attribute of ``[thermography]`` that states it.
+_STATED = {
+    "emissivity": "emissivity_u",
+    "reflected_temperature_K": "reflected_temperature_u_K",
+    "atmospheric_temperature_K": "atmospheric_temperature_u_K",
+    "relative_humidity": "relative_humidity_u",
+    "object_distance_m": "object_distance_u_m",
+    "window_transmission": "window_transmission_u",
+    "window_temperature_K": "window_temperature_u_K",
+    "camera_offset_K": "camera_offset_u_K",
+    "camera_scale": "camera_scale_u",
+    "camera_drift_K": "camera_drift_u_K",
+}
+
+
+#: Camera parameter -> attribute of ``[thermography]`` that overrides it.
+_OVERRIDING = {
+    "emissivity": "emissivity",
+    "relative_humidity": "relative_humidity",
+    "object_distance_m": "object_distance_m",
+    "reflected_temperature_K": "reflected_temperature_degC",
+    "atmospheric_temperature_K": "atmospheric_temperature_degC",
+    "window_transmission": "window_transmission",
+    "window_temperature_K": "window_temperature_degC",
+}
+
+
+def overridden_parameters(table: ThermographyTable) -> dict[str, float]:
+    """Return the camera parameters that the campaign file overrides."""
+    stated = {name: getattr(table, key) for name, key in _OVERRIDING.items()}
+    given = {name: value for name, value in stated.items() if value is not None}
+    return {name: value + ZERO_CELSIUS_K if name.endswith("_K") else value for name, value in given.items()}
+
+
+def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:
+    """Return the uncertainties of the radiometric inputs: those that the campaign states, defaults for the others."""
+    given = {name: getattr(table, key) for name, key in _STATED.items()}
+    return InputUncertainty(**{name: u for name, u in given.items() if u is not None})
+
+
+def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overrides) -> Outcome[xr.Dataset]:
+    """Calibrate the surfaces that have an emissivity of their own, and add the total uncertainties."""
+    table, inputs = source.thermography, stated_uncertainty(source.thermography)
+    along = {"cycle": "cycle_time", "time": "time"}
+    cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
+    camera = cameras["cycle"][reference_cycle(fields["temperature"])]
+    regions = [_emissivity_region(one, fields, camera, inputs) for one in table.region]
+    surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
+    if regions:
+        fields = calibrate_surfaces(fields, surfaces, edge, cameras)
+    fields = evaluate_uncertainty(fields, cameras["cycle"], inputs, surfaces=surfaces if regions else ())
+    part = {
+        **_two_parts(fields),
+        "rise_scale_u": float(fields["rise_scale_u"].mean()),
+        "budget": _budget(table, fields, camera, inputs),
+        "surfaces": [_surface_part(table, one, fields, camera, inputs) for one in surfaces],
+        "edge_cells": int(edge.sum()),
+    }
+    return Outcome(fields, {"radiometry": part}, (*_edge_notices(edge, regions), *_drift_notices(table, fields)))
+
+
+def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part ``field`` of results.json."""
+    rise, times = fields["temperature_rise"], fields["time"].values
+    seen = cycles_with_field(rise)
+    mean = float(rise.isel(cycle=int(np.flatnonzero(seen)[-1])).mean())
+    at = _largest_at(rise)
+    cell = rise[at]
+    unit = plan_unit(fields)
+    since = (fields["cycle_time"].values[at[0]] - fields["cycle_time"].values[seen][0]) / np.timedelta64(1, "s")
+    return {
+        "fields": int(seen.sum()),
+        "frames": int(fields["frame_count"].sum()) if "frame_count" in fields else int(times.size),
+        "duration_s": float((times[-1] - times[0]) / np.timedelta64(1, "s")),
+        "mean_rise_K": {"value": mean, "u": radiometry["rise_u"]["common_K"]},
+        "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"][at])},
+        "largest_cycle": int(cell["cycle"]),
+        "largest_after_s": float(since),
+        **{f"largest_{axis}_{unit}": float(cell[axis]) for axis in "xy"},
+    }
+
+
+def _largest_at(rise: xr.DataArray) -> tuple[int, int, int]:
+    """Cycle, row and column of the largest rise, the first of equal ones."""
+    largest, at = -np.inf, (0, 0, 0)
+    for some, piece in in_pieces(rise):
+        cycle, y, x = np.unravel_index(int(np.argmax(np.where(np.isnan(piece), -np.inf, piece))), piece.shape)
+        if piece[cycle, y, x] > largest:
+            largest, at = piece[cycle, y, x], (some.start + int(cycle), int(y), int(x))
+    return at
+
+
+def _parameters_at(
+    source: CameraInputs, parameters: Overrides, times: NDArray[np.datetime64]
+) -> list[CameraParameters]:
+    """Parameters of the frame nearest to each time; frames of one cycle or block hardly ever differ in them."""
+    frames = source.frame_times
+    last = np.minimum(np.searchsorted(frames, np.where(np.isnat(times), frames[0], times)), len(frames) - 1)
+    return [parameters(source.frames[int(k)]) for k in last]
+
+
+def _emissivity_region(
+    table: SurfaceTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+) -> EmissivityRegion:
+    """One region of the campaign file, its emissivity measured from two states where it is not given."""
+    outline = Polygon(f"region {table.name}", np.array(table.corners_mm))
+    if table.states is None:
+        assert table.emissivity is not None
+        u = inputs.emissivity if table.emissivity_u is None else table.emissivity_u
+        return EmissivityRegion(outline, table.emissivity, u)
+    states = [(state.cycle, state.temperature_degC, state.temperature_u_K) for state in table.states]
+    estimate = measure_emissivity(fields, outline, states, camera, camera_scale=inputs.camera_scale)
+    return EmissivityRegion(outline, min(estimate.emissivity, 1.0), estimate.emissivity_u)
+
+
+def _two_parts(fields: xr.Dataset) -> dict[str, dict[str, float]]:
+    """Noise, common part and total of temperature and rise, root mean squares over the cells of the last cycle."""
+    parts = {}
+    last = _last_field(fields)
+    for key, name in (("temperature_u", "temperature"), ("rise_u", "temperature_rise")):
+        noise, total = (float(np.sqrt((last[f"{name}{end}"] ** 2).mean())) for end in ("_noise_u", "_u"))
+        parts[key] = {"noise_K": noise, "common_K": float(np.sqrt(max(total**2 - noise**2, 0.0))), "total_K": total}
+    return parts
+
+
+def _last_field(fields: xr.Dataset) -> xr.Dataset:
+    """The last cycle with a field."""
+    return fields.isel(cycle=int(np.flatnonzero(cycles_with_field(fields["temperature"]))[-1]))
+
+
+def _budget(
+    table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+) -> list[dict[str, Any]]:
+    """Every input that all frames share, with its contributions on the main surface at the mean of the last field."""
+    last = _last_field(fields)
+    mean = float(last["temperature"].mean())
+    middle = mean - 0.5 * float(last["temperature_rise"].mean())
+    to_temperature = common_contributions(mean, camera, inputs)
+    to_rise = rise_scale_contributions(middle, camera, inputs)
+    entries = []
+    for name, key in _STATED.items():
+        if name == "camera_drift_K":
+            entries.append(_zero_entry(table, fields, inputs))
+            continue
+        if camera.window_transmission == 1 and name.startswith("window_") and getattr(inputs, name) == 0:
+            continue
+        source = "assumed" if getattr(table, key) is None else "stated"
+        of_temperature = abs(float(to_temperature.get(name, 0.0)))
+        of_rise = {"temperature_u_K": of_temperature, "rise_u_percent": 100.0 * abs(float(to_rise.get(name, 0.0)))}
+        value = {"value": getattr(camera, name, None), "u": getattr(inputs, name)}
+        entries.append({"input": name, **value, "source": source, **of_rise})
+    return entries
+
+
+def _zero_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> dict[str, Any]:
+    """The entry of the budget for the camera's zero: what its correction leaves, or the drift that is stated or assumed."""
+    left_K, given_K = _zero_left_K(fields), inputs.camera_drift_K
+    source = "measured" if left_K > given_K else "assumed" if table.camera_drift_u_K is None else "stated"
+    zero = {"input": "camera_drift_K", "value": None, "u": max(left_K, given_K), "source": source}
+    return {**zero, "temperature_u_K": 0.0, "rise_u_percent": None}
+
+
+def _zero_left_K(fields: xr.Dataset) -> float:
+    """Largest standard uncertainty of the camera's zero that its correction leaves, K; 0 where it was not examined."""
+    left = fields["camera_correction_u"].values if "camera_correction_u" in fields else np.zeros(1)
+    return float(np.nan_to_num(left).max())
+
+
+def _drift_notices(table: ThermographyTable, fields: xr.Dataset) -> Iterator[Notice]:
+    """Return a notice where the stated drift of the camera's zero is not the one that the frames leave."""
+    stated_K, left_K = table.camera_drift_u_K, _zero_left_K(fields)
+    if stated_K is None or left_K == 0.0:
+        return
+    larger = "the stated one" if stated_K >= left_K else "that of the frames"
+    yield Notice(
+        "camera_drift_stated",
+        f"camera_drift_u = {stated_K:.2g} K is stated; the frames leave up to {left_K:.2g} K of the camera's zero uncertain. The "
+        f"larger was taken, {larger}.",
+        "" if stated_K >= left_K else "Leave camera_drift_u out, or keep a surface of constant temperature in view.",
+    )
+
+
+def _surface_part(
+    table: ThermographyTable, surface: Surface, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+) -> dict[str, Any]:
+    """One entry of ``radiometry.surfaces`` in results.json."""
+    shown = find_range(fields, surface.cells)
+    sources = {f"region {one.name}": "stated" if one.states is None else "two states" for one in table.region}
+    ratio = scale = None
+    if shown is not None:
+        own = replace(inputs, emissivity=surface.emissivity_u)
+        compared = compare_with_monte_carlo(shown, override(camera, emissivity=surface.emissivity), own)
+        ratio, scale = compared.rise_ratio, float(np.nanmean(fields["rise_scale_u"].values[surface.cells]))
+    return {
+        "name": surface.name.removeprefix("region "),
+        "emissivity": {"value": surface.emissivity, "u": surface.emissivity_u},
+        "source": sources.get(surface.name, "frames" if table.emissivity is None else "stated"),
+        "cells": int(surface.cells.sum()),
+        "rise_scale_u": scale,
+        "monte_carlo_ratio": ratio,
+    }
+
+
+def _edge_notices(edge: NDArray[np.bool_], regions: list[EmissivityRegion]) -> Iterator[Notice]:
+    """Return a notice for the cells that see two surfaces."""
+    if not regions:
+        return
+    named = ", ".join(region.outline.name for region in regions)
+    yield Notice(
+        "surface_edges",
+        f"{counted(int(edge.sum()), 'cell')} at the edges of {named} see two surfaces and were left empty.",
+        "",
+    )
+
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
 _REGISTRATION_FRAMES = 5
@@ -45,32 +549,7 @@ _PIXEL_FRAMES = 24
 
 
 def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
-    """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle.
-
-    Parameters
-    ----------
-    source : CameraInputs
-        Inputs of the campaign; a `Source` where the laser gives the cycles.
-    checkpoint : Path
-        Folder that keeps the finished cycles of a long recording, from which an interrupted run goes on.
-    scheduler : str or None
-        Address of a dask scheduler for the per-frame work.
-    report : callable
-        ``report(label, done, total)``, for progress.
-
-    Returns
-    -------
-    Outcome
-        Fields on the laser's clock that keep ``thermography.contract.FIELDS``; parts ``registration``, ``alignment``, ``camera`` and
-        ``radiometry``.
-
-    Raises
-    ------
-    ThermographyError
-        If the plan cannot be registered or the clock offset cannot be estimated.
-    ContractError
-        If the fields break their contract.
-    """
+    """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle."""
     override = Overrides(overridden_parameters(source.thermography))
     survey = survey_campaign(source, override, report=report)
     report("registration", 0, 1)
@@ -88,14 +567,9 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     )
     offset_s = clock["value"]
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
-    fields = fields.assign_attrs(
-        frames_damaged=json.dumps(
-            [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
-        ),
-        frames_repeated=json.dumps(
-            [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
-        ),
-    )
+    damaged = [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
+    repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
+    fields = fields.assign_attrs(frames_damaged=json.dumps(damaged), frames_repeated=json.dumps(repeated))
     fields = fields.assign_coords(cycle=source.cycles.number)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
@@ -109,7 +583,9 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     fields = fields.assign(_registration_variables(registration, reference))
     parts = {"registration": _registration_part(registration, source), "camera": camera.part, **completed.parts}
     if isinstance(source, Source):
-        fields = fields.assign(_target_places(source))
+        x, y = source.axis.points(source.deviations["position"].values)
+        places = {"target_x": ("target", x, {"units": "mm"}), "target_y": ("target", y, {"units": "mm"})}
+        fields = fields.assign(xr.Dataset(places, coords={"target": source.deviations["target"].values}))
         parts["alignment"] = {"clock_offset_s": clock}
     return Outcome(fields, parts, tuple(notices))
 
@@ -141,20 +617,29 @@ def _reduce_on_clock(
 ) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
     """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
     source = camera.source
+    moving = source.thermography.table == "moving"
+
+    def reduce(offset_s: float, kept: Path = checkpoint) -> xr.Dataset:
+        """Reduce the frames, the cycles brought to the camera's clock."""
+        common: dict[str, Any] = {
+            "override": override,
+            "correction_K": camera.correction_K,
+            "scheduler": scheduler,
+            "checkpoint": kept if len(source.frames) > _CHECKPOINT_FRAMES else None,
+            "progress": counter(report, "frames", len(source.frames)),
+        }
+        where = (source.frames, registration, source.grid, _bounds(source, offset_s))
+        if moving:
+            return reduce_moving_frames(*where, direction=source.direction, **common)
+        return reduce_frames(*where, **common)
+
     given = source.thermography.clock_offset_s
-    how: dict[str, Any] = {"scheduler": scheduler, "report": report}
-    if not isinstance(source, Source):
+    if not isinstance(source, Source) or given is not None or not moving:
         # Without a laser the logs are the other clock; an offset that is not stated is none.
-        stated_s = given or 0.0
-        fields = _reduce(camera, registration, override, stated_s, checkpoint=checkpoint, **how)
-        return fields, {"value": stated_s, "u": None}, []
-    if given is not None:
-        fields = _reduce(camera, registration, override, given, checkpoint=checkpoint, **how)
-        return fields, {"value": given, "u": 0.0}, []
-    if source.thermography.table == "still":
-        fields = _reduce(camera, registration, override, 0.0, checkpoint=checkpoint, **how)
-        return fields, {"value": 0.0, "u": None}, [_ASSUMED_CLOCK]
-    fields = _reduce(camera, registration, override, 0.0, checkpoint=checkpoint / "before_alignment", **how)
+        assumed = isinstance(source, Source) and given is None
+        u = 0.0 if isinstance(source, Source) and given is not None else None
+        return reduce(given or 0.0), {"value": given or 0.0, "u": u}, [_ASSUMED_CLOCK] if assumed else []
+    fields = reduce(0.0, checkpoint / "before_alignment")
     report("clock offset", 0, 1)
     clock = estimate_clock_offset(
         fields["frame_time"].values,
@@ -166,72 +651,28 @@ def _reduce_on_clock(
     )
     report("clock offset", 1, 1)
     # Frames belong to cycles by the laser's clock, so they are sorted into them again.
-    fields = _reduce(camera, registration, override, clock.offset_s, checkpoint=checkpoint, **how)
-    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, clock_notices(clock)
+    fields = reduce(clock.offset_s)
+    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, [*clock_notices(clock)]
 
 
-def clock_notices(clock: ClockOffset) -> list[Notice]:
-    """Return a notice where the offset of the clocks is one of several that a periodic test shows.
-
-    Parameters
-    ----------
-    clock : ClockOffset
-        Estimated from the motion of the table.
-    """
+def clock_notices(clock: ClockOffset) -> Iterator[Notice]:
+    """Return a notice where the offset of the clocks is one of several that a periodic test shows."""
     if not clock.rivals_s:
-        return []
+        return
     others = listed(f"{offset:.1f} s" for offset in clock.rivals_s)
-    return [
-        Notice(
-            "clock_offset_periodic",
-            f"The motion repeats: clock offsets of {others} fit about as well as {clock.offset_s:.1f} s, which is the smallest and was "
-            "taken as an assumption.",
-            "Write thermography.clock_offset if the clocks may be further apart, or film from before the first reading to after the last.",
-        )
-    ]
+    yield Notice(
+        "clock_offset_periodic",
+        f"The motion repeats: clock offsets of {others} fit about as well as {clock.offset_s:.1f} s, which is the smallest and was "
+        "taken as an assumption.",
+        "Write thermography.clock_offset if the clocks may be further apart, or film from before the first reading to after the last.",
+    )
 
 
 _ASSUMED_CLOCK = Notice(
     "clock_offset_assumed",
-    "The clock offset is not given and frames of a still table cannot show it: 0 s was taken.",
+    "The clock offset is not given and frames of a still table cannot show it: 0 s was assumed.",
     'Write thermography.clock_offset = "0 s" if both clocks were set by the same time server, or the offset that was noted.',
 )
-
-
-def _reduce(
-    camera: CameraState,
-    registration: Registration,
-    override: Overrides,
-    offset_s: float,
-    *,
-    checkpoint: Path,
-    scheduler: str | None,
-    report: Report,
-) -> xr.Dataset:
-    """Reduce the frames of a still or moving table, its cycles brought to the camera's clock."""
-    source = camera.source
-    bounds = _bounds(source, offset_s)
-    total, done = len(source.frames), 0
-
-    def count(more: int) -> None:
-        nonlocal done
-        done += more
-        report("frames", done, total)
-
-    report("frames", 0, total)
-    kept = checkpoint if total > _CHECKPOINT_FRAMES else None
-    common: dict[str, Any] = {
-        "override": override,
-        "correction_K": camera.correction_K,
-        "scheduler": scheduler,
-        "checkpoint": kept,
-        "progress": count,
-    }
-    if source.thermography.table == "moving":
-        return reduce_moving_frames(
-            source.frames, registration, source.grid, bounds, direction=source.direction, **common
-        )
-    return reduce_frames(source.frames, registration, source.grid, bounds, **common)
 
 
 def _bounds(source: CameraInputs, offset_s: float) -> np.ndarray:
@@ -239,29 +680,21 @@ def _bounds(source: CameraInputs, offset_s: float) -> np.ndarray:
     return source.cycles.bounds + np.timedelta64(round(offset_s * 1e9), "ns")
 
 
-def pixel_notices(counts: np.ndarray) -> list[Notice]:
-    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column).
-
-    Parameters
-    ----------
-    counts : (time, row, column) ndarray of uint16
-        Raw counts of the first frames of a still table.
-    """
+def pixel_notices(counts: np.ndarray) -> Iterator[Notice]:
+    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column)."""
     flags = find_bad_pixels(counts)
     count = int(np.count_nonzero(flags))
     if not count:
-        return []
+        return
     kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
     named = ", ".join(
         f"{int(np.count_nonzero(flags & flag))} {name}" for name, flag in kinds.items() if (flags & flag).any()
     )
-    return [
-        Notice(
-            "bad_pixels",
-            f"{counted(count, 'pixel')} do not follow their neighbours ({named}); they are included in the cell averages.",
-            "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
-        )
-    ]
+    yield Notice(
+        "bad_pixels",
+        f"{counted(count, 'pixel')} do not follow their neighbours ({named}); they are included in the cell averages.",
+        "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
+    )
 
 
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
@@ -290,14 +723,14 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
 
 def _registration_part(registration: Registration, source: CameraInputs) -> dict[str, Any]:
     """Return the part ``registration`` of results.json."""
+    part = {"model": registration.model, "frames_rejected": source.frames_rejected}
     if registration.is_picture:
-        return {
-            "rms_mm": None,
-            "model": registration.model,
-            "leave_one_out_mm": {},
-            "frames_rejected": source.frames_rejected,
-        }
+        return {**part, "rms_mm": None, "leave_one_out_mm": {}}
+    # The share of the plan that the fiducials in use span.
+    places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
+    hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
     return {
+        **part,
         "rms_mm": registration.rms_mm,
         "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
         "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
@@ -305,32 +738,21 @@ def _registration_part(registration: Registration, source: CameraInputs) -> dict
         "contradicted_hints": registration.contradicted_hints,
         "mirrored": registration.mirrored,
         "area_ratio": registration.area_ratio,
-        "span": _span(registration, source.grid),
-        "model": registration.model,
+        "span": float(cv2.contourArea(hull)) / (source.grid.width_mm * source.grid.height_mm),
         "leave_one_out_mm": registration.leave_one_out_mm,
-        "frames_rejected": source.frames_rejected,
     }
 
 
-def _span(registration: Registration, grid: PlanGrid) -> float:
-    """Return the share of the plan that the fiducials in use span."""
-    places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
-    hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
-    return float(cv2.contourArea(hull)) / (grid.width_mm * grid.height_mm)
-
-
-def _registration_notices(registration: Registration) -> list[Notice]:
+def _registration_notices(registration: Registration) -> Iterator[Notice]:
     """Return one notice for all fiducials that were not used."""
     if not registration.left_out:
-        return []
+        return
     named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
-    return [
-        Notice(
-            "fiducials_left_out",
-            f"{counted(len(registration.left_out), 'fiducial')} or hints not used: {named}.",
-            "Correct the list of fiducials, or clean and repaint the discs; the others carry the registration.",
-        )
-    ]
+    yield Notice(
+        "fiducials_left_out",
+        f"{counted(len(registration.left_out), 'fiducial')} or hints not used: {named}.",
+        "Correct the list of fiducials, or clean and repaint the discs; the registration rests on the others.",
+    )
 
 
 #: Attributes of the fields that list frames: sentence that follows their number, remedy.
@@ -343,9 +765,9 @@ _FRAME_ATTRIBUTES = {
         "show that the table moved and did not return; the plan was registered again from there on",
         "Fasten camera and table, and check what happened at that time.",
     ),
-    "frames_shaken": ("are displaced alone and were left out", "Shield the camera from vibration."),
+    "frames_shaken": ("are displaced singly and were left out", "Shield the camera from vibration."),
     "frames_obstructed": (
-        "differ from those before and after them as if something stood before the table, and were left out",
+        "differ from those before and after them as if an object were in front of the table, and were left out",
         "Keep hands, trays and doors out of the view while a frame is taken.",
     ),
     "frames_unplaced": (
@@ -359,17 +781,15 @@ _FRAME_ATTRIBUTES = {
 }
 
 
-def _frame_notices(fields: xr.Dataset) -> list[Notice]:
+def _frame_notices(fields: xr.Dataset) -> Iterator[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
-    notices = []
     for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
         if name == "frames_unchecked" and plan_unit(fields) == "px":
             continue
         frames = json.loads(fields.attrs.get(name, "[]"))
         if frames:
             named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])
-            notices.append(Notice(name, f"{counted(len(frames), 'frame')} {text}: {named}.", remedy))
-    return notices
+            yield Notice(name, f"{counted(len(frames), 'frame')} {text}: {named}.", remedy)
 
 
 def _words(value: Any) -> str:
@@ -381,37 +801,13 @@ def _words(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else Path(str(value)).name
 
 
-def _target_places(source: Source) -> xr.Dataset:
-    """Return the plan points of the targets, along ``target``."""
-    x, y = source.axis.points(source.deviations["position"].values)
-    targets = source.deviations["target"].values
-    places = {"target_x": ("target", x, {"units": "mm"}), "target_y": ("target", y, {"units": "mm"})}
-    return xr.Dataset(places, coords={"target": targets})
-
-
 def map_name(cycle: int) -> str:
-    """Return the name of the file with the maps of one cycle.
-
-    Parameters
-    ----------
-    cycle : int
-        Number of the cycle, from 1.
-    """
+    """Return the name of the file with the maps of one cycle."""
     return f"cycle_{cycle:04d}.exr"
 
 
 def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]:
-    """Write the fields of every cycle as OpenEXR maps and return the files.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the maps.
-    fields : Dataset
-        Content of fields.nc.
-    report : callable
-        ``report(label, done, total)``, for progress.
-    """
+    """Write the fields of every cycle as OpenEXR maps and return the files; the mask is 1 where the table was seen."""
     total = fields.sizes["cycle"]
     paths: list[Path] = []
     mapped = fields[["temperature", "temperature_rise", "temperature_u"]]
@@ -419,19 +815,15 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
         piece = mapped.isel(cycle=some).load()
         for cycle in piece["cycle"].values:
             report("OpenEXR maps", len(paths), total)
-            maps = _exr_maps(piece.sel(cycle=cycle))
+            field = piece.sel(cycle=cycle)
+            named = {
+                "temperature": field["temperature"],
+                "rise": field["temperature_rise"],
+                "uncertainty": field["temperature_u"],
+                "mask": np.isfinite(field["temperature"]),
+            }
+            maps = {name: np.ascontiguousarray(values, dtype="f4") for name, values in named.items()}
             path = folder / map_name(cycle)
             paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
     report("OpenEXR maps", total, total)
     return paths
-
-
-def _exr_maps(field: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the maps of one cycle for OpenEXR; the mask is 1 where the table was seen."""
-    maps = {
-        "temperature": field["temperature"],
-        "rise": field["temperature_rise"],
-        "uncertainty": field["temperature_u"],
-        "mask": np.isfinite(field["temperature"]),
-    }
-    return {name: np.ascontiguousarray(values, dtype="f4") for name, values in maps.items()}

@@ -1,73 +1,70 @@
-"""Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no network."""
+"""report.html: one self-contained file, made from the products alone."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+import csv
+import io
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
-from importlib import resources
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import jinja2
+import rich.table
+import xarray as xr
 from markupsafe import Markup
 
-from fusion.report.charts.embedding import EmbeddedChart, chart_scripts
-from fusion.report.wording import number
-from fusion.terminal import printable
+from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
+from fusion.common import FusionError
+from fusion.report.campaign import describe_campaign, describe_iso230, single_run_table
+from fusion.report.charts.campaign import Drawn, draw_campaign
+from fusion.report.charts.readings import plot_single_runs, plot_test, plot_windows
+from fusion.report.charts.style import Chart, EmbeddedChart, chart_scripts, embed
+from fusion.report.conclusions import headline
+from fusion.report.record import describe_record, draw_record
+from fusion.report.wording import (
+    CHANNELS,
+    TEMPLATES,
+    Table,
+    Words,
+    environment,
+    moment,
+    number,
+    place,
+    print_table,
+    print_unit,
+    say,
+    sentences,
+    table,
+)
+from fusion.results.axis import Iso230Part
+from fusion.results.loop import RecordLoop
+from fusion.results.results import Results, read_results
+from fusion.results.store import group, is_file_list, read_fusion, read_product, write_atomically, write_text
+
+# Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
+# network.
 
 
 def render_page(template: str, charts: Mapping[str, EmbeddedChart], **context: Any) -> str:
-    """Return a page as HTML text.
-
-    Parameters
-    ----------
-    template : str
-        Name of a template in ``fusion/report/templates``.
-    charts : mapping of str to EmbeddedChart
-        By the name with which the template calls ``draw``; names that it calls and that are not here leave no trace.
-    **context
-        Further variables of the template.
-
-    Returns
-    -------
-    str
-        One HTML page. Every variable is escaped where it is shown, and what would turn the direction of the text around it is written
-        out, as in a terminal.
-    """
-    templates = resources.files("fusion.report") / "templates"
-    loader = jinja2.FileSystemLoader(str(templates))
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_in_page,
-    )  # fmt: skip
-    environment.filters |= {"number": number, "css_string": _css_string}
-    own = Markup((templates / "page.js").read_text(encoding="utf-8"))
+    """Return a page as HTML text."""
+    own = Markup((TEMPLATES / "page.js").read_text(encoding="utf-8"))
     scripts = (*chart_scripts(), own) if charts else (own,)
-    return environment.get_template(template).render(
-        figures=charts, scripts=scripts, policy=content_security_policy(scripts), **context
-    )
+    shared = {"figures": charts, "scripts": scripts, "policy": content_security_policy(scripts)}
+    return environment(html=True).get_template(template).render(**shared, css_string=_css_string, **context)
 
 
 def content_security_policy(scripts: Sequence[str]) -> Markup:
     """Return what a browser may do with a page: run these scripts, draw, and nothing else; above all, load nothing.
 
-    Parameters
-    ----------
-    scripts : sequence of str
-        Texts of the page's script elements; any other script in it is not run, wherever it came from.
-
-    Returns
-    -------
-    Markup
-        For a ``meta`` element. Styles may stand in the page because the charts make theirs while they are drawn.
-
-    References
-    ----------
-    Content Security Policy Level 3, W3C Working Draft, sections 6.1 (directives) and 8.3 (hashes of scripts).
-
-    Examples
-    --------
-    >>> str(content_security_policy(["start()"])).split("; ")[1]
-    "script-src 'sha256-DIm7WJS6ZKDYe5qFLPy+h4JFI9Bol5QmYC57mt3Fb00='"
+    Content Security Policy Level 3, W3C Working Draft, sections 6.1 (directives) and 8.3 (hashes of scripts). Styles may stand in the
+    page because the charts make theirs while they are drawn.
     """
     hashes = (base64.b64encode(sha256(text.encode()).digest()).decode() for text in scripts)
     allowed = " ".join(f"'sha256-{one}'" for one in hashes)
@@ -75,13 +72,367 @@ def content_security_policy(scripts: Sequence[str]) -> Markup:
     return Markup(f"default-src 'none'; script-src {allowed}; {rest}")
 
 
-def _in_page(value: object) -> object:
-    """Return a text of which no sign acts on what stands beside it; what is HTML already is made of such texts."""
-    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
-
-
 def _css_string(text: str) -> Markup:
     """Return a text as a string of CSS that can neither end the string nor the style element."""
-    return Markup(
-        '"' + "".join(sign if sign.isalnum() or sign in " ,.-" else f"\\{ord(sign):x} " for sign in text) + '"'
+    signs = (sign if sign.isalnum() or sign in " ,.-" else f"\\{ord(sign):x} " for sign in text)
+    return Markup(f'"{"".join(signs)}"')
+
+
+#: Products that a report draws, where a campaign has them.
+_DRAWN = ("fields", "deviations", "fusion", "sensors")
+
+
+class ProductsError(FusionError):
+    """A folder that does not hold the products of a finished run."""
+
+
+def render_report(
+    results: Results,
+    provenance: Mapping[str, Any],
+    datasets: Mapping[str, Any],
+    *,
+    joint: Mapping[str, Any] | None = None,
+    drawn: Callable[[], Drawn] | None = None,
+) -> str:
+    """Return the report of a run as HTML text.
+
+    Parameters
+    ----------
+    results : Results
+        Results of the run, see `fusion.results.results.read_results`.
+    provenance : mapping
+        Content of provenance.json.
+    datasets : mapping
+        ``fields`` and ``deviations`` (Dataset) and ``fusion`` (DataTree) as they were written; those that a campaign does not
+        have may be absent. A ``record`` (Dataset) stands alone.
+    joint : mapping, optional
+        What this campaign and another one of the machine agree on: ``other`` (its title), ``causes`` (places in words),
+        ``table`` (Table of the places, None without any), ``rows`` (name and text of every part of the drift).
+    drawn : callable, optional
+        Returns the charts of a campaign as `fusion.report.charts.campaign.draw_campaign` does, where another process draws them; called
+        when everything else is written. Left out: they are drawn here.
+
+    Returns
+    -------
+    str
+        One HTML page that needs no other file and no network.
+
+    Raises
+    ------
+    KeyError
+        If the products lack what the results refer to, because they belong to different runs.
+
+    Notes
+    -----
+    Maps that exceed three million values are thinned in cycles and averaged in cells, and the page says so. Terms of
+    ISO 230-2:2014; expanded uncertainties with k = 2 (GUM 6.2).
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> page = render_report(read_results(Path("results")), provenance, datasets)  # doctest: +SKIP
+    """
+    context: dict[str, Any] = {"results": results, "provenance": provenance}
+    if "record" in datasets:
+        context["summary"] = describe_record(results, datasets["record"])
+        return render_page("record.html.j2", embed(draw_record(datasets["record"])), **context)
+    context["summary"] = describe_campaign(results, provenance, datasets, joint)
+    charts, context["thermal_map"] = draw_campaign(results, datasets) if drawn is None else drawn()
+    return render_page("report.html.j2", charts, **context)
+
+
+def report_of(folder: Path) -> str:
+    """Return the report of a finished run, made anew from its products."""
+    results = read_results(folder)
+    origin = folder / "provenance.json"
+    again = "run the campaign again, with --resume to keep what is finished"
+    if not origin.is_file():
+        raise ProductsError(f"{origin} is missing; {again}")
+    try:
+        provenance = json.loads(origin.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ProductsError(f"{origin}: not JSON ({error}); {again}") from None
+    if not _is_provenance(provenance):
+        raise ProductsError(f"{origin}: not the provenance of a run; {again}")
+    if isinstance(results.loop, RecordLoop):
+        return render_report(results, provenance, {"record": read_product(folder, "record")})
+    there = [name for name in _DRAWN if (folder / f"{name}.nc").is_file()]
+    read = {name: read_fusion(folder) if name == "fusion" else read_product(folder, name) for name in there}
+    return render_report(results, provenance, read)
+
+
+def _is_provenance(content: Any) -> bool:
+    """Whether JSON holds what a report tells of a run's origin: its inputs, versions and parameters."""
+    if not isinstance(content, dict):
+        return False
+    parts = [content.get(key) for key in ("inputs", "versions", "parameters")]
+    if not (all(isinstance(part, dict) for part in parts) and isinstance(content["parameters"].get("campaign"), dict)):
+        return False
+    return is_file_list(content["inputs"])
+
+
+# A report on paper: printed to PDF by an installed browser.
+
+#: Commands of the browsers that can print without a window, in the order in which they are looked for.
+_COMMANDS = (
+    "chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "microsoft-edge", "microsoft-edge-stable", "msedge",
+    "brave-browser",
+)  # fmt: skip
+#: Where they are installed without being on the path: macOS and Windows.
+_PLACES = (
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "/Applications/Chromium.app/Contents/MacOS/Chromium",
+    "/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge",
+    r"C:\Program Files\Google\Chrome\Application\chrome.exe",
+    r"C:\Program Files (x86)\Google\Chrome\Application\chrome.exe",
+    r"C:\Program Files (x86)\Microsoft\Edge\Application\msedge.exe",
+    r"C:\Program Files\Microsoft\Edge\Application\msedge.exe",
+)
+_LONGEST_S = 180
+
+
+class PrintError(FusionError):
+    """A report cannot be printed to PDF."""
+
+
+def find_browser(named: str | None = None) -> str:
+    """Return the browser that prints."""
+    for candidate in (*_COMMANDS, *_PLACES) if named is None else (named,):
+        if (found := shutil.which(candidate)) is not None:
+            return found
+    if named is not None:
+        raise PrintError(f'--browser "{named}": there is no such program; name the file of Chrome, Chromium or Edge')
+    raise PrintError(
+        "no browser that can print was found (looked for Chromium, Chrome, Edge and Brave); install one, name it with --browser FILE, or "
+        "open report.html and press its button Print"
     )
+
+
+def print_pdf(page: str, out: Path, *, browser: str | None = None, full: bool = False) -> Path:
+    """Print a page to a PDF file."""
+    program = find_browser(browser)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "report.html"
+        file.write_text(page, encoding="utf-8")
+        address = f"{file.as_uri()}#on-a4{'-full' if full else ''}"
+        return write_atomically(out, lambda temporary: _print(program, address, temporary, folder))
+
+
+def _print(program: str, address: str, out: Path, profile: str) -> None:
+    """Run the browser until it has printed."""
+    command = [
+        program, "--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer", f"--user-data-dir={profile}/profile",
+        "--window-size=1000,1400", "--virtual-time-budget=60000", f"--print-to-pdf={out.resolve()}", address,
+    ]  # fmt: skip
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        command.insert(1, "--no-sandbox")  # a browser refuses to run for root with its sandbox
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise PrintError(f"{program} did not print: {error}; name another browser with --browser FILE") from error
+    if done.returncode or not out.exists() or not out.stat().st_size:
+        said = done.stderr.strip().splitlines()
+        raise PrintError(
+            f"{program} ended with {done.returncode} and printed nothing{': ' + said[-1] if said else ''}; name another browser with "
+            "--browser FILE"
+        )
+
+
+# A test by ISO 230-2 without a campaign: its page, its tables for the terminal, and its values for programs.
+
+
+class Iso230PageError(FusionError):
+    """A test whose page or values cannot be written; the message says why."""
+
+
+#: A test of one cycle has no scatter.
+NO_SCATTER = (
+    "One cycle: a standard deviation s is not possible, and with it neither R nor A nor any uncertainty of sampling. These are the single "
+    "deviations; ISO 230-2 asks for five cycles."
+)
+
+
+def draw_iso230(part: Iso230Part | None, dataset: xr.Dataset) -> dict[str, Chart]:
+    """Return the charts of the section on ISO 230-2, by name."""
+    if part is None:
+        return {"iso230": plot_single_runs(dataset)}
+    charts = {"iso230": plot_test(group(dataset, "settled"), dataset["position"])}
+    windows = group(dataset, "iso")
+    return charts if windows.sizes["window"] < 3 else {**charts, "windows": plot_windows(windows)}
+
+
+def render_iso230(
+    title: str, part: Iso230Part | None, dataset: xr.Dataset, *, remarks: tuple[str, ...], versions: Mapping[str, str]
+) -> str:
+    """Return the page of a test as HTML text."""
+    _refuse_angles(dataset, "page")
+    standard = None if part is None else describe_iso230(part, dataset)
+    single = single_run_table(dataset) if part is None else None
+    shown = {"title": title, "iso230": part, "single": single, "no_scatter": NO_SCATTER, "remarks": remarks}
+    summary = {"iso230": standard, "assumptions": {"iso230": ""}}
+    return render_page("iso230.html.j2", embed(draw_iso230(part, dataset)), summary=summary, versions=versions, **shown)
+
+
+def write_iso230(path: Path, page: str) -> None:
+    """Write the page of a test; nothing is replaced."""
+    if path.exists():
+        raise Iso230PageError(f"{path} exists already; name another file with --out, or remove it")
+    if path.suffix.lower() not in (".html", ".htm", ".pdf"):
+        raise Iso230PageError(f"{path}: the sheet is written as .html or .pdf; name such a file with --out")
+    if path.suffix.lower() == ".pdf":
+        print_pdf(page, path)
+    else:
+        write_text(path, page)
+
+
+def iso230_tables(part: Iso230Part | None, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
+    """Return the tables of a test for the terminal."""
+    if part is None:
+        return [print_table(single_run_table(dataset), title)]
+    described = describe_iso230(part, dataset, unit=print_unit(dataset["deviation"].attrs["units"]))
+    shown: list[tuple[str, Table | None]] = [
+        (f"{title}, {described['quoted'].window}", described["axis"]),
+        ("per target position", described["positions"]),
+        ("uncertainty budget", described["budget"]),
+        ("tolerances", described["tolerances"]),
+    ]
+    return [print_table(found, name) for name, found in shown if found is not None]
+
+
+def iso230_json(part: Iso230Part | None, dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the values of a test for programs: the part ``iso230`` of results.json, and the values per target."""
+    _refuse_angles(dataset, "JSON")
+    rows = _rows(part, dataset)
+    return {"targets": rows} if part is None else {**part.model_dump(mode="json"), "targets": rows}
+
+
+def _refuse_angles(dataset: xr.Dataset, kind: str) -> None:
+    """Refuse a rotary axis where the names of the values carry the units of a linear one."""
+    if dataset["deviation"].attrs["units"] == "arcsec":
+        raise Iso230PageError(
+            f"the axis is a rotary one, whose {kind} is not written: its units are those of lengths; use the tables, or --csv"
+        )
+
+
+def iso230_csv(part: Iso230Part | None, dataset: xr.Dataset) -> str:
+    """Return the values per target as CSV text, one line per target."""
+    rows = _rows(part, dataset)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _rows(part: Iso230Part | None, dataset: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the values of each target; headings carry the units of the dataset."""
+    unit, place = dataset["deviation"].attrs["units"], dataset["position"].attrs["units"]
+    settled = None if part is None else group(dataset, "settled")
+    rows = []
+    for target in dataset["target"].values:
+        at = float(dataset["position"].sel(target=target))
+        row: dict[str, Any] = {"target": int(target), f"position_{place}": at}
+        for direction in dataset["direction"].values:
+            if settled is None:
+                reading = dataset["deviation"].sel(target=target, direction=direction).values
+                row |= {f"deviation_{direction}_{unit}": _finite(float(reading[0]))}
+                continue
+            here = settled.sel(target=target, direction=direction)
+            for symbol, name in (("mean", "mean_unidirectional"), ("s", "standard_deviation"), ("R", "repeatability")):
+                row[f"{symbol}_{direction}_{unit}"] = _finite(float(here[name]))
+            row[f"readings_{direction}"] = int(here["count"])
+        if settled is not None:
+            here = settled.sel(target=target)
+            names = (("mean", "mean_bidirectional"), ("B_i", "reversal"), ("R_i", "repeatability_bidirectional"))
+            row |= {f"{symbol}_{unit}": _finite(float(here[name])) for symbol, name in names}
+        rows.append(row)
+    return rows
+
+
+def _finite(value: float) -> float | None:
+    return value if value == value else None
+
+
+# Two campaigns of one machine on a page of their own: which session is which, what both show, and what only one
+# shows.
+
+_LETTERS = ("A", "B")
+
+
+class SourceWords(NamedTuple):
+    """A source in words: name of its place, where it is, what either session shows there, and whether it is a cause, or why not."""
+
+    name: str
+    where: str
+    shown: tuple[str, ...]
+    verdict: str
+
+
+def session_names(results: Sequence[Results]) -> list[str]:
+    """Return the names of two sessions: a letter and the title of the campaign."""
+    return [f"{letter} ({one.campaign})" for letter, one in zip(_LETTERS, results, strict=True)]
+
+
+def describe_sources(comparison: SessionComparison, sessions: Sequence[str]) -> list[SourceWords]:
+    """Return every source that either session shows, in words; places are numbered."""
+    names = {_key(source): f"place {k}" for k, source in enumerate(comparison.sources, start=1)}
+    described = []
+    for source in comparison.sources:
+        near = names.get((source.channel, *source.agreed_near_mm[:2])) if source.agreed_near_mm else None
+        of_sessions = (source.sensitivity_um_per_K, source.sensitivity_u_um_per_K, source.lag_s)
+        found = zip(source.p_value, comparison.least_p, *of_sessions, strict=True)
+        where = f"{place(source.x_mm, source.y_mm)}, {CHANNELS.get(source.channel, source.channel)}"
+        shown = tuple(say("session_source", *one) for one in found)
+        verdict = say("source_verdict", source, sessions, near, LEVEL)
+        described.append(SourceWords(names[_key(source)], where, shown, verdict))
+    return described
+
+
+def _key(source: SourceAgreement) -> tuple[str, float, float]:
+    return source.channel, source.x_mm, source.y_mm
+
+
+def conclude_sessions(
+    comparison: SessionComparison, described: Sequence[SourceWords], sessions: Sequence[str]
+) -> list[str]:
+    """Return what two sessions say together: on what both show, and on what each shows alone."""
+    return sentences("joint_outcome", comparison, list(zip(comparison.sources, described, strict=True)), sessions)
+
+
+def sources_table(described: Sequence[SourceWords], sessions: Sequence[str]) -> Table | None:
+    """Return the sources that either of two sessions shows; None where neither shows one."""
+    columns = [Words(title) for title in ("Place", "Where, and part of the drift", *sessions, "Verdict")]
+    rows = [[one.name, one.where, *one.shown, one.verdict] for one in described]
+    return table(columns, rows, stacked=True) if rows else None
+
+
+def channel_sentence(channel: ChannelAgreement) -> str:
+    """Return the agreement on one part of the drift as a sentence."""
+    return say("channel_agreement", channel)
+
+
+def render_joint(results: Sequence[Results], folders: Sequence[str], comparison: SessionComparison) -> str:
+    """Return the page of two campaigns as HTML text."""
+    sessions = session_names(results)
+    described = describe_sources(comparison, sessions)
+    return render_page(
+        "joint.html.j2",
+        {},
+        title=f"{results[0].campaign} and {results[1].campaign}",
+        sentences=conclude_sessions(comparison, described, sessions),
+        sessions=_sessions_table(results, sessions),
+        reports=[(name, f"{folder}/report.html") for name, folder in zip(sessions, folders, strict=True)],
+        sources=sources_table(described, sessions),
+        channels=[(CHANNELS.get(one.channel, one.channel), channel_sentence(one)) for one in comparison.channels],
+        summary={"assumptions": {}},
+    )
+
+
+def _sessions_table(results: Sequence[Results], sessions: Sequence[str]) -> Table:
+    """Return which session is which: when it was, what it found by itself, and its prediction error."""
+    rows = []
+    for name, one in zip(sessions, results, strict=True):
+        when = f"{moment(one.time.first, one.time.zone)} to {moment(one.time.last, one.time.zone)}" if one.time else "–"
+        error = number(one.loop.rmse_final_um, 2) if one.loop else "–"
+        rows.append([name, when, headline(one), error])
+    return table([Words("Session"), Words("Time"), Words("By itself"), "Prediction error / µm"], rows, stacked=True)

@@ -4,22 +4,70 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
+import jinja2
 import numpy as np
+import rich.table
+from markupsafe import Markup
 
-from fusion.effects.library import describe_effect
-from fusion.products.results_inputs import Figures, InputsPart
-from fusion.products.results_part import Quantity
+from fusion.analysis.diagnosis.causes import CAUSES
+from fusion.analysis.effects.library import describe_effect
+from fusion.messages import cell, printable
+from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, HotspotPart, Iso230Part, Iso230Window
+from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop, StepPart
+from fusion.results.parts import AreaPart, Figures, InputsPart, PixelAreaPart, Quantity
+from fusion.results.results import Results
+
+# Tables as the report and the terminal show them: columns, rows, and which rows are marked.
+
+
+class Words(str):
+    """Heading of a column of text, set to the left; a plain str is the heading of a column of numbers, with their unit."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table, one text per column; a marked one is set off from the others."""
+
+    cells: Sequence[str]
+    marked: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of finished texts; the cells of a stacked one stand below each other on a narrow screen, for long sentences."""
+
+    titles: tuple[str, ...]
+    rows: tuple[Row, ...]
+    stacked: bool = False
+
+
+def table(titles: Iterable[str], rows: Iterable[Row | Sequence[str]], *, stacked: bool = False) -> Table:
+    """Return a table."""
+    return Table(tuple(titles), tuple(row if isinstance(row, Row) else Row(row) for row in rows), stacked)
+
+
+def print_table(shown: Table, title: str) -> rich.table.Table:
+    """Return a table as the terminal shows it."""
+    printed = rich.table.Table(title=cell(title), title_justify="left")
+    for title in shown.titles:
+        printed.add_column(cell(title), justify="left" if isinstance(title, Words) else "right")
+    for row in shown.rows:
+        printed.add_row(*map(cell, row.cells))
+    return printed
+
 
 _FIGURE_WORDS: dict[Figures, str] = {
     "positions": "what the laser shows alone (deviations, drift, ISO 230-2 values, positions that stand out)",
     "field": "what the camera shows alone (temperatures and their rise)",
-    "attribution": "which part of the field goes with the drift",
+    "attribution": "which part of the field the drift follows",
 }
 
 
@@ -46,16 +94,14 @@ CHANNELS = {
 }
 
 
-class EffectWords(NamedTuple):
-    """An effect as a reader meets it.
+#: Units at the end of a name in the results, as they are printed.
+_UNITS = {
+    "_um_per_K": "µm/K", "_um": "µm", "_nats": "in log-likelihood", "_min": "min", "_mm": "mm", "_s": "s", "_K": "K",
+}  # fmt: skip
 
-    Attributes
-    ----------
-    name : str
-        Its name in words.
-    remedy : str
-        What to check on the machine or the measurement where the effect was missing; empty where the effect states none.
-    """
+
+class EffectWords(NamedTuple):
+    """An effect as a reader meets it: its name, and what to check where it was missing (empty where nothing is stated)."""
 
     name: str
     remedy: str
@@ -63,27 +109,13 @@ class EffectWords(NamedTuple):
 
 @cache
 def effect_words(name: str) -> EffectWords:
-    """Return the words of an effect.
-
-    Parameters
-    ----------
-    name : str
-        Name as in results.json; that of a user's effect that is not installed here has spaces for underscores and no remedy.
-    """
+    """Return the words of an effect."""
     effect = describe_effect(name)
     return EffectWords(name.replace("_", " "), "") if effect is None else EffectWords(effect.words, effect.remedy)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with significant digits and a true minus sign.
-
-    Parameters
-    ----------
-    value : float or None
-        None and values that are not finite are shown as a dash.
-    digits : int
-        Significant digits.
-    """
+    """Return a number with significant digits and a true minus sign."""
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -93,30 +125,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def decimals_of(u: float) -> int:
-    """Return how many decimals show an expanded uncertainty with two significant digits (GUM 7.2.6).
-
-    Parameters
-    ----------
-    u : float
-        Standard uncertainty; 2 decimals where it is not positive or not finite.
-    """
+    """Return how many decimals show an expanded uncertainty with two significant digits (GUM 7.2.6)."""
     return max(0, 1 - math.floor(math.log10(2 * u))) if u > 0 and math.isfinite(u) else 2
 
 
 def measured(value: float | None, u: float | None, unit: str = "", *, decimals: int | None = None) -> str:
-    """Return ``value ± U unit`` with the expanded uncertainty U = 2 u, both to the same decimal place.
-
-    Parameters
-    ----------
-    value : float or None
-        Estimate; None and values that are not finite are shown as a dash.
-    u : float or None
-        Standard uncertainty, same unit; None or 0 where there is none, then the value has three significant digits.
-    unit : str
-        Unit as it is printed; `print_unit` makes it from the unit of a variable.
-    decimals : int, optional
-        Decimal places; left out: U has two significant digits.
-    """
+    """Return ``value ± U unit`` with the expanded uncertainty U = 2 u, both to the same decimal place."""
     tail = f" {unit}" if unit else ""
     if value is None or not math.isfinite(value):
         return "–"
@@ -127,44 +141,32 @@ def measured(value: float | None, u: float | None, unit: str = "", *, decimals: 
 
 
 def quantity(found: Quantity, unit: str = "") -> str:
-    """Return a quantity of the results as ``value ± U unit``, see `measured`.
-
-    Parameters
-    ----------
-    found : Quantity
-        Estimate and standard uncertainty.
-    unit : str
-        Unit as it is printed.
-    """
+    """Return a quantity of the results as ``value ± U unit``, see `measured`."""
     return measured(found.value, found.u, unit)
 
 
 def print_unit(unit: str) -> str:
-    """Return a unit as it is printed.
-
-    Parameters
-    ----------
-    unit : str
-        Unit of a variable, for example ``um/K``.
-    """
+    """Return a unit as it is printed."""
     return {"degC": "°C", "percent": "%", "1": ""}.get(unit, unit.replace("um", "µm"))
 
 
+def small(value: float | None) -> str:
+    """Return a size in µm, values below a nanometre as such."""
+    return "below 0.001" if value is not None and value < 1e-3 else number(value, 2)
+
+
+def gain(value: float | None) -> str:
+    """Return a gain in log-likelihood to one decimal."""
+    return "–" if value is None else f"{value:z.1f}".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent."""
+    return f"{100 * share:g} %"
+
+
 def p_cell(p: float | None, least: float | None = None) -> str:
-    """Return a p-value for a table: to two digits, as a bound below 0.001 and where it is the smallest that can be shown.
-
-    Parameters
-    ----------
-    p : float or None
-        None and NaN are shown as a dash.
-    least : float, optional
-        Smallest p-value that the number of simulations can show; a p-value equal to it is an upper limit, rounded up.
-
-    Examples
-    --------
-    >>> p_cell(0.212, 0.002), p_cell(0.0035714, 0.0035714), p_cell(1e-6)
-    ('0.21', '≤ 0.004', '< 0.001')
-    """
+    """Return a p-value for a table: to two digits, as a bound below 0.001 and where it is `least`, the resolution of the simulations."""
     if p is None or not math.isfinite(p):
         return "–"
     if least and p <= least * (1.0 + 1e-9):
@@ -175,63 +177,27 @@ def p_cell(p: float | None, least: float | None = None) -> str:
 
 
 def p_words(p: float | None, least: float | None = None) -> str:
-    """Return a p-value in a sentence, see `p_cell`.
-
-    Parameters
-    ----------
-    p : float or None
-        None and NaN are shown as a dash.
-    least : float, optional
-        Smallest p-value that the number of simulations can show.
-
-    Examples
-    --------
-    >>> p_words(0.212), p_words(0.002, 0.002)
-    ('p = 0.21', 'p ≤ 0.002, limit of the simulation')
-    """
+    """Return a p-value in a sentence, see `p_cell`."""
     cell = p_cell(p, least)
     if cell.startswith("≤"):
-        return f"p {cell}, limit of the simulation"
+        return f"p {cell}, resolution of the Monte Carlo test"
     return f"p {cell}" if cell.startswith("<") else f"p = {cell}"
 
 
-def alike(values: Sequence[float | None], digits: int = 2, *, distinct: bool = True) -> list[str]:
-    """Return numbers that are compared with as many decimals each, so many that the smallest has the digits.
-
-    Parameters
-    ----------
-    values : sequence of float or None
-        In one unit; None and values that are not finite are shown as a dash.
-    digits : int
-        Significant digits of the smallest one.
-    distinct : bool
-        Whether there are more where two that differ would read alike.
-
-    Examples
-    --------
-    >>> alike([1.938, 0.4643]), alike([0.733, 0.7331])
-    (['1.94', '0.46'], ['0.7330', '0.7331'])
-    """
+def alike(values: Sequence[float | None], *, distinct: bool = True) -> list[str]:
+    """Return numbers that are compared with as many decimals each, so many that the smallest has two digits, more where `distinct`."""
     known = [value for value in values if value is not None and math.isfinite(value) and value]
     smallest = min(map(abs, known), default=1.0)
-    decimals = max(0, digits - 1 - math.floor(math.log10(smallest)))
+    decimals = max(0, 1 - math.floor(math.log10(smallest)))
     differ = len(set(known))
     while distinct and decimals < 4 and len({round(value, decimals) for value in known}) < differ:
         decimals += 1
-    return [
-        "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")
-        for value in values
-    ]
+    shown = (math.nan if value is None else value for value in values)
+    return [f"{value:.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–" for value in shown]
 
 
 def duration(seconds: float | None) -> str:
-    """Return a time span in seconds below 2 min, in minutes below 2 h, in hours above.
-
-    Parameters
-    ----------
-    seconds : float or None
-        Time span, s; None and NaN are shown as a dash.
-    """
+    """Return a time span in seconds below 2 min, in minutes below 2 h, in hours above."""
     if seconds is None or not math.isfinite(seconds):
         return "–"
     if 0 < seconds < 2:
@@ -244,20 +210,7 @@ def duration(seconds: float | None) -> str:
 
 
 def moment(time: np.datetime64 | str, zone: str | None = None) -> str:
-    """Return a time to the minute with its zone.
-
-    Parameters
-    ----------
-    time : datetime64 or str
-        UTC, or a time as results.json writes it; NaT is shown as a dash.
-    zone : str, optional
-        Name of a zone in the IANA data base, for local time; None: UTC.
-
-    Examples
-    --------
-    >>> moment("2026-03-09T06:30:00Z"), moment("2026-03-09T06:30:00Z", "Europe/Vienna")
-    ('2026-03-09 06:30 UTC', '2026-03-09 07:30 CET')
-    """
+    """Return a UTC time to the minute with its zone, local to a zone of the IANA data base where one is named; NaT is a dash."""
     stamp = np.datetime64(time.removesuffix("Z")) if isinstance(time, str) else time
     if np.isnat(stamp):
         return "–"
@@ -267,38 +220,18 @@ def moment(time: np.datetime64 | str, zone: str | None = None) -> str:
 
 
 def place(x: float | None, y: float | None, unit: str = "mm") -> str:
-    """Return a place on the plan to the millimetre, or to the pixel.
-
-    Parameters
-    ----------
-    x, y : float or None
-        Plan coordinates.
-    unit : str
-        mm, or px where the picture is the plan.
-    """
+    """Return a place on the plan to the millimetre, or to the pixel."""
     across, down = ("–" if value is None else f"{value:z.0f}" for value in (x, y))
     return f"x {across} {unit}, y {down} {unit}"
 
 
 def region_words(name: str) -> str:
-    """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself.
-
-    Parameters
-    ----------
-    name : str
-        Name in the results.
-    """
+    """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself."""
     return re.sub(r"^hotspot (?=\d+$)", "disc about hotspot ", name)
 
 
 def join(items: Sequence[str]) -> str:
-    """Return ``a, b and c``.
-
-    Parameters
-    ----------
-    items : sequence of str
-        An empty one gives an empty text.
-    """
+    """Return ``a, b and c``."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
 
 
@@ -313,60 +246,319 @@ BASELINES = {
 
 
 def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> str:
-    """Return a sentence with the conditions under which it holds.
+    """Return a sentence with the conditions under which it holds."""
+    sentence = sentence.strip()
+    right = assumption(inputs, *figures)
+    return f"Only if {right}: {lower_first(sentence)}" if right and sentence else sentence
 
-    Parameters
-    ----------
-    sentence : str
-        What is concluded.
-    inputs : InputsPart or None
-        The part ``inputs`` of the results.
-    *figures : Figures
-        What the sentence rests on.
-    """
-    right = premise(inputs, *figures)
-    return f"Only if {right}: {sentence[0].lower()}{sentence[1:]}" if right else sentence
+
+def lower_first(text: str) -> str:
+    """Return a sentence as it goes on after a colon."""
+    return text[:1].lower() + text[1:]
+
+
+def upper_first(text: str) -> str:
+    """Return a text as it begins a sentence."""
+    return text[:1].upper() + text[1:]
 
 
 def condition(inputs: InputsPart | None, *figures: Figures) -> str:
-    """Return the conditions of a number in brackets, empty where there are none.
-
-    Parameters
-    ----------
-    inputs : InputsPart or None
-        The part ``inputs`` of the results.
-    *figures : Figures
-        What the number rests on.
-    """
-    right = premise(inputs, *figures)
+    """Return the conditions of a number in brackets, empty where there are none."""
+    right = assumption(inputs, *figures)
     return f"(only if {right})" if right else ""
 
 
-def premise(inputs: InputsPart | None, *figures: Figures) -> str:
-    """Return what has to be right for some figures to hold, as it follows "only if"; empty where no doubt touches them.
-
-    Parameters
-    ----------
-    inputs : InputsPart or None
-        The part ``inputs`` of the results.
-    *figures : Figures
-        What is concluded.
-    """
-    premises = inputs.premises(*figures) if inputs else ()
-    return join(premises) if len(premises) <= 2 else f"{len(premises)} doubted inputs are right"
+def assumption(inputs: InputsPart | None, *figures: Figures) -> str:
+    """Return what has to be right for some figures to hold, as it follows "only if"; empty where no doubt touches them."""
+    assumptions = inputs.assumptions(*figures) if inputs else ()
+    return join(assumptions) if len(assumptions) <= 2 else f"{len(assumptions)} doubted inputs are right"
 
 
 def untouched(inputs: InputsPart | None, there: Collection[Figures] = tuple(_FIGURE_WORDS)) -> str:
-    """Return one sentence on what holds whatever becomes of the doubts, empty where nothing is doubted or nothing is left.
-
-    Parameters
-    ----------
-    inputs : InputsPart or None
-        The part ``inputs`` of the results.
-    there : collection of Figures
-        What the run has.
-    """
+    """Return one sentence on what holds whatever becomes of the doubts, empty where nothing is doubted or nothing is left."""
     if inputs is None or not inputs.doubts:
         return ""
-    held = [words for figure, words in _FIGURE_WORDS.items() if figure in there and not inputs.premises(figure)]
-    return f"Not touched by that: {join(held)}." if held else ""
+    held = [words for figure, words in _FIGURE_WORDS.items() if figure in there and not inputs.assumptions(figure)]
+    return f"Not affected: {join(held)}." if held else ""
+
+
+def parameters(values: Mapping[str, Any], ranges: Mapping[str, Range] | None = None) -> str:
+    """Return parameters in words, ``name value unit``, each with the values that fit as well where their range is known."""
+    as_well = {name: _as_well(name, fits) for name, fits in (ranges or {}).items() if name in values}
+    return ", ".join(f"{_parameter(name, value)}{as_well.get(name, '')}" for name, value in values.items())
+
+
+def _parameter(name: str, value: Any) -> str:
+    """One parameter in words; an instant as time since the start."""
+    if name == "time_s" and isinstance(value, int | float):
+        return f"{duration(float(value))} after the start"
+    for ending, unit in _UNITS.items():
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ')} {in_words(value)} {unit}"
+    return f"{name.replace('_', ' ')} {in_words(value)}"
+
+
+def _as_well(name: str, fits: Range) -> str:
+    """The values of a parameter that fit as well, in brackets."""
+    others = [word for word in fits if isinstance(word, str)]
+    if others or not fits:
+        return f" (or {join([spaced(word) for word in others])})"
+    show = duration if name == "time_s" else number
+    low, high = (None if value is None else show(float(value)) for value in fits)
+    if low is None and high is None:
+        return " (not determined)"
+    return f" (at most {high})" if low is None else f" (at least {low})" if high is None else f" ({low} to {high})"
+
+
+def spaced(name: str) -> str:
+    """Return a name of the results as words, with the unit at its end set off."""
+    for ending, unit in _UNITS.items():
+        if name.endswith(ending):
+            bracketed = f"({unit})" if "/" in unit else unit
+            return f"{name.removesuffix(ending).replace('_', ' ')} / {bracketed}"
+    return name.replace("_", " ")
+
+
+def in_words(value: Any) -> str:
+    """Return the value of a parameter or of a piece of evidence for a table cell."""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return join([in_words(item) for item in value])
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        return number(float(value), 3)
+    return "–" if value is None else str(value).replace("_", " ")
+
+
+# What a run found: the choices behind each statement of report and terminal, whose words are in
+# ``templates/sentences.j2``.
+
+TEMPLATES = Path(__file__).parent / "templates"
+#: Axis values in the terms of ISO 230-2:2014, in the order of the report.
+ISO230_TERMS = {
+    "A": "Bidirectional positioning accuracy A",
+    "R": "Bidirectional positioning repeatability R",
+    "E": "Bidirectional systematic positioning error E",
+    "M": "Mean bidirectional positioning error M",
+    "B": "Reversal error B",
+}
+#: Inputs of the uncertainty of a positioning test in words.
+CONTRIBUTORS = {
+    "device": "laser with its air compensation",
+    "alignment": "alignment (cosine error)",
+    "material_temperature": "temperature of the material",
+    "expansion_coefficient": "expansion coefficient",
+    "environmental_variation": "environmental variation error (EVE)",
+    "sampling": "scatter of the readings",
+    "extremes": "largest of noisy values",
+}
+#: A drift of less than this share of the median scatter is none that readings can show.
+_SHARE_OF_SCATTER = 0.01
+
+
+@cache
+def environment(*, html: bool) -> jinja2.Environment:
+    """Return the templates with what formats values in them; text from files is escaped where a page is made."""
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=html, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
+        finalize=_without_control if html else None,
+    )  # fmt: skip
+    made.filters |= {
+        name: globals()[name]
+        for name in (
+            "condition", "conditional", "duration", "gain", "lower_first", "measured", "moment", "number", "p_cell", "p_words",
+            "parameters", "percent", "place", "print_unit", "quantity", "region_words", "small", "upper_first",
+        )
+    }  # fmt: skip
+    made.filters |= {
+        "channel": lambda name: CHANNELS.get(name, name),
+        "contributor": lambda name: CONTRIBUTORS.get(name, name),
+        "edges": edges,
+        "effect": effect_words,
+        "input_name": lambda name: INPUT_NAMES.get(name, name),
+        "is_record": lambda loop: isinstance(loop, RecordLoop),
+        "listed": join,
+        "scatter_um": scatter_of,
+    }
+    made.globals["text"] = Words
+    made.tests |= {
+        "assumed": lambda origin: origin.startswith("assumed"),
+        "numeric": lambda title: not isinstance(title, Words),
+    }
+    found = (
+        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_values, quoted_window, randomised_causes, spot_places,
+        worse_channels,
+    )  # fmt: skip
+    made.globals |= {"say": say, **{function.__name__: function for function in found}}
+    return made
+
+
+def _without_control(value: object) -> object:
+    """Return a text of which no character acts on the text around it; what is HTML already is made of such texts."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def sentences(name: str, *facts: Any) -> list[str]:
+    """Return the lines of a statement of ``sentences.j2`` as plain text."""
+    macro = getattr(environment(html=False).get_template("sentences.j2").module, name)
+    return [" ".join(line.split()) for line in macro(*facts).splitlines() if line.strip()]
+
+
+def say(name: str, *facts: Any) -> str:
+    """Return a statement of ``sentences.j2`` as plain text on one line."""
+    return " ".join(sentences(name, *facts))
+
+
+def quoted_window(iso: Iso230Part) -> Iso230Part | Iso230Window:
+    """Return the window whose values are quoted: the most settled one, the first of results that hold no other."""
+    return iso if iso.settled is None else iso.settled
+
+
+def iso230_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
+    """Return the axis values with their expanded uncertainty (k = 2) by symbol, µm."""
+    return {symbol: quantity(getattr(iso, f"{symbol}_um"), "µm") for symbol in ISO230_TERMS}
+
+
+def approach_of(iso: Iso230Part | Iso230Window) -> str:
+    """Return the only direction of approach that a window holds, "positive" or "negative"; empty where it holds both."""
+    if not isinstance(iso, Iso230Window) or iso.A_um.value is not None:
+        return ""
+    return next((side for side in ("positive", "negative") if getattr(iso, side).A_um.value is not None), "")
+
+
+def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
+    """Return the axis values to quote with their expanded uncertainty (k = 2) by symbol, µm: A, R and B, of one approach A and R."""
+    side = approach_of(iso)
+    if not side:
+        values = iso230_values(iso)
+        return {symbol: values[symbol] for symbol in ("A", "R", "B")}
+    arrow = {"positive": "↑", "negative": "↓"}[side]
+    return {f"{symbol}{arrow}": quantity(getattr(getattr(iso, side), f"{symbol}_um"), "µm") for symbol in "AR"}
+
+
+def drift_u_note(iso: Iso230Part | None) -> str:
+    """Return what the ± of profile and drift contains, and where the rest stands."""
+    return say("drift_uncertainty", iso)
+
+
+class DriftExtreme(NamedTuple):
+    """Range of the drift at one position, µm; `negligible` where it is far below the scatter of the readings."""
+
+    size: Quantity
+    target: int
+    position_mm: float | None
+    negligible: bool
+
+
+def drift_extremes(drift: DriftPart) -> tuple[DriftExtreme, DriftExtreme]:
+    """Return the largest and the smallest range of the drift."""
+    scatters = drift.scatter_um.values()
+    limit = _SHARE_OF_SCATTER * float(np.median(scatters)) if scatters else 0.0
+    ranges = {at: value for at, value in enumerate(drift.range_um) if value is not None}
+
+    def extreme(at: int) -> DriftExtreme:
+        size = Quantity(value=ranges[at], u=drift.range_u_um[at])
+        return DriftExtreme(size, at + 1, drift.position_mm[at], ranges[at] < limit)
+
+    return extreme(max(ranges, key=ranges.__getitem__)), extreme(min(ranges, key=ranges.__getitem__))
+
+
+def anomaly_place(anomaly: AnomalyPart) -> str:
+    """Return which target and direction of approach stand out."""
+    approach = "both approaches" if anomaly.direction == "both" else f"{anomaly.direction} approach"
+    return f"position {anomaly.target}, {approach}"
+
+
+def anomaly_cause(anomaly: AnomalyPart) -> str:
+    """Return the cause of an anomaly in words."""
+    return CAUSES[anomaly.cause].words
+
+
+def anomaly_figures(anomaly: AnomalyPart) -> tuple[Figures, ...]:
+    """Return what the statement on an anomaly rests on: the laser, and the camera where the cause is a temperature."""
+    return ("positions", "field") if anomaly.cause == "local_temperature" else ("positions",)
+
+
+def figures_of_anomalies(anomalies: Iterable[AnomalyPart]) -> list[Figures]:
+    """Return what the statements on all anomalies rest on."""
+    return sorted({"positions", *(figure for anomaly in anomalies for figure in anomaly_figures(anomaly))})
+
+
+def scatter_of(anomaly: AnomalyPart) -> float | None:
+    """Return the standard deviation of the approach that stands out, µm; root mean square of both where both do."""
+    evidence = anomaly.evidence
+    sides = {"positive": evidence.scatter_positive_um, "negative": evidence.scatter_negative_um}
+    if anomaly.direction != "both":
+        return sides[anomaly.direction]
+    known = [value for value in sides.values() if value is not None]
+    return float((sum(value**2 for value in known) / len(known)) ** 0.5) if known else None
+
+
+def edges(area: AreaPart | PixelAreaPart | None) -> str:
+    """Return the edges of an area on the plan, mm, or in the picture, px; a dash where there is none."""
+    if area is None:
+        return "–"
+    unit = "mm" if isinstance(area, AreaPart) else "px"
+    low_x, high_x, low_y, high_y = (getattr(area, f"{end}_{unit}") for end in ("x_low", "x_high", "y_low", "y_high"))
+    return f"x {low_x:.0f} to {high_x:.0f} {unit}, y {low_y:.0f} to {high_y:.0f} {unit}"
+
+
+class SpotPlaces(NamedTuple):
+    """Edges, peak and middle of the area of a hotspot in words: on the plan in mm, or in the picture in px."""
+
+    area: str
+    peak: str
+    middle: str
+
+
+def spot_places(spot: HotspotPart) -> SpotPlaces:
+    """Return the places of a hotspot in words."""
+    if spot.x_px is None:
+        return SpotPlaces(edges(spot.area), place(spot.x_mm, spot.y_mm), place(spot.centroid_x_mm, spot.centroid_y_mm))
+    middle = place(spot.centroid_x_px, spot.centroid_y_px, "px")
+    return SpotPlaces(edges(spot.area_px), place(spot.x_px, spot.y_px, "px"), middle)
+
+
+def figures_of(results: Results) -> list[Figures]:
+    """Return which kinds of figures a run has: of the laser, of the camera, and of both together."""
+    there: list[Figures] = []
+    if results.iso230 is not None or results.loop is not None:
+        there.append("positions")
+    if results.registration is not None:
+        there.append("field")
+    if results.correlation is not None:
+        there.append("attribution")
+    return there
+
+
+def randomised_causes(correlation: CorrelationPart) -> list[str]:
+    """Return the loads that randomisation shows to cause drift."""
+    return [load.name for load in correlation.randomised_duty or () if load.cause]
+
+
+def beaten_by_repetition(loop: Loop) -> str:
+    """Return what the plain repetition predicts better than: the final "model", the "declared" one alone, or neither (empty)."""
+    plain, declared, final = loop.rmse_persistence_um, loop.rmse_declared_um, loop.rmse_final_um
+    if plain is None or declared is None or final is None:
+        return ""
+    return "model" if plain < final else "declared" if plain < declared else ""
+
+
+def worse_channels(loop: Loop) -> list[tuple[str, ChannelErrors]]:
+    """Return the channels of a record whose error does not fall with the added effects."""
+    channels = loop.channels if isinstance(loop, RecordLoop) else {}
+    return [(name, one) for name, one in channels.items() if (one.rmse_final_um or 0.0) > (one.rmse_declared_um or 0.0)]
+
+
+def baseline_words(loop: Loop) -> dict[str, str]:
+    """Return plain predictions in words, by their key in ``loop.baselines``: along an axis cycles are repeated, of a record values."""
+    record = isinstance(loop, RecordLoop)
+    return {
+        name: words.replace("cycles before", "time before").replace("cycle", "value") if record else words
+        for name, words in BASELINES.items()
+    }
+
+
+def step_errors(step: StepPart) -> str:
+    """Return the errors before and after an effect entered: on the hold-out, and of blocks predicted from the others, µm."""
+    return say("step_errors", step)

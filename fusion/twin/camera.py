@@ -14,10 +14,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion._typing import Array
-from fusion.twin.machine.effects import EFFECTS
-from fusion.twin.machine.recipe import Camera, Plan, Recipe
-from fusion.twin.machine.streams import stream
+from fusion.common import Array
+from fusion.twin.effects import EFFECTS
+from fusion.twin.machine import stream
+from fusion.twin.recipe import Camera, Plan, Recipe
 from fusion.twin.simulate import Truth
 
 Image = NDArray[np.float32]
@@ -41,47 +41,19 @@ SUBSAMPLES = 8
 BAD_COUNTS = (12000, 30000)
 #: Step of the grid on which the temperature field is evaluated before it is interpolated to the pixels.
 FIELD_STEP_MM = 1.0
-#: Emissivity of the room's surfaces beside the table.
+#: Emissivity of the room's surfaces around the table.
 SURROUND_EMISSIVITY = 0.95
 
 
 def counts_of(temperature_degC: Array | Image | float) -> Array:
-    """Return the detector counts of a black body, R1 / (R2 (exp(B / T) - F)) - O.
-
-    Parameters
-    ----------
-    temperature_degC : ndarray or float, degC
-        Temperature of the black body.
-
-    Returns
-    -------
-    ndarray of the same shape
-        Counts (not rounded), with the constants of `SC660`.
-    """
+    """Return the detector counts of a black body, R1 / (R2 (exp(B / T) - F)) - O."""
     kelvin = np.asarray(temperature_degC) + KELVIN
-    return np.asarray(
-        SC660["planck_r1"] / (SC660["planck_r2"] * (np.exp(SC660["planck_b"] / kelvin) - SC660["planck_f"]))
-        - SC660["planck_o"]
-    )
+    r1, b, f, o, r2 = (SC660[f"planck_{name}"] for name in ("r1", "b", "f", "o", "r2"))
+    return np.asarray(r1 / (r2 * (np.exp(b / kelvin) - f)) - o)
 
 
 def air_transmission(distance_m: float, temperature_degC: float, humidity: float) -> float:
-    """Return the transmission of the air in the optical path by the vendor's atmospheric model.
-
-    Parameters
-    ----------
-    distance_m : float, m
-        Length of the path.
-    temperature_degC : float, degC
-        Temperature of the air.
-    humidity : float
-        Relative humidity, 0..1.
-
-    Returns
-    -------
-    float
-        Transmission, 0..1.
-    """
+    """Return the transmission of the air in the optical path by the vendor's atmospheric model."""
     t = temperature_degC
     water = np.sqrt(humidity * np.exp(1.5587 + 0.06939 * t - 0.00027816 * t**2 + 0.00000068455 * t**3))
     k, root = SC660, np.sqrt(distance_m)
@@ -92,18 +64,9 @@ def air_transmission(distance_m: float, temperature_degC: float, humidity: float
 
 @dataclass(frozen=True)
 class View:
-    """Projection of the table's plane to the sensor.
+    """Projection of the table's plane to the sensor: pinhole homography from plan mm to ideal pixels (column, row), and radial distortion.
 
-    Attributes
-    ----------
-    homography : (3, 3) ndarray
-        Pinhole projection from plan coordinates, mm, to ideal pixels (column, row).
-    focal_px : float, px
-        Focal length.
-    k1 : float
-        Coefficient of the radial distortion about the centre: r is imaged at r (1 + k1 r^2), r in units of the focal length.
-    centre_px : tuple of two floats, px
-        Principal point (column, row).
+    About the principal point, r is imaged at r (1 + k1 r^2), r in units of the focal length.
     """
 
     homography: Array
@@ -127,10 +90,8 @@ class View:
         for _ in range(6):
             ideal -= (ideal * (1.0 + self.k1 * ideal**2) - radius) / (1.0 + 3.0 * self.k1 * ideal**2)
         scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
-        points = (
-            np.column_stack([normal * scale[:, None] * self.focal_px + self.centre_px, np.ones(len(normal))])
-            @ np.linalg.inv(self.homography).T
-        )
+        seen = np.column_stack([normal * scale[:, None] * self.focal_px + self.centre_px, np.ones(len(normal))])
+        points = seen @ np.linalg.inv(self.homography).T
         return np.asarray(points[:, :2] / points[:, 2:])
 
     def shifted(self, columns: float, rows: float) -> View:
@@ -141,21 +102,7 @@ class View:
 
 
 def make_view(camera: Camera) -> View:
-    """Return the view of a camera from its pose and lens.
-
-    Parameters
-    ----------
-    camera : Camera
-        Distance to `centre_mm`, tilt, pan and roll, focal length and distortion.
-
-    Returns
-    -------
-    View
-
-    Notes
-    -----
-    Homography of a plane: Hartley and Zisserman, Multiple View Geometry, 2nd ed. (2003), section 8.1.
-    """
+    """Return the view of a camera from its pose and lens."""
     tilt, pan, roll = np.deg2rad([camera.tilt_deg, camera.pan_deg, camera.roll_deg])
     about_x = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     about_y = np.array([[np.cos(pan), 0, np.sin(pan)], [0, 1, 0], [-np.sin(pan), 0, np.cos(pan)]])
@@ -169,36 +116,12 @@ def make_view(camera: Camera) -> View:
 
 
 def fiducial_points(plan: Plan) -> Array:
-    """Return the centres of the disc fiducials.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    (n, 2) ndarray, mm
-        Plan coordinates x, y.
-    """
+    """Return the centres of the disc fiducials."""
     return np.column_stack([plan.fiducials_x_mm, plan.fiducials_y_mm]).astype(float)
 
 
 def reflected_spot(recipe: Recipe, x_mm: Array, y_mm: Array) -> Array:
-    """Return the spot in which the paint of the table reflects a warm body, as a weight of 1 at its centre.
-
-    Parameters
-    ----------
-    recipe : Recipe
-        Centre and size of the spot come from its effect `reflected_source`, or from that effect's defaults.
-    x_mm, y_mm : ndarray, mm
-        Plan coordinates, broadcast against each other. The spot is fixed in the room: for a moving table these are the plan
-        coordinates at axis position 0.
-
-    Returns
-    -------
-    ndarray
-        Weight of the body's radiance, 0..1.
-    """
+    """Return the spot in which the paint of the table reflects a warm body, as a weight of 1 at its centre."""
     given = [effect.parameters for effect in recipe.effect if effect.name == "reflected_source"]
     spot = EFFECTS["reflected_source"].parameters | (given[0] if given else {})
     return np.exp(-0.5 * ((x_mm - spot["x_mm"]) ** 2 + (y_mm - spot["y_mm"]) ** 2) / spot["spread_mm"] ** 2)
@@ -206,14 +129,9 @@ def reflected_spot(recipe: Recipe, x_mm: Array, y_mm: Array) -> Array:
 
 @dataclass(frozen=True)
 class Scene:
-    """What every pixel sees at one position of the table.
+    """What every pixel sees at one position of the table: shares 0..1 of table and discs, the surroundings fill the rest.
 
-    Attributes
-    ----------
-    table, disc : (row, column) ndarray
-        Share of the pixel that table and discs cover, 0..1; the surroundings fill the rest.
-    column_of_field, row_of_field : (row, column) ndarray
-        Place of the pixel on the temperature field of step `FIELD_STEP_MM`.
+    ``column_of_field`` and ``row_of_field`` are the place of the pixel on the temperature field of step `FIELD_STEP_MM`.
     """
 
     table: Image
@@ -290,10 +208,8 @@ class Renderer:
         room = float(np.interp(float(frame["time_s"]), self.truth.session.grid_s, self.truth.session.air_degC))
         surround = SURROUND_EMISSIVITY * counts_of(room) + (1.0 - SURROUND_EMISSIVITY) * reflected
         leaving = surround + scene.table * (table - surround) + scene.disc * (disc - surround)
-        arriving = self.transmission * leaving + (1.0 - self.transmission) * counts_of(
-            camera.atmospheric_temperature_degC
-        )
-        return np.asarray(arriving, dtype=np.float32)
+        air = (1.0 - self.transmission) * counts_of(camera.atmospheric_temperature_degC)
+        return np.asarray(self.transmission * leaving + air, dtype=np.float32)
 
     def _spot(self, knocked: bool, reflected_K: float) -> Image:
         """Return the additional counts of a warm body that the table reflects in one part; fixed in the room, not on the table."""

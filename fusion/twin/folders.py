@@ -9,7 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from fusion.twin.machine.recipe import RecipeError
+from fusion.twin.recipe import RecipeError
 
 #: What makes a folder a campaign; it comes last into a folder that existed.
 CAMPAIGN_FILE = "campaign.toml"
@@ -18,63 +18,25 @@ PARTIAL = ".partial"
 
 
 def truth_folder(out: Path) -> Path:
-    """Return the folder in which the truth of a campaign is kept: beside the campaign, never inside.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the campaign.
-
-    Returns
-    -------
-    Path
-        ``<out>-truth``, absolute.
-    """
+    """Return the folder in which the truth of a campaign is kept: next to the campaign, never inside."""
     out = Path(out).resolve()
     return out.with_name(f"{out.name}-truth")
 
 
 def check_free(out: Path) -> None:
-    """Raise an error where a folder of the campaign cannot be filled.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the campaign.
-
-    Raises
-    ------
-    RecipeError
-        It or the folder of its truth holds something already or is a file, or it is the root of a disk, which has nothing beside it.
-    """
+    """Raise an error where a folder of the campaign cannot be filled."""
     for folder in (out, truth_folder(out)):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise RecipeError(f"{folder} exists and is not an empty folder; name another output folder or empty it")
     if out.is_mount():
         raise RecipeError(
-            f"{out} is the root of a disk, and the truth is kept beside the campaign; name a folder in it: {out / 'campaign'}"
+            f"{out} is the root of a disk, and the truth is kept next to the campaign; name a folder in it: {out / 'campaign'}"
         )
 
 
 @contextmanager
 def whole_folders(out: Path) -> Iterator[tuple[Path, Path]]:
-    """Let a campaign and its truth be written under temporary names, and put them in place when both are whole.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the campaign; it and `truth_folder` of it must be absent or empty.
-
-    Yields
-    ------
-    campaign, truth : Path
-        Empty folders to write to. What fails or is stopped leaves neither.
-
-    Raises
-    ------
-    RecipeError
-        As `check_free`, or another simulation writes to the same folder, or the disk takes no more.
-    """
+    """Let a campaign and its truth be written under temporary names, and put them in place when both are whole."""
     check_free(out)
     places = (truth_folder(out), out.resolve())
     truth, campaign = (place.with_name(f".{place.name}{PARTIAL}") for place in places)
@@ -99,19 +61,7 @@ def whole_folders(out: Path) -> Iterator[tuple[Path, Path]]:
 
 
 def write_truth_nc(folder: Path, truth: xr.Dataset) -> None:
-    """Write ``truth.nc``.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the truth.
-    truth : Dataset
-        Readings or a record, and what they are made of.
-
-    Notes
-    -----
-    The file is made in memory: the HDF5 library, which cannot close a file on a full disk, would end the process.
-    """
+    """Write ``truth.nc``."""
     (folder / "truth.nc").write_bytes(truth.to_netcdf(engine="h5netcdf"))
 
 
@@ -126,10 +76,7 @@ def _make(growing: Path) -> None:
 
 
 def _put_in_place(growing: Path, place: Path, moved: ExitStack) -> None:
-    """Give a folder its name; an empty folder that has the name stays, in which somebody may be at work, and is filled.
-
-    What is moved can be moved back.
-    """
+    """Give a folder its name; an empty folder that has the name stays, in which somebody may be at work, and is filled."""
     if not place.exists():
         growing.rename(place)
         moved.callback(place.rename, growing)

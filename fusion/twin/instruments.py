@@ -1,20 +1,21 @@
-"""Writes a simulated campaign as the files that the instruments of a laboratory would write, with the truth in a folder beside it."""
+"""Writes a simulated campaign as the files that the instruments of a laboratory would write, with the truth in a folder next to it."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from fusion.twin.camera import KELVIN, SC660, Renderer, fiducial_points, make_view
 from fusion.twin.folders import CAMPAIGN_FILE, check_free, whole_folders, write_truth_nc
-from fusion.twin.machine.streams import stream
-from fusion.twin.recipe_file import read_recipe
+from fusion.twin.machine import stream
+from fusion.twin.recipe_file import find_recipe, read_recipe
 from fusion.twin.record import simulate_record, write_record
 from fusion.twin.simulate import PROBE_MM, Truth, driver_log, environment_log, moving_rms, simulate
 from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
@@ -37,14 +38,15 @@ LOGGED = (
 )
 
 
-def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None = None) -> Path:
+def simulate_campaign(recipe: str | Path, out: str | Path, *, progress: Progress | None = None) -> Path:
     """Simulate the campaign that a recipe describes and write it as files.
 
     Parameters
     ----------
-    recipe_path : Path
-        RECIPE.toml, with the tables of :class:`fusion.twin.machine.recipe.Recipe`; what it leaves out keeps its default.
-    out : Path
+    recipe : str or Path
+        RECIPE.toml, with the tables of :class:`fusion.twin.recipe.Recipe`; what it leaves out keeps its default. Or the name of a recipe
+        that comes with the package: ``demo``, ``paper`` or ``record``.
+    out : str or Path
         Folder of the campaign; the truth goes to ``<out>-truth`` beside it. Both must be absent or empty.
     progress : callable or None
         Called as ``progress(done, total, what)`` after every frame.
@@ -73,46 +75,26 @@ def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None
     >>> sorted(path.name for path in campaign.parent.iterdir())
     ['campaign.toml', 'drivers.csv', 'environment.csv', 'fiducials.csv', 'laser.csv', 'thermal']
     """
-    recipe, out = read_recipe(Path(recipe_path)), Path(out)
-    if recipe.record is None:
+    described, out = read_recipe(find_recipe(recipe)), Path(out)
+    if described.record is None:
         check_free(out)
-        return write_campaign(simulate(recipe), out, progress=progress)
-    truth = simulate_record(recipe)
+        return write_campaign(simulate(described), out, progress=progress)
+    truth = simulate_record(described)
     with whole_folders(out) as (folder, beside):
         write_record(truth, folder, beside)
     return out / CAMPAIGN_FILE
 
 
 def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None) -> Path:
-    """Write a simulated campaign: frames, laser, environment, drivers, fiducials, campaign file; the truth beside it.
-
-    Parameters
-    ----------
-    truth : Truth
-        From :func:`fusion.twin.simulate.simulate`.
-    out : Path
-        Folder of the campaign; it and ``<out>-truth`` must be absent or empty.
-    progress : callable or None
-        Called as ``progress(done, total, what)`` after every frame.
-
-    Returns
-    -------
-    Path
-        The campaign file.
-
-    Raises
-    ------
-    RecipeError
-        `out` or the folder of the truth is not empty or cannot be written to; both are as they were before.
-    """
+    """Write a simulated campaign: frames, laser, environment, drivers, fiducials, campaign file; the truth next to it."""
     out = Path(out)
-    with whole_folders(out) as (folder, beside):
+    with whole_folders(out) as (folder, truth_folder):
         _write_laser(truth, folder)
         write_environment_csv(folder / "environment.csv", environment_log(truth))
         _write_drivers(truth, folder / "drivers.csv")
         _write_fiducials(truth, folder / "fiducials.csv")
         (folder / CAMPAIGN_FILE).write_text(_campaign_text(truth), encoding="utf-8")
-        _write_truth(truth, beside)
+        _write_truth(truth, truth_folder)
         _write_frames(truth, folder / "thermal", progress)
     return out / CAMPAIGN_FILE
 
@@ -123,15 +105,12 @@ def _campaign_text(truth: Truth) -> str:
     camera, plan = recipe.camera, recipe.plan
     clock = f'clock_offset = "{camera.clock_offset_s:g} s"\n' if camera.state_clock_offset else ""
     # A .rtl file holds no times of readings, which are reconstructed from feed and dwell, and no zone.
-    motion = (
-        f'time_zone = "UTC"\nfeed = "{recipe.test.feed_mm_per_min:g} mm/min"\ndwell = "{recipe.test.dwell_s:g} s"\n'
-    )
-    duty = recipe.duty
-    law = (
-        f'randomised = ["duty [1]"]\nmean_dwell = "{duty.mean_hold_min:g} min"\nleast_dwell = "{duty.least_hold_min:g} min"\n'
-        if duty.kind == "randomised"
-        else ""
-    )
+    test, duty = recipe.test, recipe.duty
+    motion = f'time_zone = "UTC"\nfeed = "{test.feed_mm_per_min:g} mm/min"\ndwell = "{test.dwell_s:g} s"\n'
+    law = ""
+    if duty.kind == "randomised":
+        law = f'mean_dwell = "{duty.mean_hold_min:g} min"\nleast_dwell = "{duty.least_hold_min:g} min"\n'
+        law = f'randomised = ["duty [1]"]\n{law}'
     return f"""[campaign]
 title = {json.dumps(recipe.campaign.title)}
 axis = {json.dumps(recipe.campaign.axis)}
@@ -180,14 +159,18 @@ def _write_laser(truth: Truth, out: Path) -> None:
         write_deviations_csv(out / "laser.csv", deviations)
 
 
+def _write_rows(path: Path, *rows: Sequence[str]) -> None:
+    """Write a table as CSV."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
 def _write_drivers(truth: Truth, path: Path) -> None:
     """Write the load as logged once a minute."""
     log = driver_log(truth)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["time", "duty [1]"])
-        for time, duty in zip(log["time"].values, log["duty"].values, strict=True):
-            rows.writerow([f"{np.datetime_as_string(time, unit='ms')}+00:00", f"{duty:.3f}"])
+    times = np.datetime_as_string(log["time"].values, unit="ms")
+    rows = ([f"{time}+00:00", f"{duty:.3f}"] for time, duty in zip(times, log["duty"].values, strict=True))
+    _write_rows(path, ["time", "duty [1]"], *rows)
 
 
 def _write_fiducials(truth: Truth, path: Path) -> None:
@@ -196,19 +179,11 @@ def _write_fiducials(truth: Truth, path: Path) -> None:
     points = fiducial_points(plan)
     pixels = make_view(truth.recipe.camera).to_sensor(points)
     pixels += stream(truth.recipe.campaign.seed, "pixel hints").normal(0.0, plan.hint_error_px, pixels.shape)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["name", "x_mm", "y_mm", "diameter_mm", "column_px", "row_px"])
-        for number, (point, pixel) in enumerate(zip(points, pixels, strict=True), 1):
-            rows.writerow(
-                [
-                    f"F{number}",
-                    f"{point[0]:g}",
-                    f"{point[1]:g}",
-                    f"{plan.fiducial_diameter_mm:g}",
-                    *(f"{p:.0f}" for p in pixel),
-                ]
-            )
+    rows = [["name", "x_mm", "y_mm", "diameter_mm", "column_px", "row_px"]]
+    for number, (point, pixel) in enumerate(zip(points, pixels, strict=True), 1):
+        place = [f"{value:g}" for value in (*point, plan.fiducial_diameter_mm)]
+        rows.append([f"F{number}", *place, *(f"{value:.0f}" for value in pixel)])
+    _write_rows(path, *rows)
 
 
 def _write_truth(truth: Truth, folder: Path) -> None:
@@ -218,19 +193,14 @@ def _write_truth(truth: Truth, folder: Path) -> None:
     y = np.arange(0.5 * TRUTH_CELL_MM, plan.height_mm, TRUTH_CELL_MM, dtype=float)
     per_cycle = (np.arange(truth.schedule.cycles, dtype=float) + 0.5) * truth.schedule.period_s
     field_s = truth.session.frame_s if recipe.camera.table == "still" else per_cycle
+    temperature = truth.temperature(field_s, x, y, cell_mm=TRUTH_CELL_MM).astype(np.float32)
     fields = xr.Dataset(
-        {
-            "temperature": (
-                ("field_time", "y", "x"),
-                truth.temperature(field_s, x, y, cell_mm=TRUTH_CELL_MM).astype(np.float32),
-                {"units": "degC"},
-            )
-        },
+        {"temperature": (("field_time", "y", "x"), temperature, {"units": "degC"})},
         coords={"field_time": truth.clock(field_s).astype("datetime64[ns]"), "y": y, "x": x},
     )
-    readings = truth.readings.drop_encoding()
-    write_truth_nc(folder, xr.merge([readings, fields, truth.frames]))
+    write_truth_nc(folder, xr.merge([truth.readings.drop_encoding(), fields, truth.frames]))
     view = make_view(recipe.camera)
+    knock = {"cycle": recipe.camera.knock_cycle, "px": list(recipe.camera.knock_px)}
     moving = {name: moving_rms(truth.in_order(name), truth.session) for name in truth.parts}
     content = {
         "recipe": asdict(recipe),
@@ -241,9 +211,7 @@ def _write_truth(truth: Truth, folder: Path) -> None:
         "clock_offset_s": recipe.camera.clock_offset_s,
         "plan_to_sensor": view.homography.tolist(),
         "distortion": {"k1": view.k1, "focal_px": view.focal_px, "centre_px": list(view.centre_px)},
-        "knock": {"cycle": recipe.camera.knock_cycle, "px": list(recipe.camera.knock_px)}
-        if recipe.camera.knock_cycle
-        else None,
+        "knock": knock if recipe.camera.knock_cycle else None,
     }
     (folder / "truth.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -255,15 +223,8 @@ def _write_frames(truth: Truth, folder: Path, progress: Progress | None) -> None
         write_sequence(folder / "IR_0001.seq", _frames(truth, progress))
         return
     for number, frame in enumerate(_frames(truth, progress), 1):
-        write_jpeg(
-            folder / f"IR_{number:04d}.jpg",
-            frame.counts,
-            frame.parameters,
-            frame.time,
-            camera=frame.camera,
-            limits=frame.limits,
-            housekeeping=frame.housekeeping,
-        )
+        told: dict[str, Any] = {"camera": frame.camera, "limits": frame.limits, "housekeeping": frame.housekeeping}
+        write_jpeg(folder / f"IR_{number:04d}.jpg", frame.counts, frame.parameters, frame.time, **told)
 
 
 def _frames(truth: Truth, progress: Progress | None) -> Iterator[Frame]:

@@ -10,17 +10,17 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy.linalg import expm
 
-from fusion._typing import Array
+from fusion.common import Array
+from fusion.twin.effects import EFFECTS
 from fusion.twin.folders import write_truth_nc
-from fusion.twin.machine.effects import EFFECTS
-from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError, Record
-from fusion.twin.machine.session import Session
-from fusion.twin.machine.streams import first_order, random_levels, stream
+from fusion.twin.machine import Session, first_order, random_levels, stream
+from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError, Record
 from fusion.twin.recipe_file import check_recipe
 
 #: Heat capacity (J/K) and heat transfer to the air (W/K) of every part.
@@ -73,22 +73,7 @@ class RecordTruth:
 
 
 def simulate_record(recipe: Recipe) -> RecordTruth:
-    """Simulate the record that the recipe's ``[record]`` asks for.
-
-    Parameters
-    ----------
-    recipe : Recipe
-        With a `record`; its tables of test, plan, camera and laser are not used.
-
-    Returns
-    -------
-    RecordTruth
-
-    Raises
-    ------
-    RecipeError
-        There is no ``[record]``, or an effect or anomaly needs positions.
-    """
+    """Simulate the record that the recipe's ``[record]`` asks for."""
     record = check_recipe(recipe).record
     if record is None:
         raise RecipeError(
@@ -105,9 +90,8 @@ def simulate_record(recipe: Recipe) -> RecordTruth:
     with_sensor = rises[:, 1:]
 
     size = (time_s.size, record.channels)
-    per_K = stream(seed, "sensitivities").normal(
-        0.0, record.sensitivity_um_per_K, (with_sensor.shape[1], record.channels)
-    )
+    sensitivities = (with_sensor.shape[1], record.channels)
+    per_K = stream(seed, "sensitivities").normal(0.0, record.sensitivity_um_per_K, sensitivities)
     walks = stream(seed, "walks").standard_normal(size) * np.sqrt(record.step_s / 3600.0)
     series: dict[str, Array] = {
         "quasi_static": with_sensor @ per_K,
@@ -117,15 +101,11 @@ def simulate_record(recipe: Recipe) -> RecordTruth:
     session = _session(recipe, record, time_s, duty, with_sensor.mean(axis=1))
     for effect in recipe.effect:
         series[effect.name] = series.get(effect.name, np.zeros(size)) + _effect(effect, session, record, seed)
-    dims = ("time", "channel")
+    dims, logged = ("time", "channel"), _logged_temperatures(record, with_sensor, seed)
     start = np.datetime64(recipe.campaign.start.removesuffix("Z"), "ns")
     table = xr.Dataset(
         {
-            "temperature": (
-                ("time", "sensor"),
-                np.round(_logged_temperatures(record, with_sensor, seed), 3),
-                {"units": "degC"},
-            ),
+            "temperature": (("time", "sensor"), np.round(logged, 3), {"units": "degC"}),
             "displacement": (dims, np.round(np.sum(list(series.values()), axis=0), 3), {"units": "um"}),
             "speed": ("time", np.round(duty * record.top_speed_rpm), {"units": "1/min"}),
             **{name: (dims, part, {"units": "um"}) for name, part in series.items()},
@@ -155,36 +135,15 @@ def _logged_temperatures(record: Record, rises: Array, seed: int) -> Array:
     return 20.0 + sensed + record.noise_K * rng.standard_normal(sensed.shape)
 
 
-def write_record(truth: RecordTruth, out: Path, beside: Path) -> Path:
-    """Write a simulated record as CSV with its campaign file, and its truth apart.
-
-    Parameters
-    ----------
-    truth : RecordTruth
-        From :func:`simulate_record`.
-    out : Path
-        Existing folder of the campaign.
-    beside : Path
-        Existing folder of the truth.
-
-    Returns
-    -------
-    Path
-        The campaign file.
-    """
+def write_record(truth: RecordTruth, out: Path, truth_folder: Path) -> Path:
+    """Write a simulated record as CSV with its campaign file, and its truth apart."""
     table = truth.table
     seconds = (table["time"].values - table["time"].values[0]) / np.timedelta64(1, "s")
     headings = ["time [s]", *(f"{name} [degC]" for name in table["sensor"].values)]
     headings += [*(f"{name} [um]" for name in table["channel"].values), "spindle speed [1/min]"]
-    columns = [
-        seconds[:, None],
-        table["temperature"].values,
-        table["displacement"].values,
-        table["speed"].values[:, None],
-    ]
-    np.savetxt(
-        out / "record.csv", np.hstack(columns), fmt="%.10g", delimiter=",", header=",".join(headings), comments=""
-    )
+    columns = [seconds, *table["temperature"].values.T, *table["displacement"].values.T, table["speed"].values]
+    how: dict[str, Any] = {"fmt": "%.10g", "delimiter": ",", "header": ",".join(headings), "comments": ""}
+    np.savetxt(out / "record.csv", np.transpose(columns), **how)
     wanted = ", ".join(json.dumps(f"{name} [um]") for name in table["channel"].values)
     (out / "campaign.toml").write_text(
         f"""[campaign]
@@ -200,34 +159,15 @@ drivers = ["spindle speed*"]
 """,
         encoding="utf-8",
     )
-    write_truth_nc(beside, table)
+    write_truth_nc(truth_folder, table)
     rms = {name: float(_centred_rms(table[name].values)) for name in truth.parts}
     content = {"recipe": asdict(truth.recipe), "parts_rms_um": rms, "undeclared": [e.name for e in truth.recipe.effect]}
-    (beside / "truth.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (truth_folder / "truth.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return out / "campaign.toml"
 
 
 def solve_parts(duty: Array, axes: Array, air: Array, step_s: float) -> Array:
-    """Return the temperature rise of every part of the machine.
-
-    Parameters
-    ----------
-    duty, axes : (n,) ndarray
-        Loads of the spindle and of the axes' motor, 0..1.
-    air : (n,) ndarray, K
-        Rise of the room temperature.
-    step_s : float, s
-        Step of the series.
-
-    Returns
-    -------
-    (n, parts) ndarray, K
-        Rise of each part of `PARTS`, 0 at the first time; exact for loads and air that are constant over each step.
-
-    Notes
-    -----
-    Lumped capacities, C dT/dt = A T + q, advanced by the matrix exponential (Van Loan 1978, IEEE Trans. Autom. Control 23, 395).
-    """
+    """Return the temperature rise of every part of the machine."""
     names = list(PARTS)
     capacity = np.array([PARTS[name][0] for name in names])
     exchange = np.array([PARTS[name][1] for name in names])
@@ -265,11 +205,7 @@ def _session(recipe: Recipe, record: Record, time_s: Array, duty: Array, mean_ri
         grid_s=time_s,
         duty=duty,
         table_rise_K=mean_rise,
-        probe_degC=zeros,
-        air_degC=zeros,
-        air_hPa=zeros,
-        air_percent=zeros,
-        refractivity=zeros,
+        **dict.fromkeys(("probe_degC", "air_degC", "air_hPa", "air_percent", "refractivity"), zeros),
         frame_s=zeros[:0],
     )
 

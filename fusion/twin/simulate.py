@@ -7,20 +7,29 @@ anomalies), what the camera adds of its own, and what the environment unit and t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion._typing import Array
-from fusion.twin.machine.air import Air, simulate_air
-from fusion.twin.machine.effects import ANOMALIES, EFFECTS, logged_air
-from fusion.twin.machine.heat import Plate, solve_plate
-from fusion.twin.machine.recipe import AnomalyRecipe, Drift, EffectRecipe, Laser, Profile, Recipe, RecipeError, Source
-from fusion.twin.machine.schedule import Schedule, duty_levels, make_schedule
-from fusion.twin.machine.session import Session
-from fusion.twin.machine.streams import first_order, random_levels, stream
+from fusion.common import Array
+from fusion.twin.effects import EFFECTS, anomaly_series, logged_air
+from fusion.twin.machine import (
+    Air,
+    Plate,
+    ReadingSequence,
+    Schedule,
+    Session,
+    duty_levels,
+    first_order,
+    make_schedule,
+    random_levels,
+    simulate_air,
+    solve_plate,
+    stream,
+)
+from fusion.twin.recipe import Drift, EffectRecipe, Laser, Profile, Recipe, RecipeError, Source
 from fusion.twin.recipe_file import check_recipe
 
 #: Step of the time grid on which heat and air are solved.
@@ -77,10 +86,7 @@ class Truth:
         return np.asarray(ordered.ravel())
 
     def temperature(self, time_s: Array, x_mm: Array, y_mm: Array, *, cell_mm: float = 0.0) -> Array:
-        """Return the true table temperature (time, y, x), degC, at plan points or averaged over square cells around them.
-
-        Parameters are those of :meth:`fusion.twin.machine.heat.Plate.field`.
-        """
+        """Return the true table temperature (time, y, x), degC, at plan points or averaged over square cells around them."""
         return self.plate.field(time_s, x_mm, y_mm, cell_mm=cell_mm) + self.recipe.table.initial_temperature_degC
 
 
@@ -132,8 +138,11 @@ def simulate(recipe: Recipe) -> Truth:
     for effect in recipe.effect:
         series[_unused_name(effect.name, series)] = _scaled(effect, session)
     for anomaly, local_rise in zip(recipe.anomaly, local_rises, strict=True):
-        name = _unused_name(f"anomaly_{anomaly.target}_{anomaly.kind}", series)
-        series[name] = _anomaly(anomaly, session, local_rise, seed)
+        name, what = f"anomaly_{anomaly.target}_{anomaly.kind}", f"anomaly at target {anomaly.target}"
+        rng = stream(seed, f"anomaly {anomaly.target} {anomaly.kind}")
+        affected = (session.target == anomaly.target) & np.isin(session.sign, _SIGNS[anomaly.direction])
+        motion = np.where(affected, anomaly_series(anomaly.kind, session, local_rise, rng, anomaly.at_cycle), 0.0)
+        series[_unused_name(name, series)] = motion * _gain(anomaly.amplitude_um, moving_rms(motion, session), what)
     readings = _dataset(recipe, schedule, series)
     return Truth(recipe, schedule, session, plate, readings, _frames(recipe, schedule, session), tuple(series))
 
@@ -149,11 +158,13 @@ def _clock(recipe: Recipe, time_s: Array) -> NDArray[np.datetime64]:
 
 def _heat(recipe: Recipe, schedule: Schedule, grid_s: Array, duty: Array, air: Air) -> tuple[Plate, list[Array]]:
     """Solve the plate with all sources; also the rise (m,) at each anomalous target due to a heat source of its own."""
-    local_sources = {
-        number: _local_source(recipe, schedule, anomaly)
-        for number, anomaly in enumerate(recipe.anomaly)
-        if anomaly.kind == "local_temperature"
-    }
+    local_sources = {}
+    for number, anomaly in enumerate(recipe.anomaly):
+        if anomaly.kind == "local_temperature":
+            position = schedule.positions_mm[anomaly.target - 1]
+            x_mm, y_mm = np.array(recipe.plan.origin_mm) + np.array(recipe.plan.direction) * position
+            name = f"target {anomaly.target}"
+            local_sources[number] = Source(name, float(x_mm), float(y_mm), 14.0, 14.0, 6.0, 4.0, "own")
     sources = (*recipe.source, *local_sources.values())
     power = np.zeros((grid_s.size, len(sources)))
     for column, source in enumerate(sources):
@@ -174,25 +185,12 @@ def _heat(recipe: Recipe, schedule: Schedule, grid_s: Array, duty: Array, air: A
     return plate, local_rises
 
 
-def _local_source(recipe: Recipe, schedule: Schedule, anomaly: AnomalyRecipe) -> Source:
-    """Return the small heat source under an anomalous target."""
-    position = schedule.positions_mm[anomaly.target - 1]
-    x_mm, y_mm = np.array(recipe.plan.origin_mm) + np.array(recipe.plan.direction) * position
-    return Source(f"target {anomaly.target}", float(x_mm), float(y_mm), 14.0, 14.0, 6.0, 4.0, "own")
-
-
 def _session(recipe: Recipe, schedule: Schedule, grid_s: Array, duty: Array, air: Air, plate: Plate) -> Session:
     """Collect the states that effects act through."""
     probe = plate.points(np.array([PROBE_MM[0]]), np.array([PROBE_MM[1]]))[:, 0]
     probe = first_order(probe, GRID_STEP_S, 60.0 * recipe.room.probe_lag_min)
     return Session(
-        time_s=schedule.time_s,
-        cycle=schedule.cycle,
-        sign=schedule.sign,
-        target=schedule.target,
-        position_mm=schedule.position_mm,
-        cycles=schedule.cycles,
-        period_s=schedule.period_s,
+        **{one.name: getattr(schedule, one.name) for one in fields(ReadingSequence)},
         seed=recipe.campaign.seed,
         travel_mm=float(schedule.positions_mm[-1]),
         grid_s=grid_s,
@@ -212,9 +210,8 @@ def _frame_times(recipe: Recipe, schedule: Schedule) -> Array:
     camera = recipe.camera
     if camera.table == "moving":
         return np.arange(0.5 * camera.frame_interval_s, schedule.duration_s, camera.frame_interval_s, dtype=float)
-    burst = (
-        schedule.last_reading_s + camera.frame_after_s + np.arange(camera.frames_per_cycle) * camera.burst_interval_s
-    )
+    burst_s = np.arange(camera.frames_per_cycle) * camera.burst_interval_s
+    burst = schedule.last_reading_s + camera.frame_after_s + burst_s
     if burst[-1] >= schedule.period_s:
         raise RecipeError(
             f"camera: the last frame of a cycle is due {burst[-1]:.1f} s after its start, past its end at {schedule.period_s:.1f} s; "
@@ -227,21 +224,7 @@ def _frame_times(recipe: Recipe, schedule: Schedule) -> Array:
 
 
 def static_profile(profile: Profile, session: Session, seed: int) -> Array:
-    """Return the static positioning error: slope, bow, roughness, cyclic error and reversal error.
-
-    Parameters
-    ----------
-    profile : Profile
-        Sizes of the five parts.
-    session : Session
-        Readings of the test.
-    seed : int
-        Seed of the campaign.
-
-    Returns
-    -------
-    (n,) ndarray, um
-    """
+    """Return the static positioning error: slope, bow, roughness, cyclic error and reversal error."""
     rng = stream(seed, "profile")
     targets = int(session.target.max())
     rough = profile.rough_um * rng.standard_normal(targets)
@@ -261,24 +244,7 @@ def _axis_expansion(drift: Drift, schedule: Schedule, session: Session, plate: P
 
 
 def nuisance(drift: Drift, session: Session, seed: int) -> Array:
-    """Return the drift that no physical quantity explains: a common part, and one proportional to position.
-
-    Both move in real time, between the readings of a pass as well.
-
-    Parameters
-    ----------
-    drift : Drift
-        Kind and intensities: the standard deviation after one hour (random_walk, integrated) or the stationary one (ou, with a
-        correlation time of one hour).
-    session : Session
-        Readings of the test.
-    seed : int
-        Seed of the campaign.
-
-    Returns
-    -------
-    (n,) ndarray, um
-    """
+    """Return the drift that no physical quantity explains: a common part, and one proportional to position."""
     hours = np.diff(session.time_s, prepend=0.0) / 3600.0
     common = drift.walk_common_um_per_sqrt_h * _walk(drift.walk, hours, stream(seed, "common walk"))
     slope = drift.walk_slope_um_per_sqrt_h * _walk(drift.walk, hours, stream(seed, "slope walk"))
@@ -303,21 +269,7 @@ def _walk(kind: str, hours: Array, rng: np.random.Generator) -> Array:
 
 
 def laser_noise(laser: Laser, session: Session, seed: int) -> Array:
-    """Return the random error of every reading.
-
-    Parameters
-    ----------
-    laser : Laser
-        Standard deviation, its spread over the targets, and tails of the distribution.
-    session : Session
-        Readings of the test.
-    seed : int
-        Seed of the campaign.
-
-    Returns
-    -------
-    (n,) ndarray, um
-    """
+    """Return the random error of every reading."""
     rng = stream(seed, "noise")
     n = session.time_s.size
     unit = rng.standard_normal(n) if laser.tails == "normal" else rng.standard_t(4, n) / np.sqrt(2.0)
@@ -352,29 +304,8 @@ def _with_fault_sized(effect: EffectRecipe, session: Session) -> EffectRecipe:
     return replace(effect, parameters=parameters)
 
 
-def _anomaly(anomaly: AnomalyRecipe, session: Session, local_rise_K: Array, seed: int) -> Array:
-    """Return the motion of an anomalous target, um; 0 at all other targets."""
-    rng = stream(seed, f"anomaly {anomaly.target} {anomaly.kind}")
-    affected = (session.target == anomaly.target) & np.isin(session.sign, _SIGNS[anomaly.direction])
-    series = np.where(affected, ANOMALIES[anomaly.kind](session, local_rise_K, rng, anomaly.at_cycle), 0.0)
-    return series * _gain(anomaly.amplitude_um, moving_rms(series, session), f"anomaly at target {anomaly.target}")
-
-
 def moving_rms(series: Array, session: Session) -> float:
-    """Return the rms about the mean per target and direction, over the targets and directions that move at all.
-
-    Parameters
-    ----------
-    series : (n,) ndarray, um
-        One value per reading, in the order in which they are taken.
-    session : Session
-        Readings of the test.
-
-    Returns
-    -------
-    float, um
-        0 where nothing moves.
-    """
+    """Return the rms about the mean per target and direction, over the targets and directions that move at all."""
     moving = _by_site(series, session.cycles)
     moving = moving - moving.mean(axis=0)
     affected = np.abs(moving).max(axis=0) > 1e-12
@@ -408,31 +339,21 @@ def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Array]) -> xr
     dims = ("cycle", "direction", "target")
     parts = {name: (dims, _by_site(part, schedule.cycles), {"units": "um"}) for name, part in series.items()}
     deviation = np.sum([part for _, part, _ in parts.values()], axis=0)
-    random = np.sum(
-        [part for name, (_, part, _) in parts.items() if name == "noise" or name.endswith("structural")], axis=0
-    )
-    statistics = {
-        "mean_profile": (
-            dims[1:],
-            (deviation - random).mean(axis=0),
-            {"units": "um", "long_name": "profile at the test's mean state"},
-        ),
-        "scatter": (
-            dims[1:],
-            random.std(axis=0, ddof=min(1, schedule.cycles - 1)),
-            {"units": "um", "long_name": "sample standard deviation of what is random"},
-        ),
-    }
-    lost = (
-        stream(recipe.campaign.seed, "lost readings").uniform(size=np.shape(deviation)) < recipe.test.missing_fraction
-    )
+    random_parts = [part for name, (_, part, _) in parts.items() if name == "noise" or name.endswith("structural")]
+    random = np.sum(random_parts, axis=0)
+    profile_of = {"units": "um", "long_name": "profile at the test's mean state"}
+    scatter_of = {"units": "um", "long_name": "sample standard deviation of what is random"}
+    scatter = random.std(axis=0, ddof=min(1, schedule.cycles - 1))
+    drawn = stream(recipe.campaign.seed, "lost readings").uniform(size=np.shape(deviation))
+    lost = drawn < recipe.test.missing_fraction
     time = _clock(recipe, _by_site(schedule.time_s, schedule.cycles)).astype("datetime64[ns]")
     return xr.Dataset(
         {
             "deviation": (dims, np.where(lost, np.nan, deviation), {"units": "um"}),
             "time": (dims, time),
             **parts,
-            **statistics,
+            "mean_profile": (dims[1:], (deviation - random).mean(axis=0), profile_of),
+            "scatter": (dims[1:], scatter, scatter_of),
         },
         coords={
             "cycle": np.arange(1, schedule.cycles + 1),
@@ -452,7 +373,10 @@ def _frames(recipe: Recipe, schedule: Schedule, session: Session) -> xr.Dataset:
     warm_up = CAMERA_WARM_UP_K * (1.0 - np.exp(-session.frame_s / CAMERA_WARM_UP_S))
     housing = session.at_frames(session.air_degC) + warm_up
     housing_drift = camera.drift_K_per_K * (housing - session.at_start(session.air_degC))
-    offset, reflected = _ffc_offsets(recipe, session) + housing_drift, np.zeros(session.frame_s.size)
+    # A new random offset after every flat-field correction.
+    number = (session.frame_s // (60.0 * camera.ffc_interval_min)).astype(int)
+    corrected = camera.ffc_step_K * stream(recipe.campaign.seed, "ffc").standard_normal(number.max() + 1)[number]
+    offset, reflected = corrected + housing_drift, np.zeros(session.frame_s.size)
     for effect in recipe.effect:
         if effect.name == "reflected_source":
             reflected = reflected + _scaled_for_camera(effect, recipe, session)
@@ -471,13 +395,6 @@ def _frames(recipe: Recipe, schedule: Schedule, session: Session) -> xr.Dataset:
     )
 
 
-def _ffc_offsets(recipe: Recipe, session: Session) -> Array:
-    """Return the camera's offset per frame, K: a new random one after every flat-field correction."""
-    number = (session.frame_s // (60.0 * recipe.camera.ffc_interval_min)).astype(int)
-    offsets = stream(recipe.campaign.seed, "ffc").standard_normal(number.max() + 1)
-    return np.asarray(recipe.camera.ffc_step_K * offsets[number])
-
-
 def _scaled_for_camera(effect: EffectRecipe, recipe: Recipe, session: Session) -> Array:
     """Return what an effect adds to the camera's view, K; an rms in um is that of the declared model's error of prediction."""
     parameters = effect.parameters | ({} if effect.amplitude_K is None else {"K": effect.amplitude_K})
@@ -491,22 +408,11 @@ def _scaled_for_camera(effect: EffectRecipe, recipe: Recipe, session: Session) -
     return series * _gain(effect.amplitude_um, moving_rms(predicted, session), "effect camera_offset")
 
 
-# What is logged beside the readings.
+# What is logged with the readings.
 
 
 def environment_log(truth: Truth) -> xr.Dataset:
-    """Return what the laser's environment unit logs once a minute, with sensor noise, faults and resolution.
-
-    Parameters
-    ----------
-    truth : Truth
-        From :func:`simulate`.
-
-    Returns
-    -------
-    xarray.Dataset
-        (time,): air_temperature, degC; air_pressure, hPa; relative_humidity, percent; material_temperature, degC.
-    """
+    """Return what the laser's environment unit logs once a minute, with sensor noise, faults and resolution."""
     session, recipe = truth.session, truth.recipe
     minute = np.arange(0.0, truth.schedule.duration_s, 60.0, dtype=float)
     temperature, pressure = session.air_degC, session.air_hPa
@@ -520,33 +426,16 @@ def environment_log(truth: Truth) -> xr.Dataset:
         "relative_humidity": (session.air_percent, 0.05, 1, "percent"),
         "material_temperature": (session.probe_degC, 0.004, 2, "degC"),
     }
-    noisy = {
-        name: (
-            "time",
-            np.round(np.interp(minute, session.grid_s, true) + noise * rng.standard_normal(minute.size), digits),
-            {"units": unit},
-        )
-        for name, (true, noise, digits, unit) in columns.items()
-    }
-    return xr.Dataset(noisy, coords={"time": truth.clock(minute).astype("datetime64[ns]")})
+    logged = {}
+    for name, (true, noise, digits, unit) in columns.items():
+        noisy = np.interp(minute, session.grid_s, true) + noise * rng.standard_normal(minute.size)
+        logged[name] = ("time", np.round(noisy, digits), {"units": unit})
+    return xr.Dataset(logged, coords={"time": truth.clock(minute).astype("datetime64[ns]")})
 
 
 def driver_log(truth: Truth) -> xr.Dataset:
-    """Return the load of the machine as logged once a minute.
-
-    Parameters
-    ----------
-    truth : Truth
-        From :func:`simulate`.
-
-    Returns
-    -------
-    xarray.Dataset
-        (time,): duty, 0..1.
-    """
+    """Return the load of the machine as logged once a minute."""
     minute = np.arange(0.0, truth.schedule.duration_s, 60.0, dtype=float)
     level = truth.session.duty[np.searchsorted(truth.session.grid_s, minute)]
-    return xr.Dataset(
-        {"duty": ("time", level.round(3), {"units": "1"})},
-        coords={"time": truth.clock(minute).astype("datetime64[ns]")},
-    )
+    logged = {"duty": ("time", level.round(3), {"units": "1"})}
+    return xr.Dataset(logged, coords={"time": truth.clock(minute).astype("datetime64[ns]")})

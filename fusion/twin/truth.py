@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from fusion._typing import Array
-from fusion.errors import FusionError
+from fusion.common import Array, FusionError
 from fusion.twin.camera import counts_of, make_view, reflected_spot
-from fusion.twin.machine.streams import stream
+from fusion.twin.machine import stream
 from fusion.twin.simulate import Truth
 
 _ON_SCALE = {"units": "degC", "units_metadata": "temperature: on_scale"}
@@ -20,18 +19,7 @@ _DIFFERENCE = {"units": "K", "units_metadata": "temperature: difference"}
 
 
 def deviations_of(truth: Truth) -> xr.Dataset:
-    """Return the measured deviations of a simulated campaign.
-
-    Parameters
-    ----------
-    truth : Truth
-        From :func:`fusion.twin.simulate.simulate`.
-
-    Returns
-    -------
-    xarray.Dataset
-        (cycle, direction, target): `deviation`, um (NaN where lost), `time` (NaT where lost) and `quality_flag` (0); `position`, mm.
-    """
+    """Return the measured deviations of a simulated campaign."""
     measured = truth.readings[["deviation", "time"]].copy()
     measured["time"] = measured["time"].where(measured["deviation"].notnull())
     measured["time"].attrs = {"long_name": "time of the reading, recorded"}
@@ -41,28 +29,7 @@ def deviations_of(truth: Truth) -> xr.Dataset:
 
 
 def fields_of(truth: Truth, *, cell_size_mm: float = 5.0, noise_K: float | None = None) -> xr.Dataset:
-    """Return the table's temperature per cycle on the plan grid, as the frames of a still table would give it.
-
-    Parameters
-    ----------
-    truth : Truth
-        From :func:`fusion.twin.simulate.simulate`, with ``camera.table = "still"``.
-    cell_size_mm : float, mm
-        Size of a cell; the cell's value is the mean of the true field over it.
-    noise_K : float or None, K
-        Standard deviation per cell and frame; None: the camera's noise averaged over the pixels that a cell covers.
-
-    Returns
-    -------
-    xarray.Dataset
-        temperature, degC, temperature_rise, K, their uncertainties and spread, K, and count (cycle, y, x); frame_temperature, degC
-        (time, y, x); cycle_time. Effects of the camera are included: its offset, and a reflected source to first order in its temperature.
-
-    Raises
-    ------
-    FusionError
-        The table moves in the camera's view.
-    """
+    """Return the table's temperature per cycle on the plan grid, as the frames of a still table would give it."""
     camera, plan = truth.recipe.camera, truth.recipe.plan
     if camera.table != "still":
         raise FusionError(
@@ -118,8 +85,6 @@ def _reflection_gain(truth: Truth, x_mm: Array, y_mm: Array) -> Array:
     """Return by how many K a cell (y, x) reads high per K of a body that is reflected in it."""
     recipe = truth.recipe
     reflected, start = recipe.camera.reflected_temperature_degC, recipe.table.initial_temperature_degC
-    gain = (1.0 - recipe.camera.emissivity) / recipe.camera.emissivity
-    gain *= float(
-        (counts_of(reflected + 0.5) - counts_of(reflected - 0.5)) / (counts_of(start + 0.5) - counts_of(start - 0.5))
-    )
+    per_K = [counts_of(at + 0.5) - counts_of(at - 0.5) for at in (reflected, start)]
+    gain = (1.0 - recipe.camera.emissivity) / recipe.camera.emissivity * float(per_K[0] / per_K[1])
     return gain * reflected_spot(recipe, x_mm, y_mm[:, None])

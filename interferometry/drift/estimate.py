@@ -20,18 +20,93 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
-from threadpoolctl import threadpool_limits
 
-from interferometry._typing import Array
-from interferometry.contract import check_dataset
+from interferometry.common import Array, InterferometryError, check_dataset, one_thread
 from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
-from interferometry.drift.air import drift_covariance, estimate_air_noise
-from interferometry.drift.components import BASE_COMPONENTS, COMPONENTS, component_loadings
-from interferometry.drift.gls import DriftFit, average_drift, estimate, von_neumann_p_value
-from interferometry.drift.memory import typical_memory
-from interferometry.drift.shapes import common_shape
-from interferometry.drift.state_space import Order, Smoothed
-from interferometry.errors import InterferometryError
+from interferometry.drift.gls import (
+    DriftFit,
+    average_drift,
+    drift_covariance,
+    estimate,
+    estimate_air_noise,
+    typical_memory,
+    von_neumann_p_value,
+)
+from interferometry.drift.kalman import Order, Smoothed
+
+# Shapes along the axis that a drift may have by name, and the share of each in a reading.
+
+#: Share of a drift component in a reading, by its sign of approach (+1, -1) and its place (0 first position, 1 last).
+COMPONENTS = {
+    "shift": lambda sign, place: np.ones(place.size),
+    "stretch": lambda sign, place: place,
+    "reversal": lambda sign, place: sign / 2.0,
+    "bend": lambda sign, place: 4.0 * place * (1.0 - place),
+}
+BASE_COMPONENTS = ("shift", "stretch")
+
+
+def component_loadings(
+    sign: Array, position_mm: Array, *, components: Sequence[str], span_mm: tuple[float, float]
+) -> Array:
+    """Return the share of each drift component in readings of a direction at a position."""
+    place = (np.asarray(position_mm, float) - span_mm[0]) / (span_mm[1] - span_mm[0])
+    return np.column_stack([COMPONENTS[name](np.asarray(sign, float), place) for name in components])
+
+
+# Shape along the axis of a drift that shift, stretch and bend do not describe, from the readings themselves.
+
+#: Level at which a common motion of the targets is a shape.
+SHAPE_LEVEL = 0.01
+#: Least number of targets that take part in a shape (inverse participation ratio): fewer are positions that move by themselves.
+LEAST_TARGETS = 3.5
+#: Fewest cycles in which a shape is looked for.
+SHORTEST_TEST_CYCLES = 15
+_PERMUTATIONS = 199
+_SEED = 0
+
+
+def common_shape(residual: Array, known: Array) -> Array | None:
+    """Return the shape along the axis of a motion over the cycles that the known shapes leave."""
+    cycles, targets = residual.shape
+    if cycles < SHORTEST_TEST_CYCLES or targets < known.shape[1] + 2:
+        return None
+    remainder = _without(residual, known)
+    whitened = remainder[1:] - _memory(remainder) * remainder[:-1]
+    value, shape = _first_mode(whitened)
+    if 1.0 / float((shape**4).sum()) < LEAST_TARGETS:
+        return None
+    rng = np.random.default_rng(_SEED)
+    permuted = [_first_mode(rng.permutation(whitened))[0] for _ in range(_PERMUTATIONS)]
+    if (1 + np.count_nonzero(np.array(permuted) >= value)) / (_PERMUTATIONS + 1) > SHAPE_LEVEL:
+        return None
+    return np.asarray(shape / shape[np.argmax(np.abs(shape))])
+
+
+def _without(residual: Array, known: Array) -> Array:
+    """Take the known shapes from every cycle; a missing target is 0 after that."""
+    remainder = np.zeros_like(residual)
+    for row, values in zip(remainder, residual, strict=True):
+        present = np.isfinite(values)
+        if np.count_nonzero(present) > known.shape[1]:
+            basis = known[present]
+            row[present] = values[present] - basis @ np.linalg.lstsq(basis, values[present], rcond=None)[0]
+    return remainder - remainder.mean(axis=0)
+
+
+def _memory(remainder: Array) -> float:
+    """Median over the targets of the lag-one correlation over the cycles, at least 0."""
+    product = (remainder[1:] * remainder[:-1]).sum(axis=0)
+    square = (remainder**2).sum(axis=0)
+    return max(0.0, float(np.median(product[square > 0] / square[square > 0]))) if (square > 0).any() else 0.0
+
+
+def _first_mode(series: Array) -> tuple[float, Array]:
+    """Largest eigenvalue of the symmetric covariance of successive rows, and its eigenvector."""
+    product = series[:-1].T @ series[1:]
+    values, vectors = np.linalg.eigh(product + product.T)
+    return float(values[-1]), vectors[:, -1]
+
 
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
 #: readings the chance of one is 0.07.
@@ -52,8 +127,7 @@ class DriftDataError(InterferometryError):
     """The deviations cannot be fitted jointly; the message says what is missing."""
 
 
-# Threaded linear algebra is many times slower than one thread on matrices of a hundred columns, and gives other last digits.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def estimate_drift(
     deviations: xr.Dataset,
     *,
@@ -96,7 +170,7 @@ def estimate_drift(
           ``drift_share`` (component, direction, target; 1): its share in a reading.
         - ``noise`` (cycle, direction, target): estimated random part of each reading. ``standardised`` (1): its deletion
           residual in standard deviations, infinite for a gross outlier.
-        - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted); ``scatter_undetermined``: 1 where the noise vanishes beside the
+        - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted); ``scatter_undetermined``: 1 where the noise is small against the
           drift between readings, so that ``sigma`` and ``scatter`` are what the search for the variances was limited to, 0 elsewhere.
 
     Raises
@@ -134,20 +208,7 @@ def estimate_drift(
 
 
 def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
-    """Set the outlier flag of every reading whose deletion residual exceeds 4.5 standard deviations.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    estimated : xarray.Dataset
-        What `estimate_drift` returns for them.
-
-    Returns
-    -------
-    xarray.Dataset
-        The deviations with OUTLIER added to ``quality_flag``; values are left as they are.
-    """
+    """Set the outlier flag of every reading whose deletion residual exceeds 4.5 standard deviations."""
     with np.errstate(invalid="ignore"):
         beyond = np.abs(estimated["standardised"].values) > OUTLIER_LIMIT
     return set_flag(deviations, OUTLIER, beyond)
@@ -190,36 +251,11 @@ class JointFit:
         )
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_joint(
-    deviations: xr.Dataset,
-    *,
-    robust: bool = True,
-    order: Order | None = None,
-    components: Sequence[str] | None = None,
+    deviations: xr.Dataset, *, robust: bool = True, order: Order | None = None, components: Sequence[str] | None = None
 ) -> JointFit:
-    """Fit profile and drift; `estimate_drift` also describes the result.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    robust : bool
-        Leave gross outliers out and down-weight readings far from the others.
-    order : {1, 2}, optional
-        1 random walk, 2 integrated random walk; None: chosen by the restricted likelihood.
-    components : sequence of str, optional
-        Names out of COMPONENTS; None: shift and stretch, and reversal and bend where the readings ask for them.
-
-    Returns
-    -------
-    JointFit
-
-    Raises
-    ------
-    DriftDataError
-        As `estimate_drift`.
-    """
+    """Fit profile and drift; `estimate_drift` also describes the result."""
     check_dataset(deviations, "deviations")
     if order not in (None, 1, 2):
         raise DriftDataError(f"order={order!r} is neither 1 (random walk), 2 (integrated random walk) nor None")
@@ -254,15 +290,11 @@ def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
             f"{cycles} cycles and {targets} targets hold readings; the joint estimate needs two of each"
         )
     if not _without_medians(readings).any():
-        raise DriftDataError("readings repeat exactly: there is no random part to weigh them by; export more digits")
+        raise DriftDataError("readings repeat exactly: there is no scatter to weight them by; export more digits")
 
 
 def _is_gross(readings: xr.Dataset) -> NDArray[np.bool_]:
-    """Mark gross outliers, which would mislead even the start of a robust fit: sentinels, beam breaks, readings of other targets.
-
-    A reading is compared with the median of its position and direction, and then with the median of its pass. GROSS_LIMIT
-    median absolute deviations of the remainder, which still holds drift, are beyond any drift.
-    """
+    """Mark gross outliers, which would mislead even the start of a robust fit: sentinels, beam breaks, readings of other targets."""
     remainder = _without_medians(readings)
     typical = float(np.median(np.abs(remainder))) or float(np.mean(np.abs(remainder)))
     return np.abs(remainder) > GROSS_LIMIT * typical
@@ -358,10 +390,10 @@ def _missing_components(joint: JointFit) -> tuple[str, ...]:
     by_cycle = np.argsort(readings["cycle"].values, kind="stable")
     starts = np.flatnonzero(np.diff(readings["cycle"].values[by_cycle])) + 1
     missing = []
-    for component, beside in (("reversal", BASE_COMPONENTS), ("bend", (*BASE_COMPONENTS, "reversal"))):
+    for component, earlier in (("reversal", BASE_COMPONENTS), ("bend", (*BASE_COMPONENTS, "reversal"))):
         if component == "reversal" and np.unique(sign).size < 2:
             continue
-        basis = component_loadings(sign, position, components=(component, *beside), span_mm=_span_mm(readings))
+        basis = component_loadings(sign, position, components=(component, *earlier), span_mm=_span_mm(readings))
         contrasts = []
         for rows in np.split(by_cycle, starts):
             contrast, others = basis[rows, 0], basis[rows, 1:]
@@ -375,28 +407,7 @@ def _missing_components(joint: JointFit) -> tuple[str, ...]:
 
 
 def state_weights(seconds: Array, cycle: NDArray[np.int64], state: str | float) -> Array:
-    """Return the weight of each reading in a thermal state.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading since the first one, s, not decreasing.
-    cycle : (n,) ndarray of int
-        Number of its cycle.
-    state : {"mean", "start", "end"} or float
-        Average over the measured cycles, first reading, last reading, or s since the first reading (interpolated linearly).
-
-    Returns
-    -------
-    (n,) ndarray
-        Weights that sum to one. In the mean state every cycle has the same weight, however many readings it lacks: with complete
-        readings that is their plain mean.
-
-    Raises
-    ------
-    DriftDataError
-        The state has an unknown name or lies outside the test.
-    """
+    """Return the weight of each reading in a thermal state."""
     if state == "mean":
         _, index, readings = np.unique(cycle, return_inverse=True, return_counts=True)
         return 1.0 / (readings.size * readings[index.ravel()])
@@ -438,10 +449,7 @@ def _drift_at_state(joint: JointFit, columns: Array, weights: Array) -> _StateDr
 
 
 def _with_start_rates(levels: Array, hours: Array, joint: JointFit) -> tuple[Array, Array]:
-    """Return the whole drift (n, components) and its derivative by the coefficients (n, components, p).
-
-    An integrated random walk starts with a rate that is a coefficient: it belongs to the drift, not to the profile.
-    """
+    """Return the whole drift (n, components) and its derivative by the coefficients (n, components, p)."""
     per_coefficient = -levels[:, :, 1:]
     first = len(joint.cells)
     for component in range(joint.fit.coefficients.size - first):
@@ -485,16 +493,22 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     standardised[grid.is_left_out(deviations)] = np.inf
     noise = fit.system.variance * _smoothing_errors(joint, smoothed)
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
-    by_component = _component_variables(grid, joint, drift, covariance)
+    loadings = fit.system.loadings
+    drift_variance = np.einsum("kc,kce,ke->k", loadings, covariance, loadings)
     result = xr.Dataset(
         {
             **_profile_variables(grid, joint, deviations, at_state, excess),
             **_scatter_variables(grid, joint, scatter, freedom),
-            **_drift_variables(grid, joint, drift, covariance),
+            "drift": (
+                DIMS,
+                grid.per_reading(np.einsum("kc,kc->k", loadings, drift)),
+                {"units": "um", "long_name": "drift from the stated state"},
+            ),
+            "drift_u": (DIMS, grid.per_reading(np.sqrt(np.maximum(drift_variance, 0.0))), {"units": "um"}),
             "noise": (DIMS, grid.per_reading(noise), {"units": "um", "long_name": "random part of the reading"}),
             "standardised": (DIMS, standardised, {"units": "1"}),
             "sigma": ((), fit.sigma, {"units": "um"}),
-            **by_component,
+            **_component_variables(grid, joint, drift, covariance),
         },
         coords={**{name: deviations[name].values for name in DIMS}, "component": list(joint.components)},
     )
@@ -555,12 +569,7 @@ def _smoothing_errors(joint: JointFit, smoothed: Smoothed) -> Array:
 
 
 def _scatter(joint: JointFit, smoothed: Smoothed, standardised: Array) -> tuple[Array, Array]:
-    """Return the random standard deviation of each cell (um) and its degrees of freedom.
-
-    The deletion residual of a reading has the variance of the reading plus that of its prediction from all others; the latter is
-    subtracted, and the degrees of freedom that the estimated coefficients took are restored. Readings beyond OUTLIER_LIMIT of
-    their own cell are left out; large scatter of a whole cell is kept.
-    """
+    """Return the random standard deviation of each cell (um) and its degrees of freedom."""
     fit, u, D = joint.fit, smoothed.u, smoothed.D
     cells = len(joint.cells)
     unit = fit.covariance / fit.sigma**2
@@ -610,7 +619,7 @@ def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Ar
         np.bincount(target, freedom * np.nan_to_num(scatter) ** 2, minlength=targets)
         / np.where(pooled_freedom, pooled_freedom, np.nan)
     )
-    # Where the drift's own uncertainty is all that a cell shows, its scatter is not known to be nothing: the common one stands for it.
+    # Where the drift's own uncertainty is all that a cell shows, its scatter is not known to be nothing: the common one replaces it.
     typical = np.where(scatter == 0.0, joint.fit.sigma, scatter)
     scatter_u = typical / np.sqrt(2 * np.maximum(freedom, 1.0))
     dims = DIMS[1:]
@@ -618,22 +627,7 @@ def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Ar
         "scatter": (dims, grid.per_cell(scatter), {"units": "um", "long_name": "random standard deviation"}),
         "scatter_u": (dims, grid.per_cell(scatter_u), {"units": "um"}),
         "scatter_freedom": (dims, grid.per_cell(freedom), {"units": "1"}),
-        "scatter_position": (
-            ("target",),
-            pooled,
-            {"units": "um", "long_name": "scatter, both directions together"},
-        ),
-    }
-
-
-def _drift_variables(grid: _Grid, joint: JointFit, drift: Array, covariance: Array) -> Variables:
-    """Drift at the position and direction of each reading."""
-    loadings = joint.fit.system.loadings
-    value = np.einsum("kc,kc->k", loadings, drift)
-    value_u = np.sqrt(np.maximum(np.einsum("kc,kce,ke->k", loadings, covariance, loadings), 0.0))
-    return {
-        "drift": (DIMS, grid.per_reading(value), {"units": "um", "long_name": "drift from the stated state"}),
-        "drift_u": (DIMS, grid.per_reading(value_u), {"units": "um"}),
+        "scatter_position": (("target",), pooled, {"units": "um", "long_name": "scatter, both directions together"}),
     }
 
 

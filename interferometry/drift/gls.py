@@ -7,7 +7,7 @@ integrated random walk, which enter every reading with a known loading::
 
 For a positioning test the components are a common shift (loading 1) and a stretch (loading = position); for a record of several
 displacement channels there is one component per channel. All components start at zero: their start is a fixed effect, and
-:func:`~interferometry.drift.state_space.start_columns` gives the columns that a design must span for that. The variances of the
+:func:`~interferometry.drift.kalman.start_columns` gives the columns that a design must span for that. The variances of the
 drift are estimated by restricted maximum likelihood; one likelihood costs O(n) in the number of readings.
 
 In this order: the fit under given variances; the search for the variances; the average of a drift over its readings, with its
@@ -28,20 +28,101 @@ from numpy.typing import NDArray
 from scipy import linalg, optimize, special
 from scipy.linalg import lapack
 
-from interferometry._typing import Array
+from interferometry.common import Array
 from interferometry.drift import kalman
-from interferometry.drift.state_space import (
-    MANY_COLUMNS,
-    DriftModelError,
-    DriftSystem,
-    Order,
-    drift_system,
-    start_columns,
-)
+from interferometry.drift.kalman import MANY_COLUMNS, DriftModelError, DriftSystem, Order, drift_system, start_columns
+
+# Noise that neighbouring readings of a pass share, as turbulent air along the beam makes it.
+
+#: Correlation times that are tried, s; longer ones are a drift within the pass.
+CORRELATION_TIMES_S = (5.0, 10.0, 20.0, 40.0)
+#: Standard errors by which the correlation must be known before it is taken into account.
+LEAST_SIGNIFICANCE = 4.0
+#: Fewest complete passes from which a correlation is estimated.
+LEAST_PASSES = 20
+_REALISATIONS = 32
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class AirNoise:
+    """Noise with an exponential correlation in time, in addition to independent noise.
+
+    Attributes
+    ----------
+    variance_um2 : float
+        Of the correlated part.
+    correlation_time_s : float
+    independent_um2 : float
+        Variance of the independent part.
+    """
+
+    variance_um2: float
+    correlation_time_s: float
+    independent_um2: float
+
+
+def estimate_air_noise(
+    residual: Array, seconds: Array, loadings: Array, *, number: NDArray[np.int64], position: Array
+) -> AirNoise | None:
+    """Estimate the correlated noise from the covariance of the readings within a pass."""
+    # Index of every reading of the complete passes, by position, (pass, target).
+    _, index, readings = np.unique(number, return_inverse=True, return_counts=True)
+    targets = np.unique(position).size
+    rows = np.flatnonzero(readings[index.ravel()] == targets)
+    rows = rows[np.lexsort((position[rows], index.ravel()[rows]))].reshape(-1, targets)
+    count, targets = rows.shape
+    if count < LEAST_PASSES or targets < loadings.shape[1] + 3:
+        return None
+    passes = residual[rows]
+    for odd in (0, 1):
+        direction = number[rows[:, 0]] % 2 == odd
+        if direction.any():
+            passes[direction] -= np.median(passes[direction], axis=0)
+    known = loadings[rows[0]]
+    free = np.eye(targets) - known @ np.linalg.pinv(known)
+    remainder = passes @ free
+    covariance = remainder.T @ remainder / count
+    # Both directions visit the targets in opposite order; only times between readings enter.
+    elapsed = np.median(np.abs(seconds[rows] - seconds[rows[:, :1]]), axis=0)
+    lag = np.abs(elapsed[:, None] - elapsed)
+    fits = []
+    for correlation_time in CORRELATION_TIMES_S:
+        air = free @ np.exp(-lag / correlation_time) @ free
+        basis = np.column_stack([free.ravel(), air.ravel()])
+        scale = np.linalg.norm(basis, axis=0)
+        weights, misfit = optimize.nnls(basis / scale, covariance.ravel())
+        fits.append((misfit, correlation_time, weights / scale, air))
+    _, correlation_time, (independent, variance), air = min(fits, key=lambda fit: fit[0])
+    # The part of the correlation that independent noise cannot make: its mean over the passes is zero without correlation.
+    contrast = air - free * float((air * free).sum() / (free * free).sum())
+    by_pass = np.einsum("pi,ij,pj->p", remainder, contrast, remainder)
+    if variance <= 0.0 or by_pass.mean() <= LEAST_SIGNIFICANCE * by_pass.std() / np.sqrt(count):
+        return None
+    return AirNoise(float(variance), float(correlation_time), float(independent))
+
+
+def drift_covariance(system: DriftSystem, air: AirNoise, sigma_um: float) -> Array:
+    """Return what correlated noise adds to the covariance of the drift levels."""
+    rng = np.random.default_rng(_SEED)
+    shape = (system.seconds.size, _REALISATIONS)
+    kept = np.exp(-np.diff(system.seconds) / air.correlation_time_s)
+    correlated = rng.standard_normal(shape)
+    for k, share in enumerate(kept, start=1):
+        correlated[k] = share * correlated[k - 1] + np.sqrt(1.0 - share**2) * correlated[k]
+    white = rng.standard_normal(shape)
+    true = np.sqrt(air.variance_um2) * correlated + np.sqrt(air.independent_um2) * white
+    levels = system.smooth(np.hstack([true, sigma_um * white])).levels
+    of_true, assumed = (
+        np.einsum("kcr,ker->ce", part, part) / (shape[0] * _REALISATIONS) for part in np.split(levels, 2, axis=2)
+    )
+    values, vectors = np.linalg.eigh(of_true - assumed)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
 
 #: Search limits of log10(process noise over reading variance) of either order, in units that make the drift of one hour comparable to the
 #: noise of one reading: from a drift far below the noise to one that hides everything else. A random walk that is a hundred times the noise
-#: passes for noise itself; an integrated one stays smooth, and a good laser reads 10 nm beside 100 um of drift.
+#: passes for noise itself; an integrated one stays smooth, and a good laser reads 10 nm with 100 um of drift.
 _LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.0, 8.0)}
 #: A search that comes as near as this to a limit, decades, ended there: twice the accuracy of the search.
 _AT_LIMIT = 0.06
@@ -49,7 +130,7 @@ _AT_LIMIT = 0.06
 _FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
 _OUTLIER_LIMIT = 3.0
-#: Multiple of that limit beyond which no residual is told from a larger one.
+#: Multiple of that limit beyond which no residual is distinguished from a larger one.
 _LARGEST_EXCESS = 1e6
 #: A whitened column is collinear with those before it where they leave less than this share of its squared length unexplained.
 _DEPENDENCE_TOLERANCE = 1e-10
@@ -130,10 +211,7 @@ class DriftFit:
         return self.response - self.design @ self.coefficients
 
     def drift(self) -> tuple[Array, Array]:
-        """Drift levels at every reading (n, components) and their covariance (n, components, components).
-
-        The covariance holds the smoother's share and that of the estimated coefficients.
-        """
+        """Drift levels at every reading (n, components) and their covariance (n, components, components)."""
         smoothed = self.system.smooth(np.column_stack([self.response, self.design]))
         per_coefficient = smoothed.levels[:, :, 1:]
         levels = smoothed.levels[:, :, 0] - per_coefficient @ self.coefficients
@@ -162,27 +240,7 @@ class DriftFit:
 
 
 def fit_fixed_effects(system: DriftSystem, response: Array, design: Array) -> DriftFit:
-    """Fit fixed effects by generalised least squares, the system's variance ratios as given.
-
-    Parameters
-    ----------
-    system : DriftSystem
-        Of n readings.
-    response : (n,) ndarray
-        Readings, in any unit; those that are not observed do not enter, but must be finite.
-    design : (n, p) ndarray
-        Columns of the fixed effects; they must span the loadings, because the drift starts at zero.
-
-    Returns
-    -------
-    DriftFit
-        sigma^2 is the whitened residual sum of squares over the degrees of freedom.
-
-    Raises
-    ------
-    DriftModelError
-        A value is not finite, a column vanishes or is collinear with those before it, or there are too few readings.
-    """
+    """Fit fixed effects by generalised least squares, the system's variance ratios as given."""
     return _solve(system, _Problem.of(response, design))
 
 
@@ -275,12 +333,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
         guess,
         method="Nelder-Mead",
         bounds=[(low, high)] * components,
-        options={
-            "initial_simplex": simplex,
-            "xatol": 0.03,
-            "fatol": 1e-3,
-            "maxfev": 120 * components,
-        },
+        options={"initial_simplex": simplex, "xatol": 0.03, "fatol": 1e-3, "maxfev": 120 * components},
     )
     return _solve(replace(system, ratios=ratios(optimum.x)), problem)
 
@@ -293,11 +346,7 @@ def _log_ratio_unit(system: DriftSystem) -> Array:
 
 
 def _for_search(system: DriftSystem, problem: _Problem) -> tuple[DriftSystem, _Problem]:
-    """Return the readings by which the variances of the drift are searched for: all, or those of some of very many sites.
-
-    A site is told by its own column of the design. The drift is common to all sites, so that an even choice of them knows its variances
-    hardly worse, while the cost of one likelihood grows with the square of their number. The fixed effects are fitted to all readings.
-    """
+    """Return the readings by which the variances of the drift are searched for: all, or those of some of very many sites."""
     own = (problem.design != 0).mean(axis=0) < 1.0 / _MOST_SITES
     if own.sum() <= _MOST_SITES:
         return system, problem
@@ -319,32 +368,12 @@ def _for_search(system: DriftSystem, problem: _Problem) -> tuple[DriftSystem, _P
 
 
 def settling_noise_scale(seconds: Array, time_s: float, exponent: float) -> Array:
-    """Return a process-noise scale that falls from 1 as a power of the time since the first reading, as in a warm-up.
-
-    A warm-up is a sum of exponentials from fast to slow, whose curvature falls about like that. One constant process noise would be
-    too small at the start: the drift would be smoothed too much there, and its uncertainty stated too small.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s.
-    time_s : float
-        Settling time, s: after it the scale is 2 to the power of -exponent.
-    exponent : float
-
-    Returns
-    -------
-    (n,) ndarray
-        ``(1 + (t - t_0) / time_s) ** -exponent``.
-    """
+    """Return a process-noise scale that falls from 1 as a power of the time since the first reading, as in a warm-up."""
     return (1.0 + (seconds - seconds[0]) / time_s) ** -exponent
 
 
 def _fit_settling(fit: DriftFit) -> DriftFit:
-    """Return the fit with larger process noise at the start, if that raises the restricted log-likelihood by at least 8.
-
-    Later on the process noise stays what it was, though the likelihood would lower it: the rougher drift extrapolates less.
-    """
+    """Return the fit with larger process noise at the start, if that raises the restricted log-likelihood by at least 8."""
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
     first_s = _SETTLING_SHARE * span
@@ -358,7 +387,7 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
         return _solve(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
     def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
-        # Far out in the search the drift hides everything else all the time, or a column vanishes beside it: no model, and not the end.
+        # Far out in the search the drift hides everything else all the time, or a column is negligible against it: no model there.
         mean = np.log10(settling_noise_scale(searched.seconds, time_s, exponent).mean())
         if (log_ratio + mean > largest).any():
             return -np.inf
@@ -397,13 +426,6 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     return _solve(replace(system, process_noise_scale=scale), problem)
 
 
-def _downweight(fit: DriftFit) -> Array:
-    """Relative variances (n,) under which a reading far from the others is down-weighted (redescending weight function)."""
-    # Where the others leave no scatter an outlier is any multiple of it; the square of that has to stay a number.
-    excess = np.minimum(np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT, _LARGEST_EXCESS)
-    return np.where(excess > 1.0, excess**2, 1.0)
-
-
 def estimate(
     seconds: Array,
     loadings: Array,
@@ -417,41 +439,7 @@ def estimate(
     observed: NDArray[np.bool_] | None = None,
     variance: Array | None = None,
 ) -> DriftFit:
-    """Fit fixed effects and the variances of the drift together by restricted maximum likelihood.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, components) ndarray
-        How each drift component enters each reading.
-    response : (n,) ndarray
-        Readings, in any unit; all results are in that unit.
-    design : (n, p) ndarray
-        Columns of the fixed effects; they must span the loadings, because the drift starts at zero.
-    order : {1, 2}, optional
-        1 random walk, 2 integrated random walk; None: chosen by the restricted likelihood with identical fixed effects.
-    robust : bool
-        Down-weight readings whose deletion residual exceeds 3 standard deviations, and repeat.
-    settling : bool
-        Allow larger process noise at the start, as in a warm-up, where the restricted likelihood clearly asks for it.
-    start : (components,) ndarray, optional
-        Variance ratios to start the search from, per s (order 1) or per s^3 (order 2); used with a given order only.
-    observed : (n,) ndarray of bool, optional
-        Readings that inform the fit; the others are predicted in open loop. None: all.
-    variance : (n,) ndarray, optional
-        Relative variances of the readings; None: 1 for all.
-
-    Returns
-    -------
-    DriftFit
-        The start rates of an integrated random walk, per hour, are appended to the design after the caller's columns.
-
-    Raises
-    ------
-    DriftModelError
-        As `drift_system` and `fit_fixed_effects`.
-    """
+    """Fit fixed effects and the variances of the drift together by restricted maximum likelihood."""
     trends = start_columns(seconds, loadings, 2)[:, loadings.shape[1] :]
     with_trends = np.column_stack([design, trends])
 
@@ -474,7 +462,12 @@ def estimate(
     if robust:
         for _ in range(_ROBUST_ROUNDS):
             for _ in range(_ROBUST_PASSES):
-                fit = fit_fixed_effects(replace(fit.system, variance=_downweight(fit)), response, columns)
+                # Relative variances (n,) under which a reading far from the others is down-weighted (redescending weight function).
+                # Where the others leave no scatter an outlier is any multiple of it; the square of that has to stay a number.
+                excess = np.minimum(np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT, _LARGEST_EXCESS)
+                fit = fit_fixed_effects(
+                    replace(fit.system, variance=np.where(excess > 1.0, excess**2, 1.0)), response, columns
+                )
             if (fit.system.variance == 1.0).all():
                 break
             fit = _maximise(fit.system, response, columns, fit.system.ratios)
@@ -482,30 +475,7 @@ def estimate(
 
 
 def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[Array, Array, Array]:
-    """Average the drift that columns imply over the readings, with the exact covariance of the average, in two passes.
-
-    Averages over time need the covariance between different times, which a smoother does not give. The state is therefore augmented
-    with the running average itself (an accumulator): after the last reading the filter knows it as well as smoothing would, and a
-    backward pass gives its covariance with the drift at every reading (Durbin and Koopman 2012, section 4.7).
-
-    Parameters
-    ----------
-    system : DriftSystem
-        Of n readings.
-    weights : (n,) ndarray
-        Weight of each reading in the average.
-    columns : (n, p) ndarray
-        Response and design, or any columns to be filtered.
-
-    Returns
-    -------
-    average : (components, p) ndarray
-        Weighted sum of the smoothed drift of each column, in the units of the columns.
-    covariance : (components, components) ndarray
-        Of the average's error, the coefficients being known, in units of sigma^2.
-    with_drift : (n, components, components) ndarray
-        Covariance of the error of each reading's drift (second axis) with that of the average (third), likewise.
-    """
+    """Average the drift that columns imply over the readings, with the exact covariance of the average, in two passes."""
     weights = np.ascontiguousarray(weights, float)
     state, covariance, predicted, gains = _filter_with_average(
         system.seconds,
@@ -535,11 +505,7 @@ def _filter_with_average(
     weights: Array,
     columns: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Filter with the average as part of the state.
-
-    Returns the last state (size, p) and its covariance (size, size), the predicted covariances of the levels (n, components, size) and
-    the gains (n, size), size being order * components of the drift and components of the average.
-    """
+    """Filter with the average as part of the state."""
     n, components = loadings.shape
     m = components * order
     size = m + components
@@ -572,11 +538,7 @@ def _filter_with_average(
 def _covariance_with_average(
     seconds: Array, loadings: Array, order: int, weights: Array, predicted: Array, gains: Array
 ) -> Array:
-    """Covariance (n, components, components) of the drift at every reading with the average, in units of sigma^2.
-
-    Going back from the last reading, ``onward`` is the product of the transitions, updates and averaging steps that lead from the
-    predicted state of a reading to the final average; the covariance is the predicted one times its transpose.
-    """
+    """Covariance (n, components, components) of the drift at every reading with the average, in units of sigma^2."""
     n, components = loadings.shape
     m = components * order
     size = m + components
@@ -606,30 +568,10 @@ def _covariance_with_average(
 
 
 def von_neumann_p_value(series: Array) -> float:
-    """Return the one-sided p-value of positive serial dependence by the von Neumann ratio.
+    """Return the one-sided p-value of positive serial dependence by the von Neumann ratio; 1 for a constant or too short series.
 
-    Parameters
-    ----------
-    series : (n,) ndarray
-        Values at successive times, in any unit.
-
-    Returns
-    -------
-    float
-        Probability, under independence, of a ratio as small or smaller; 1 for a constant series or fewer than eight values.
-
-    Notes
-    -----
-    The ratio is the sum of the squared successive differences over the sum of squares about the mean. Under independence its
-    expectation is 2 and its variance 4 (n - 2) / (n^2 - 1) (von Neumann 1941, Ann. Math. Stat. 12, 367); a normal distribution is used.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> f"{von_neumann_p_value(np.arange(8.0)):.5f}"
-    '0.00149'
-    >>> f"{von_neumann_p_value(np.tile([1.0, -1.0], 4)):.5f}"
-    '0.99246'
+    The ratio is the sum of the squared successive differences over the sum of squares about the mean. Under independence its expectation
+    is 2 and its variance 4 (n - 2) / (n^2 - 1) (von Neumann 1941, Ann. Math. Stat. 12, 367); a normal distribution is used.
     """
     n = series.size
     if n < _SHORTEST_SERIES or np.ptp(series) == 0:
@@ -638,3 +580,63 @@ def von_neumann_p_value(series: Array) -> float:
     ratio = float((np.diff(series) ** 2).sum() / (centred**2).sum())
     deviation = np.sqrt(4.0 * (n - 2.0) / (n**2 - 1.0))
     return float(special.ndtr((ratio - 2.0) / deviation))
+
+
+# Memory of the noise over the cycles that all positions have alike.
+
+#: Largest order of the autoregression.
+MOST_MEMORY_CYCLES = 3
+
+
+@dataclass(frozen=True)
+class Autoregression:
+    """Autoregression over the cycles.
+
+    Attributes
+    ----------
+    weights : (order,) ndarray
+        Of the values one, two, ... cycles before; empty for noise without memory.
+    innovation_share : float
+        Variance of the innovations over that of the series, 1 without memory.
+    """
+
+    weights: Array
+    innovation_share: float
+
+    @property
+    def long_run(self) -> float:
+        """Variance of a mean over many cycles, over that of independent values with the same scatter."""
+        return self.innovation_share / (1.0 - float(self.weights.sum())) ** 2
+
+    def innovations(self, values: Array) -> Array:
+        """Take the memory from series."""
+        order = self.weights.size
+        if not order:
+            return values
+        whitened = values.copy()
+        for lag, weight in enumerate(self.weights, start=1):
+            whitened[:, lag:] -= weight * values[:, :-lag]
+        whitened[:, :order] = values[:, :order] * np.sqrt(self.innovation_share)
+        return np.asarray(whitened - whitened.mean(axis=1, keepdims=True))
+
+
+def typical_memory(values: Array) -> Autoregression:
+    """Estimate the memory that series have alike."""
+    none = Autoregression(np.empty(0), 1.0)
+    squares = (values**2).sum(axis=1)
+    rows, squares = values[squares > 0], squares[squares > 0]
+    cycles = values.shape[1]
+    if not rows.size or cycles <= MOST_MEMORY_CYCLES:
+        return none
+    lags = range(MOST_MEMORY_CYCLES + 1)
+    typical = np.array([np.median((rows[:, lag:] * rows[:, : cycles - lag]).sum(axis=1) / squares) for lag in lags])
+    best, chosen = 0.0, none
+    for order in range(1, MOST_MEMORY_CYCLES + 1):
+        weights = linalg.solve_toeplitz(typical[:order], typical[1 : order + 1])
+        share = 1.0 - float(weights @ typical[1 : order + 1])
+        if share <= 0.0 or weights.sum() >= 1.0:
+            continue
+        criterion = rows.size * np.log(share) + order * np.log(rows.size)
+        if criterion < best:
+            best, chosen = criterion, Autoregression(weights, share)
+    return chosen

@@ -14,29 +14,19 @@ Arrays share these shapes: n readings, p columns that are filtered alike (respon
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from interferometry._typing import Array
+from interferometry.common import Array, InterferometryError
 
 
 @njit(cache=True)
 def predict_covariance(covariance: Array, order: int, ratios: Array, process_noise_scale: float, step: float) -> None:
-    """Prediction step of the state covariance, in place: P = T P T' + Q (Durbin and Koopman 2012, eq. 4.24).
-
-    Parameters
-    ----------
-    covariance : (m, m) ndarray
-        P, in units of sigma^2; a leading block of a larger matrix moves with the rest of it.
-    order : {1, 2}
-    ratios : (c,) ndarray
-        Process noise over reading variance, per s (order 1) or s^3 (order 2).
-    process_noise_scale : float
-        Factor on the ratios during this step.
-    step : float
-        Time since the reading before, s.
-    """
+    """Prediction step of the state covariance, in place: P = T P T' + Q (Durbin and Koopman 2012, eq. 4.24)."""
     m = covariance.shape[0]
     for c in range(ratios.size):
         level, ratio = c * order, ratios[c] * process_noise_scale
@@ -58,26 +48,7 @@ def predict_covariance(covariance: Array, order: int, ratios: Array, process_noi
 def innovation_variance(
     covariance: Array, order: int, loadings: Array, k: int, variance: float, cross_covariance: Array
 ) -> float:
-    """Innovation variance of one reading, F = Z P Z' + v (Durbin and Koopman 2012, eq. 4.24).
-
-    Parameters
-    ----------
-    covariance : (m, m) ndarray
-        P, predicted, in units of sigma^2.
-    order : {1, 2}
-    loadings : (n, c) ndarray
-    k : int
-        Index of the reading.
-    variance : float
-        Relative variance v of the reading.
-    cross_covariance : (m,) ndarray
-        Overwritten with P Z', the covariance of the state with the reading.
-
-    Returns
-    -------
-    float
-        F, in units of sigma^2.
-    """
+    """Innovation variance of one reading, F = Z P Z' + v (Durbin and Koopman 2012, eq. 4.24)."""
     components = loadings.shape[1]
     for i in range(covariance.shape[0]):
         cross_covariance[i] = 0.0
@@ -91,17 +62,7 @@ def innovation_variance(
 
 @njit(cache=True)
 def update_covariance(covariance: Array, cross_covariance: Array, innovation_variance: float) -> None:
-    """Measurement update of the state covariance, in place: P = P - P Z' Z P / F (Durbin and Koopman 2012, eq. 4.24).
-
-    Parameters
-    ----------
-    covariance : (m, m) ndarray
-        P, in units of sigma^2.
-    cross_covariance : (m,) ndarray
-        P Z' of the reading, from `innovation_variance`.
-    innovation_variance : float
-        F of the reading, in units of sigma^2.
-    """
+    """Measurement update of the state covariance, in place: P = P - P Z' Z P / F (Durbin and Koopman 2012, eq. 4.24)."""
     m = covariance.shape[0]
     precision = 1.0 / innovation_variance
     for i in range(m):
@@ -111,16 +72,7 @@ def update_covariance(covariance: Array, cross_covariance: Array, innovation_var
 
 @njit(cache=True)
 def predict_state(state: Array, order: int, step: float) -> None:
-    """Prediction step of the expected state of every column, in place: a = T a (Durbin and Koopman 2012, eq. 4.24).
-
-    Parameters
-    ----------
-    state : (m, p) ndarray
-        In the units of the columns; rates per s.
-    order : {1, 2}
-    step : float
-        Time since the reading before, s.
-    """
+    """Prediction step of the expected state of every column, in place: a = T a (Durbin and Koopman 2012, eq. 4.24)."""
     if order == 2:
         for c in range(state.shape[0] // 2):
             level, rate = state[2 * c], state[2 * c + 1]
@@ -139,24 +91,7 @@ def update_state(
     innovation_variance: float,
     innovation: Array,
 ) -> None:
-    """Measurement update of the expected state of every column, in place: a = a + P Z' (y - Z a) / F (eq. 4.24).
-
-    Parameters
-    ----------
-    state : (m, p) ndarray
-    order : {1, 2}
-    loadings : (n, c) ndarray
-    k : int
-        Index of the reading.
-    reading : (p,) ndarray
-        Row k of the columns.
-    cross_covariance : (m,) ndarray
-        P Z' of the reading, from `innovation_variance`.
-    innovation_variance : float
-        F of the reading, in units of sigma^2.
-    innovation : (p,) ndarray
-        Overwritten with y - Z a, the one-step prediction error of every column.
-    """
+    """Measurement update of the expected state of every column, in place: a = a + P Z' (y - Z a) / F (eq. 4.24)."""
     for j in range(innovation.size):
         innovation[j] = reading[j]
     for c in range(loadings.shape[1]):
@@ -180,34 +115,7 @@ def filter_covariance(
     observed: NDArray[np.bool_],
     keep: bool,
 ) -> tuple[Array, Array, Array]:
-    """Run the covariance half of the filter over all readings (Durbin and Koopman 2012, section 4.3); it does not need their values.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, c) ndarray
-    order : {1, 2}
-    ratios : (c,) ndarray
-        Process noise over reading variance, per s (order 1) or s^3 (order 2).
-    process_noise_scale : (n,) ndarray
-        Factor on the ratios in the step before each reading.
-    variance : (n,) ndarray
-        Relative variance of each reading.
-    observed : (n,) ndarray of bool
-        Readings that update the state.
-    keep : bool
-        Whether the predicted covariances are needed, for the smoother.
-
-    Returns
-    -------
-    gains : (n, m) ndarray
-        M = P Z' / F; zero for a reading that is not observed.
-    innovation_variances : (n,) ndarray
-        F, in units of sigma^2.
-    covariances : (n, c, m) ndarray
-        Rows of the predicted P of every reading that belong to the levels; (1, c, m) and empty of meaning without `keep`.
-    """
+    """Run the covariance half of the filter over all readings (Durbin and Koopman 2012, section 4.3); it does not need their values."""
     n, components = loadings.shape
     m = components * order
     gains = np.zeros((n, m))
@@ -233,28 +141,7 @@ def filter_covariance(
 def filter_columns(
     seconds: Array, loadings: Array, order: int, gains: Array, columns: Array, keep: bool
 ) -> tuple[Array, Array]:
-    """Run the state half of the filter: the innovations of every column under the same gains.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, c) ndarray
-    order : {1, 2}
-    gains : (n, m) ndarray
-        From `filter_covariance`.
-    columns : (n, p) ndarray
-        Response and design columns.
-    keep : bool
-        Whether the predicted states are needed, for the smoother.
-
-    Returns
-    -------
-    innovations : (n, p) ndarray
-        One-step prediction errors, in the units of the columns.
-    states : (n, c, p) ndarray
-        Levels of the predicted states a; (1, c, p) and empty of meaning without `keep`.
-    """
+    """Run the state half of the filter: the innovations of every column under the same gains."""
     n, components = loadings.shape
     m = gains.shape[1]
     p = columns.shape[1]
@@ -286,34 +173,9 @@ def filter_columns(
 
 @njit(cache=True)
 def whiten_rows(
-    seconds: Array,
-    loadings: Array,
-    order: int,
-    gains: Array,
-    roots: Array,
-    first: int,
-    state: Array,
-    rows: Array,
+    seconds: Array, loadings: Array, order: int, gains: Array, roots: Array, first: int, state: Array, rows: Array
 ) -> None:
-    """Standardise the innovations of some successive readings in place, going on from the state before them.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, c) ndarray
-    order : {1, 2}
-    gains : (n, m) ndarray
-        From `filter_covariance`.
-    roots : (n,) ndarray
-        Square roots of its innovation variances.
-    first : int
-        Index of the first of these readings.
-    state : (m, p) ndarray
-        State after the reading before, zero before the first; overwritten with that after the last of these readings.
-    rows : (some, p) ndarray
-        Columns at these readings; overwritten with their innovations over the roots.
-    """
+    """Standardise the innovations of some successive readings in place, going on from the state before them."""
     p = rows.shape[1]
     for row in range(rows.shape[0]):
         k = first + row
@@ -349,10 +211,7 @@ def _whiten_under_two(
     gains: Array,
     precision: float,
 ) -> None:
-    """Prediction, update and standardised innovation of one reading under two integrated random walks, in one pass over the columns.
-
-    The usual drift of a test, a common shift and a stretch; state and reading are loaded once, not once for every term.
-    """
+    """Prediction, update and standardised innovation of one reading under two integrated random walks, in one pass over the columns."""
     loading, other_loading = loadings[0], loadings[1]
     a, b, c, d = gains[0], gains[1], gains[2], gains[3]
     for j in range(reading.size):
@@ -377,43 +236,7 @@ def smooth(
     states: Array,
     covariances: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Fixed-interval smoother of the levels and of the observation disturbances, in one backward pass.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, c) ndarray
-    order : {1, 2}
-    gains, innovation_variances, covariances : (n, m), (n,), (n, c, m) ndarray
-        From `filter_covariance` with ``keep``.
-    observed : (n,) ndarray of bool
-    innovations, states : (n, p), (n, c, p) ndarray
-        From `filter_columns` with ``keep``; overwritten with the results of the same shape, as those of a long test fill the memory.
-
-    Returns
-    -------
-    levels : (n, c, p) ndarray
-        Smoothed levels, in the units of the columns.
-    level_covariance : (n, c, c) ndarray
-        Their covariance, in units of sigma^2.
-    u : (n, p) ndarray
-        Smoothing errors; ``v u`` is the estimated noise of a reading, ``u / D`` its deletion residual.
-    D : (n,) ndarray
-        Variance of u, in units of 1 / sigma^2; ``1 / D`` is the variance of the deletion residual. Zero where not observed.
-
-    Notes
-    -----
-    Disturbance smoothing, Durbin and Koopman (2012), section 4.5, eq. 4.69, from the last reading to the first, starting at r = 0
-    and N = 0; i is the innovation, because v is the reading's variance here::
-
-        r = T' r                                   N = T' N T
-        u = i / F - M' r                           D = 1 / F + M' N M
-        r = r + Z' u                               N = N + Z' D Z - Z' M' N - N M Z
-
-    State smoothing, section 4.4, eq. 4.44: level = a + P r, covariance = P - P N P. The deletion residual is that of
-    de Jong (1988), J. R. Stat. Soc. B 50, 143.
-    """
+    """Fixed-interval smoother of the levels and of the observation disturbances, in one backward pass."""
     n, components = loadings.shape
     m = gains.shape[1]
     p = innovations.shape[1]
@@ -489,34 +312,7 @@ def normal_equations(
     observed: NDArray[np.bool_],
     columns: Array,
 ) -> tuple[Array, float]:
-    """Gram matrix of the standardised innovations of the observed readings, in one pass over the readings.
-
-    Only the state and the innovations of the last four readings are kept: a likelihood then costs its arithmetic, where a long
-    test would otherwise wait for memory.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, c) ndarray
-    order : {1, 2}
-    ratios : (c,) ndarray
-        Process noise over reading variance, per s (order 1) or s^3 (order 2).
-    process_noise_scale : (n,) ndarray
-        Factor on the ratios in the step before each reading.
-    variance : (n,) ndarray
-        Relative variance of each reading.
-    observed : (n,) ndarray of bool
-    columns : (n, p) ndarray
-        Response and design columns.
-
-    Returns
-    -------
-    gram : (p, p) ndarray
-        Sum over the readings of innovation' innovation / F.
-    log_determinant : float
-        Logarithm of the determinant of the readings' covariance over sigma^2, sum of log F.
-    """
+    """Gram matrix of the standardised innovations of the observed readings, in one pass over the readings."""
     n, components = loadings.shape
     p = columns.shape[1]
     covariance = np.zeros((components * order, components * order))
@@ -561,28 +357,7 @@ def _add_products(gram: Array, innovations: Array, precision: Array) -> None:
 
 @njit(cache=True)
 def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
-    """Sweep a Gram matrix on every design column: least squares, its inverse and its determinant in one go.
-
-    Parameters
-    ----------
-    matrix : (1 + q, 1 + q) ndarray
-        Gram matrix of response (first) and q design columns, each design column scaled to unit length.
-    tolerance : float
-        Share of a column's squared length below which what the columns before it leave unexplained counts as nothing.
-
-    Returns
-    -------
-    swept : (1 + q, 1 + q) ndarray
-        Residual sum of squares at [0, 0], coefficients in column 0, inverse of the design's block.
-    log_determinant : float
-        Of the design's block.
-    dependent : int
-        First design column that depends linearly on those before it; -1 where none does.
-
-    References
-    ----------
-    Goodnight (1979), A tutorial on the SWEEP operator, The American Statistician 33, 149.
-    """
+    """Sweep a Gram matrix on every design column: least squares, its inverse and its determinant in one go."""
     swept = matrix.copy()
     size = swept.shape[0]
     log_determinant = 0.0
@@ -601,3 +376,202 @@ def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
         swept[k] = row
         swept[k, k] = 1.0 / pivot
     return swept, log_determinant, -1
+
+
+# Linear drift model in state-space form: readings' times, loadings and variances, with its filter and smoother.
+
+Order = Literal[1, 2]
+
+#: From so many columns on their products are formed block by block, by products of whole matrices; fewer are multiplied on the way.
+MANY_COLUMNS = 64
+#: Readings of a block.
+_ROWS_AT_ONCE = 256
+
+
+class DriftModelError(InterferometryError):
+    """The readings or columns cannot be fitted; the message names what is wrong and what to do."""
+
+
+class Smoothed(NamedTuple):
+    """What the smoother returns for p columns filtered alike; variances in units of sigma^2.
+
+    Attributes
+    ----------
+    levels : (n, components, p) ndarray
+        Smoothed drift levels, in the units of the columns.
+    level_covariance : (n, components, components) ndarray
+        Covariance of the levels, the columns' coefficients being known.
+    u : (n, p) ndarray
+        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``variance * u`` is the estimated noise of each reading, ``u / D`` its
+        deletion residual, the reading minus its prediction from all others.
+    D : (n,) ndarray
+        Variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.
+    """
+
+    levels: Array
+    level_covariance: Array
+    u: Array
+    D: Array
+
+
+@dataclass(frozen=True)
+class DriftSystem:
+    """Times, loadings and relative variances of n readings, with the process noise of their drift.
+
+    Attributes
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, components) ndarray
+        How each drift component enters each reading.
+    order : {1, 2}
+        1 random walk, 2 integrated random walk.
+    ratios : (components,) ndarray
+        Process noise over reading variance, per s (order 1) or per s^3 (order 2).
+    variance : (n,) ndarray
+        Relative variance of each reading, 1 for an ordinary one.
+    observed : (n,) ndarray of bool
+        False for a held-out reading: it does not update the drift and is predicted in open loop.
+    process_noise_scale : (n,) ndarray or None
+        Factor on the ratios in the step before each reading; None where the process noise is constant.
+    """
+
+    seconds: Array
+    loadings: Array
+    order: Order
+    ratios: Array
+    variance: Array
+    observed: NDArray[np.bool_]
+    process_noise_scale: Array | None = None
+
+    @property
+    def step_scales(self) -> Array:
+        """Factor on the ratios in the step before each reading, (n,); ones where the process noise is constant."""
+        return np.ones(self.seconds.size) if self.process_noise_scale is None else self.process_noise_scale
+
+    def _filter_covariance(self, keep: bool) -> tuple[Array, Array, Array]:
+        return filter_covariance(
+            self.seconds, self.loadings, self.order, self.ratios, self.step_scales, self.variance, self.observed, keep
+        )
+
+    def innovations(self, columns: Array) -> tuple[Array, Array]:
+        """One-step prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
+        gains, innovation_variances, _ = self._filter_covariance(False)
+        innovations, _ = filter_columns(
+            self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), False
+        )
+        return innovations, innovation_variances
+
+    def whitening(self, columns: int) -> Whitening:
+        """Start to whiten so many columns, some readings after others."""
+        gains, innovation_variances, _ = self._filter_covariance(False)
+        return Whitening(self, gains, np.sqrt(innovation_variances), np.zeros((gains.shape[1], columns)))
+
+    def normal_equations(self, columns: Array) -> tuple[Array, float]:
+        """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
+        if columns.shape[1] >= MANY_COLUMNS:
+            whitening = self.whitening(columns.shape[1])
+            gram = np.zeros((columns.shape[1], columns.shape[1]))
+            for start in range(0, columns.shape[0], _ROWS_AT_ONCE):
+                rows = slice(start, start + _ROWS_AT_ONCE)
+                whitened = whitening.whiten(columns[rows].copy())[self.observed[rows]]
+                gram += whitened.T @ whitened
+            return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
+        return normal_equations(
+            self.seconds,
+            self.loadings,
+            self.order,
+            self.ratios,
+            self.step_scales,
+            self.variance,
+            self.observed,
+            np.ascontiguousarray(columns),
+        )
+
+    def whiten(self, columns: Array) -> tuple[Array, float]:
+        """Standardised innovations of the observed readings (n_observed, p), and the log-determinant of their covariance."""
+        innovations, innovation_variances = self.innovations(columns)
+        kept = innovation_variances[self.observed]
+        return innovations[self.observed] / np.sqrt(kept)[:, None], float(np.log(kept).sum())
+
+    def smooth(self, columns: Array) -> Smoothed:
+        """Smooth the drift that columns (n, p) imply, and the noise of every reading."""
+        gains, innovation_variances, covariances = self._filter_covariance(True)
+        filtered = self.seconds, self.loadings, self.order, gains
+        parts = []
+        # The states of all columns at all readings are needed on the way back, not afterwards: some columns at a time.
+        for some in np.array_split(columns, max(1, columns.shape[1] // MANY_COLUMNS), axis=1):
+            innovations, states = filter_columns(*filtered, np.ascontiguousarray(some), True)
+            parts.append(smooth(*filtered, innovation_variances, self.observed, innovations, states, covariances))
+        if len(parts) == 1:
+            return Smoothed(*parts[0])
+        levels, covariance, u, variance = zip(*parts, strict=True)
+        return Smoothed(np.concatenate(levels, axis=2), covariance[0], np.concatenate(u, axis=1), variance[0])
+
+
+@dataclass
+class Whitening:
+    """The filter of many columns on its way through the readings, so that not all readings need be held at once.
+
+    Attributes
+    ----------
+    system : DriftSystem
+        Of n readings.
+    gains : (n, m) ndarray
+        Of the filter.
+    roots : (n,) ndarray
+        Square roots of the innovation variances, in units of sigma.
+    state : (m, p) ndarray
+        Of every column, after the readings so far.
+    done : int
+        Number of these readings.
+    """
+
+    system: DriftSystem
+    gains: Array
+    roots: Array
+    state: Array
+    done: int = 0
+
+    def whiten(self, rows: Array) -> Array:
+        """Standardised innovations of the next readings, (some, p); overwrites ``rows``."""
+        system = self.system
+        whiten_rows(system.seconds, system.loadings, system.order, self.gains, self.roots, self.done, self.state, rows)
+        self.done += rows.shape[0]
+        return rows
+
+
+def start_columns(seconds: Array, loadings: Array, order: Order) -> Array:
+    """Return the fixed effects of the drift's start: its levels, and for an integrated random walk also its rates."""
+    if order == 1:
+        return loadings
+    return np.column_stack([loadings, loadings * (seconds / 3600.0)[:, None]])
+
+
+def drift_system(
+    seconds: Array,
+    loadings: Array,
+    *,
+    order: Order,
+    ratios: Array,
+    variance: Array | None = None,
+    observed: NDArray[np.bool_] | None = None,
+    process_noise_scale: Array | None = None,
+) -> DriftSystem:
+    """Build a drift system from checked, contiguous arrays."""
+    seconds = np.ascontiguousarray(seconds, float)
+    loadings = np.ascontiguousarray(loadings, float)
+    n = seconds.size
+    if loadings.ndim != 2 or loadings.shape[0] != n:
+        raise DriftModelError(f"loadings has shape {loadings.shape}; expected ({n}, number of drift components)")
+    if not np.isfinite(seconds).all() or (np.diff(seconds) < 0).any():
+        raise DriftModelError("seconds must be finite and must not decrease; sort the readings by time first")
+    return DriftSystem(
+        seconds,
+        loadings,
+        order,
+        np.ascontiguousarray(ratios, float),
+        np.ones(n) if variance is None else np.ascontiguousarray(variance, float),
+        np.ones(n, bool) if observed is None else np.ascontiguousarray(observed, bool),
+        None if process_noise_scale is None else np.ascontiguousarray(process_noise_scale, float),
+    )

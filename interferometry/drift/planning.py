@@ -9,8 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy import optimize, special
 
-from interferometry._typing import Array
-from interferometry.errors import InterferometryError
+from interferometry.common import Array, InterferometryError, check_dataset
 
 #: Shares of the final drift whose times are named t63 and t95.
 SHARES = {"t63": 1 - math.exp(-1), "t95": 0.95}
@@ -72,20 +71,16 @@ class Settling:
 
 
 def plan_cycles(
-    estimated: xr.Dataset,
-    deviations: xr.Dataset,
-    *,
-    wanted_u_um: float,
-    lead_mm: float | None = None,
+    deviations: xr.Dataset, estimated: xr.Dataset, *, wanted_u_um: float, lead_mm: float | None = None
 ) -> MeasurementPlan:
     """Return the number of cycles that a wanted standard uncertainty needs, on the machine of a trial.
 
     Parameters
     ----------
+    deviations : xarray.Dataset
+        The trial (keeps ``contract.DEVIATIONS``): its targets, and the duration of its cycle.
     estimated : xarray.Dataset
         What `estimate_drift` returns for the trial.
-    deviations : xarray.Dataset
-        The trial itself (keeps ``contract.DEVIATIONS``): its targets, and the duration of its cycle.
     wanted_u_um : float
         Standard uncertainty of every position against the first one, mean of both directions, um.
     lead_mm : float, optional
@@ -99,7 +94,7 @@ def plan_cycles(
     ------
     InterferometryError
         ``wanted_u_um`` or ``lead_mm`` is not above 0, more than 100,000 cycles would be needed, or no direction of the trial holds
-        every target.
+        every target; or ``deviations`` lack a variable of ``contract.DEVIATIONS``.
 
     Notes
     -----
@@ -117,12 +112,13 @@ def plan_cycles(
     >>> noise = np.random.default_rng(0).normal(0, 0.5, (10, 2, 3))
     >>> time = np.datetime64("2026-03-09T06:30") + (1e9 * seconds).astype("timedelta64[ns]")
     >>> trial = build_deviations(range(1, 11), [1, 2, 3], np.array([0.0, 150.0, 300.0]), noise, time)
-    >>> plan = plan_cycles(estimate_drift(trial), trial, wanted_u_um=0.05, lead_mm=10.0)
+    >>> plan = plan_cycles(trial, estimate_drift(trial), wanted_u_um=0.05, lead_mm=10.0)
     >>> plan.u_um <= 0.05, round(plan.duration_s / plan.cycles)
     (True, 60)
     >>> plan.warnings[0].split(":")[0]
     'every target spacing is a whole number of leads (10 mm)'
     """
+    check_dataset(deviations, "deviations")
     if not wanted_u_um > 0:
         raise InterferometryError(f"wanted_u_um={wanted_u_um} is not above 0")
     measured = int(np.isfinite(deviations["deviation"].values).any(axis=(1, 2)).sum())
@@ -130,37 +126,19 @@ def plan_cycles(
     cycles = max(2, math.ceil(measured * (largest_u / wanted_u_um) ** 2))
     if cycles > LONGEST_SEARCH_CYCLES:
         raise InterferometryError(
-            f"wanted_u_um={wanted_u_um} would need {cycles} cycles with this scatter; ask for more"
+            f"wanted_u_um={wanted_u_um} would need {cycles} cycles with this scatter; allow a larger uncertainty"
         )
-    period = _cycle_period_s(deviations)
+    time = deviations["time"].values.astype("datetime64[ns]")
+    has_times = (~np.isnat(time)).any(axis=(1, 2))
+    starts = np.array([cycle[~np.isnat(cycle)].min() for cycle in time[has_times]])
+    numbers = deviations["cycle"].values[has_times]
+    period = float(np.median(np.diff(starts).astype("f8") * 1e-9 / np.diff(numbers)))
     warnings = [] if lead_mm is None else spacing_warnings(deviations["position"].values, lead_mm=lead_mm)
     return MeasurementPlan(cycles, cycles * period, largest_u * math.sqrt(measured / cycles), tuple(warnings))
 
 
 def spacing_warnings(position_mm: Array, *, lead_mm: float) -> list[str]:
-    """Return a warning where the target spacing hides the periodic error of the screw.
-
-    Parameters
-    ----------
-    position_mm : (target,) ndarray
-        Target positions, mm, in any order.
-    lead_mm : float
-        Lead of the screw, mm.
-
-    Returns
-    -------
-    list of str
-        One warning where every spacing is a whole number of leads within 2 %, else empty.
-
-    Raises
-    ------
-    InterferometryError
-        ``lead_mm`` is not above 0.
-
-    Notes
-    -----
-    ISO 230-2 asks for target positions P_i = (i - 1) p + r, with r a random part within the period of the expected error.
-    """
+    """Return a warning where the target spacing hides the periodic error of the screw."""
     if not lead_mm > 0:
         raise InterferometryError(f"lead_mm={lead_mm} is not above 0")
     leads = np.diff(np.sort(position_mm)) / lead_mm
@@ -185,36 +163,9 @@ def _largest_relative_u(estimated: xr.Dataset) -> float:
     return float(np.sqrt(variance.max()))
 
 
-def _cycle_period_s(deviations: xr.Dataset) -> float:
-    time = deviations["time"].values.astype("datetime64[ns]")
-    has_times = (~np.isnat(time)).any(axis=(1, 2))
-    starts = np.array([cycle[~np.isnat(cycle)].min() for cycle in time[has_times]])
-    numbers = deviations["cycle"].values[has_times]
-    return float(np.median(np.diff(starts).astype("f8") * 1e-9 / np.diff(numbers)))
-
-
-def estimate_settling(estimated: xr.Dataset, deviations: xr.Dataset) -> list[Settling]:
-    """Fit one exponential to each drift component: the time until it has reached 63 % and 95 % of its final value.
-
-    Parameters
-    ----------
-    estimated : xarray.Dataset
-        What `estimate_drift` returns.
-    deviations : xarray.Dataset
-        The deviations that it was estimated from.
-
-    Returns
-    -------
-    list of Settling
-        One per drift component that settles; empty for a stable machine, or a test of fewer than ten cycles.
-
-    Notes
-    -----
-    Least squares over the components of each cycle. Confidence intervals are those of the profile of the sum of squares over the
-    time constant (Bates and Watts 1988, *Nonlinear regression analysis and its applications*, chapter 6), with as many
-    independent residuals as their serial correlation leaves: n (1 - r_1) / (1 + r_1).
-    """
-    seconds, series = _cycle_components(estimated, deviations)
+def estimate_settling(deviations: xr.Dataset, estimated: xr.Dataset) -> list[Settling]:
+    """Fit one exponential to each drift component: the time until it has reached 63 % and 95 % of its final value."""
+    seconds, series = _cycle_components(deviations, estimated)
     if seconds.size < SHORTEST_TEST_CYCLES:
         return []
     names = [str(name) for name in estimated["component"].values]
@@ -222,7 +173,7 @@ def estimate_settling(estimated: xr.Dataset, deviations: xr.Dataset) -> list[Set
     return [settling for settling in fitted if settling is not None]
 
 
-def _cycle_components(estimated: xr.Dataset, deviations: xr.Dataset) -> tuple[Array, Array]:
+def _cycle_components(deviations: xr.Dataset, estimated: xr.Dataset) -> tuple[Array, Array]:
     """Return the middle of each measured cycle (s since the first reading) and its drift components, not smoothed in time."""
     time = deviations["time"].values.astype("datetime64[ns]")
     first = time[~np.isnat(time)].min()

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from interferometry.errors import InterferometryError
+from interferometry.common import InterferometryError
 
 
 class LaserFormatError(InterferometryError):
@@ -14,19 +19,7 @@ class LaserFormatError(InterferometryError):
 
 @dataclass(frozen=True)
 class RejectedLine:
-    """One line of a file that was left out.
-
-    Attributes
-    ----------
-    path : str
-        Name of the file.
-    line : int
-        Its number, from 1.
-    value : str
-        The text that could not be used.
-    reason : str
-        Why, as the predicate of a sentence about the value ("is not a number").
-    """
+    """A line (from 1) of a file (its name) that was left out: its value, and why, as a predicate of the value ("is not a number")."""
 
     path: str
     line: int
@@ -35,15 +28,7 @@ class RejectedLine:
 
 
 class BadReading(InterferometryError):
-    """A line that cannot be used; it is caught by the reader, which lists the line as a `RejectedLine`.
-
-    Parameters
-    ----------
-    value : str
-        The text that could not be used.
-    reason : str
-        Why, as the predicate of a sentence about the value.
-    """
+    """A line that cannot be used, with the text and the reason of a `RejectedLine`."""
 
     def __init__(self, value: str, reason: str) -> None:
         super().__init__(f"{value!r}: {reason}")
@@ -51,38 +36,32 @@ class BadReading(InterferometryError):
         self.reason = reason
 
 
-def unreadable_spreadsheet(path: Path, fault: object) -> LaserFormatError:
-    """Return the error of a spreadsheet that its reader, or the look into it beforehand, cannot take.
+@dataclass
+class LeftOut:
+    """Lines of a file that cannot be used, collected while it is read."""
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-    fault : object
-        What is wrong, as text or exception.
-    """
-    return LaserFormatError(
-        f"{path}: cannot be read as a spreadsheet ({fault}); open it, remove a password if it has one, and save it again as XLSX"
-    )
+    path: Path
+    lines: list[RejectedLine] = field(default_factory=list)
+
+    def add(self, line: int, value: str, reason: str) -> None:
+        """Leave a line out."""
+        self.lines.append(RejectedLine(self.path.name, line, value, reason))
+
+    @contextmanager
+    def collect(self, line: int) -> Iterator[None]:
+        """Leave a line out where its reading raises `BadReading`."""
+        try:
+            yield
+        except BadReading as fault:
+            self.add(line, fault.value, fault.reason)
+
+    def as_json(self) -> str:
+        """Return the lines for the attribute ``left_out`` of a Dataset."""
+        return json.dumps([asdict(line) for line in self.lines])
 
 
 def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine]) -> None:
-    """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        For the message.
-    kept : int
-        Number of lines that can be used.
-    left_out : list of RejectedLine
-        Those that cannot.
-
-    Raises
-    ------
-    LaserFormatError
-        There are no lines, or more lines were left out than kept.
-    """
+    """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings."""
     if kept == 0 and not left_out:
         raise LaserFormatError(f"{path}: no reading below the header; export the measured values again")
     if kept < len(left_out):
@@ -91,3 +70,70 @@ def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine])
             f"{path}: {len(left_out)} of {kept + len(left_out)} lines cannot be used, the first is line {first.line}: "
             f"{first.value!r} {first.reason}; correct that column"
         )
+
+
+# Numbers as instruments and spreadsheets write them: decimal comma or point, thousands, signs, marks for "no
+# reading".
+
+#: Values that instruments write for "no reading"; Renishaw's is -1e20.
+SENTINEL_MAGNITUDE = 1e19
+#: Minus signs of word processors and tables, and spaces that part thousands.
+_SIGNS = str.maketrans({"\u2212": "-", "\u2013": "-", "\uff0d": "-", "\ufe63": "-", "\uff0b": "+"})
+_SPACES = re.compile(r"[\s\u00a0\u2007\u2009\u202f']")
+_NUMBER = re.compile(r"[+-]?(\d+[\d.,]*|[.,]\d+)([eE][+-]?\d+)?")
+#: A separator followed by three digits, once or more, may part thousands.
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
+#: 9999, -99999.999: four nines or more before the point and nothing but nines or zeros behind it.
+_ALL_NINES = re.compile(r"[+-]?9{4,}([.,](9+|0+))?")
+
+
+def parse_number(text: str) -> float:
+    """Return a finite number written with a decimal point; 1e19 or more in magnitude is a mark for "no reading"; raises `BadReading`."""
+    cleaned = text.strip().translate(_SIGNS)
+    try:
+        # Python reads "1_2.5" as 12.5; in a measured file it is a damaged number.
+        value = float("" if "_" in cleaned else cleaned)
+    except ValueError:
+        raise BadReading(text, "is not a number") from None
+    if not math.isfinite(value) or abs(value) >= SENTINEL_MAGNITUDE:
+        raise BadReading(text, "is not a finite number")
+    return value
+
+
+@dataclass(frozen=True)
+class Numerals:
+    """How the numbers of one file are written: the decimal separator, "" where a single separator is the decimal one."""
+
+    decimal: str = ""
+
+    @classmethod
+    def of(cls, texts: Iterable[str]) -> Numerals:
+        """Find the decimal separator from all fields of a file; those that are no numbers are passed over."""
+        seen = set()
+        for text in texts:
+            cleaned = _SPACES.sub("", text.translate(_SIGNS))
+            if _NUMBER.fullmatch(cleaned) and not _THOUSANDS.fullmatch(cleaned):
+                seen |= {max(".,", key=cleaned.rfind)} if ("." in cleaned or "," in cleaned) else set()
+        return cls(seen.pop() if len(seen) == 1 else "")
+
+    def number(self, text: str) -> float:
+        """Return a finite number."""
+        cleaned = _SPACES.sub("", text.strip().translate(_SIGNS))
+        if not _NUMBER.fullmatch(cleaned):
+            return parse_number(text)
+        decimal = self.decimal or max(".,", key=cleaned.rfind)
+        other = "," if decimal == "." else "."
+        whole = cleaned.replace(other, "") if not self.decimal or _groups(cleaned, other) else cleaned
+        return parse_number(whole.replace(decimal, "."))
+
+    def reading(self, text: str) -> float:
+        """Return a measured value: as `number`, but nothing except nines is a mark for "no reading"."""
+        if _ALL_NINES.fullmatch(_SPACES.sub("", text.strip().translate(_SIGNS))):
+            raise BadReading(text, "consists of nines only, a mark for no reading")
+        return self.number(text)
+
+
+def _groups(cleaned: str, separator: str) -> bool:
+    """Return whether a separator parts groups of three digits before the decimal separator."""
+    head = re.split(r"[eE]", cleaned)[0]
+    return re.fullmatch(rf"[+-]?\d{{1,3}}(\{separator}\d{{3}})+([.,]\d*)?", head) is not None

@@ -1,20 +1,98 @@
-"""Readers of Renishaw linear tests (.rtl) and dynamic captures (.rtx)."""
+"""Reader of Renishaw linear tests (.rtl)."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from interferometry.deviations import DIRECTIONS, build_deviations
-from interferometry.io.dates import NO_ZONE
-from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
-from interferometry.io.numerals import SENTINEL_MAGNITUDE, parse_number
+from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, LeftOut, parse_number
+from interferometry.io.tables import NO_ZONE, decode_text
+
+# Logs of positioning tests as the ecmc test tools write them: assignments such as
+# ``REF_DATA_FWD[target,cycle]=value``.
+
+_ASSIGNMENT = re.compile(r"^(TGT_DATA|REF_DATA_FWD|REF_DATA_BWD|UNIT|CYCLES|POSITIONS)(?:\[(\d+)(?:,(\d+))?\])?=(.*)$")
+_UM_PER_UNIT = {"mm": 1e3, "um": 1.0, "m": 1e6}
+#: Digits of the number of a target or cycle; a damaged file may name the billionth.
+_MOST_DIGITS = 5
+_DIRECTION = {"REF_DATA_FWD": 0, "REF_DATA_BWD": 1}
+
+
+def is_ecmc_log(start: bytes) -> bool:
+    """Return whether a file is such a log."""
+    return b"REF_DATA_FWD[" in start or b"TGT_DATA[" in start
+
+
+def read_ecmc_log(path: Path) -> xr.Dataset:
+    """Read a log that holds target and measured positions, but no times."""
+    stated: dict[str, str] = {}
+    target_at: dict[int, float] = {}
+    readings: dict[tuple[int, int, int], float] = {}
+    left_out = LeftOut(path)
+    for line, text in enumerate(decode_text(path, path.read_bytes()).splitlines(), start=1):
+        match = _ASSIGNMENT.match(text.strip())
+        if match is None:
+            continue
+        name, target, cycle, value = match.groups()
+        if target is None:
+            stated[name] = value.strip()
+            continue
+        with left_out.collect(line):
+            number = parse_number(value)
+            needed = [target] if name == "TGT_DATA" else [target, cycle]
+            if not all(index and len(index) <= _MOST_DIGITS and int(index) > 0 for index in needed):
+                raise BadReading(text, "names no target or cycle from 1")
+            if name == "TGT_DATA":
+                target_at[int(target)] = number
+            else:
+                readings[int(cycle) - 1, _DIRECTION[name], int(target) - 1] = number
+    unit = stated.get("UNIT", "mm")
+    if unit not in _UM_PER_UNIT:
+        raise LaserFormatError(f"{path}: UNIT={unit} is not known; use one of {', '.join(_UM_PER_UNIT)}")
+    cycles, targets = _counts(path, stated, target_at, readings)
+    scale = _UM_PER_UNIT[unit]
+    position = np.array([target_at[target] for target in range(1, targets + 1)])
+    deviation = np.full((cycles, 2, targets), np.nan)
+    for index, measured in readings.items():
+        deviation[index] = (measured - position[index[2]]) * scale
+    time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
+    dataset = build_deviations(range(1, cycles + 1), range(1, targets + 1), position * scale / 1e3, deviation, time)
+    dataset["time"].attrs.update(origin="none", reference="the file holds no times")
+    missing = int(np.isnan(deviation).sum())
+    dataset.attrs.update(source=path.name, left_out=left_out.as_json(), missing=missing)
+    return dataset
+
+
+def _counts(
+    path: Path, stated: dict[str, str], target_at: dict[int, float], readings: dict[tuple[int, int, int], float]
+) -> tuple[int, int]:
+    """Return the numbers of cycles and targets, after comparing those that were read with those that the file states."""
+    if not target_at or not readings:
+        raise LaserFormatError(f"{path}: no TGT_DATA or no REF_DATA_FWD/REF_DATA_BWD; export the test again")
+    targets, cycles = max(target_at), max(index[0] for index in readings) + 1
+    if sorted(target_at) != list(range(1, targets + 1)) or max(index[2] for index in readings) + 1 > targets:
+        raise LaserFormatError(
+            f"{path}: TGT_DATA gives targets {sorted(target_at)}, but readings refer to others; give each its position"
+        )
+    empty = sorted(set(range(cycles)) - {index[0] for index in readings})
+    if empty:
+        raise LaserFormatError(
+            f"{path}: there is a cycle {cycles}, but no reading of cycle {empty[0] + 1}; the file is damaged, export the test again"
+        )
+    for name, count in (("CYCLES", cycles), ("POSITIONS", targets)):
+        if name in stated and stated[name] != str(count):
+            raise LaserFormatError(
+                f"{path}: {name}={stated[name]}, but {count} were found; the file is cut short or joined from two, export the test again"
+            )
+    return cycles, targets
+
 
 #: A temperature sensor that is not connected reads -10 degC.
 UNCONNECTED_DEGC = -10.0
@@ -24,6 +102,10 @@ _TIME = re.compile(r"(\d{4})[-/.](\d\d)[-/.](\d\d)[ T]+(\d\d):(\d\d):(\d)(\d?)")
 #: "10:46 Dec 12 2016", without seconds.
 _TIME_WITHOUT_SECONDS = re.compile(r"(\d\d):(\d\d) ([A-Z][a-z]{2}) (\d\d?) (\d{4})")
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+
+
+#: Name of a section -> its lines with their numbers.
+_Sections = dict[str, list[tuple[int, str]]]
 
 
 @dataclass
@@ -39,40 +121,9 @@ class _Run:
         return not any(math.isfinite(value) for value in self.deviations)
 
 
-def read_rtl(
-    path: Path, *, feed_mm_per_min: float | None = None, dwell_s: float | None = None, encoding: str = "latin-1"
-) -> xr.Dataset:
-    """Read a Renishaw linear test.
-
-    Runs become cycles and directions by the order in which their targets were measured: towards larger positions is positive.
-    Readings that the file marks with -1e20 are missing. The times of readings, which the file does not hold, are reconstructed
-    from its start and end.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    feed_mm_per_min : float, optional
-        Feed between targets, mm/min.
-    dwell_s : float, optional
-        Time at rest at each target, s. With both, the remaining duration of the test is given to the turns between runs; otherwise
-        readings are spread evenly.
-    encoding : str
-        Of the user text, whose keys and values are in the language of the program that wrote the file.
-
-    Returns
-    -------
-    xarray.Dataset
-        Keeps ``contract.DEVIATIONS``, with ``time_u``, the standard uncertainty of reconstructed times (s); and at ``instant``
-        start and end: ``air_temperature`` (degC), ``air_pressure`` (hPa), ``relative_humidity`` (percent),
-        ``material_temperature`` (sensor; degC, NaN where not connected), ``environment_factor`` (um per count),
-        ``expansion_coefficient`` (ppm/K).
-
-    Raises
-    ------
-    LaserFormatError
-        The file is cut short, is not a linear test, or contradicts its own header.
-    """
-    sections = _split_sections(path, path.read_bytes().decode(encoding))
+def read_rtl(path: Path, *, feed_mm_per_min: float | None = None, dwell_s: float | None = None) -> xr.Dataset:
+    """Read a Renishaw linear test."""
+    sections = _split_sections(path, path.read_bytes().decode("latin-1"))
     kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
     if kind.lower() != "rtl":
         raise LaserFormatError(
@@ -80,7 +131,9 @@ def read_rtl(
         )
     targets = _parse_targets(path, sections)
     runs, left_out = _parse_runs(path, sections, len(targets))
-    notes = _clear_filled_runs(runs, _is_unidirectional(sections))
+    # The second of the flags says that the test was measured in one direction.
+    flags = _keyed(sections["TARGET DATA"]).get("flags", "").split()
+    notes = _clear_filled_runs(runs, unidirectional=flags[1:2] == ["1"])
     start, end, start_u = _parse_test_times(sections)
     schedule, schedule_u = _rebuild_schedule(runs, targets, start, end, feed_mm_per_min, dwell_s)
     deviation, seconds = _lay_out(runs, targets, schedule)
@@ -97,13 +150,15 @@ def read_rtl(
         named = {"units": "s", "long_name": "standard uncertainty of time"}
         dataset["time_u"] = ((), math.hypot(start_u, schedule_u), named)
     dataset = dataset.assign(_parse_environment(sections))
+    # Keys of the user text are localised, their order is not.
+    values = [content.split(":", 1)[1].strip() for _, content in sections.get("USER-TEXT", []) if ":" in content]
     dataset.attrs.update(
         source=path.name,
-        left_out=json.dumps([asdict(line) for line in left_out]),
+        left_out=left_out.as_json(),
         missing=int(np.isnan(deviation).sum()),
         runs_empty=json.dumps([run.number for run in runs if run.is_empty]),
         notes=json.dumps(notes),
-        user_text=json.dumps(_parse_user_text(sections)),
+        user_text=json.dumps(dict(zip(USER_TEXT, values, strict=False))),
     )
     return dataset
 
@@ -121,8 +176,8 @@ def _lay_out(runs: list[_Run], targets: np.ndarray, schedule: list[np.ndarray]) 
     return deviation, seconds
 
 
-def _split_sections(path: Path, text: str) -> dict[str, list[tuple[int, str]]]:
-    sections: dict[str, list[tuple[int, str]]] = {}
+def _split_sections(path: Path, text: str) -> _Sections:
+    sections: _Sections = {}
     current: list[tuple[int, str]] = []
     for line, content in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
         if content.rstrip().endswith("::") and content[:1].isalpha():
@@ -137,11 +192,6 @@ def _split_sections(path: Path, text: str) -> dict[str, list[tuple[int, str]]]:
     return sections
 
 
-def _is_unidirectional(sections: dict[str, list[tuple[int, str]]]) -> bool:
-    """Return whether the second of the flags says that the test was measured in one direction."""
-    return _keyed(sections["TARGET DATA"]).get("flags", "").split()[1:2] == ["1"]
-
-
 def _clear_filled_runs(runs: list[_Run], unidirectional: bool) -> list[str]:
     """Take the zeros with which some programs fill the reverse runs of a unidirectional test as missing; return what to tell."""
     zero = [run for run in runs if run.deviations and all(value == 0 for value in run.deviations)]
@@ -149,7 +199,7 @@ def _clear_filled_runs(runs: list[_Run], unidirectional: bool) -> list[str]:
         return []
     named = ", ".join(str(run.number) for run in zero)
     if not unidirectional:
-        return [f"warning: every reading of run {named} is 0: a run that was filled in and not measured?"]
+        return [f"warning: every reading of run {named} is 0: was it filled in instead of measured?"]
     for run in zero:
         run.deviations = [math.nan] * len(run.deviations)
     return [
@@ -172,7 +222,7 @@ def _key(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np.ndarray:
+def _parse_targets(path: Path, sections: _Sections) -> np.ndarray:
     section = sections["TARGET DATA"]
     count = _whole(path, section, "Target-count", 0)
     begin = next((i for i, (_, content) in enumerate(section) if re.match(r"Targets\s*:", content)), None)
@@ -201,7 +251,7 @@ def _whole(path: Path, section: list[tuple[int, str]], name: str, default: int) 
         return default
     if not re.fullmatch(r"\d{1,9}", text):
         raise LaserFormatError(
-            f"{path}, line {line}: {name} is {text!r} and no whole number; copy the file again from the measuring computer"
+            f"{path}, line {line}: {name} is {text!r} and not a whole number; copy the file again from the measuring computer"
         )
     return int(text)
 
@@ -214,34 +264,27 @@ def _decimal(word: str) -> float:
     return value
 
 
-def _parse_runs(
-    path: Path, sections: dict[str, list[tuple[int, str]]], targets: int
-) -> tuple[list[_Run], list[RejectedLine]]:
+def _parse_runs(path: Path, sections: _Sections, targets: int) -> tuple[list[_Run], LeftOut]:
     runs: dict[int, _Run] = {}
-    left_out: list[RejectedLine] = []
+    left_out = LeftOut(path)
     for line, content in sections["DEVIATIONS"]:
         words = content.replace(",", ".").split()
         if words[0] == "Run":
             continue
         try:
-            run, target, value = (_decimal(word) for word in words[:3])
-            run, target = int(words[0]), int(words[1])
-        except ValueError:
-            left_out.append(RejectedLine(path.name, line, content.strip(), "is not 'run target deviation'"))
+            run, target, value = int(words[0]), int(words[1]), _decimal(words[2])
+        except (ValueError, IndexError):
+            left_out.add(line, content.strip(), "is not 'run target deviation'")
             continue
+        rows = runs.get(run) or _Run(run)
         if not 1 <= target <= targets or run < 1:
-            left_out.append(
-                RejectedLine(path.name, line, content.strip(), f"names no run from 1 or no target of 1..{targets}")
-            )
-            continue
-        rows = runs.setdefault(run, _Run(run))
-        if target in rows.targets:
-            left_out.append(
-                RejectedLine(path.name, line, content.strip(), f"repeats run {run} target {target}, the first is kept")
-            )
-            continue
-        rows.targets.append(target)
-        rows.deviations.append(value if abs(value) < SENTINEL_MAGNITUDE else math.nan)
+            left_out.add(line, content.strip(), f"names no run from 1 or no target of 1..{targets}")
+        elif target in rows.targets:
+            left_out.add(line, content.strip(), f"repeats run {run} target {target}, the first is kept")
+        else:
+            runs[run] = rows
+            rows.targets.append(target)
+            rows.deviations.append(value if abs(value) < SENTINEL_MAGNITUDE else math.nan)
     stated = _whole(path, sections.get("RUNS", []), "Run-count", max(runs, default=0))
     if not runs or max(runs) > stated:
         raise LaserFormatError(
@@ -259,9 +302,7 @@ def _direction(run: _Run, targets: np.ndarray) -> str:
     return DIRECTIONS[0] if travel > 0 else DIRECTIONS[1]
 
 
-def _parse_test_times(
-    sections: dict[str, list[tuple[int, str]]],
-) -> tuple[np.datetime64 | None, np.datetime64 | None, float]:
+def _parse_test_times(sections: _Sections) -> tuple[np.datetime64 | None, np.datetime64 | None, float]:
     """Return start, end and the standard uncertainty of the start in s: 10 or 60 s / sqrt(12) where a digit or the seconds are lost."""
     text = _keyed(sections.get("ENVIRONMENT", [])).get("datetime", "")
     times, lost = [], 0.0
@@ -288,10 +329,7 @@ def _rebuild_schedule(
     feed_mm_per_min: float | None,
     dwell_s: float | None,
 ) -> tuple[list[np.ndarray], float]:
-    """Return, per run, seconds since the start of the test, and their standard uncertainty.
-
-    Runs without a reading took no time. The uncertainty is that of one step taken as a rectangle of its half width.
-    """
+    """Return, per run, seconds since the start of the test, and their standard uncertainty."""
     measured = [run for run in runs if not run.is_empty]
     count = sum(len(run.targets) for run in measured)
     duration = float((end - start) / np.timedelta64(1, "s")) if start is not None and end is not None else 0.0
@@ -317,9 +355,7 @@ def _rebuild_schedule(
     return schedule, max(step, turn) / (2 * math.sqrt(3))
 
 
-def _parse_environment(
-    sections: dict[str, list[tuple[int, str]]],
-) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
+def _parse_environment(sections: _Sections) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
     keyed = _keyed(sections.get("ENVIRONMENT", []))
     wanted = (
         ("airtemp", "air_temperature", "degC", 1.0),
@@ -348,83 +384,3 @@ def _pair(text: str) -> np.ndarray:
         except BadReading:
             values.append(math.nan)
     return np.array([*values, math.nan, math.nan][:2])
-
-
-def _parse_user_text(sections: dict[str, list[tuple[int, str]]]) -> dict[str, str]:
-    """Return the user text by English names: keys are localised, their order is not."""
-    values = [content.split(":", 1)[1].strip() for _, content in sections.get("USER-TEXT", []) if ":" in content]
-    return dict(zip(USER_TEXT, values, strict=False))
-
-
-def read_rtx(path: str | Path) -> xr.Dataset:
-    """Read a Renishaw dynamic capture.
-
-    Parameters
-    ----------
-    path : str or pathlib.Path
-
-    Returns
-    -------
-    xarray.Dataset
-        Dim sample: ``displacement`` (mm) and ``seconds`` (s since the first sample); the header in ``attrs["header"]`` as JSON.
-
-    Raises
-    ------
-    LaserFormatError
-        A marker is missing, no sample rate is given, the number of samples is not the one stated, or a sample is no number.
-    """
-    path = Path(path)
-    content = path.read_bytes()
-    begin, end = content.find(b"Data:\r\n"), content.rfind(b"EOF::")
-    if not content.startswith(b"HEADER::") or begin < 0 or end < 0:
-        raise LaserFormatError(
-            f"{path}: HEADER::, Data: or EOF:: is missing; the file is not a complete .rtx, copy it again"
-        )
-    lines = [
-        (number, line)
-        for number, line in enumerate(content[:begin].decode("latin-1").split("\r\n"), start=1)
-        if ":" in line and not line.endswith("::")
-    ]
-    header = {line.split(":", 1)[0].strip(): line.split(":", 1)[1].strip() for _, line in lines}
-    keyed = _keyed(lines)
-    data = content[begin + len(b"Data:\r\n") : end]
-    rate = _header_number(path, lines, "Actual sample rate") or _header_number(path, lines, "Sample rate") or 0.0
-    if rate <= 0:
-        raise LaserFormatError(
-            f"{path}: no 'Actual sample rate' or 'Sample rate' above 0 in the header; copy it again from the measuring computer"
-        )
-    usable = len(data) // 8 * 8
-    displacement = np.frombuffer(data[:usable], dtype="<f8")
-    stated = displacement.size if "sampleno" not in keyed else _header_number(path, lines, "Sample no")
-    if stated != displacement.size:
-        raise LaserFormatError(
-            f"{path}: 'Sample no' is {keyed['sampleno']}, but {displacement.size} samples follow; the file is cut short, "
-            "copy it again from the measuring computer"
-        )
-    damaged = np.flatnonzero(~np.isfinite(displacement) | (np.abs(displacement) >= SENTINEL_MAGNITUDE))
-    if damaged.size:
-        raise LaserFormatError(
-            f"{path}: {damaged.size} of {displacement.size} samples are no numbers, the first is sample {damaged[0] + 1}; "
-            "the file is damaged, copy it again from the measuring computer"
-        )
-    return xr.Dataset(
-        {
-            "displacement": (("sample",), displacement.astype("f8"), {"units": "mm"}),
-            "seconds": (("sample",), np.arange(displacement.size) / rate, {"units": "s"}),
-        },
-        attrs={"source": path.name, "header": json.dumps(header)},
-    )
-
-
-def _header_number(path: Path, lines: list[tuple[int, str]], name: str) -> float | None:
-    """Return the number that a line of the header gives, None without such a line."""
-    for line, content in lines:
-        key, _, text = content.partition(":")
-        if key.strip().lower() == name.lower() and text.strip():
-            try:
-                return parse_number(text.strip().replace(",", "."))
-            except BadReading as fault:
-                raise LaserFormatError(
-                    f"{path}, line {line}: {name} is {fault.value!r}, which {fault.reason}; copy the file again"
-                ) from None
-    return None

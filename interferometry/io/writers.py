@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from interferometry.errors import InterferometryError
+from interferometry.common import InterferometryError
 
 #: Lines of the ENVIRONMENT block: key of the argument, label in the file, factor to the file's unit.
 _ENVIRONMENT = (
@@ -70,7 +71,7 @@ def write_rtl(
     >>> from pathlib import Path
     >>> import numpy as np
     >>> from interferometry.deviations import build_deviations
-    >>> from interferometry.io.readers import read_deviations
+    >>> from interferometry.io.readings import read_deviations
     >>> time = np.datetime64("2026-03-09T06:30") + np.array([[[0, 6], [20, 14]]], "timedelta64[s]")
     >>> test = build_deviations([1], [1, 2], [0.0, 100.0], np.array([[[0.1, 1.2], [0.5, 1.6]]]), time)
     >>> path = Path(tempfile.mkdtemp()) / "laser.rtl"
@@ -88,7 +89,14 @@ def write_rtl(
     lines += ["Flags: 0 0 2 1", "", "USER-TEXT::"]
     lines += [f"{label}:{user_text.get(name, '')}" for name, label in _USER_TEXT]
     lines += ["", "RUNS::", f"Run-count:{2 * deviations.sizes['cycle']}", "", "DEVIATIONS::", "Run Target Data:"]
-    lines += _deviation_rows(deviations)
+    # A run along falling positions is stored last target first.
+    along = np.argsort(deviations["position"].values, kind="stable")
+    values = np.nan_to_num(deviations["deviation"].values, nan=-1e20)
+    for cycle in range(values.shape[0]):
+        for direction, name in enumerate(deviations["direction"].values):
+            order = along if name == "positive" else along[::-1]
+            run = 2 * cycle + direction + 1
+            lines += [f"{run:<3d} {i + 1:<4d} {values[cycle, direction, i]:10.4f}" for i in order]
     lines += ["", "ENVIRONMENT::"]
     for name, label, factor in _ENVIRONMENT:
         if name in environment:
@@ -107,19 +115,6 @@ def _raise_if_unknown(argument: str, given: Mapping[str, object], allowed: list[
         )
 
 
-def _deviation_rows(deviations: xr.Dataset) -> list[str]:
-    """Return the rows of all runs; a run along falling positions is stored last target first."""
-    along = np.argsort(deviations["position"].values, kind="stable")
-    values = np.nan_to_num(deviations["deviation"].values, nan=-1e20)
-    rows = []
-    for cycle in range(values.shape[0]):
-        for direction, name in enumerate(deviations["direction"].values):
-            order = along if name == "positive" else along[::-1]
-            run = 2 * cycle + direction + 1
-            rows += [f"{run:<3d} {i + 1:<4d} {values[cycle, direction, i]:10.4f}" for i in order]
-    return rows
-
-
 def _test_times(deviations: xr.Dataset, start: np.datetime64 | None, end: np.datetime64 | None) -> list[str]:
     times = deviations["time"].values
     times = times[~np.isnat(times)]
@@ -132,62 +127,29 @@ def _test_times(deviations: xr.Dataset, start: np.datetime64 | None, end: np.dat
 
 
 def write_deviations_csv(path: str | Path, deviations: xr.Dataset) -> None:
-    """Write readings in measuring order as CSV, with the columns cycle, direction, target, position_mm, time, deviation_um.
-
-    Missing readings, and readings without a time, have no line.
-
-    Parameters
-    ----------
-    path : str or pathlib.Path
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    """
-    present = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
-    times = deviations["time"].values
-    cells = sorted(zip(*np.nonzero(present), strict=True), key=lambda cell: times[cell])
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("cycle", "direction", "target", "position_mm", "time", "deviation_um"))
-        for cycle, direction, target in cells:
-            writer.writerow(
-                (
-                    int(deviations["cycle"].values[cycle]),
-                    str(deviations["direction"].values[direction]),
-                    int(deviations["target"].values[target]),
-                    f"{deviations['position'].values[target]:.6g}",
-                    _iso_utc(times[cycle, direction, target]),
-                    f"{deviations['deviation'].values[cycle, direction, target]:.4f}",
-                )
-            )
+    """Write readings in measuring order as CSV, with the columns cycle, direction, target, position_mm, time, deviation_um."""
+    cells = deviations[["deviation", "time", "position"]].to_dataframe().reset_index()
+    readings = cells.dropna(subset=["deviation", "time"]).sort_values("time", kind="stable")
+    table: dict[str, Any] = {
+        **{name: readings[name].to_numpy() for name in ("cycle", "direction", "target")},
+        "position_mm": [f"{value:.6g}" for value in readings["position"]],
+        "time": _iso_utc(readings["time"].to_numpy()),
+        "deviation_um": [f"{value:.4f}" for value in readings["deviation"]],
+    }
+    _write_csv(path, table)
 
 
 def write_environment_csv(path: str | Path, environment: xr.Dataset) -> None:
-    """Write air and material conditions as CSV, in the form that `read_environment` reads.
-
-    Parameters
-    ----------
-    path : str or pathlib.Path
-    environment : xarray.Dataset
-        Dim time (UTC): ``air_temperature`` (degC), ``air_pressure`` (hPa), ``relative_humidity`` (percent),
-        ``material_temperature`` (degC).
-    """
-    names = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
-    columns = [environment[name].values for name in names]
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(
-            (
-                "time",
-                "air_temperature_degC",
-                "air_pressure_hPa",
-                "relative_humidity_percent",
-                "material_temperature_degC",
-            )
-        )
-        for time, *values in zip(environment["time"].values, *columns, strict=True):
-            writer.writerow((_iso_utc(time), *(f"{value:.4f}" for value in values)))
+    """Write air and material conditions as CSV, in the form that `read_environment` reads."""
+    table = {"time": _iso_utc(environment["time"].values)}
+    for column, *_ in _ENVIRONMENT[:4]:
+        table[column] = [f"{value:.4f}" for value in environment[column.rpartition("_")[0]].values]
+    _write_csv(path, table)
 
 
-def _iso_utc(time: np.datetime64) -> str:
-    milliseconds = time.astype("datetime64[ms]")
-    return f"{milliseconds}+00:00"
+def _write_csv(path: str | Path, table: Mapping[str, Sequence[str] | np.ndarray]) -> None:
+    pd.DataFrame(table).to_csv(path, index=False, encoding="utf-8", lineterminator="\n")
+
+
+def _iso_utc(times: np.ndarray) -> list[str]:
+    return [f"{time}+00:00" for time in times.astype("datetime64[ms]")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -11,6 +12,18 @@ from scipy.special import fdtrc
 
 from interferometry.drift.planning import Settling, spacing_warnings
 from interferometry.iso230.evaluation import STANDARD_CYCLES
+
+# Whether a quantity keeps its tolerance, with its uncertainty.
+
+Decision = Literal["pass", "fail", "not decided within the uncertainty"]
+
+
+def decide(value: float, expanded_u: float, limit: float) -> Decision:
+    """Judge a quantity with its expanded uncertainty (k = 2) against its upper limit (ISO 14253-1)."""
+    if value + expanded_u <= limit:
+        return "pass"
+    return "fail" if value - expanded_u > limit else "not decided within the uncertainty"
+
 
 #: Least number of target positions, and per metre of travel; travel in mm above which the standard has another test.
 LEAST_TARGETS, TARGETS_PER_METRE, LONGEST_TRAVEL_MM = 5, 5, 2000.0
@@ -22,17 +35,7 @@ _SIGNIFICANT = 0.01
 
 @dataclass(frozen=True)
 class ConditionCheck:
-    """One condition of a test.
-
-    Attributes
-    ----------
-    name : str
-        What is asked for.
-    met : bool or None
-        None where the readings do not tell.
-    evidence : str
-        What was found, as a sentence.
-    """
+    """One condition of a test: what is asked for, whether it is met (None: the readings do not tell), and the evidence in a sentence."""
 
     name: str
     met: bool | None
@@ -46,32 +49,7 @@ def check_conditions(
     lead_mm: float | None = None,
     settling: Sequence[Settling] | None = None,
 ) -> list[ConditionCheck]:
-    """Check what ISO 230-2 asks of a test of a linear axis.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    cycles : sequence of int
-        Cycles of the window that is evaluated.
-    lead_mm : float, optional
-        Lead of the screw, mm; None: the spacing is not compared with it.
-    settling : sequence of Settling, optional
-        What `interferometry.drift.planning.estimate_settling` returns; None where the drift could not be estimated.
-
-    Returns
-    -------
-    list of ConditionCheck
-
-    Raises
-    ------
-    InterferometryError
-        ``lead_mm`` is not above 0.
-
-    Notes
-    -----
-    ISO 230-2:2014, clauses 3.1 and 5.3 (targets, spacing, cycles; axes up to 2 m) and the warm-up that it asks for.
-    """
+    """Check what ISO 230-2 asks of a test of a linear axis."""
     position = np.sort(deviations["position"].values)
     checks = [_targets(position), _travel(position), _spacing(position, lead_mm)]
     return [*checks, _cycles(cycles), _completeness(deviations, cycles), _settled(deviations, cycles, settling)]
@@ -79,10 +57,10 @@ def check_conditions(
 
 def _targets(position: np.ndarray) -> ConditionCheck:
     travel_m = 1e-3 * float(np.ptp(position))
-    asked = max(LEAST_TARGETS, int(np.ceil(TARGETS_PER_METRE * travel_m)))
+    required = max(LEAST_TARGETS, int(np.ceil(TARGETS_PER_METRE * travel_m)))
     name = f"at least {LEAST_TARGETS} targets, and {TARGETS_PER_METRE} per metre"
     return ConditionCheck(
-        name, position.size >= asked, f"{position.size} targets over {1e3 * travel_m:g} mm; asked for: {asked}."
+        name, position.size >= required, f"{position.size} targets over {1e3 * travel_m:g} mm; required: {required}."
     )
 
 
@@ -140,7 +118,7 @@ def _settled(deviations: xr.Dataset, cycles: Sequence[int], settling: Sequence[S
                 name,
                 False,
                 f"The deviations still change within the cycles evaluated, by up to {change_um:.2g} µm (straight lines over the cycles, "
-                f"F test, p < {_SIGNIFICANT:g}), and no end of that is seen.",
+                f"F test, p < {_SIGNIFICANT:g}), without levelling off.",
             )
         return ConditionCheck(name, True, "No part of the drift settles during the test: none looks like a warm-up.")
     last = max(settling, key=lambda part: part.t95_s)
@@ -152,11 +130,7 @@ def _settled(deviations: xr.Dataset, cycles: Sequence[int], settling: Sequence[S
 
 
 def _change_within(window: xr.Dataset) -> tuple[float, float]:
-    """Largest change of a position over the cycles, um, by straight lines, and the p-value of "no position changes".
-
-    The F test compares the lines of all positions and approaches that were read in every cycle with the scatter about them; a drift
-    that is no straight line widens that scatter, so that the test is rather too careful.
-    """
+    """Largest change of a position over the cycles, um, by straight lines, and the p-value of "no position changes"."""
     values = window["deviation"].transpose("cycle", "direction", "target").values.reshape(window.sizes["cycle"], -1)
     values = values[:, np.isfinite(values).all(axis=0)]
     cycles, series = values.shape

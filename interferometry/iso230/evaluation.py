@@ -14,19 +14,26 @@ In this order: the evaluation of one window; windows along a test and which of t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 import xarray as xr
 from scipy import special
 
+from interferometry.common import InterferometryError, check_dataset
 from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
-from interferometry.contract import check_dataset
 from interferometry.deviations import DIRECTIONS
-from interferometry.errors import InterferometryError
-from interferometry.iso230.budget import CONTRIBUTIONS, SCATTER_ALONE, Iso230Budget
-from interferometry.iso230.quantities import axis_quantities, target_quantities
-from interferometry.iso230.uncertainty import AXIS, ONE_WAY, UncertainTest
+from interferometry.iso230.uncertainty import (
+    AXIS,
+    CONTRIBUTIONS,
+    ONE_WAY,
+    SCATTER_ALONE,
+    Iso230Budget,
+    UncertainTest,
+    axis_quantities,
+    target_quantities,
+)
 
 #: Quantities of the axis: reversal error, bidirectional repeatability, bidirectional systematic positioning error, mean bidirectional
 #: positioning error, bidirectional accuracy.
@@ -163,35 +170,11 @@ def evaluate_windows(
     drift: xr.DataArray | None = None,
     material_degC: xr.DataArray | None = None,
 ) -> xr.Dataset:
-    """Evaluate windows of a few cycles along a long test, and the whole test as the last window.
-
-    Within a window of the standard's length the drift is small; between windows it shows as a change of the means, and in the last
-    window as larger R and A.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-    length : int
-        Cycles of a window.
-    budget, drift, material_degC
-        See `evaluate_iso230`.
-
-    Returns
-    -------
-    xarray.Dataset
-        What `evaluate_iso230` returns for the axis and per direction, along ``window``, whose coordinate names the cycles;
-        ``first_cycle``, ``middle_cycle`` and ``last_cycle`` are those of each. Windows in which no target has two readings are not
-        listed; a test shorter than one window is its only window.
-
-    Raises
-    ------
-    InterferometryError
-        No target has two readings in the whole test.
-    """
+    """Evaluate windows of a few cycles along a long test, and the whole test as the last window."""
     numbers = deviations["cycle"].values.tolist()
     windows = [numbers[start : start + length] for start in range(0, len(numbers) - length + 1, length)]
-    windows = [window for window in windows if _can_be_evaluated(deviations.sel(cycle=window))] + [numbers]
+    repeated = [(deviations["deviation"].sel(cycle=window).count("cycle") >= 2).any() for window in windows]
+    windows = [*compress(windows, repeated), numbers]
     parts, names = [], []
     # The results of thousands of windows are very many small objects: those of some windows become one at a time.
     for start in range(0, len(windows), _WINDOWS_AT_ONCE):
@@ -218,23 +201,7 @@ def _of_the_axis(result: xr.Dataset) -> xr.Dataset:
 
 
 def settled_window(windows: xr.Dataset) -> int:
-    """Return which window of a test shows the warmed-up axis: in its second half, the one in which the drift varied least.
-
-    Parameters
-    ----------
-    windows : xarray.Dataset
-        What `evaluate_windows` returns.
-
-    Returns
-    -------
-    int
-        Index along ``window``. Without a drift estimate it is the last window before the whole test; a test shorter than two windows
-        is its only one.
-
-    Notes
-    -----
-    ISO 230-2 asks for a warmed-up axis. The rule looks at the drift alone, not at the quantities that it selects.
-    """
+    """Return which window of a test shows the warmed-up axis: in its second half, the one in which the drift varied least."""
     several = windows.sizes["window"] - 1
     if several < 1:
         return 0
@@ -271,7 +238,7 @@ def _leave_out_single_readings(
     if not ((count >= 2) & measured).any():
         window = "one cycle" if x.shape[0] == 1 else f"{x.shape[0]} cycles"
         raise InterferometryError(
-            f"no target has two readings from one side in a window of {window}; ISO 230-2 asks for {STANDARD_CYCLES} cycles, and "
+            f"no target has two readings from one side in a window of {window}; ISO 230-2 requires {STANDARD_CYCLES} cycles, and "
             "scatter needs two: measure more, or widen the window"
         )
     names = [
@@ -318,14 +285,65 @@ def _quantities(x: np.ndarray, count: np.ndarray) -> dict[str, tuple[tuple[str, 
 
 
 def _reversal_of_scatter(s: np.ndarray, count: np.ndarray) -> float:
-    """Return the B that scatter alone gives in half of such tests, um.
-
-    The median q of max |z| over m targets solves (2 Phi(q) - 1)^m = 1/2.
-    """
+    """Return the B that scatter alone gives in half of such tests, um."""
     variance = (s**2 / np.fmax(count, 1)).sum(axis=0)
     both = variance[np.isfinite(variance)]
     return float(special.ndtri((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean())) if both.size else np.nan
 
 
-def _can_be_evaluated(deviations: xr.Dataset) -> bool:
-    return bool((deviations["deviation"].count("cycle") >= 2).any())
+# Other evaluations of the same readings: VDI/DGQ 3441 and the Japanese practice of JIS B 6330.
+
+VDI, JIS = "VDI/DGQ 3441", "JIS B 6330"
+
+
+@dataclass(frozen=True)
+class OtherQuantity:
+    """A quantity of VDI/DGQ 3441 or JIS B 6330, with its symbol where it has one, and how it is calculated."""
+
+    standard: str
+    name: str
+    value_um: float
+    definition: str
+
+
+def evaluate_other_standards(deviations: xr.Dataset, *, cycles: Sequence[int]) -> list[OtherQuantity]:
+    """Evaluate a window of cycles by VDI/DGQ 3441 and JIS B 6330."""
+    ordered = deviations.reindex(direction=list(DIRECTIONS)).sel(cycle=list(cycles)).sortby("position")
+    x = ordered["deviation"].values
+    whole = (np.isfinite(x).sum(axis=0) >= 2).all(axis=0)
+    if not whole.any():
+        return []
+    return [*_by_vdi(x[:, :, whole]), *_by_jis(x[:, :, whole])]
+
+
+def _by_vdi(x: np.ndarray) -> list[OtherQuantity]:
+    """Position uncertainty, scatter, deviation and reversal of deviations (cycle, direction, target)."""
+    mean, s = np.nanmean(x, axis=0), np.nanstd(x, axis=0, ddof=1)
+    middle, reversal, scatter = mean.mean(axis=0), np.abs(mean[0] - mean[1]), 6 * s.mean(axis=0)
+    half = (reversal + scatter) / 2
+    uncertainty = np.max(middle + half) - np.min(middle - half)
+    rows = (
+        ("position uncertainty P", uncertainty, "range of m ± (U + Ps) / 2 over the targets"),
+        ("position deviation Pa", np.ptp(middle), "range of m over the targets"),
+        ("largest position scatter Ps max", scatter.max(), "largest 6 s, s the mean of both approaches"),
+        ("mean position scatter Ps", scatter.mean(), "mean of 6 s over the targets"),
+        ("largest reversal U max", reversal.max(), "largest difference of both approaches' means"),
+        ("mean reversal U", reversal.mean(), "mean of these differences, each without its sign"),
+    )
+    return [OtherQuantity(VDI, name, float(value), definition) for name, value, definition in rows]
+
+
+def _by_jis(x: np.ndarray) -> list[OtherQuantity]:
+    """Positioning accuracy, repeatability and lost motion of deviations (cycle, direction, target), targets by position."""
+    starts = np.stack([x[:, 0, :1], x[:, 1, -1:]], axis=1)
+    accuracy = np.nanmax(np.abs(x - starts))
+    repeatability = ((np.nanmax(x, axis=0) - np.nanmin(x, axis=0)) / 2).max()
+    mean = np.nanmean(x, axis=0)
+    lost_motion = np.abs(mean[0] - mean[1]).max()
+    from_first = "largest deviation from the first target of its pass, over all passes"
+    half_range = "half of the largest range of readings of one target from one side"
+    return [
+        OtherQuantity(JIS, "positioning accuracy", float(accuracy), from_first),
+        OtherQuantity(JIS, "positioning repeatability (±)", float(repeatability), half_range),
+        OtherQuantity(JIS, "lost motion", float(lost_motion), "largest difference of both approaches' means"),
+    ]

@@ -3,13 +3,140 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
 
 import GTC
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from interferometry.iso230.budget import CONTRIBUTIONS, Iso230Budget
-from interferometry.iso230.quantities import axis_quantities
+from interferometry.common import InterferometryError
+
+# The uncertainty budget of a positioning test: its inputs, and what is assumed where nothing is stated.
+
+#: Contributions to the uncertainty, in the order of the budget. The last two are the sampling, by which a few cycles stand for the axis:
+#: scatter of the readings, and that the largest of noisy values is too large.
+CONTRIBUTIONS = (
+    "device",
+    "alignment",
+    "material_temperature",
+    "expansion_coefficient",
+    "environmental_variation",
+    "sampling",
+    "extremes",
+)
+SAMPLING = ("sampling", "extremes")
+
+
+@dataclass(frozen=True)
+class Iso230Budget:
+    """Contributions to the uncertainty besides the scatter of the readings (ISO 230-2:2014 Annex A, ISO/TR 230-9).
+
+    All are standard uncertainties (k = 1). Those that scale with length act over the distance between the positions that decide a
+    quantity. The defaults are assumptions for a workshop; a laboratory that knows better states its own.
+
+    Attributes
+    ----------
+    device_ppm : float
+        Laser with its compensation for the air, ppm. Assumed: 0.25 ppm, a laser with weather station that is stated as 0.5 ppm at k = 2.
+    alignment_ppm : float
+        Cosine error, ppm; a beam 1 mrad off reads 0.5 ppm short. Assumed: 0.3 ppm, limits of 1 mrad with a rectangular distribution.
+    material_temperature_K : float
+        Of the temperature that the compensation took for that of the measured length, K: accuracy of the probe and of its place.
+        Assumed: 0.3 K.
+    expansion_coefficient_ppm_per_K : float
+        Of the expansion coefficient that the compensation used, ppm/K. Assumed: 2 ppm/K, a steel or cast iron of unknown grade.
+    difference_from_20_degC_K : float
+        Difference of the material temperature from 20 degC, K (no uncertainty: it scales that of the coefficient). Assumed: 3 K.
+    nominal_expansion_ppm_per_K : float
+        The coefficient itself, ppm/K (no uncertainty: it scales that of the temperature). Assumed: 11.7 ppm/K, steel.
+    environmental_variation_um : float or None
+        Environmental variation error (EVE) during one evaluation, um; that of a drift test of range E is E / sqrt 12. None: the
+        standard deviation of the drift that the joint estimate finds within the window, where there is one.
+
+    Raises
+    ------
+    InterferometryError
+        A standard uncertainty is negative.
+
+    Notes
+    -----
+    docs/method/iso230.md derives the assumptions and states how often the intervals cover the truth.
+
+    Examples
+    --------
+    >>> Iso230Budget(device_ppm=0.1, environmental_variation_um=0.4).material_temperature_K
+    0.3
+    """
+
+    device_ppm: float = 0.25
+    alignment_ppm: float = 0.3
+    material_temperature_K: float = 0.3
+    expansion_coefficient_ppm_per_K: float = 2.0
+    difference_from_20_degC_K: float = 3.0
+    nominal_expansion_ppm_per_K: float = 11.7
+    environmental_variation_um: float | None = None
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name.split("_")[0] not in ("difference", "nominal") and value is not None and value < 0:
+                raise InterferometryError(f"{field.name}={value} is negative; a standard uncertainty is 0 or more")
+
+    @property
+    def is_scatter_alone(self) -> bool:
+        """Whether instrument, alignment and material contribute nothing."""
+        scales = (
+            self.device_ppm,
+            self.alignment_ppm,
+            self.material_temperature_K,
+            self.expansion_coefficient_ppm_per_K,
+        )
+        return not any(scales)
+
+
+#: No error of instrument, alignment or material, as for a rotary axis: the budget is one of lengths.
+SCATTER_ALONE = Iso230Budget(
+    device_ppm=0.0, alignment_ppm=0.0, material_temperature_K=0.0, expansion_coefficient_ppm_per_K=0.0
+)
+
+
+# The quantities of ISO 230-2:2014, clause 3, from mean deviations and their standard deviations.
+
+Array = NDArray[np.float64]
+
+
+def target_quantities(mean: Array, s: Array) -> tuple[Array, Array, Array]:
+    """Return mean bidirectional deviation, reversal error B_i and bidirectional repeatability R_i of every position."""
+    positive, negative = mean[..., 0, :], mean[..., 1, :]
+    s_positive, s_negative = s[..., 0, :], s[..., 1, :]
+    reversal = positive - negative
+    wide = np.fmax(2 * s_positive + 2 * s_negative + np.abs(reversal), np.fmax(4 * s_positive, 4 * s_negative))
+    return (positive + negative) / 2, reversal, np.where(np.isnan(reversal), np.nan, wide)
+
+
+def axis_quantities(mean: Array, s: Array) -> dict[str, Array]:
+    """Return the quantities of the axis: B, R, E, M and A of both directions, and R, E and A of each."""
+    both, reversal, repeatability = target_quantities(mean, s)
+    bidirectional = np.isfinite(reversal).any(axis=-1)
+    upper, lower = mean + 2 * s, mean - 2 * s
+    cells = (-2, -1)
+    return {
+        "B": _largest(np.abs(reversal)),
+        "R": _largest(repeatability),
+        "E": np.where(bidirectional, _largest(mean, cells) + _largest(-mean, cells), np.nan),
+        "M": _largest(both) + _largest(-both),
+        "A": np.where(bidirectional, _largest(upper, cells) + _largest(-lower, cells), np.nan),
+        "R_unidirectional": _largest(4 * s),
+        "E_unidirectional": _largest(mean) + _largest(-mean),
+        "A_unidirectional": _largest(upper) + _largest(-lower),
+    }
+
+
+def _largest(values: Array, axes: int | tuple[int, ...] = -1) -> Array:
+    """Return the largest finite value along axes, NaN where there is none."""
+    return np.asarray(np.fmax.reduce(values, axis=axes), dtype=float)
+
 
 #: Quantities of the axis that have an uncertainty: reversal error, bidirectional repeatability, bidirectional systematic positioning
 #: error, mean bidirectional positioning error, bidirectional accuracy, signed mean of the reversal errors.
@@ -48,8 +175,6 @@ class UncertainTest:
         self._variation = budget.environmental_variation_um or 0.0
         self._mean, self._s = result["mean_unidirectional"].values, result["standard_deviation"].values
         self._count, self._distance_mm = result["count"].values, position_mm - position_mm.min()
-        self._deviations: dict[tuple[int, int], GTC.lib.UncertainReal] = {}
-        self._sigmas: dict[tuple[int, int], GTC.lib.UncertainReal] = {}
         self._excess = _excess_of_extremes(self._mean, self._s, self._count)
         self._scale = 1e-3 * (
             GTC.ureal(0, budget.device_ppm, label="device")
@@ -59,8 +184,19 @@ class UncertainTest:
             + budget.difference_from_20_degC_K
             * GTC.ureal(0, budget.expansion_coefficient_ppm_per_K, label="expansion_coefficient")
         )
+        cells = [(int(direction), int(target)) for direction, target in np.argwhere(np.isfinite(self._mean))]
+        self._deviations = {cell: self._deviation(*cell) for cell in cells}
+        self._sigmas = {cell: self._sigma(*cell) for cell in cells}
 
-    def _make_deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+    def deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+        """Mean deviation of one approach to one target: the same correlated number wherever it enters."""
+        return self._deviations[direction, target]
+
+    def sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+        """Standard deviation of one approach to one target, likewise."""
+        return self._sigmas[direction, target]
+
+    def _deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
         readings = int(self._count[direction, target])
         scatter = GTC.ureal(0, self._s[direction, target] / readings**0.5, readings - 1, label="sampling")
         environment = GTC.ureal(0, self._variation / readings**0.5, label="environmental_variation")
@@ -71,26 +207,12 @@ class UncertainTest:
             + float(self._distance_mm[target]) * self._scale
         )
 
-    def _make_sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+    def _sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
         """Return s with the scatter of an estimate, and with what the environmental variation has added to it."""
         readings, s = int(self._count[direction, target]), float(self._s[direction, target])
         added = s - np.sqrt(max(s**2 - self._variation**2, 0.0))
         scatter = GTC.ureal(s, s / (2 * (readings - 1)) ** 0.5, readings - 1, label="sampling")
         return scatter + GTC.ureal(0, added, label="environmental_variation")
-
-    def deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
-        """Mean deviation of one approach to one target: the same correlated number wherever it enters."""
-        cell = direction, target
-        if cell not in self._deviations:
-            self._deviations[cell] = self._make_deviation(*cell)
-        return self._deviations[cell]
-
-    def sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
-        """Standard deviation of one approach to one target, likewise."""
-        cell = direction, target
-        if cell not in self._sigmas:
-            self._sigmas[cell] = self._make_sigma(*cell)
-        return self._sigmas[cell]
 
     def reversal(self, target: int) -> GTC.lib.UncertainReal:
         """Reversal error B_i, signed."""
@@ -197,11 +319,7 @@ def _contributions(value: GTC.lib.UncertainReal) -> list[float]:
 
 
 def _excess_of_extremes(mean: np.ndarray, s: np.ndarray, count: np.ndarray) -> dict[str, np.ndarray]:
-    """Return by how much the quantities of tests of an axis exceed those of the axis itself, on average, um.
-
-    The axis is the test without the spread that its scatter has put between positions. Means are drawn with s / sqrt(n), variances with
-    n - 1 degrees of freedom.
-    """
+    """Return by how much the quantities of tests of an axis exceed those of the axis itself, on average, um."""
     rng = np.random.default_rng(_SEED)
     readings = np.where(np.isfinite(mean), count, 2)
     u = s / np.sqrt(readings)
@@ -213,11 +331,7 @@ def _excess_of_extremes(mean: np.ndarray, s: np.ndarray, count: np.ndarray) -> d
 
 
 def _without_scatter(mean: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return mean deviations whose bidirectional means and reversal errors differ between positions by no more than the axis makes them.
-
-    Each series is drawn towards its mean over the positions until its variance is that which scatter of standard uncertainty u does not
-    explain. With one direction the series is that direction.
-    """
+    """Return mean deviations whose bidirectional means and reversal errors differ between positions by no more than the axis makes them."""
     if not np.isfinite(mean).all(axis=0).any():
         return _drawn_together(mean, u)
     noise = np.sqrt((u**2).sum(axis=0))

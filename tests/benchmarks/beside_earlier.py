@@ -150,7 +150,8 @@ def commands(trees: Sequence[Path], turns: int) -> Iterator[str]:
     folders = [HERE / "build" / "speeds" / name for name in ("before", "now")]
     for tree, folder in zip(trees, folders, strict=True):
         shutil.rmtree(folder, ignore_errors=True)
-        timed(tree, ["simulate", str(tree / "data" / "demo.toml"), "--out", str(folder / "campaign")])
+        recipe = HERE / "fusion" / "twin" / "recipes" / "demo.toml"
+        timed(tree, ["simulate", str(recipe), "--out", str(folder / "campaign")])
     for work, (arguments, aim) in works.items():
         seconds: list[list[tuple[float, float]]] = [[], []]
         # The first turn of each compiles, and fills the page cache.

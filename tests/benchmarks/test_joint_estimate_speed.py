@@ -1,6 +1,6 @@
 """Speed of the joint estimate, as ratios against a dense solution of the same model measured in the same run.
 
-Reproduces the rows of docs/measured.md, "Speed and memory", on the joint estimate.
+Reproduces figures of docs/measured.csv, on the joint estimate.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def test_cost_grows_with_the_number_of_readings(rng: np.random.Generator) -> Non
         seconds[cycles] = (
             sort_readings(deviations).sizes["reading"],
             cpu_seconds(lambda d=deviations: estimate_drift(d)),  # type: ignore[misc]
-            cpu_seconds(lambda e=estimated, d=deviations: detect_anomalies(e, d), 1),  # type: ignore[misc]
+            cpu_seconds(lambda e=estimated, d=deviations: detect_anomalies(d, e), 1),  # type: ignore[misc]
         )
     for cycles, (readings, estimate_s, anomalies_s) in seconds.items():
         print(

@@ -1,6 +1,6 @@
 """Peak memory of whole runs with thousands of cycles, by the stage in which it is reached.
 
-Reproduces the rows of docs/measured.md, "Memory of long campaigns". Every run is a process of its own. The pictures are small, so that
+Reproduces figures of docs/measured.csv. Every run is a process of its own. The pictures are small, so that
 they are soon simulated; the plan has the usual 5,040 cells, whose fields are what grows with the cycles.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import simulate
 from tests.fusion.pipeline.test_any_subset import BOTH, write_laser
 

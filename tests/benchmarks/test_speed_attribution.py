@@ -1,6 +1,6 @@
 """Speed of the screen at full size, and as a ratio to nilearn on one regressor measured in the same run.
 
-Reproduces the rows of docs/measured.md, "Speed and memory", on the screen.
+Reproduces figures of docs/measured.csv, on the screen.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from fusion.attribution.drift_channels import TargetSeries
-from fusion.attribution.family_wise import LAGS_S, FieldSeries
-from fusion.attribution.per_target import screen
-from fusion.attribution.warm_up import Excitation
+from fusion.analysis.attribution.drift_channels import TargetSeries
+from fusion.analysis.attribution.modes import Excitation
+from fusion.analysis.attribution.significance import LAGS_S, FieldSeries, screen
 
 pytestmark = pytest.mark.slow
 
@@ -48,14 +47,7 @@ def run(
 ) -> Callable[[], object]:
     directions = ("positive",) * len(values)
     series = TargetSeries(directions, np.arange(1, len(values) + 1), values, SECONDS, np.eye(CYCLES))
-    return lambda: screen(
-        series,
-        seen,
-        VARIED,
-        lags_s=lags,
-        permutations=permutations,
-        rng=np.random.default_rng(1),
-    )
+    return lambda: screen(series, seen, VARIED, lags_s=lags, permutations=permutations, rng=np.random.default_rng(1))
 
 
 def test_full_size(rng: np.random.Generator) -> None:

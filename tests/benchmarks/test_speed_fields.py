@@ -1,6 +1,6 @@
 """Speed and memory of file to fields, as ratios against named peers measured in the same run on the same file.
 
-Reproduces the rows of docs/measured.md, "Speed and memory", on file to fields.
+Reproduces figures of docs/measured.csv, on file to fields.
 """
 
 from __future__ import annotations
@@ -19,20 +19,17 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.thermography.fields.tasks.test_stretches import simulated
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene
+from tests.thermography.fields.test_still import simulated
+from tests.thermography.plan_scene import GRID, SC660, START, Scene, registered
 from thermography.fields.blocks import cut_blocks
-from thermography.fields.checkpoint import recalibrate
 from thermography.fields.moving import reduce_moving_frames
-from thermography.fields.still import reduce_frames
-from thermography.fields.tasks.stretches import cut_stretches, gather_frames
+from thermography.fields.still import cut_stretches, gather_frames, reduce_frames
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraIdentity, Frame, FrameReference
-from thermography.io.frame_index.flir_frame import FlirFrameReference
-from thermography.radiometry.planck import counts_from_temperature, override
+from thermography.io.sequence import FlirFrameReference
+from thermography.radiometry.planck import counts_from_temperature
 from thermography.registration.displacement import RegistrationSpan
-from thermography.registration.register import register
 
 pytestmark = pytest.mark.slow
 
@@ -67,7 +64,7 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def registration():
-    return register(Scene(disc_K=-4.0).render(), DISCS, grid=GRID)
+    return registered()
 
 
 def take_turns(*works: Callable[[], object], rounds: int = 9) -> np.ndarray:
@@ -223,26 +220,6 @@ def samples_in_file(reference: FrameReference) -> tuple[int, int]:
     """Place and length of the packed pixels of a frame in its file, bytes."""
     assert isinstance(reference, FlirFrameReference)
     return reference.segments[0][0] + reference.samples.offset, reference.samples.length
-
-
-def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -> None:
-    references, _ = index_frames([film])
-    reduce_frames(references, registration, GRID, bounds_of(FRAMES, 100), checkpoint=tmp_path)
-    (again, whole), _ = take_turns(
-        lambda: recalibrate(
-            tmp_path,
-            [RegistrationSpan(0, registration)],
-            GRID,
-            100,
-            lambda parameters: override(parameters, emissivity=0.9),
-        ),
-        lambda: reduce_frames(references, registration, GRID, bounds_of(FRAMES, 100)),
-        rounds=5,
-    )
-    print(
-        f"\nrecalibrating 100 cycles: {median_of(again)} s, reducing their frames anew ({FRAMES // 100} per cycle) {median_of(whole)} s: "
-        f"{median_of(whole / again)} x"
-    )
 
 
 PEAK = """

@@ -1,6 +1,6 @@
 """Speeds of reading and calibrating, as ratios to named readers measured in the same run, on one core.
 
-Reproduces the rows of docs/measured.md, "Speed and memory", on reading and calibrating.
+Reproduces figures of docs/measured.csv, on reading and calibrating.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from tests.thermography.flir_mutations import frame
 from thermography.io.flir import index_frames, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FrameReference
-from thermography.io.frame_index.by_threads import call_by_threads, usable_threads
-from thermography.io.frame_index.flir_frame import FlirFrameReference
+from thermography.io.sequence import FlirFrameReference, call_by_threads, usable_threads
 from thermography.io.xarray_backend import FlirBackendEntrypoint
 from thermography.radiometry.planck import calibrate
 

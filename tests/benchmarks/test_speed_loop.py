@@ -1,6 +1,6 @@
 """Time and memory of runs with many cycles or many targets: how they grow with the readings.
 
-Reproduces the rows of docs/measured.md, "Many cycles, many targets". Every run is a process of its own, so that its peak memory is; times
+Reproduces figures of docs/measured.csv. Every run is a process of its own, so that its peak memory is; times
 are of the processor, and only their ratios tell something on a machine with other work.
 """
 

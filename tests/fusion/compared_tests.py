@@ -8,11 +8,10 @@ from typing import Any
 
 import xarray as xr
 
-from fusion.products.grouped import joined
-from fusion.products.results import assemble
-from fusion.products.store import write_dataset, write_json
+from fusion.results.results import assemble
+from fusion.results.store import joined, write_dataset, write_json
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from fusion.twin.truth import deviations_of
 from interferometry.drift.estimate import estimate_drift
 from tests.fusion.results_sample import PARTS

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from fusion.alignment.first_order_lag import respond
-from fusion.attribution.randomised_duty import DutyLaw
+from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.attribution.duty import DutyLaw
 from tests.fusion import field_simulator as simulator
 
 MIDDLE = np.arange(simulator.CYCLES) * simulator.PERIOD_S

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion._typing import Array
-from fusion.alignment.first_order_lag import respond
-from fusion.alignment.readings import Readings
+from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.alignment.readings import Readings
+from fusion.common import Array
 
 TARGETS, NOISE_UM, WARM_UP_S = 3, 0.25, 5400.0
 #: Drifts without a cause that the library could name: how the shift, um, and the stretch follow the time.

@@ -11,14 +11,13 @@ from functools import cache
 
 import numpy as np
 
-from fusion.alignment.align import AxisGeometry, align
-from fusion.alignment.readings import Readings, read_fused
-from fusion.effects.library import library
-from fusion.loop.axis import close_loop, hold_out
-from fusion.loop.result import LoopResult, rmse
-from fusion.model.fit import ModelFit, Term, fit_model
+from fusion.analysis.alignment.align import AxisGeometry, align
+from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.drift_model.axis import LoopResult, close_loop, hold_out, rmse
+from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
+from fusion.analysis.effects.library import library
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
 
@@ -69,10 +68,10 @@ class Outcome:
         )
 
 
-def readings_of(*effects: EffectRecipe, seed: int, jitter_mm: float = 0.0) -> Readings:
+def readings_of(*effects: EffectRecipe, seed: int, jitter_mm: float = 0.0, cycles: int = CYCLES) -> Readings:
     """Simulate a campaign without rendering frames."""
     recipe = Recipe().vary(
-        campaign={"seed": seed}, test={"cycles": CYCLES, "jitter_mm": jitter_mm}, effect=tuple(effects)
+        campaign={"seed": seed}, test={"cycles": cycles, "jitter_mm": jitter_mm}, effect=tuple(effects)
     )
     truth = simulate(recipe)
     axis = AxisGeometry((500.0, 90.0), (-1.0, 0.0))

@@ -26,7 +26,7 @@ STEP = {
     "cross_rmse_after_um": 0.5,
     "rms_um": 0.3,
     "tied": [],
-    "runner_up": {"effect": "dead_path", "behind_by": 4.0, "p_value": 0.2},
+    "runner_up": {"effect": "dead_path", "gain_deficit": 4.0, "p_value": 0.2},
     "confirmed": True,
     "doubt": "",
     "confirmed_by": "on later blocks of cycles",
@@ -46,24 +46,24 @@ LOOP = {
         "ridge_with_lags": {"rmse_um": 0.5, "low_um": 0.4, "high_um": 0.6},
     },
     "best_baseline": "ridge_with_lags",
-    "unnamed": {},
+    "unconfirmed_effects": {},
     "verdict": "explained",
     "not_tried": {"dead_path": "no air"},
-    "blocked": {},
+    "not_admitted": {},
 }
-LEFT = {"shape": "", "rms_um": 0.0, "p_value": 0.4, "nearest": ""}
+LEFT = {"shape": "", "rms_um": 0.0, "p_value": 0.4, "closest_effect": ""}
 RESIDUAL = {
     "p_values": dict.fromkeys(
         (
-            "memory",
+            "autocorrelation",
             "event",
-            "rhythm",
+            "periodicity",
             "curvature",
-            "one place",
+            "single_target",
             "direction",
-            "direction along the axis",
+            "direction_along_axis",
             "pattern",
-            "slow pattern",
+            "slow_pattern",
         ),
         0.4,
     ),
@@ -144,19 +144,19 @@ PARTS: dict[str, Any] = {
         "steps": [
             {**STEP, "coefficients": [{"value": 1.0, "u": 0.1, "unit": "um"}], "held_out_p": 0.01, "event_cycle": 9}
         ],
-        "unexplained": {**LEFT, "nearest_p": None, "nearest_share": None},
+        "unexplained": {**LEFT, "closest_effect_p": None, "closest_effect_share": None},
         "declared_coefficients": [
             {"effect": "axis_expansion", "value": 11.6, "u": 0.2, "unit": "ppm/K", "prior": 11.7, "prior_u": 2.0}
         ],
-        "nuisance": {
+        "residual_drift": {
             "kind": "random walk",
             "common_rms_um": 0.1,
             "stretch_rms_um": 0.0,
             "common_um_per_sqrt_h": 0.1,
             "stretch_um_per_sqrt_h": 0.0,
         },
-        "sealed_question": {},
-        "search": [[{**SCORE, "held_out_gain": 4.0, "held_out_p": 0.01, "share_not_separable": 0.0}]],
+        "held_out_test": {},
+        "search": [[{**SCORE, "held_out_gain": 4.0, "held_out_p": 0.01, "collinear_share": 0.0}]],
         "identifiability": [
             {
                 "effect": "dead_path",
@@ -164,7 +164,7 @@ PARTS: dict[str, Any] = {
                 "best_um": None,
                 "worst_um": None,
                 "visible_share": 0.1,
-                "looks_like": ["air_index"],
+                "confounded_with": ["air_index"],
                 "note": "",
             }
         ],
@@ -185,7 +185,7 @@ RECORD_LOOP: dict[str, Any] = {
             "event_s": None,
         }
     ],
-    "unexplained": {**LEFT, "p_values": {"rhythm": 0.4}, "variance_share": 0.1},
+    "unexplained": {**LEFT, "p_values": {"periodicity": 0.4}, "variance_share": 0.1},
     "channels": {"X": {**ERRORS, "noise_um": 0.1, "variance_share": 0.1}},
     "chained": [{"first_h": 6.0, "last_h": 9.0, "in_training": True, "effects": [], **ERRORS}],
     "search": [

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fusion.alignment.readings import Readings, Series
-from fusion.effects.effect import Candidate
-from fusion.model.fit import ModelFit, Term
+from fusion.analysis.alignment.readings import Readings, Series
+from fusion.analysis.drift_model.fit import ModelFit, Term
+from fusion.analysis.effects.effect import Candidate
 from interferometry.drift.gls import drift_system, fit_fixed_effects
 
 #: Time between two readings, and between the last reading of a cycle and the first of the next, s.

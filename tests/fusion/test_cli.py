@@ -18,7 +18,7 @@ import xarray as xr
 from typer.testing import CliRunner, Result
 
 from fusion import cli
-from fusion.products.results import results_schema
+from fusion.results.results import results_schema
 
 
 def invoke(*arguments: str | Path) -> Result:
@@ -39,7 +39,7 @@ def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_f
     assert result.exit_code == 0, result.output
     loop = json.loads((out / "results.json").read_text())["loop"]
     assert "reversal_drift (p < 0.001), held-out error" in result.output
-    told = f"{loop['verdict']}: The declared model does not explain the drift alone: it lacks a reversal error that changes"
+    told = f"{loop['verdict']}: The declared model alone does not explain the drift: it lacks a reversal error that changes"
     assert told in result.output
     assert result.output.rstrip().endswith(f"report: {out / 'report.html'}")
     assert "input files: done in" in result.output
@@ -209,7 +209,7 @@ def test_iso230_evaluates_a_window(campaign_folder: Path, tmp_path: Path) -> Non
     assert "exists already" in invoke("iso230", campaign_folder / "laser.csv", "--out", out).stderr
     for bad, message in (
         ("one", 'thermofuse: --cycles "one" is not a window of cycles; write for example 1-5\n'),
-        ("20-30", 'thermofuse: --cycles "20-30" asks for cycles that were not measured; there are 1 to 24\n'),
+        ("20-30", 'thermofuse: --cycles "20-30" contains cycles that were not measured; there are 1 to 24\n'),
     ):
         refused = invoke("iso230", campaign_folder / "laser.csv", "--cycles", bad)
         assert (refused.exit_code, refused.stderr) == (2, message)
@@ -336,7 +336,7 @@ def test_what_cannot_be_watched_is_refused(campaign_folder: Path, tmp_path: Path
     both = invoke("run", campaign, campaign, "--watch")
     assert (both.exit_code, both.stderr) == (2, "thermofuse: one campaign can be watched at a time\n")
     wish = invoke("run", campaign, "--out", tmp_path / "r", "--watch", "--wanted", "-1 um")
-    assert wish.exit_code == 2 and "the wanted uncertainty lies above 0" in wish.stderr
+    assert wish.exit_code == 2 and "the wanted uncertainty must be above 0" in wish.stderr
 
 
 def test_results_that_were_edited_are_not_reported(results_folder: Path, tmp_path: Path) -> None:

@@ -17,13 +17,14 @@ class Interrupting:
             os.kill(os.getpid(), {number})
 sys.meta_path.insert(0, Interrupting())
 sys.argv = ["thermofuse", "schema", "recipe"]
-from fusion.command import main
+from fusion.cli import main
 main()
 """
 
 
-@pytest.mark.parametrize("library", ["typer", "fusion.twin.recipe_file"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("library", "number"), [("pydantic", signal.SIGINT), ("fusion.twin.recipe_file", signal.SIGTERM)]
+)
 def test_a_signal_while_libraries_load_is_told_in_one_line(library: str, number: signal.Signals) -> None:
     text = LOADING.format(library=library, number=int(number))
     ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)

@@ -10,18 +10,19 @@ from typing import Any
 import numpy as np
 from typer.main import get_command
 
+import thermofuse
 from fusion import cli
+from fusion.analysis.diagnosis.diagnose import CAUSES
+from fusion.analysis.effects.effect import Effect
+from fusion.analysis.effects.library import LIBRARY
+from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import RECORD_EFFECTS, load_campaign
-from fusion.diagnosis.causes import CAUSES
-from fusion.effects.effect import Effect
-from fusion.effects.library import LIBRARY
-from fusion.effects.thermal import QUASI_STATIC
-from fusion.products.results import CorrelationPart, Notice, SourcePart, assemble
 from fusion.report.terminal import summary_rows
+from fusion.results.axis import CorrelationPart, SourcePart
+from fusion.results.results import Notice, assemble
 from fusion.twin.recipe_file import read_recipe
 from tests.fusion.results_sample import PARTS
-from thermography.io.frame_readers import FrameReader
-from thermography.io.temperature_frames import StackOptions
+from thermography.io.other_cameras import FrameReader, StackOptions
 from thermography.registration.plan import read_fiducials
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,7 +79,7 @@ def test_the_readme_is_short_and_its_pictures_are_small() -> None:
 def test_the_demo_of_the_tutorial_is_the_demo() -> None:
     page = (TUTORIALS / "demo.md").read_text(encoding="utf-8")
     (recipe,) = re.findall(r"%%writefile demo.toml\n(.*?)```", page, flags=re.DOTALL)
-    assert tomllib.loads(recipe) == tomllib.loads((ROOT / "data/demo.toml").read_text(encoding="utf-8"))
+    assert tomllib.loads(recipe) == tomllib.loads((ROOT / "fusion/twin/recipes/demo.toml").read_text(encoding="utf-8"))
 
 
 def test_the_recipes_of_the_tutorials_are_valid(tmp_path: Path) -> None:
@@ -127,22 +128,40 @@ def test_the_effect_of_contributing_is_a_whole_effect() -> None:
 
 def test_the_layout_of_contributing_names_real_files() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    for name in re.findall(r"`((?:fusion|data)/[\w./]+)`", text):
+    for name in re.findall(r"`((?:thermography|interferometry|fusion|tests|docs|data)/[\w./-]+)`", text):
         assert (ROOT / name).exists(), name
 
 
-def test_every_effect_of_the_library_has_its_words() -> None:
-    assert all(effect.label and effect.remedy and effect.physics and effect.source for effect in LIBRARY)
+def test_a_record_is_declared_with_no_effect_of_the_library() -> None:
     # What a record is declared with is no effect that a search could add.
     assert RECORD_EFFECTS == (QUASI_STATIC,)
     assert QUASI_STATIC not in {effect.name for effect in LIBRARY}
 
 
 def test_every_cause_has_its_words_and_checks() -> None:
-    from fusion.products.results import CAUSES as NAMES
+    from fusion.results.axis import CAUSES as NAMES
 
     assert set(CAUSES) == set(NAMES)
     assert all(record.words and record.check for record in CAUSES.values())
+
+
+def test_python_on_the_pages_uses_public_names() -> None:
+    pages = {"README.md": README, **{page.name: page.read_text(encoding="utf-8") for page in TUTORIALS.glob("*.md")}}
+    for page, text in pages.items():
+        assert set(re.findall(r"\btf\.(\w+)", text)) <= set(thermofuse.__all__), page
+    (chain,) = blocks(README, "python")
+    compile(chain, "README.md", "exec")
+
+
+def test_every_dependency_has_its_reason() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    page = (ROOT / "docs/start/install.md").read_text(encoding="utf-8")
+    listed = {
+        name.strip() for cell in re.findall(r"^\| (.*?) \|", page, flags=re.MULTILINE) for name in cell.split(",")
+    }
+    needed = {re.split(r"[\[>]", one)[0] for one in project["dependencies"]}
+    extras = {f"`{name}`" for name in project["optional-dependencies"]} - {"`docs`", "`test`"}
+    assert needed | extras == listed - {"package", "extra", "---"}
 
 
 def test_the_makefile_makes_what_the_readme_says() -> None:
@@ -150,4 +169,4 @@ def test_the_makefile_makes_what_the_readme_says() -> None:
     for target in re.findall(r"^make (\w+)", README, flags=re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["scripts"]["thermofuse"] == "fusion.command:main"
+    assert project["scripts"]["thermofuse"] == "fusion.cli:main"

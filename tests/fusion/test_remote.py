@@ -16,11 +16,12 @@ from typing import ClassVar
 import pytest
 from typer.testing import CliRunner
 
-from fusion import cli, remote
+from fusion import cli
 from fusion.campaign.config import Campaign, load_campaign
+from fusion.pipeline import remote
+from fusion.pipeline.remote import RemoteError, fetch_campaign, fetch_file, is_address
+from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
-from fusion.remote import RemoteError, fetch_campaign, fetch_file, is_address
-from fusion.reproduction import reproduce
 from tests.fusion.campaign_parts import without
 
 pytest.importorskip("aiohttp", reason="needs thermofuse[remote]")
@@ -218,7 +219,7 @@ def test_what_is_not_there_or_may_not_be_read_is_named(shelf, tmp_path):
     with pytest.raises(RemoteError, match=r"http://127.0.0.1:9/a.toml: the connection was lost 4 times"):
         fetch_file("http://127.0.0.1:9/a.toml")
     (day / "outside.toml").write_text('[plan]\nfiducials = "../../secret.csv"\n')
-    with pytest.raises(RemoteError, match=r'outside.toml: "../../secret.csv" lies outside the folder of the campaign'):
+    with pytest.raises(RemoteError, match=r'outside.toml: "../../secret.csv" is outside the folder of the campaign'):
         fetch_campaign(f"{server}/day%201/outside.toml")
 
 
@@ -264,9 +265,7 @@ def test_two_campaigns_of_one_folder_keep_their_files(shelf):
 
 def test_results_are_not_written_into_the_cache(shelf, cache):
     address, _ = shelf
-    with pytest.raises(
-        RemoteError, match=r"lies in .*cache, which keeps what is fetched; name another folder with --out"
-    ):
+    with pytest.raises(RemoteError, match=r"is in .*cache, the download cache; name another folder with --out"):
         run_campaign(f"{address}/day%201/laser.toml", cache / "a" / "results")
     assert not cache.exists()
 

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from fusion import reproduction as module
 from fusion.campaign.config import load_campaign
-from fusion.pipeline.provenance import hash_files, versions
-from fusion.products.results import ResultsError
-from fusion.reproduction import reproduce
+from fusion.common import versions
+from fusion.pipeline import reproduce as module
+from fusion.pipeline.reproduce import reproduce
+from fusion.pipeline.stages import hash_files
+from fusion.results.results import ResultsError
 
 
 @pytest.fixture

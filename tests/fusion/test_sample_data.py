@@ -8,7 +8,7 @@ from urllib.parse import urlparse
 
 import pytest
 
-from fusion.sample_data import FOLDER_VARIABLE, DatasetError, fetch, read_registry
+from fusion.pipeline.remote import FOLDER_VARIABLE, DatasetError, fetch_sample, read_registry
 
 NAME = "owner__project/folder/file.bin"
 
@@ -40,40 +40,38 @@ def test_every_listed_file_has_a_public_address_a_hash_and_a_licence() -> None:
 def test_local_files_have_the_promised_size_and_hash(real_file) -> None:
     for name, dataset in read_registry().items():
         path = real_file(name)
-        assert fetch(name) == path
+        assert fetch_sample(name) == path
         assert path.stat().st_size == dataset.size
 
 
-def test_local_folder_wins_over_the_network(registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    path = tmp_path / NAME
-    path.parent.mkdir(parents=True)
-    path.write_bytes(b"measured")
-    assert fetch(NAME, registry=registry) == path
-
-
-def test_a_file_of_another_content_is_refused(registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    path = tmp_path / NAME
-    path.parent.mkdir(parents=True)
-    path.write_bytes(b"invented")
-    with pytest.raises(DatasetError, match=r"file\.bin: SHA-256 is .* the registry promises .*; fetch the file again"):
-        fetch(NAME, registry=registry)
-
-
-def test_a_missing_local_file_names_the_variable(
-    registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("content", "refusal"),
+    [
+        (b"measured", None),
+        (b"invented", r"file\.bin: SHA-256 is .* the registry promises .*; fetch the file again"),
+        (None, "does not exist; THERMOFUSE_DATA must name a folder"),
+    ],
+)
+def test_a_local_folder_wins_over_the_network_where_it_holds_the_promised_file(
+    registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes | None, refusal: str | None
 ) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    with pytest.raises(DatasetError, match="does not exist; THERMOFUSE_DATA must name a folder"):
-        fetch(NAME, registry=registry)
+    path = tmp_path / NAME
+    path.parent.mkdir(parents=True)
+    if content is not None:
+        path.write_bytes(content)
+    if refusal is None:
+        assert fetch_sample(NAME, registry=registry) == path
+    else:
+        with pytest.raises(DatasetError, match=refusal):
+            fetch_sample(NAME, registry=registry)
 
 
 def test_an_unlisted_name_and_a_missing_registry_are_refused(registry: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"'nothing' is not listed in .*; the first of 1 names is 'owner__project"):
-        fetch("nothing", registry=registry)
-    with pytest.raises(DatasetError, match="no registry of measured files; use a clone"):
-        fetch(NAME, registry=tmp_path / "absent.csv")
+        fetch_sample("nothing", registry=registry)
+    with pytest.raises(DatasetError, match="no registry of measured files; install thermofuse again"):
+        fetch_sample(NAME, registry=tmp_path / "absent.csv")
 
 
 def test_an_unreachable_address_says_how_to_go_on(
@@ -84,4 +82,4 @@ def test_an_unreachable_address_says_how_to_go_on(
     with pytest.raises(
         DatasetError, match=r"could not be fetched from http://127\.0\.0\.1:9/file\.bin .*copy the file by hand"
     ):
-        fetch(NAME, registry=registry)
+        fetch_sample(NAME, registry=registry)

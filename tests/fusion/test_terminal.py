@@ -11,8 +11,8 @@ import rich.table
 from typer.testing import CliRunner
 
 from fusion.cli import app
-from fusion.report.tables import print_table, table
-from fusion.terminal import Terminal, ascii_json, cell, printable, printable_json, short
+from fusion.messages import Terminal, ascii_json, cell, printable, printable_json, short
+from fusion.report.wording import print_table, table
 
 #: Clears the screen, renames the window, rings, goes back over the line, sets by C1, turns the direction of what follows.
 ACTING = "\x1b[2J \x1b]0;x\x07 \r \x08 \x9b2J \u202e"

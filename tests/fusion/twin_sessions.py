@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import xarray as xr
 
-from fusion.alignment.align import AxisGeometry, align
+from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from fusion.twin.truth import deviations_of, fields_of
 
 #: Anomaly that is planted, and what the diagnosis must call it.

@@ -1,24 +1,18 @@
 """Damaged laser files: mutations of one small file of each kind, through the readers that a user's file meets."""
 
-from __future__ import annotations
-
-import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import openpyxl
 
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.readers import is_environment_log, read_deviations, read_environment
-from interferometry.io.renishaw import read_rtx
+from interferometry.io.readings import is_environment_log, read_deviations, read_environment
 
 #: Pieces that damage or odd programs put into files.
 PIECES = (
     b"", b"\0", b"-", b"1_2.5", b"9999", b"nan", b"-1e20", b"1e999", b"\xff", b"\n", b"\r", b",", b";", b'"', b"::", b"\xe2\x88\x92",
     b"99999999999999999999", b"0", b"31/02/2026 25:61", b"[um]", b"position", b"::\n", b"\xff\xfe", b"A" * 140_000,
 )  # fmt: skip
-
 LONG = "cycle,direction,target,position_mm,time,deviation_um\n" + "".join(
     f"{cycle},{sign},{target},{20 * target},2026-03-09T06:{10 * cycle + (target if sign == '+' else 9 - target):02d}:00Z,{target}.5\n"
     for cycle in (1, 2)
@@ -40,11 +34,6 @@ ECMC = "UNIT=mm\nCYCLES=2\nPOSITIONS=2\nTGT_DATA[1]=0\nTGT_DATA[2]=10\n" + "".jo
     for way in ("FWD", "BWD")
     for target in (1, 2)
 )
-
-
-def _rtx() -> bytes:
-    header = "HEADER::\r\nFile Type: rtx\r\nSample no: 20\r\nActual sample rate: 100\r\nData:\r\n"
-    return header.encode() + struct.pack("<20d", *range(20)) + b"EOF::\r\n"
 
 
 def _workbook(folder: Path) -> bytes:
@@ -87,41 +76,25 @@ def _mutated(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def fuzz(folder: Path, number: int, *, seed: int) -> dict[str, tuple[int, int]]:
-    """Send mutated files of every kind through the readers.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the files go.
-    number : int
-        Mutations of all kinds together.
-    seed : int
-        Of the mutations.
-
-    Returns
-    -------
-    dict of str to tuple of (int, int)
-        Per kind, files that were read and files that were refused; any error other than LaserFormatError passes through.
-    """
-    readers: dict[str, tuple[bytes, Callable[[Path], object]]] = {
-        "long.csv": (LONG.encode(), _read_any),
-        "wide.csv": (WIDE.encode(), _read_any),
-        "utf16.csv": (WIDE.encode("utf-16"), _read_any),
-        "environment.csv": (LOG.encode(), _read_any),
-        "test.rtl": (RTL.encode(), _read_any),
-        "log.dat": (ECMC.encode(), _read_any),
-        "long.xlsx": (_workbook(folder), _read_any),
-        "capture.rtx": (_rtx(), read_rtx),
+    """Return how many of the mutated files of each kind were read and refused; any error other than LaserFormatError passes through."""
+    contents = {
+        "long.csv": LONG.encode(),
+        "wide.csv": WIDE.encode(),
+        "utf16.csv": WIDE.encode("utf-16"),
+        "environment.csv": LOG.encode(),
+        "test.rtl": RTL.encode(),
+        "log.dat": ECMC.encode(),
+        "long.xlsx": _workbook(folder),
     }
     rng = np.random.default_rng(seed)
-    counts = dict.fromkeys(readers, (0, 0))
+    counts = dict.fromkeys(contents, (0, 0))
     for i in range(number):
-        name, (content, read) = list(readers.items())[i % len(readers)]
+        name, content = list(contents.items())[i % len(contents)]
         path = folder / name
         path.write_bytes(_mutated(content, rng))
         taken, refused = counts[name]
         try:
-            read(path)
+            _read_any(path)
             counts[name] = taken + 1, refused
         except LaserFormatError as error:
             assert str(path) in str(error), f"{name}: {error} does not name the file"

@@ -1,7 +1,5 @@
 """Positioning tests of known truth: 16 targets, 300 mm, 300 mm/min, 2 s dwell, 100 cycles in 7 h."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,10 +1,5 @@
 """Index of air against published vectors, real files, and compensation undone and redone."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -18,7 +13,7 @@ from interferometry.compensation import (
     environment_factor,
     implied_wavelength_nm,
 )
-from interferometry.io.readers import read_deviations
+from interferometry.io.readings import read_deviations
 from tests.interferometry.simulated_campaigns import START, simulate
 
 #: NIST Engineering Metrology Toolbox: degC, kPa, % relative humidity, nm, index.
@@ -41,15 +36,13 @@ VECTORS = [
 
 
 @pytest.mark.parametrize(("temperature", "pressure", "humidity", "wavelength", "index"), VECTORS)
-def test_index_of_air_meets_the_published_vectors(
-    temperature: float, pressure: float, humidity: float, wavelength: float, index: float
-) -> None:
+def test_index_of_air_meets_the_published_vectors(temperature, pressure, humidity, wavelength, index):
     computed = air_index(temperature, pressure * 10, humidity, wavelength_nm=wavelength)
     # The vectors are printed to 1e-9.
     assert float(computed) == pytest.approx(index, abs=0.6e-9)
 
 
-def test_sensitivities_of_the_index() -> None:
+def test_sensitivities_of_the_index():
     at = air_index(20.0, 1013.25, 50.0)
     assert float(air_index(21.0, 1013.25, 50.0) - at) * 1e6 == pytest.approx(-0.955, abs=0.005)
     assert float(air_index(20.0, 1014.25, 50.0) - at) * 1e6 == pytest.approx(0.268, abs=0.001)
@@ -57,7 +50,7 @@ def test_sensitivities_of_the_index() -> None:
 
 
 @pytest.mark.real_data
-def test_genuine_file_implies_the_wavelength_of_the_laser(real_file: Callable[[str], Path]) -> None:
+def test_genuine_file_implies_the_wavelength_of_the_laser(real_file):
     test = read_deviations(real_file("friedcucumber__RenishawWork/data/22.rtl"))
     index = air_index(*(test[name].values for name in ("air_temperature", "air_pressure", "relative_humidity")))
     implied = implied_wavelength_nm(
@@ -73,13 +66,13 @@ RECORD = "matusm__NmmEnvironment/TestData/T22-0263_L2_15_{}.pos"
 
 
 @pytest.fixture
-def record(real_file: Callable[[str], Path]) -> np.ndarray:
+def record(real_file):
     """56.8 h: X, Y, Z in m, three air temperatures in degC, pressure in Pa, humidity in %, sample temperature in degC."""
     return np.concatenate([np.loadtxt(real_file(RECORD.format(part))) for part in (1, 2)])
 
 
 @pytest.mark.real_data
-def test_long_record_index_of_air_and_dead_path(record: np.ndarray) -> None:
+def test_long_record_index_of_air_and_dead_path(record):
     index = air_index(record[:, 3:6].mean(axis=1), record[:, 6] / 100, record[:, 7])
     assert np.ptp(index) * 1e6 == pytest.approx(4.0, abs=0.02)
     # One row every 204 s: 7 h are 124 rows.
@@ -90,7 +83,7 @@ def test_long_record_index_of_air_and_dead_path(record: np.ndarray) -> None:
 
 
 @pytest.mark.real_data
-def test_long_record_height_follows_the_sample_temperature(record: np.ndarray) -> None:
+def test_long_record_height_follows_the_sample_temperature(record):
     first, second = record[:501], record[501:]
     # Both halves traverse the same line: the difference of heights is free of the surface's shape.
     slope = np.polyfit(second[:, 8] - first[:, 8], (second[:, 2] - first[:, 2]) * 1e9, 1)[0]
@@ -110,14 +103,14 @@ def conditions(temperature: np.ndarray, pressure: np.ndarray, material: np.ndarr
 
 
 @pytest.fixture
-def campaign(rng: np.random.Generator) -> tuple[xr.Dataset, xr.Dataset]:
+def campaign(rng):
     deviations, _ = simulate(rng, cycles=10)
     minutes = np.arange(0.0, 50.0)
     environment = conditions(22 + 0.05 * minutes, 1000 + 0.1 * minutes, 21 + 0.1 * minutes, minutes)
     return deviations, environment
 
 
-def test_what_was_done_with_a_fixed_factor_is_undone(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+def test_what_was_done_with_a_fixed_factor_is_undone(campaign):
     """A display with one fixed factor, of an axis that keeps its length, is brought to the lengths the counts mean."""
     deviations, environment = campaign
     true = deviations["deviation"].values
@@ -136,9 +129,7 @@ def test_what_was_done_with_a_fixed_factor_is_undone(campaign: tuple[xr.Dataset,
     assert redone.attrs["outside_environment"] == 0
 
 
-def test_dead_path_is_corrected_by_its_length_and_the_change_of_index(
-    campaign: tuple[xr.Dataset, xr.Dataset],
-) -> None:
+def test_dead_path_is_corrected_by_its_length_and_the_change_of_index(campaign):
     deviations, environment = campaign
     redone = compensate(deviations, environment, dead_path_mm=100.0)
     index = redone["air_index"].values
@@ -149,7 +140,7 @@ def test_dead_path_is_corrected_by_its_length_and_the_change_of_index(
     assert np.ptp(added, axis=2).max() < 0.01
 
 
-def test_temperature_seen_along_the_axis_replaces_the_probe(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+def test_temperature_seen_along_the_axis_replaces_the_probe(campaign):
     deviations, environment = campaign
     fixed = (0.31639, 0.31639)
     probe = compensate(deviations, environment, applied_factor_um=fixed)
@@ -161,7 +152,7 @@ def test_temperature_seen_along_the_axis_replaces_the_probe(campaign: tuple[xr.D
     np.testing.assert_allclose(difference, expected, atol=2e-3)
 
 
-def test_uncertainty_follows_the_sensitivities(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+def test_uncertainty_follows_the_sensitivities(campaign):
     deviations, environment = campaign
     only_temperature = SensorUncertainty(
         air_temperature_K=1.0,
@@ -183,7 +174,7 @@ def test_uncertainty_follows_the_sensitivities(campaign: tuple[xr.Dataset, xr.Da
         SensorUncertainty(formula_ppm=-1)
 
 
-def test_readings_without_conditions_are_refused_or_counted(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+def test_readings_without_conditions_are_refused_or_counted(campaign):
     deviations, environment = campaign
     short = environment.isel(time=slice(0, 35))
     assert compensate(deviations, short)["air_index"].notnull().all()
@@ -196,7 +187,7 @@ def test_readings_without_conditions_are_refused_or_counted(campaign: tuple[xr.D
         compensate(timeless, environment)
 
 
-def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign):
     deviations, environment = campaign
     complete = compensate(deviations, environment, applied_factor_um=(0.31639, 0.31639))
     lost = deviations.copy(deep=True)
@@ -211,8 +202,8 @@ def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign: t
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("wavelength_nm", -1.0, "lies outside 300 .. 1700"),
-        ("wavelength_nm", 0.633, "lies outside 300 .. 1700"),
+        ("wavelength_nm", -1.0, "is outside 300 .. 1700"),
+        ("wavelength_nm", 0.633, "is outside 300 .. 1700"),
         ("wavelength_nm", np.nan, "is not finite"),
         ("expansion_coefficient_ppm_per_K", np.nan, "is not finite"),
         ("dead_path_mm", np.inf, "is not finite"),
@@ -220,9 +211,7 @@ def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign: t
         ("zero_mm", np.nan, "is not finite"),
     ],
 )
-def test_a_number_that_has_no_meaning_is_refused(
-    name: str, value: float, reason: str, rng: np.random.Generator
-) -> None:
+def test_a_number_that_has_no_meaning_is_refused(name, value, reason, rng):
     deviations = simulate(rng, cycles=2)[0]
     conditions = {
         "air_temperature": 20.0,
@@ -232,4 +221,4 @@ def test_a_number_that_has_no_meaning_is_refused(
     }
     environment = xr.Dataset({key: ("time", [number]) for key, number in conditions.items()}, {"time": [START]})
     with pytest.raises(CompensationError, match=f"{name}={value} {reason}"):
-        compensate(deviations, environment, **{name: value})  # type: ignore[arg-type]
+        compensate(deviations, environment, **{name: value})

@@ -1,19 +1,17 @@
 """What crosses the border of the package: every source of deviations keeps the contract."""
 
-from __future__ import annotations
+import importlib
+import pkgutil
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 import xarray as xr
 
+import interferometry
 from interferometry.anomalies import detect_anomalies
+from interferometry.common import DEVIATIONS, ENVIRONMENT, ESTIMATE, InterferometryError
 from interferometry.compensation import compensate
-from interferometry.contract import DEVIATIONS, ENVIRONMENT, ESTIMATE
 from interferometry.drift.estimate import estimate_drift
-from interferometry.errors import InterferometryError
-from interferometry.io.readers import read_deviations, read_environment
+from interferometry.io.readings import read_deviations, read_environment
 from interferometry.io.writers import write_deviations_csv, write_rtl
 from interferometry.iso230 import evaluate_iso230
 from interferometry.neighbours import compare, evaluate_neighbours
@@ -28,15 +26,15 @@ def keeps_contract(deviations: xr.Dataset) -> bool:
     )
 
 
-def test_built_deviations_keep_the_contract(rng: np.random.Generator) -> None:
+def test_built_deviations_keep_the_contract(rng):
     deviations, _ = simulate(rng, cycles=2)
     assert keeps_contract(deviations)
     assert not keeps_contract(deviations.assign(position=deviations["position"].assign_attrs(units="m")))
 
 
 @pytest.mark.parametrize(("name", "write"), [("laser.csv", write_deviations_csv), ("laser.rtl", write_rtl)])
-def test_read_deviations_keep_the_contract(name: str, write: object, tmp_path: Path, rng: np.random.Generator) -> None:
-    write(tmp_path / name, simulate(rng, cycles=2)[0])  # type: ignore[operator]
+def test_read_deviations_keep_the_contract(name, write, tmp_path, rng):
+    write(tmp_path / name, simulate(rng, cycles=2)[0])
     assert keeps_contract(read_deviations(tmp_path / name))
 
 
@@ -50,7 +48,7 @@ ENTRIES = {
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
-def test_an_evaluation_refuses_what_is_no_dataset_of_deviations(entry: str, rng: np.random.Generator) -> None:
+def test_an_evaluation_refuses_what_is_no_dataset_of_deviations(entry, rng):
     good = simulate(rng, cycles=2)[0]
     faults = {
         r"deviations is of type NoneType, not a Dataset; give what read_deviations or build_deviations returns": None,
@@ -65,21 +63,17 @@ def test_an_evaluation_refuses_what_is_no_dataset_of_deviations(entry: str, rng:
             ENTRIES[entry](dataset)
 
 
-def test_anomalies_and_compensation_name_which_dataset_is_wrong(rng: np.random.Generator) -> None:
+def test_anomalies_and_compensation_name_which_dataset_is_wrong(rng):
     good = simulate(rng, cycles=2)[0]
-    with pytest.raises(
-        InterferometryError, match=r"estimated has no variable 'standardised' .*; give what estimate_drift"
-    ):
+    with pytest.raises(InterferometryError, match=r"estimated has no variable 'standardised' .*; give what"):
         detect_anomalies(good, good)
     with pytest.raises(InterferometryError, match="deviations has no variable 'deviation'"):
-        detect_anomalies(estimate_drift(good), xr.Dataset())
+        detect_anomalies(estimate_drift(good), good)
     with pytest.raises(InterferometryError, match=r"environment has no variable 'time' .*; give what read_environment"):
         compensate(good, xr.Dataset())
 
 
-def test_what_the_package_returns_keeps_the_contracts_of_estimate_and_environment(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_what_the_package_returns_keeps_the_contracts_of_estimate_and_environment(tmp_path, rng):
     estimated = estimate_drift(simulate(rng, cycles=4)[0])
     assert {name: (estimated[name].dims, estimated[name].dtype.kind) for name in ESTIMATE} == {
         name: (dims, kind) for name, (dims, _, kind) in ESTIMATE.items()
@@ -91,3 +85,18 @@ def test_what_the_package_returns_keeps_the_contracts_of_estimate_and_environmen
         name: (environment[name].dims, environment[name].attrs.get("units", ""), environment[name].dtype.kind)
         for name in ENVIRONMENT
     } == ENVIRONMENT
+
+
+def test_every_error_class_has_the_base_of_the_package():
+    names = [module.name for module in pkgutil.walk_packages(interferometry.__path__, "interferometry.")]
+    classes = {
+        value
+        for name in names
+        for value in vars(importlib.import_module(name)).values()
+        if isinstance(value, type) and issubclass(value, Exception) and value.__module__.startswith("interferometry")
+    }
+    assert {"CompensationError", "DriftDataError", "DriftModelError", "LaserFormatError"} <= {
+        c.__name__ for c in classes
+    }
+    assert all(issubclass(error, InterferometryError) for error in classes)
+    assert issubclass(InterferometryError, ValueError)

@@ -1,16 +1,11 @@
 """The summary of a test: missing readings, and factor, air and material compared with each other."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from interferometry.compensation import air_index, environment_factor
 from interferometry.inspection import describe_test
-from interferometry.io.readers import read_deviations
+from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from tests.interferometry.simulated_campaigns import simulate
 
@@ -24,16 +19,14 @@ AIR = {
 }
 
 
-def test_inspection_holds_factor_air_and_material_against_each_other(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_inspection_holds_factor_air_and_material_against_each_other(tmp_path, rng):
     deviations, _ = simulate(rng, cycles=2)
     deviations["deviation"].values[:, 1] = np.nan
     deviations["deviation"].values[0, 0, 3] = np.nan
     for coefficient, starts in ((11.7, "environment factor"), (10.7, "warning: environment factor")):
         index = air_index(np.array([26.2, 26.3]), np.array([1011.4, 1011.6]), np.array([37.0, 38.0]))
         factor = environment_factor(
-            index,
-            material_temperature_degC=np.array([24.5, 24.6]),
-            expansion_coefficient_ppm_per_K=coefficient,
+            index, material_temperature_degC=np.array([24.5, 24.6]), expansion_coefficient_ppm_per_K=coefficient
         )
         path = tmp_path / "t.rtl"
         write_rtl(path, deviations, environment={**AIR, "environment_factor_um": (factor[0], factor[1])})
@@ -48,7 +41,7 @@ def test_inspection_holds_factor_air_and_material_against_each_other(tmp_path: P
 
 
 @pytest.mark.real_data
-def test_inspection_of_the_genuine_file(real_file: Callable[[str], Path]) -> None:
+def test_inspection_of_the_genuine_file(real_file):
     lines = describe_test(read_deviations(real_file(GENUINE)))
     assert "warning: no reading in the negative direction" in lines
     assert "runs without a reading: 2" in lines

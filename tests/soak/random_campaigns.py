@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from fusion.twin.effects import EFFECTS
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.effects import EFFECTS
-from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
+from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError
 from fusion.twin.simulate import simulate
 
 #: Most readings of a campaign, so that a thousand of them take hours and not days.

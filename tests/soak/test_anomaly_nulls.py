@@ -80,7 +80,7 @@ def test_no_anomaly_is_reported(noise: str, hot_zone_um: float) -> None:
         for run in range(RUNS):
             deviations, truth, drift_um = campaign(700_000 + 1000 * number + run, noise, drift, hot_zone_um)
             estimated = estimate_drift(deviations)
-            count += any(anomaly.stands_out for anomaly in detect_anomalies(estimated, deviations))
+            count += any(anomaly.stands_out for anomaly in detect_anomalies(deviations, estimated))
             relative = truth - truth[:, :1]
             error = (estimated["profile_relative"].values - relative)[:, 1:]
             mean = deviations["deviation"].values.mean(axis=0)

@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.attribution.attribute import correlate
-from fusion.attribution.contact_sensors import FOLDS, choose_sensors
-from fusion.attribution.leading_source import find_source
-from fusion.attribution.randomised_duty import DutyLaw, randomisation_test
+from fusion.analysis.attribution.correlate import correlate, find_source
+from fusion.analysis.attribution.duty import DutyLaw, randomisation_test
+from fusion.analysis.attribution.sensors import FOLDS, choose_sensors
 from tests.fusion import field_simulator as simulator
 from tests.fusion.duty_simulator import NAMES, driven, run_schedule
 from tests.soak.rates import campaigns, rate, wilson
@@ -58,10 +57,10 @@ def test_power_to_find_the_right_source(lag_s, bar):
         maps = correlate(made.fused, made.field[:, ::2, ::2], checks=1, seed=seed)
         cells += bool((maps["p_value"] <= 0.05).any())
         found = find_source(maps)
-        if found.verdict == "attributable":
+        if maps.attrs["verdict"] == "attributable":
             hit = names(found, source)
             right, wrong = right + (hit is True), wrong + (hit is False)
-            alone += hit is False and not found.others_mm
+            alone += hit is False and not found.equivalent_places_mm
     print(f"\nlag {lag_s:.0f} s: right source {rate(right, runs)}, wrong {rate(wrong, runs)} ", end="")
     print(f"(without naming another as equal: {rate(alone, runs)}); any cell {rate(cells, runs)}")
     assert wilson(right, runs)[1] >= bar
@@ -115,8 +114,7 @@ def test_losses_and_their_uncertainty_against_the_truth():
         scores.append((choice.without.value / perfect, choice.without.u / perfect, choice.sets[0].loss.value / perfect))
     worth, u, loss = np.array(scores).T
     print(
-        f"\ncamera takes out {np.median(worth):.2f} of what a perfect prediction would (u {np.median(u):.2f}); ",
-        end="",
+        f"\ncamera takes out {np.median(worth):.2f} of what a perfect prediction would (u {np.median(u):.2f}); ", end=""
     )
     print(
         f"more than all in {np.mean(worth - 2 * u > 1.0):.3f}; one sensor loses {np.median(loss):.3f}, N = {CONTACT_RUNS}"

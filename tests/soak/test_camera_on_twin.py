@@ -9,16 +9,15 @@ import pytest
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
-from fusion.pipeline.camera import camera_corrected
-from fusion.pipeline.thermal import reduce_thermography
-from fusion.products.progress import silent
+from fusion.pipeline.thermal import camera_corrected, reduce_thermography
+from fusion.results.progress import silent
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import environment_log
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import sound_recipe
-from thermography.radiometry.camera_correction import LevelSeries, estimate_correction, room_temperatures
+from thermography.radiometry.camera import LevelSeries, estimate_correction, room_temperatures
 
 pytestmark = pytest.mark.slow
 

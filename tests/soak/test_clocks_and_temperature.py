@@ -1,43 +1,37 @@
-"""Checks of clocks and of the camera's rise: how often they doubt sound campaigns, and what they notice; quoted in docs/measured.md."""
+"""Checks of clocks and of the camera's rise: how often they doubt sound campaigns, and what they notice; quoted in docs/measured.csv."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.alignment.align import AxisGeometry, align
-from fusion.alignment.readings import read_fused
-from fusion.consistency.camera_stamps import check_phase
-from fusion.consistency.checks import Check
-from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_load_scale, check_material_clock
-from fusion.consistency.field_series import field_at, thin_fields
-from fusion.consistency.temperature import check_material
+from fusion.analysis.alignment.align import AxisGeometry, align
+from fusion.analysis.alignment.readings import read_fused
+from fusion.analysis.consistency.camera import check_phase
+from fusion.analysis.consistency.checks import Check
+from fusion.analysis.consistency.clocks import (
+    check_camera_clock,
+    check_load_clock,
+    check_load_scale,
+    check_material_clock,
+)
+from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.analysis.consistency.logs import check_material
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
-from tests.fusion.consistency.twin_fields import late, scaled
+from tests.fusion.analysis.consistency.twin_fields import Recorded, late, scaled
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import sound_recipe
 from thermography.fields.survey import stray_frames
 
 pytestmark = pytest.mark.slow
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """What the instruments of one campaign recorded."""
-
-    axis: AxisGeometry
-    deviations: xr.Dataset
-    fields: xr.Dataset
-    environment: xr.Dataset
-    drivers: xr.Dataset
 
 
 def varied_recipe(seed: int) -> Recipe:
@@ -148,42 +142,33 @@ def _of(log: xr.Dataset, **columns: np.ndarray) -> xr.Dataset:
     return log.assign({name: log[name].copy(data=values) for name, values in columns.items()})
 
 
+def _material(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recorded], Recorded]:
+    """A lie of the material temperature."""
+
+    def lied(test: Recorded) -> Recorded:
+        changed = change(test.environment["material_temperature"].values)
+        return replace(test, environment=_of(test.environment, material_temperature=changed))
+
+    return lied
+
+
+def _exchanged(test: Recorded) -> Recorded:
+    air, material = (test.environment[f"{name}_temperature"].values for name in ("air", "material"))
+    return replace(test, environment=_of(test.environment, material_temperature=air, air_temperature=material))
+
+
+def _per_cent(test: Recorded) -> Recorded:
+    duty = test.drivers["duty"].values
+    late_half = np.arange(duty.size) >= duty.size // 2
+    return replace(test, drivers=_of(test.drivers, duty=duty * np.where(late_half, 100.0, 1.0)))
+
+
 LYING_LOGS: dict[str, Callable[[Recorded], Recorded]] = {
-    "backwards": lambda test: replace(
-        test,
-        environment=_of(test.environment, material_temperature=test.environment["material_temperature"].values[::-1]),
-    ),
-    "another hour": lambda test: replace(
-        test,
-        environment=_of(
-            test.environment, material_temperature=np.roll(test.environment["material_temperature"].values, -60)
-        ),
-    ),
-    "stands still": lambda test: replace(
-        test,
-        environment=_of(
-            test.environment,
-            material_temperature=np.full(
-                test.environment.sizes["time"], test.environment["material_temperature"].values[0]
-            ),
-        ),
-    ),
-    "exchanged": lambda test: replace(
-        test,
-        environment=_of(
-            test.environment,
-            material_temperature=test.environment["air_temperature"].values,
-            air_temperature=test.environment["material_temperature"].values,
-        ),
-    ),
-    "per cent": lambda test: replace(
-        test,
-        drivers=_of(
-            test.drivers,
-            duty=test.drivers["duty"].values
-            * np.where(np.arange(test.drivers.sizes["time"]) < test.drivers.sizes["time"] // 2, 1.0, 100.0),
-        ),
-    ),
+    "backwards": _material(lambda values: values[::-1]),
+    "another hour": _material(lambda values: np.roll(values, -60)),
+    "stands still": _material(lambda values: np.full(values.size, values[0])),
+    "exchanged": _exchanged,
+    "per cent": _per_cent,
 }
 
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.comparison.profile_changes import ProfileChange, compare_profiles
-from fusion.comparison.scatter_changes import compare_scatters
+from fusion.analysis.comparison import ProfileChange, compare_profiles, compare_scatters
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 

@@ -1,4 +1,4 @@
-"""Robustness of the FLIR reader: the row "damaged files" of docs/measured.md."""
+"""Robustness of the FLIR reader: quoted in docs/measured.csv."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged files of every kind through the readers that a user's file meets: the row "damaged inputs" of docs/measured.md.
+"""Damaged files of every kind through the readers that a user's file meets: quoted in docs/measured.csv.
 
 The contract: read or refused with a message; no other exception, no ended process, nothing above 2 s, nothing above four times the file
 plus 200 MB. ``THERMOFUSE_FUZZ_INPUTS`` sets the number of inputs, ``THERMOFUSE_FUZZ_SEED`` their seed, ``THERMOFUSE_FUZZ_KINDS`` the kinds.

@@ -1,4 +1,4 @@
-"""Robustness of the laser readers: the row "damaged laser files" of docs/measured.md."""
+"""Robustness of the laser readers: quoted in docs/measured.csv."""
 
 from __future__ import annotations
 

@@ -1,19 +1,18 @@
 """How often the diagnosis names the right cause of an odd position: docs/method/diagnosis.md, table of error rates.
 
 Campaigns of 100 cycles with 0.3 um rms of effect at one target beside 0.4 um of noise and a random-walk drift (200 per cause, seeds from 0
-on); and campaigns of the twin with 0.4 um. The same runs show what other thresholds in `fusion.diagnosis.diagnose` would give.
+on); and campaigns of the twin with 0.4 um. The same runs show what other thresholds in `fusion.analysis.diagnosis.diagnose` would give.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from fusion.diagnosis.diagnose import THRESHOLDS, Diagnosis, diagnose
-from fusion.twin.machine.recipe import AnomalyRecipe
+from fusion.analysis.diagnosis.diagnose import THRESHOLDS, Diagnosis, diagnose
+from fusion.twin.recipe import AnomalyRecipe
 from tests.fusion import twin_sessions
 from tests.fusion.residual_simulator import CAUSES, odd_position
 from tests.soak.rates import campaigns, rate, wilson
@@ -33,14 +32,11 @@ BARS = {
 TRIED = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 0.9)
 
 
-@dataclass(frozen=True)
-class Flag:
-    target: int = 3
-    direction: str = "both"
-
-
 def diagnoses_of(cause: str) -> list[Diagnosis]:
-    return [diagnose([Flag()], odd_position(cause, np.random.default_rng([seed, 41])))[0] for seed in range(RUNS)]
+    return [
+        diagnose(odd_position(cause, np.random.default_rng([seed, 41])), [twin_sessions.Flag(3)])[0]
+        for seed in range(RUNS)
+    ]
 
 
 @pytest.mark.parametrize("cause", list(BARS))
@@ -67,7 +63,7 @@ def test_causes_on_the_twin_at_the_size_of_the_noise():
         names = []
         for seed in range(runs):
             fused, _ = twin_sessions.session(100 + seed, anomaly=(AnomalyRecipe(5, kind, "both", 0.4),))
-            names.append(diagnose([twin_sessions.Flag()], fused)[0].cause)
+            names.append(diagnose(fused, [twin_sessions.Flag()])[0].cause)
         wrong = [name for name in names if name not in (right, "undetermined")]
         print(f"\n{kind}: right {names.count(right)}, wrong {wrong} of {runs}", end="")
         assert len(wrong) <= 2

@@ -194,7 +194,7 @@ def rates(first_seed: int, **options: float) -> dict[str, tuple[float, float]]:
     for seed in range(RUNS):
         rng = np.random.default_rng(first_seed + seed)
         deviations, _ = simulate(rng, kind=("warmup", "duty", "rw")[seed % 3], noise=noise(rng, **options))
-        found = detect_anomalies(estimate_drift(deviations), deviations, permutations=399)
+        found = detect_anomalies(deviations, estimate_drift(deviations), permutations=399)
         count["any"] += bool(found)
         count["target 3"] += any(one.target == 3 for one in found)
         count["elsewhere"] += any(one.target != 3 for one in found)

@@ -12,17 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.alignment.align import cycle_bounds
+from fusion.analysis.alignment.align import cycle_bounds
 from fusion.twin import simulate
 from fusion.twin.camera import make_view
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from fusion.twin.truth import deviations_of
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.io.flir import index_frames
-from thermography.radiometry.overrides import Overrides
-from thermography.radiometry.planck import calibrate
+from thermography.radiometry.planck import Overrides, calibrate
 from thermography.registration.clock_offset import estimate_clock_offset
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.register import register

@@ -18,9 +18,9 @@ import pandas as pd
 import pytest
 from scipy.signal import lfilter
 
+from fusion.pipeline.remote import FOLDER_VARIABLE
 from fusion.pipeline.run import run_campaign
-from fusion.products.results_loop import RecordLoop
-from fusion.sample_data import FOLDER_VARIABLE
+from fusion.results.loop import RecordLoop
 
 pytestmark = pytest.mark.slow
 
@@ -210,7 +210,7 @@ class Answer:
 
 def ask(case: Case) -> Answer:
     """Run a case as a user would, without drawing its report."""
-    with tempfile.TemporaryDirectory() as base, mock.patch("fusion.report.html.render_report", return_value=""):
+    with tempfile.TemporaryDirectory() as base, mock.patch("fusion.report.page.render_report", return_value=""):
         folder = Path(base)
         case.table().to_csv(folder / "record.csv", index=False)
         text = f'[campaign]\ntitle = "{case.name}"\n\n[record]\nfile = "record.csv"\n{case.keys}'
@@ -221,7 +221,7 @@ def ask(case: Case) -> Answer:
         loop.verdict,
         tuple(step.effect for step in loop.steps if step.confirmed),
         tuple(step.effect for step in loop.steps if not step.confirmed),
-        tuple(loop.unnamed),
+        tuple(loop.unconfirmed_effects),
         tuple(f"{one.sensor.split('(')[0]} {one.state.replace('_', ' ')}" for one in loop.sensor_faults),
         loop.rmse_declared_um,
         loop.rmse_final_um,

@@ -1,4 +1,4 @@
-"""Hostile NetCDF and Zarr stores as frames of a campaign: the row "hostile NetCDF and Zarr stores" of docs/measured.md.
+"""Hostile NetCDF and Zarr stores as frames of a campaign: quoted in docs/measured.csv.
 
 Each is read in a process of its own: as a user's `inspect` does, and frame by frame as a run does. The contract: frames, or one message;
 no other exception, no ended process, and nothing of a file outside the folder.
@@ -18,11 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.starting.inspection import inspect_paths
+from fusion.pipeline.inspect import inspect_paths
 from tests.soak.fuzz.harness import REFUSALS, _place
 from tests.soak.fuzz.stores import SECRET, hostile_stores, write_secret
-from thermography.io.frame_readers import index_recordings
-from thermography.io.temperature_frames import StackOptions
+from thermography.io.other_cameras import StackOptions, index_recordings
 
 #: Memory that a process may take beyond that of the imports, bytes, and processor time, s: above both it is ended, which is a breach.
 MOST_BYTES, MOST_SECONDS = 4_000_000_000, 60

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import pytest
 
-from fusion.alignment.align import align_logs
-from fusion.alignment.readings import Readings, read_fused
-from fusion.loop.axis import close_loop
+from fusion.analysis.alignment.align import align_logs
+from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.drift_model.axis import close_loop
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
 from fusion.twin.truth import deviations_of
 from tests.fusion.loop_bench import CYCLES, effect_of

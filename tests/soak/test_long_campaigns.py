@@ -11,14 +11,13 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from fusion.alignment.reflection_patch import find_switching_patch
-from fusion.attribution.attribute import correlate
-from fusion.loop.axis import close_loop
-from fusion.loop.decisions import Reason
-from fusion.loop.result import LoopResult
-from fusion.pipeline.sizes import average_cycles
+from fusion.analysis.alignment.reflections import find_switching_patch
+from fusion.analysis.attribution.correlate import correlate
+from fusion.analysis.drift_model.axis import LoopResult, close_loop
+from fusion.analysis.drift_model.search import Reason
+from fusion.pipeline.positioning import average_cycles
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.truth import fields_of
 from tests.fusion import field_simulator
 from tests.fusion.long_tests import long_test
@@ -32,7 +31,7 @@ FIRST_SEED = first_seed(31000)
 
 def would_be_named(result: LoopResult) -> bool:
     """Whether an event was refused for restless drift alone: significant and confirmed."""
-    refused = {one.effect for one in result.state.decisions if one.reason is Reason.RESTLESS_DRIFT}
+    refused = {one.effect for one in result.state.decisions if one.reason is Reason.HETEROSCEDASTIC_DRIFT}
     scores = [score for scored in result.state.rounds for score in scored.scores if score.name in refused]
     return any(score.confirmation is not None and score.confirmation.passed for score in scores)
 

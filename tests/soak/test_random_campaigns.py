@@ -20,12 +20,12 @@ from typing import Any
 
 import pytest
 
-from fusion.errors import FusionError
+from fusion.common import FusionError
 from fusion.pipeline.run import run_campaign
 from fusion.report.terminal import summary_table
-from interferometry.errors import InterferometryError
+from interferometry.common import InterferometryError
 from tests.soak.random_campaigns import broken_invariants, strict, write_random_campaign
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 
 KEPT = Path("build/campaigns")
 #: Time of the processor after which a campaign counts as hung, s.

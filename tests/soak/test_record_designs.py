@@ -13,15 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion.campaign.config import load_campaign
-from fusion.campaign.record_runs import read_record
-from fusion.record import blocks, effects
-from fusion.record.baselines import plain_predictions
-from fusion.record.blocks import Record, reduce_record
-from fusion.record.hold_out import declare
-from fusion.record.prediction import channel_rmse
-from fusion.record.problem import chain_forward
-from tests.fusion.record.test_problem import CAIVIAC
+from fusion.analysis.drift_model import record as effects
+from fusion.analysis.drift_model import record_data as blocks
+from fusion.analysis.drift_model.record import chain_forward, channel_rmse, declare, plain_predictions
+from fusion.analysis.drift_model.record_data import Record, reduce_record
+from tests.fusion.record_tables import SPINDLE, spindle_table
 
 pytestmark = pytest.mark.slow
 
@@ -49,9 +45,7 @@ def test_range_of_the_error_over_designs(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    path = real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")
-    (tmp_path / "campaign.toml").write_text(CAIVIAC.format(file=path.as_posix()), encoding="utf-8")
-    table = read_record(load_campaign(tmp_path / "campaign.toml"))
+    table = spindle_table(tmp_path, real_file(SPINDLE))
     errors = []
     for name, choices in DESIGNS.items():
         with monkeypatch.context() as patched:

@@ -12,11 +12,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from fusion.loop.closed_loop import open_hold_out
-from fusion.record.blocks import reduce_record
-from fusion.record.hold_out import declare, hold_out
-from fusion.record.problem import search_record
-from fusion.twin.machine.recipe import EffectRecipe
+from fusion.analysis.drift_model.record import declare, hold_out, search_record
+from fusion.analysis.drift_model.record_data import reduce_record
+from fusion.analysis.drift_model.search import open_hold_out
+from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
 from tests.soak.rates import campaigns, first_seed
 

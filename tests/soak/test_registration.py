@@ -1,6 +1,6 @@
 """Registration on rendered views of a table: error over stated uncertainty, discs that are named, what is refused and what is doubted.
 
-Reproduces the table of docs/measured.md: nothing may be silently wrong. ``THERMOFUSE_RUNS`` sets the number of views per case.
+Reproduces figures of docs/measured.csv: nothing may be silently wrong. ``THERMOFUSE_RUNS`` sets the number of views per case.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from fusion.consistency.registration import check_registration
+from fusion.analysis.consistency.camera import check_registration
 from tests.soak.table_views import DISCS, GRID, Table, View, draw_view, hinted
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 from thermography.registration.plan import Fiducial
 from thermography.registration.register import Registration, register
 
@@ -226,10 +226,7 @@ CASES = (
     Case("320 x 240", view={"shape": (240, 320), "focal_px": 450.0, "mm_per_px": (1.7, 2.0)}),
     Case("160 x 120", view={"shape": (120, 160), "focal_px": 225.0, "mm_per_px": (3.4, 4.0)}, refused=None),
     Case("table larger than the frame", view={"mm_per_px": (0.55, 0.6), "centre_mm": (190.0, 120.0)}, refused=None),
-    Case(
-        "contrast of either sign",
-        table=lambda rng: Table(contrast_K=tuple(rng.choice([-3.0, 3.0], 12).tolist())),
-    ),
+    Case("contrast of either sign", table=lambda rng: Table(contrast_K=tuple(rng.choice([-3.0, 3.0], 12).tolist()))),
     Case("gradient 8 times", table=lambda rng: Table(gradient=8.0)),
     Case("contrasts 0.05 to 1.5 K", table=lambda rng: Table(contrast_K=tuple((-rng.uniform(0.05, 1.5, 12)).tolist()))),
     Case("4 listed", listed_as(CORNERS), table=lambda rng: Table(discs=CORNERS)),

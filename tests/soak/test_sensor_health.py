@@ -13,12 +13,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.alignment.sensor_health import examine_sensors
-from fusion.campaign.config import load_campaign
-from fusion.campaign.record_runs import read_record
-from fusion.record.sensor_health import examine_record
-from tests.fusion.record.test_problem import CAIVIAC
-from tests.fusion.record_tables import twin_table
+from fusion.analysis.alignment.sensor_health import examine_sensors
+from fusion.analysis.drift_model.record import examine_record
+from tests.fusion.record_tables import SPINDLE, spindle_table, twin_table
 from tests.soak.rates import campaigns
 
 pytestmark = pytest.mark.slow
@@ -39,10 +36,7 @@ OTHERS = ("stuck", "noise x 10", "open circuit")
 
 @pytest.fixture
 def spindle(tmp_path: Path, real_file: Callable[[str], Path]) -> xr.Dataset:
-    """The public spindle record (CAIVIAC/FL_THERMAL), 46.3 h, 16 sensors."""
-    path = real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")
-    (tmp_path / "campaign.toml").write_text(CAIVIAC.format(file=path.as_posix()), encoding="utf-8")
-    return read_record(load_campaign(tmp_path / "campaign.toml"))
+    return spindle_table(tmp_path, real_file(SPINDLE))
 
 
 def seconds_of(table: xr.Dataset) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Robustness of the loop on records: the row "short records" of docs/measured.md.
+"""Robustness of the loop on records: quoted in docs/measured.csv.
 
 Records of the twin of 0.5 h to 12 h, one sample a second to one a minute, are damaged as loggers and machines damage them. Each goes
 from the logged table to checked results, one in `WHOLE` from its file to the report, as the command runs it. The answer is a result or an
@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.errors import FusionError
+from fusion.analysis.drift_model.record import examine_record
+from fusion.analysis.drift_model.record_data import reduce_record
+from fusion.common import FusionError
 from fusion.pipeline.record import RecordSource, model_record, record_notices, sensor_notices
 from fusion.pipeline.run import run_campaign
-from fusion.products.progress import silent
-from fusion.products.results import assemble
-from fusion.record.blocks import reduce_record
-from fusion.record.sensor_health import examine_record
-from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
+from fusion.results.progress import silent
+from fusion.results.results import assemble
+from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError
 from fusion.twin.record import RecordTruth, simulate_record, write_record
 from tests.fusion.record_tables import table_of
 from tests.soak.rates import campaigns, first_seed, rate
@@ -207,8 +207,8 @@ def test_short_records_end_with_a_result_or_a_clear_error(
                     outcomes[run_command(truth, seed, tmp_path / str(seed))] += 1
                 else:
                     with monkeypatch.context() as reduced:
-                        reduced.setattr("fusion.record.problem.DRAWS", DRAWS)
-                        reduced.setattr("fusion.record.blocks.MOST_BLOCKS", BLOCKS)
+                        reduced.setattr("fusion.analysis.drift_model.record.DRAWS", DRAWS)
+                        reduced.setattr("fusion.analysis.drift_model.record_data.MOST_BLOCKS", BLOCKS)
                         outcomes[model(truth, seed)] += 1
         except FusionError:
             outcomes["refused"] += 1

@@ -8,16 +8,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.alignment.align import AxisGeometry, align
-from fusion.alignment.readings import read_fused
-from fusion.consistency.axis_line import compare_lines
-from fusion.consistency.coefficients import check_coefficients
-from fusion.consistency.logs import check_log
-from fusion.consistency.readings import check_readings
-from fusion.consistency.signs import check_signs
-from fusion.loop.axis import close_loop
+from fusion.analysis.alignment.align import AxisGeometry, align
+from fusion.analysis.alignment.readings import read_fused
+from fusion.analysis.consistency.logs import check_log
+from fusion.analysis.consistency.model import check_coefficients, compare_lines
+from fusion.analysis.consistency.readings import check_readings, check_signs
+from fusion.analysis.drift_model.axis import close_loop
+from fusion.results.loop import ResidualTestsPart
 from fusion.twin import simulate
-from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe
+from fusion.twin.recipe import AnomalyRecipe, EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
 from tests.soak.rates import campaigns, first_seed, rate, wilson
@@ -66,13 +65,13 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         fused = align(deviations, fields, axis, environment=environment, drivers=drivers)
         result = close_loop(read_fused(fused), ["axis_expansion", "table_offset"])
         line = compare_lines(result.after, len(result.declared), fields, axis)
-        loop = {**result.as_json(), "axis_line": None if line is None else line.as_json()}
+        loop = result.described(ResidualTestsPart.model_construct(), axis_line=line).model_dump(exclude_unset=True)
         times = deviations["time"].values.ravel()
         checks = [
             *check_readings(deviations, plan_extent_mm=truth.recipe.plan.width_mm),
             *check_signs(deviations),
-            *check_log(environment, times, name="environment", file="environment.csv", endangers=""),
-            *check_log(drivers, times, name="drivers", file="drivers.csv", endangers=""),
+            *check_log(environment, times, name="environment", file="environment.csv"),
+            *check_log(drivers, times, name="drivers", file="drivers.csv"),
             *check_coefficients(loop, travel_mm=result.after.readings.span_mm),
         ]
         failed = [check for check in checks if not check.passed]

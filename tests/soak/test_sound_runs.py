@@ -18,15 +18,15 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from fusion.errors import FusionError
+from fusion.common import FusionError
 from fusion.pipeline.run import run_campaign
-from fusion.products.results import Results
-from fusion.twin.machine.recipe import Recipe
-from interferometry.errors import InterferometryError
+from fusion.results.results import Results
+from fusion.twin.recipe import Recipe
+from interferometry.common import InterferometryError
 from tests.soak.lies.campaigns import write
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import sound_recipe
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 
 pytestmark = pytest.mark.slow
 
@@ -63,7 +63,7 @@ def run(seed: int) -> Run:
     with tempfile.TemporaryDirectory() as base, contextlib.ExitStack() as stack:
         folder = Path(base)
         write(recipe, folder / "campaign")
-        stack.enter_context(mock.patch("fusion.report.html.render_report", return_value=""))
+        stack.enter_context(mock.patch("fusion.report.page.render_report", return_value=""))
         try:
             results = run_campaign(folder / "campaign" / "campaign.toml", folder / "out")
         except (FusionError, InterferometryError, ThermographyError) as error:
@@ -78,7 +78,7 @@ def statements_of(results: Results) -> tuple[str, ...]:
     loop = results.loop
     assert loop is not None
     said = [f"effect {step.effect}" for step in loop.steps]
-    said += [f"significant {name}" for name in loop.unnamed]
+    said += [f"significant {name}" for name in loop.unconfirmed_effects]
     said += [f"remainder: {loop.unexplained.shape}"] if loop.unexplained.shape else []
     said += [f"anomaly at target {anomaly.target}" for anomaly in results.anomalies or ()]
     return tuple(said)

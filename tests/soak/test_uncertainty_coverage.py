@@ -11,27 +11,25 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fusion.alignment.align import align
-from fusion.alignment.readings import read_fused
+from fusion.analysis.alignment.align import align
+from fusion.analysis.alignment.readings import read_fused
+from fusion.analysis.drift_model.axis import coefficients_of, declare
+from fusion.analysis.drift_model.fit import fit_model
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
-from fusion.loop.axis import declare
-from fusion.loop.result import coefficients_of
-from fusion.model.fit import fit_model
-from fusion.pipeline.drift_model import library_for
-from fusion.pipeline.rise_scale import axis_scale_u, scaled
+from fusion.pipeline.drift_model import axis_scale_u, library_for, scaled
 from fusion.pipeline.thermal import reduce_thermography
-from fusion.products.progress import silent
+from fusion.results.progress import silent
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.thermography.flir_mutations import PARAMETERS
+from tests.thermography.rise_budget import temperature_rise_uncertainty
 from thermography.radiometry.planck import counts_from_temperature, override, temperature_from_counts
 from thermography.radiometry.uncertainty import (
     InputUncertainty,
     monte_carlo_ratio,
-    temperature_rise_uncertainty,
     temperature_uncertainty,
 )
 
@@ -93,7 +91,7 @@ def errors_over_u(seed: int, folder: Path) -> list[float]:
     )
     terms = declare(readings, ["axis_expansion", "table_offset"], library_for(source))
     model = fit_model(readings, terms)
-    entry = coefficients_of(model, terms[0])[0]
+    entry = coefficients_of(model, terms[0])[0].model_dump(exclude_unset=True)
     both = scaled(entry, axis_scale_u(fields, source.axis, source.deviations["position"].values))
     error = both["value"] - truth.recipe.drift.expansion_ppm_per_K
     return [

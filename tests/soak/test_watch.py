@@ -18,7 +18,7 @@ import pytest
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.watch import follow
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import simulate
 from tests.fusion.laboratory import Laboratory
 from thermography.io.flir import index_frames

@@ -1,7 +1,5 @@
 """FLIR files of known content, and ways to damage them."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -76,7 +74,7 @@ def jpeg(path: Path, encoding: str = "raw", **size: int) -> Frame:
         limits=LIMITS,
         housekeeping=HOUSEKEEPING,
         utc_offset_minutes=60,
-        encoding=encoding,  # type: ignore[arg-type]
+        encoding=encoding,
     )
     return written
 
@@ -84,7 +82,7 @@ def jpeg(path: Path, encoding: str = "raw", **size: int) -> Frame:
 def sequence(path: Path, encoding: str = "raw", *, frames: int = 3, padding: int = 0, **size: int) -> list[Frame]:
     """Write frames one second apart as a SEQ file and return them."""
     written = [replace(frame(seed=index, seconds=index, **size), index=index) for index in range(frames)]
-    write_sequence(path, written, encoding=encoding, padding=padding)  # type: ignore[arg-type]
+    write_sequence(path, written, encoding=encoding, padding=padding)
     return written
 
 

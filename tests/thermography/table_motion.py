@@ -1,7 +1,5 @@
 """A positioning test as a camera sees it: the table travels, stands, is read and goes on."""
 
-from __future__ import annotations
-
 import numpy as np
 
 T0 = np.datetime64("2026-03-09T06:30:00", "ns")

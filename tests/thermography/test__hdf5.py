@@ -1,17 +1,15 @@
-"""HDF5 files that show other files of the machine, or state values that nobody wrote."""
-
-from __future__ import annotations
+"""What several folders of the package use: HDF5 files that are refused, and the scatter by the median."""
 
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from scipy import stats
 
-from fusion.products.store import DamagedProductError, read_dataset
-from thermography._hdf5 import hdf5_fault
-from thermography.io.frame_readers import index_recordings
-from thermography.io.temperature_frames import StackOptions
+from fusion.results.store import DamagedProductError, read_dataset
+from thermography.common import scatter_by_median
+from thermography.io.other_cameras import StackOptions, hdf5_fault, index_recordings
 
 SHAPE = (3, 4, 5)
 
@@ -43,14 +41,14 @@ def written(path: Path, kind: str) -> Path:
 @pytest.mark.parametrize(
     ("kind", "told"),
     [
-        ("storage", "the values of deep/temperature stand in another file"),
-        ("virtual", "the values of temperature stand in another file"),
-        ("link", "deep/temperature stands in another file"),
-        ("sparse", "temperature states 1.29e+03 GB, which a file of"),
+        ("storage", "the values of deep/temperature are in another file"),
+        ("virtual", "the values of temperature are in another file"),
+        ("link", "deep/temperature is in another file"),
+        ("sparse", "temperature states 1.29e+03 GB, more than the file holds"),
         ("many", "it holds more than 1000 datasets and groups"),
     ],
 )
-def test_what_the_library_would_read_is_refused(tmp_path: Path, kind: str, told: str) -> None:
+def test_what_the_library_would_read_is_refused(tmp_path, kind, told):
     path = written(tmp_path / "a.nc", kind)
     assert hdf5_fault(path).startswith(told)
     _, (rejected,) = index_recordings([path], StackOptions(unit="degC"))
@@ -59,5 +57,25 @@ def test_what_the_library_would_read_is_refused(tmp_path: Path, kind: str, told:
         read_dataset(path)
 
 
-def test_a_file_that_holds_its_values_is_read(tmp_path: Path) -> None:
+def test_a_file_that_holds_its_values_is_read(tmp_path):
     assert hdf5_fault(written(tmp_path / "a.nc", "circle")) == ""
+
+
+@pytest.mark.parametrize("shape", [(5,), (24,), (3, 7)])
+def test_scatter_is_that_of_the_library(shape):
+    values = np.random.default_rng(4).normal(3.0, 0.5, shape)
+    assert scatter_by_median(values) == stats.median_abs_deviation(values, axis=None, scale="normal")
+    about_zero = stats.median_abs_deviation(values, axis=None, center=lambda x, axis: 0.0, scale="normal")
+    assert scatter_by_median(values, centre=0.0) == about_zero > scatter_by_median(values)
+
+
+def test_missing_values_are_left_out_and_a_few_strange_ones_change_little():
+    values = np.array([1.0, np.nan, 2.0, 3.0, 4.0, 5.0])
+    one = 1.4826022185056018
+    assert scatter_by_median(values) == pytest.approx(one)
+    assert scatter_by_median([1.0, 2.0, 3.0, 4.0, 1e9]) == pytest.approx(one)
+
+
+@pytest.mark.parametrize("values", [[], [np.nan, np.nan]])
+def test_without_values_there_is_no_scatter(values):
+    assert np.isnan(scatter_by_median(values))

@@ -1,7 +1,5 @@
 """Content of a FLIR file, and one warning for everything in it that is implausible or damaged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, TIME, frame, jpeg, sequence
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 from thermography.inspection import describe_stack, inspect_file, is_flir_file, thumbnail
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, FlirFormatError
@@ -23,11 +21,11 @@ def _codes(path: Path) -> set[str]:
 
 def _write(path: Path, *, counts: np.ndarray | None = None, time: object = TIME, limits=LIMITS, **parameters) -> Path:
     values = frame().counts if counts is None else counts
-    write_jpeg(path, values, replace(PARAMETERS, **parameters), time, camera=CAMERA, limits=limits)  # type: ignore[arg-type]
+    write_jpeg(path, values, replace(PARAMETERS, **parameters), time, camera=CAMERA, limits=limits)
     return path
 
 
-def test_an_intact_file_gives_its_content_and_no_warnings(tmp_path: Path) -> None:
+def test_an_intact_file_gives_its_content_and_no_warnings(tmp_path):
     sequence(tmp_path / "a.seq", frames=3)
     inspection = inspect_file(tmp_path / "a.seq")
     assert inspection.warnings == () and len(inspection.frames) == inspection.frames_read == 3
@@ -46,7 +44,7 @@ def test_an_intact_file_gives_its_content_and_no_warnings(tmp_path: Path) -> Non
         assert part in text
 
 
-def test_a_long_sequence_is_sampled(tmp_path: Path) -> None:
+def test_a_long_sequence_is_sampled(tmp_path):
     sequence(tmp_path / "a.seq", frames=100)
     inspection = inspect_file(tmp_path / "a.seq")
     assert len(inspection.frames) == 100 and inspection.frames_read == 32
@@ -55,30 +53,18 @@ def test_a_long_sequence_is_sampled(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parameters", "code", "message"),
     [
-        (
-            {"reflected_temperature_K": 22.0},
-            "celsius_as_kelvin",
-            "reflected temperature 22 K: probably degC stored as K",
-        ),
-        (
-            {"reflected_temperature_K": 571.0},
-            "kelvin_as_celsius",
-            "reflected temperature 298 degC: probably K stored as",
-        ),
+        ({"reflected_temperature_K": 22.0}, "celsius_as_kelvin", "reflected temperature 22 K: probably degC stored as"),
+        ({"reflected_temperature_K": 571.0}, "kelvin_as_celsius", "reflected temperature 298 degC: probably K stored"),
         ({"atmospheric_temperature_K": 24.0}, "celsius_as_kelvin", "atmospheric temperature 24 K: probably degC"),
         ({"relative_humidity": 45.0}, "humidity_percent", "relative humidity was stored in percent"),
         ({"relative_humidity": 0.0}, "humidity", "relative humidity 0"),
         ({"object_distance_m": 0.0}, "distance_zero", "distance 0 m: the atmosphere is not corrected"),
-        ({"emissivity": 1.0}, "emissivity", "emissivity 1 is not that of a real surface"),
+        ({"emissivity": 1.0}, "emissivity", "emissivity 1 is not physical"),
         ({"planck_r1": 0.0}, "not_calibrated", "the Planck constants are not positive"),
-        (
-            {"stored_transmission": 0.5},
-            "stored_transmission",
-            "the file stores a transmission of 0.5000, but distance",
-        ),
+        ({"stored_transmission": 0.5}, "stored_transmission", "the file stores a transmission of 0.5000, but distance"),
     ],
 )
-def test_implausible_parameters_give_a_warning(tmp_path: Path, parameters: dict, code: str, message: str) -> None:
+def test_implausible_parameters_give_a_warning(tmp_path, parameters, code, message):
     path = _write(tmp_path / "a.jpg", **parameters)
     warnings = {each.code: each for each in inspect_file(path).warnings}
     assert set(warnings) == {code}
@@ -86,7 +72,7 @@ def test_implausible_parameters_give_a_warning(tmp_path: Path, parameters: dict,
     assert f"  warning: {warnings[code].message} {warnings[code].remedy}" in inspect_file(path).lines()
 
 
-def test_pixels_outside_the_calibrated_range_give_a_warning(tmp_path: Path) -> None:
+def test_pixels_outside_the_calibrated_range_give_a_warning(tmp_path):
     hot = frame().counts.copy()
     hot[:3] = 60000
     assert _codes(_write(tmp_path / "a.jpg", counts=hot)) == {"saturated", "outside_range"}
@@ -99,14 +85,14 @@ def test_pixels_outside_the_calibrated_range_give_a_warning(tmp_path: Path) -> N
     assert _codes(_write(tmp_path / "c.jpg", counts=hot, limits=silent)) == set()
 
 
-def test_constant_frames_and_clocks_never_set_give_a_warning(tmp_path: Path) -> None:
+def test_constant_frames_and_clocks_never_set_give_a_warning(tmp_path):
     flat = np.full((12, 16), 18000, np.uint16)
     assert _codes(_write(tmp_path / "a.jpg", counts=flat)) == {"no_content"}
     assert _codes(_write(tmp_path / "b.jpg", time="2000-01-04T04:43:58")) == {"clock_not_set"}
     assert _codes(_write(tmp_path / "c.jpg", time=np.datetime64("NaT"))) == {"no_time"}
 
 
-def test_changes_within_a_file_give_a_warning(tmp_path: Path) -> None:
+def test_changes_within_a_file_give_a_warning(tmp_path):
     first = frame()
     second = replace(frame(seconds=1), parameters=override(PARAMETERS, emissivity=0.5))
     other = replace(frame(seconds=2), camera=replace(CAMERA, serial="1"))
@@ -116,7 +102,7 @@ def test_changes_within_a_file_give_a_warning(tmp_path: Path) -> None:
     assert messages["parameters_vary"] == "parameters differ between the frames: emissivity."
 
 
-def test_damage_gives_a_warning(tmp_path: Path) -> None:
+def test_damage_gives_a_warning(tmp_path):
     path = tmp_path / "a.seq"
     sequence(path, frames=2)
     data = bytearray(path.read_bytes())
@@ -129,7 +115,7 @@ def test_damage_gives_a_warning(tmp_path: Path) -> None:
     assert "the frame is truncated" in messages["frame_left_out"]
 
 
-def test_damaged_pixels_are_not_shown(tmp_path: Path) -> None:
+def test_damaged_pixels_are_not_shown(tmp_path):
     path = tmp_path / "a.seq"
     sequence(path, frames=2)
     data = bytearray(path.read_bytes())
@@ -141,32 +127,20 @@ def test_damaged_pixels_are_not_shown(tmp_path: Path) -> None:
     assert inspection.frames_read == 1
 
 
-def test_a_damaged_frame_in_an_intact_file_is_rejected_and_reported(tmp_path: Path) -> None:
-    path = tmp_path / "a.seq"
-    sequence(path, "jpegls", frames=2)
-    data = bytearray(path.read_bytes())
-    start = data.rindex(b"\xff\xd8\xff\xf7")
-    data[start + 25 : start + 60] = bytes(35)
-    path.write_bytes(data)
-    inspection = inspect_file(path)
-    assert inspection.frames_read == 1
-    assert {each.code for each in inspection.warnings} == {"frame_left_out"}
-
-
-def test_a_file_without_a_frame_raises(tmp_path: Path) -> None:
+def test_a_file_without_a_frame_raises(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xd9")
     with pytest.raises(FlirFormatError, match="the JPEG is not radiometric"):
         inspect_file(tmp_path / "a.jpg")
 
 
-def test_files_are_distinguished_by_their_first_bytes(tmp_path: Path) -> None:
+def test_files_are_distinguished_by_their_first_bytes(tmp_path):
     jpeg(tmp_path / "a.jpg")
     sequence(tmp_path / "a.seq")
     (tmp_path / "laser.csv").write_text("cycle,direction\n", encoding="utf-8")
     assert [is_flir_file(tmp_path / name) for name in ("a.jpg", "a.seq", "laser.csv")] == [True, True, False]
 
 
-def test_thumbnail_is_a_small_picture(tmp_path: Path) -> None:
+def test_thumbnail_is_a_small_picture(tmp_path):
     jpeg(tmp_path / "a.jpg", rows=480, columns=640)
     picture = cv2.imdecode(np.frombuffer(thumbnail(tmp_path / "a.jpg"), np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (240, 320, 3)
@@ -174,14 +148,14 @@ def test_thumbnail_is_a_small_picture(tmp_path: Path) -> None:
     assert picture[:, -20:].mean() > picture[:, :20].mean() + 50
 
 
-def test_sensors_at_zero_degc_are_placeholders(tmp_path: Path) -> None:
+def test_sensors_at_zero_degc_are_placeholders(tmp_path):
     each = replace(frame(), housekeeping={**HOUSEKEEPING, "Internal": 273.15})
     write_sequence(tmp_path / "a.seq", [each])
     assert "Internal" not in "\n".join(inspect_file(tmp_path / "a.seq").lines())
 
 
 @pytest.mark.real_data
-def test_real_files_give_the_warnings_of_their_known_faults(real_file) -> None:
+def test_real_files_give_the_warnings_of_their_known_faults(real_file):
     expected = {
         "gtatters__Thermimage/inst/extdata/IR_2412.jpg": set(),
         "VladimirSinitsin__flir_extractor/bin/examples/frame.fff": {"clock_not_set", "outside_range"},
@@ -192,7 +166,7 @@ def test_real_files_give_the_warnings_of_their_known_faults(real_file) -> None:
     assert {name: _codes(real_file(name)) for name in expected} == expected
 
 
-def test_a_file_of_temperatures_is_described_with_what_must_be_stated(tmp_path: Path) -> None:
+def test_a_file_of_temperatures_is_described_with_what_must_be_stated(tmp_path):
     np.save(tmp_path / "a.npy", np.full((3, 8, 9), 7329, np.uint16))
     assert describe_stack(tmp_path / "a.npy") == [
         f"{tmp_path / 'a.npy'}: NumPy array, 3 frames of 9 x 8",
@@ -200,24 +174,24 @@ def test_a_file_of_temperatures_is_described_with_what_must_be_stated(tmp_path: 
         "  state under [thermography.stack]: unit; time_in_name, times, or start and interval",
     ]
     (tmp_path / "b.npy").write_bytes(b"nothing\0")
-    with pytest.raises(ThermographyError, match="no file of temperatures that is read"):
+    with pytest.raises(ThermographyError, match="not a known file of temperatures"):
         describe_stack(tmp_path / "b.npy")
 
 
-def test_what_no_camera_writes_is_told_and_not_made(tmp_path: Path) -> None:
+def test_what_no_camera_writes_is_told_and_not_made(tmp_path):
     """A few bytes may state any number of pixels and frames."""
     for name, shape in [("pixels", (1, 20_000, 20_000)), ("nothing", (3, 0, 5)), ("frames", (2_000_000, 1, 1))]:
         np.lib.format.open_memmap(tmp_path / f"{name}.npy", mode="w+", dtype=np.float32, shape=shape).flush()
     for name, told in [
-        ("pixels", "20000 x 20000 pixels are no thermal frame"),
-        ("nothing", "5 x 0 pixels are no thermal frame"),
+        ("pixels", "20000 x 20000 pixels are not a thermal frame"),
+        ("nothing", "5 x 0 pixels are not a thermal frame"),
         ("frames", r"2,000,000 frames, 1 to 1,000,000 in a file can be read; export them in parts"),
     ]:
         with pytest.raises(ThermographyError, match=told):
             describe_stack(tmp_path / f"{name}.npy")
 
 
-def test_of_large_frames_fewer_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_large_frames_fewer_are_read(tmp_path, monkeypatch):
     write_sequence(tmp_path / "a.seq", (frame(6, 8, seconds=second) for second in range(5)))
     assert inspect_file(tmp_path / "a.seq").frames_read == 5
     monkeypatch.setattr("thermography.inspection._PIXELS_READ", 2 * 6 * 8)

@@ -2,29 +2,145 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from thermography._typing import Array
+from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import noise_of_differences
-from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import PlanWeights
-from thermography.io.frame import CameraParameters, StoredPixels
-from thermography.io.window_reader import WindowReader
+from thermography.io.frame import CameraParameters, FrameReference, PlainFrame, PlainSamples, StoredPixels
+from thermography.io.sequence import WindowReader, frame_shapes, frame_times
 from thermography.radiometry.averaging import (
     AVERAGING_LIMIT_K,
     CHUNK_FRAMES,
     Accumulator,
-    CountStatistics,
     MeanTemperature,
     mean_temperature,
 )
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import FiducialMonitor, RegistrationSpan
+
+# Inputs of a reduction: frames with their times, cycles and corrections, checked before any frame is read.
+
+Override = Callable[[FrameReference], CameraParameters]
+
+#: Cycle index of a frame that lies in no cycle.
+NO_CYCLE = -1
+
+
+class ReductionError(ThermographyError):
+    """The frames cannot be reduced to fields; the message names the frame or cycle and the remedy."""
+
+
+@dataclass(frozen=True)
+class FrameSeries:
+    """Frames of one size in the order of time, and the cycles that they belong to.
+
+    Attributes
+    ----------
+    references : sequence of FrameReference
+        Where the frames are stored.
+    times : (frames,) ndarray of datetime64[ns]
+        Rising.
+    bounds : (cycles, 2) ndarray of datetime64[ns]
+        Start and end of every cycle on the frames' clock; the end is excluded.
+    cycles : (frames,) ndarray of int
+        Index of the cycle of every frame, `NO_CYCLE` for none.
+    correction_K : (frames,) ndarray, K
+        Added to the temperature of every frame.
+    override : callable
+        From a frame reference to the camera parameters to calibrate it with.
+    """
+
+    references: Sequence[FrameReference]
+    times: Array
+    bounds: Array
+    cycles: NDArray[np.int64]
+    correction_K: Array
+    override: Override
+
+    def __len__(self) -> int:
+        return len(self.references)
+
+    def name(self, index: int) -> str:
+        """File name and number of a frame, for messages."""
+        return f"{self.references[index].path.name}#{self.references[index].index}"
+
+    def names(self, chosen: Array) -> list[str]:
+        """Names of the frames where `chosen`, (frames,), is True."""
+        return [self.name(index) for index in np.flatnonzero(chosen)]
+
+    def temperature(self, index: int) -> Array:
+        """Read and calibrate a frame: (row, column) degC, without its correction."""
+        reference = self.references[index]
+        return calibrate(reference.read().counts, self.override(reference))
+
+    def mean_time(self, chosen: slice | Array) -> np.datetime64:
+        """Mean time of the frames with the indices `chosen`."""
+        times = self.times[chosen]
+        return times[0] + (times - times[0]).mean()
+
+
+def make_frame_series(
+    references: Sequence[FrameReference],
+    cycle_bounds: ArrayLike,
+    *,
+    shape: tuple[int, int],
+    override: Override,
+    correction_K: ArrayLike | None = None,
+) -> FrameSeries:
+    """Check frames, cycles and corrections, and assign the frames to the cycles."""
+    # Cycle bounds as (cycles, 2) datetime64[ns], in order and without overlap.
+    bounds = np.asarray(cycle_bounds, "datetime64[ns]")
+    bounds = np.stack([bounds[:-1], bounds[1:]], axis=-1) if bounds.ndim == 1 else bounds
+    if len(bounds) == 0:
+        raise ReductionError("cycle_bounds is empty; give the start and end of at least one cycle")
+    reversed_cycles = np.flatnonzero(~(bounds[:, 0] < bounds[:, 1]))
+    if reversed_cycles.size:
+        n = int(reversed_cycles[0])
+        raise ReductionError(f"cycle {n + 1} ends at {bounds[n, 1]}, before it starts at {bounds[n, 0]}")
+    overlaps = np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1])
+    if overlaps.size:
+        n = int(overlaps[0])
+        raise ReductionError(f"cycle {n + 2} starts at {bounds[n + 1, 0]}, before cycle {n + 1} ends at {bounds[n, 1]}")
+    times = _check_frames(references, shape)
+    correction = np.zeros(len(times)) if correction_K is None else np.asarray(correction_K, float)
+    if correction.shape != times.shape or not np.isfinite(correction).all():
+        raise ReductionError(
+            f"correction_K has shape {correction.shape}; it needs one finite value for each of {len(times)} frames"
+        )
+    index = np.searchsorted(bounds[:, 0], times, side="right") - 1
+    inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
+    return FrameSeries(references, times, bounds, np.where(inside, index, NO_CYCLE), correction, override)
+
+
+def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) -> Array:
+    """Times of the frames, (frames,) datetime64[ns]."""
+    if not references:
+        raise ReductionError("there is no frame to reduce")
+    times = frame_times(references)
+    shapes = frame_shapes(references)
+    wrong = (shapes != shape).any(axis=1) | np.isnat(times)
+    wrong[1:] |= times[1:] <= times[:-1]
+    if not wrong.any():
+        return times
+    i = int(np.argmax(wrong))
+    frame = references[i]
+    where = f"{frame.path}: frame {frame.index}"
+    if tuple(frame.shape) != tuple(shape):
+        raise ReductionError(
+            f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce one size at a time"
+        )
+    if np.isnat(times[i]):
+        raise ReductionError(f"{where} has no time; leave it out")
+    raise ReductionError(f"{where} has the time {frame.time}, not after {references[i - 1].time}; sort the frames")
+
 
 #: Largest number of frames of one block.
 BLOCK_FRAMES = 512
@@ -43,7 +159,7 @@ class Block:
     first, stop : int
         Frames `first` to ``stop - 1``.
     cycle : int
-        Index of their cycle, `thermography.fields.inputs.NO_CYCLE` for none.
+        Index of their cycle, `thermography.fields.blocks.NO_CYCLE` for none.
     span : int
         Index of their registration span.
     parameters : CameraParameters
@@ -74,7 +190,7 @@ class RegisteredSensor:
 
     @cached_property
     def sampled(self) -> NDArray[np.int64]:
-        """Some hundreds of pixels, as indices into the flattened window, evenly spread over the table beside fiducials and edges."""
+        """Some hundreds of pixels, as indices into the flattened window, evenly spread over the table away from fiducials and edges."""
         interior = self.weights.interior
         step = max(int(np.sqrt(interior.sum() / _SAMPLED_PIXELS)), 1)
         grid = np.zeros_like(interior)
@@ -88,8 +204,6 @@ class BlockResult:
 
     Attributes
     ----------
-    temperature : MeanTemperature
-        Mean and variance over the frames for the pixels of the window, degC.
     cells : (y, x) ndarray, degC
         Mean temperature on the plan.
     displacement_px : (frames, 4) ndarray, px
@@ -98,61 +212,21 @@ class BlockResult:
         Temperature of the sampled pixels in every frame.
     noise_K : float, K
         Standard deviation of the noise of a pixel.
-    statistics : CountStatistics or None
-        Sums of the counts, if they are kept.
-    """
-
-    temperature: MeanTemperature
-    cells: Array
-    displacement_px: Array
-    samples: Array
-    noise_K: float
-    statistics: CountStatistics | None = None
-
-    @property
-    def view(self) -> BlockView:
-        """The result without what is kept per pixel."""
-        return BlockView(self.cells, self.displacement_px, self.samples, self.noise_K)
-
-
-@dataclass(frozen=True)
-class BlockView:
-    """What a block shows of the table, small beside its sums; the attributes are those of `BlockResult`.
-
-    Attributes
-    ----------
-    cells : (y, x) ndarray, degC
-    displacement_px : (frames, 4) ndarray, px
-    samples : (frames, points) ndarray, degC
-    noise_K : float, K
+    temperature : MeanTemperature or None
+        Mean and variance over the frames for the pixels of the window, degC; None once they are added to those of the cycle.
     """
 
     cells: Array
     displacement_px: Array
     samples: Array
     noise_K: float
+    temperature: MeanTemperature | None
 
 
 def cut_blocks(
     frames: FrameSeries, spans: Sequence[RegistrationSpan], *, block_s: float, first: int = 0
 ) -> list[Block]:
-    """Cut frames into blocks: the unit of memory and of `frame_temperature`.
-
-    Parameters
-    ----------
-    frames : FrameSeries
-    spans : sequence of RegistrationSpan
-        In order, the first one from frame 0 on.
-    block_s : float, s
-        Length of time of a block; 0 gives every frame a block of its own.
-    first : int
-        Frame to start at.
-
-    Returns
-    -------
-    list of Block
-        In order, without gaps, up to the last frame.
-    """
+    """Cut frames into blocks: the unit of memory and of `frame_temperature`."""
     starts = np.array([span.first_frame for span in spans])
     span_of = np.searchsorted(starts, np.arange(len(frames)), side="right") - 1
     longest = round(block_s * 1e9)
@@ -180,31 +254,8 @@ def cut_blocks(
     return blocks
 
 
-def reduce_block(
-    frames: Sequence[StoredPixels],
-    parameters: CameraParameters,
-    sensor: RegisteredSensor,
-    keep_statistics: bool = False,
-) -> BlockResult:
-    """Read the frames of a block and reduce them.
-
-    Counts are averaged before they are calibrated; pixels whose counts vary too much for that are calibrated frame by frame.
-
-    Parameters
-    ----------
-    frames : sequence of StoredPixels
-        Of one block.
-    parameters : CameraParameters
-        To calibrate them with.
-    sensor : RegisteredSensor
-        Of their registration.
-    keep_statistics : bool
-        Whether the result contains the sums of the counts.
-
-    Returns
-    -------
-    BlockResult
-    """
+def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, sensor: RegisteredSensor) -> BlockResult:
+    """Read the frames of a block and reduce them."""
     weights = sensor.weights
     sums = Accumulator(weights.used.shape)
     displacements, samples, noise = [], [], np.nan
@@ -214,33 +265,26 @@ def reduce_block(
             noise = noise_of_differences(counts[0], weights.interior) if np.isnan(noise) else noise
             displacements.append(sensor.monitor.displacements(counts, noise))
             samples.append(counts.reshape(len(counts), -1)[:, sensor.sampled])
-    statistics = sums.statistics()
     if len(frames) == 1:
         temperature = calibrate(counts[0], parameters).astype(float)
         mean = MeanTemperature(1, temperature, np.zeros_like(temperature), np.zeros_like(temperature))
     else:
-        mean = mean_temperature(statistics, parameters, used=weights.used)
+        mean = mean_temperature(sums.statistics(), parameters, used=weights.used)
         # Also where there is no bound: a pixel without a temperature in one of the frames.
         varying = ~(mean.bound_K <= AVERAGING_LIMIT_K) & weights.used
         if varying.any():
             _calibrate_per_frame(mean, varying, frames, parameters, weights.window)
-    cells = weights.resample(mean.mean)
     sampled = np.concatenate(samples)
+    # Slope of the calibration at the middle of the samples.
+    middle = np.uint16(np.median(sampled[0])) if sampled[0].size else np.uint16(0)
+    low, high = calibrate(np.array([middle, middle + np.uint16(1)]), parameters)
     return BlockResult(
-        mean,
-        cells,
+        weights.resample(mean.mean),
         np.concatenate(displacements),
         calibrate(sampled, parameters),
-        noise * _kelvin_per_count(sampled[0], parameters),
-        statistics if keep_statistics else None,
+        noise * float(high - low),
+        mean,
     )
-
-
-def _kelvin_per_count(counts: Array, parameters: CameraParameters) -> float:
-    """Slope of the calibration at the middle of some counts, K."""
-    middle = np.uint16(np.median(counts)) if counts.size else np.uint16(0)
-    low, high = calibrate(np.array([middle, middle + np.uint16(1)]), parameters)
-    return float(high - low)
 
 
 def _calibrate_per_frame(
@@ -250,10 +294,7 @@ def _calibrate_per_frame(
     parameters: CameraParameters,
     window: tuple[slice, slice],
 ) -> None:
-    """Replace mean and variance of the varying pixels by those of their calibrated frames, which are read a second time.
-
-    A frame in which a pixel has no temperature takes no part in that pixel.
-    """
+    """Replace mean and variance of the varying pixels by those of their calibrated frames, which are read a second time."""
     pixels = int(varying.sum())
     total, squares, count = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
     reference = np.nan_to_num(mean.mean[varying])
@@ -267,3 +308,51 @@ def _calibrate_per_frame(
         offset = total / count
         mean.variance[varying] = np.maximum(squares / count - offset**2, 0.0)
     mean.mean[varying] = reference + offset
+
+
+# Frames on their way to another process: of video, only where the pixels stand, some bytes per frame.
+
+
+class FrameRun(Sequence[StoredPixels]):
+    """Some frames in order; sent to another process, frames of plain samples in one file become a table of their places.
+
+    Parameters
+    ----------
+    frames : sequence of StoredPixels
+        For example `thermography.io.frame.FrameReference`.
+    """
+
+    def __init__(self, frames: Sequence[StoredPixels]) -> None:
+        self._frames = frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[StoredPixels]:
+        return iter(self._frames)
+
+    def __getitem__(self, place: Any) -> Any:
+        return self._frames[place]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        first = self._frames[0] if self._frames else None
+        samples = [frame.plain_samples for frame in self._frames]
+        plain = [place for place in samples if place is not None]
+        if (
+            first is None
+            or len(plain) < len(samples)
+            or any(frame.path != first.path or frame.shape != first.shape for frame in self._frames)
+            or len({place.little_endian for place in plain}) > 1
+        ):
+            return FrameRun, (list(self._frames),)
+        offsets = np.array([place.offset for place in plain], np.int64)
+        indices = np.array([frame.index for frame in self._frames], np.int64)
+        return _restore, (first.path, first.shape, plain[0].little_endian, indices, offsets)
+
+
+def _restore(
+    path: Path, shape: tuple[int, int], little_endian: bool, indices: NDArray[np.int64], offsets: NDArray[np.int64]
+) -> FrameRun:
+    """Return the frames of a table of places."""
+    places = zip(indices.tolist(), offsets.tolist(), strict=True)
+    return FrameRun([PlainFrame(path, index, shape, PlainSamples(offset, little_endian)) for index, offset in places])

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from thermography._constants import MAD_TO_SIGMA
-from thermography._typing import Array
+from thermography.common import MAD_TO_SIGMA, Array
+from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
 from thermography.fields.resampling import PlanWeights
-from thermography.fields.tasks.pieces import in_pieces, piece_slices
-from thermography.fields.tasks.spool import Spool, empty_array, give_back
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
 from thermography.registration.plan import PlanGrid
-from thermography.registration.register import Registration
 
 #: Bits of `quality_flag`.
 _FLAGS = {
@@ -124,10 +121,6 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
 }
 
 
-#: Arrays of a finished part.
-_CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
-
-
 @dataclass
 class CyclePart:
     """The frames of one cycle under one registration: means over pixels while it is open, cells of the plan once it is finished.
@@ -199,90 +192,13 @@ class CyclePart:
         self.pixels = None
 
 
-class FinishedParts(Sequence[CyclePart]):
-    """Finished parts of cycles, in the order of time, their cells in spools.
-
-    Parameters
-    ----------
-    folder : Path or None
-        For their files; None for that of the system.
-    """
-
-    def __init__(self, folder: Path | None = None) -> None:
-        self._parts: list[CyclePart] = []
-        self._cells = {name: Spool(folder) for name in _CELLS}
-
-    def append(self, part: CyclePart) -> None:
-        """Add a finished part."""
-        for name, spool in self._cells.items():
-            spool.append(getattr(part, name))
-        self._parts.append(_with_cells(part, dict.fromkeys(_CELLS, np.empty(0))))
-
-    def __len__(self) -> int:
-        return len(self._parts)
-
-    def __iter__(self) -> Iterator[CyclePart]:
-        return (self[k] for k in range(len(self)))
-
-    @overload
-    def __getitem__(self, place: int) -> CyclePart: ...
-
-    @overload
-    def __getitem__(self, place: slice) -> Sequence[CyclePart]: ...
-
-    def __getitem__(self, place: int | slice) -> CyclePart | Sequence[CyclePart]:
-        if isinstance(place, slice):
-            return [self[k] for k in range(*place.indices(len(self)))]
-        place = range(len(self))[place]
-        return _with_cells(self._parts[place], {name: spool[place] for name, spool in self._cells.items()})
-
-
-def _with_cells(part: CyclePart, cells: dict[str, Array]) -> CyclePart:
-    """Copy of a part with other arrays of cells."""
-    copy = replace(part)
-    for name, array in cells.items():
-        setattr(copy, name, array)
-    return copy
-
-
 def pixel_noise(image: Array, used: NDArray[np.bool_]) -> float:
-    """Standard deviation of white noise in an image, insensitive to smooth fields.
-
-    Parameters
-    ----------
-    image : (row, column) ndarray
-        Any unit.
-    used : (row, column) ndarray of bool
-        Pixels that take part, with all their neighbours.
-
-    Returns
-    -------
-    float
-        In the unit of `image`; NaN where fewer than 30 pixels have eight neighbours in use.
-
-    Notes
-    -----
-    Median absolute response to the Laplacian difference of J. Immerkaer, Fast noise variance estimation, Computer Vision and Image
-    Understanding 64 (1996) 300-302.
-    """
+    """Standard deviation of white noise in an image, insensitive to smooth fields."""
     return noise_of_differences(image, ndimage.binary_erosion(used, np.ones((3, 3))))
 
 
 def noise_of_differences(image: Array, interior: NDArray[np.bool_]) -> float:
-    """As `pixel_noise`, for pixels whose neighbours are known to be in use.
-
-    Parameters
-    ----------
-    image : (row, column) ndarray
-        Any unit. Of images above 60,000 px the middle 64 rows are evaluated.
-    interior : (row, column) ndarray of bool
-        Pixels of which all eight neighbours are in use.
-
-    Returns
-    -------
-    float
-        In the unit of `image`; NaN for fewer than 30 interior pixels.
-    """
+    """As `pixel_noise`, for pixels whose neighbours are known to be in use."""
     if interior.sum() < 30:
         return float("nan")
     if image.size > _LARGE_PX:
@@ -296,22 +212,6 @@ def noise_of_differences(image: Array, interior: NDArray[np.bool_]) -> float:
     return MAD_TO_SIGMA * float(np.nanmedian(np.abs(both[interior[1:-1, 1:-1]]))) / 6
 
 
-def position_covariance(registration: Registration, grid: PlanGrid) -> Array:
-    """Covariance of the position of every cell's centre.
-
-    Parameters
-    ----------
-    registration : Registration
-    grid : PlanGrid
-
-    Returns
-    -------
-    (y, x, 2, 2) ndarray, mm2
-        Of (x, y) on the plan.
-    """
-    return registration.position_covariance(grid.centres_mm)
-
-
 def assemble_fields(
     parts: Sequence[CyclePart],
     cycles: int,
@@ -323,62 +223,50 @@ def assemble_fields(
     frame_coordinates: Mapping[str, Any] | None = None,
     folder: Path | None = None,
 ) -> xr.Dataset:
-    """Assemble the cycles to one Dataset: mean, rise, rate, spread, count, uncertainties and flags on the plan.
-
-    Parameters
-    ----------
-    parts : sequence of CyclePart
-        Finished, in the order of time; at least one.
-    cycles : int
-        Number of cycles of the campaign, with or without frames.
-    grid : PlanGrid
-        The plan.
-    covariances : sequence of (y, x, 2, 2) ndarray, mm2
-        `position_covariance` of every registration span.
-    coverages : sequence of (y, x) ndarray
-        Share of every cell that is seen unmasked, of every registration span.
-    frames, frame_coordinates : mapping of str to variable, or None
-        Variables and coordinates per frame or block of frames to add, as xarray takes them.
-    folder : Path or None
-        For the temporary files in which very many cycles are kept; None for that of the system.
-
-    Returns
-    -------
-    xr.Dataset
-        Variables of `thermography.contract.FIELDS` but for the total uncertainties, and `temperature_rate`, `quality_flag`,
-        `position_u`, with the dimensions (cycle, y, x), in degC, K and K/h.
-
-    Notes
-    -----
-    The uncertainty of a cell combines pixel noise with the position uncertainty of the registration through the gradient of the field
-    (law of propagation, JCGM 100:2008, 5.1.2); see ``docs/method/fields.md``.
-    """
+    """Assemble the cycles to one Dataset: mean, rise, rate, spread, count, uncertainties and flags on the plan."""
     shape = (cycles, *grid.shape)
-    fields = {name: _filled(shape, np.float64, np.nan, folder) for name in ("mean", "spread", "noise")}
+    mean, spread, noise = (fill_array(shape, float, lambda _: np.nan, folder) for _ in range(3))
     span_of = np.zeros(cycles, int)
-    count, flags = _filled(shape, np.int32, 0, folder), _filled(shape, np.uint8, _FLAGS["no_frame"], folder)
+    count = fill_array(shape, np.int32, lambda _: 0, folder)
+    flags = fill_array(shape, np.uint8, lambda _: _FLAGS["no_frame"], folder)
     time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
     step = next(piece_slices(shape)).stop
     for number, (cycle, group) in enumerate(groupby(parts, lambda part: part.cycle), start=1):
         of_cycle = list(group)
-        time[cycle] = of_cycle[0].first_time + np.timedelta64(_mean_nanoseconds(of_cycle), "ns")
-        merged = _merge(of_cycle)
-        for name, values in zip(fields, merged, strict=True):
-            fields[name][cycle] = values
+        # Mean time of all frames since the first one of the first part, ns.
+        start = of_cycle[0].first_time
+        total = sum(
+            part.seconds + part.frames * float((part.first_time - start) / np.timedelta64(1, "s")) for part in of_cycle
+        )
+        time[cycle] = of_cycle[0].first_time + np.timedelta64(
+            round(1e9 * total / sum(part.frames for part in of_cycle)), "ns"
+        )
+        mean[cycle], spread[cycle], noise[cycle] = merged = _merge(of_cycle)
         span_of[cycle] = of_cycle[-1].span
         count[cycle] = sum(part.count for part in of_cycle)
         flags[cycle] = _flags(of_cycle, merged[0], np.max([coverages[part.span] for part in of_cycle], axis=0))
         if number % step == 0:
-            give_back(*fields.values(), count, flags)
+            give_back(mean, spread, noise, count, flags)
     plan = ("cycle", "y", "x")
     temperatures = {name: empty_array(shape, np.float32, folder) for name in _TEMPERATURES}
+    first, first_span = parts[0].cycle, parts[0].span
     for some in piece_slices(shape):
-        evaluated = _temperatures(
-            **fields, some=some, time=time, reference=parts[0], spans=span_of, covariances=covariances, grid=grid
-        )
-        for name, array in evaluated.items():
-            temperatures[name][some] = array
-        give_back(*fields.values(), *temperatures.values())
+        means, noises, spans = mean[some], noise[some], span_of[some]
+        position = np.full(means.shape, np.nan)
+        for span, covariance in enumerate(covariances):
+            chosen = spans == span
+            if chosen.any():
+                position[chosen] = _gradient_variance(means[chosen], covariance, grid)
+        rise = means - mean[first]
+        rise_position = _gradient_variance(rise, covariances[first_span], grid)
+        # The noise of the reference cycle enters every rise but its own, which is zero by definition.
+        is_first = np.arange(some.start, some.stop)[:, None, None] == first
+        rise_noise = np.where(is_first, 0.0, noises + noise[first])
+        noise_u, rise_noise_u = np.sqrt(noises + position), np.sqrt(rise_noise + rise_position)
+        values = (means, noise_u, rise, rise_noise_u, _rate_of(mean, time, some), spread[some])
+        for array, value in zip(temperatures.values(), values, strict=True):
+            array[some] = value
+        give_back(mean, spread, noise, *temperatures.values())
     dataset = xr.Dataset(
         {name: (plan, array) for name, array in temperatures.items()}
         | {
@@ -413,51 +301,9 @@ def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[
     return np.sum([np.where(where, _FLAGS[name], 0) for name, where in limits.items()], axis=0, dtype=np.uint8)
 
 
-def _filled(shape: tuple[int, ...], kind: Any, value: float, folder: Path | None) -> Array:
-    """Array of one value, see `empty_array`."""
-    array = empty_array(shape, kind, folder)
-    for some in piece_slices(shape):
-        array[some] = value
-        give_back(array)
-    return array
-
-
 _TEMPERATURES = (
     "temperature", "temperature_noise_u", "temperature_rise", "temperature_rise_noise_u", "temperature_rate", "temperature_spread"
 )  # fmt: skip
-
-
-def _temperatures(
-    mean: Array,
-    spread: Array,
-    noise: Array,
-    *,
-    some: slice,
-    time: Array,
-    reference: CyclePart,
-    spans: NDArray[np.int64],
-    covariances: Sequence[Array],
-    grid: PlanGrid,
-) -> dict[str, Array]:
-    """Temperature, rise since the reference cycle, rate, spread and their noise of some cycles, (cycle, y, x).
-
-    `mean`, `spread` and `noise`, the variance of the mean from pixel noise in K2, are those of all cycles; `reference` is the first part.
-    """
-    first, numbers = reference.cycle, np.arange(some.start, some.stop)
-    means, noises = mean[some], noise[some]
-    position = np.full(means.shape, np.nan)
-    for span, covariance in enumerate(covariances):
-        chosen = spans[some] == span
-        if chosen.any():
-            position[chosen] = _gradient_variance(means[chosen], covariance, grid)
-    rise = means - mean[first]
-    rise_position = _gradient_variance(rise, covariances[reference.span], grid)
-    # The noise of the reference cycle enters every rise but its own, which is zero by definition.
-    rise_noise = np.where(numbers[:, None, None] == first, 0.0, noises + noise[first])
-    values = (
-        means, np.sqrt(noises + position), rise, np.sqrt(rise_noise + rise_position), _rate_of(mean, time, some), spread[some]
-    )  # fmt: skip
-    return dict(zip(_TEMPERATURES, values, strict=True))
 
 
 def _rate_of(mean: Array, time: Array, some: slice) -> Array:
@@ -470,19 +316,7 @@ def _rate_of(mean: Array, time: Array, some: slice) -> Array:
 
 
 def in_pixels(fields: xr.Dataset) -> xr.Dataset:
-    """Return fields on a plan that is the picture itself, with coordinates that say so.
-
-    Parameters
-    ----------
-    fields : Dataset
-        As assembled, with coordinates in px and attributes for mm.
-
-    Returns
-    -------
-    Dataset
-        Attribute ``plan_unit`` is ``"px"``; coordinates are counts of pixels (CF: ``units = "1"``), the uncertainty of the place of a cell,
-        which has none by definition, is absent.
-    """
+    """Return fields on a plan that is the picture itself, with coordinates that say so."""
     named = fields.drop_vars("position_u", errors="ignore").assign_attrs(
         title="Temperature fields on the picture", plan_unit="px"
     )
@@ -497,24 +331,12 @@ def in_pixels(fields: xr.Dataset) -> xr.Dataset:
 
 
 def plan_unit(fields: xr.Dataset) -> str:
-    """Return the unit of the places on a plan: mm, or px where the picture itself is the plan.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Fields, or what was made from them.
-    """
+    """Return the unit of the places on a plan: mm, or px where the picture itself is the plan."""
     return str(fields.attrs.get("plan_unit", "mm"))
 
 
 def annotate(dataset: xr.Dataset) -> xr.Dataset:
-    """Set the CF attributes of every listed variable, and no fill value for coordinates.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        Changed in place, and returned.
-    """
+    """Set the CF attributes of every listed variable, and no fill value for coordinates."""
     for name, variable in dataset.variables.items():
         variable.attrs.update(_ATTRIBUTES.get(str(name), {}))
         if "ancillary_variables" in variable.attrs:
@@ -523,15 +345,6 @@ def annotate(dataset: xr.Dataset) -> xr.Dataset:
         if name in dataset.coords:
             variable.encoding["_FillValue"] = None
     return dataset
-
-
-def _mean_nanoseconds(parts: Sequence[CyclePart]) -> int:
-    """Mean time of all frames since the first one of the first part, ns."""
-    start = parts[0].first_time
-    total = sum(
-        part.seconds + part.frames * float((part.first_time - start) / np.timedelta64(1, "s")) for part in parts
-    )
-    return round(1e9 * total / sum(part.frames for part in parts))
 
 
 def _merge(parts: Sequence[CyclePart]) -> tuple[Array, Array, Array]:
@@ -569,49 +382,17 @@ def _gradient_variance(fields_K: Array, covariance: Array, grid: PlanGrid) -> Ar
 
 
 def cycles_with_field(temperature: Array | xr.DataArray) -> NDArray[np.bool_]:
-    """Return which cycles have a field.
-
-    Parameters
-    ----------
-    temperature : (cycle, y, x) ndarray or DataArray, degC
-        Or its rise; NaN where there is none.
-
-    Returns
-    -------
-    (cycle,) ndarray of bool
-    """
+    """Return which cycles have a field."""
     return np.concatenate([np.isfinite(some).any(axis=(1, 2)) for _, some in in_pieces(temperature)])
 
 
 def reference_cycle(temperature: Array | xr.DataArray) -> int:
-    """Index of the cycle from which rises are counted: the first one with a field.
-
-    Parameters
-    ----------
-    temperature : (cycle, y, x) ndarray or DataArray, degC
-        NaN where there is none.
-    """
+    """Index of the cycle from which rises are counted: the first one with a field."""
     return int(np.flatnonzero(cycles_with_field(temperature))[0])
 
 
 def rate(mean: Array, time: Array, *, since: np.datetime64 | None = None) -> Array:
-    """Rate of the temperature as central difference over the cycles that have a time.
-
-    Parameters
-    ----------
-    mean : (cycle, y, x) ndarray, degC
-        Mean temperature of every cycle.
-    time : (cycle,) ndarray of datetime64
-        NaT for a cycle without frames.
-    since : datetime64 or None
-        From which the time is counted, so that some cycles of a series have the rates that they have in it, bit for bit; None for the
-        first time.
-
-    Returns
-    -------
-    (cycle, y, x) ndarray, K/h
-        NaN where fewer than two cycles have a time.
-    """
+    """Rate of the temperature as central difference over the cycles that have a time."""
     rates = np.full(mean.shape, np.nan)
     timed = np.flatnonzero(~np.isnat(time))
     if timed.size >= 2:

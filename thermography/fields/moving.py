@@ -6,38 +6,280 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
 
-from thermography._typing import Array
-from thermography.fields.blocks import BLOCK_FRAMES, Block, cut_blocks
-from thermography.fields.checkpoint import Checkpoint, describe_reduction
-from thermography.fields.cycle_fields import CyclePart, assemble_fields, pixel_noise, position_covariance
-from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
-from thermography.fields.moving_sampling import (
-    CellSums,
-    CellWeights,
-    Samples,
-    add_frame,
-    on_plan,
-    sample_points,
-    weigh_pixels,
+from thermography.common import Array
+from thermography.fields.blocks import (
+    BLOCK_FRAMES,
+    NO_CYCLE,
+    Block,
+    FrameSeries,
+    Override,
+    ReductionError,
+    cut_blocks,
+    make_frame_series,
 )
+from thermography.fields.cycle_fields import CyclePart, assemble_fields, pixel_noise
+from thermography.fields.resampling import LEAST_COVERAGE, centring_matrix
 from thermography.fields.scheduling import in_order, open_pool
-from thermography.fields.still import BLOCK_S
-from thermography.fields.tasks.frame_run import FrameRun
-from thermography.fields.tasks.stretches import cut_stretches
-from thermography.io.frame import CameraParameters, FrameReference
-from thermography.io.window_reader import WindowReader
+from thermography.fields.still import (
+    BLOCK_S,
+    BlockFrames,
+    Checkpoint,
+    cut_stretches,
+    describe_reduction,
+    gather_frames,
+)
+from thermography.io.frame import FrameReference
+from thermography.io.sequence import WindowReader
 from thermography.radiometry.averaging import CHUNK_FRAMES
 from thermography.radiometry.planck import temperature_from_counts
 from thermography.registration.displacement import RegistrationSpan
-from thermography.registration.plan import PlanGrid
+from thermography.registration.plan import PlanGrid, mask_discs
+from thermography.registration.projection import project_point
 from thermography.registration.register import Registration
 from thermography.registration.tracking import TableTracker, locate_table, make_tracker
+
+# Sampling of a plan that moves through the view: points of every cell, and the addition of one frame to all cells
+# that it shows.
+
+#: Points per cell and side, each interpolated between four pixels.
+_POINTS_PER_SIDE = 4
+#: Range of the counts within a cell up to which they are averaged before they are calibrated: the temperature of the mean count
+#: differs from the mean temperature by a few hundredths of a millikelvin.
+_NARROW_COUNTS = 600
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points of every cell at which the frames are sampled.
+
+    Attributes
+    ----------
+    points_mm : (cells, points, 2) ndarray, mm
+        Plan points (x, y).
+    valid : (cells, points) ndarray of bool
+        False near fiducials and the plan's edge.
+    coverage : (y, x) ndarray
+        Share of the points of every cell that are valid.
+    centring : (cells, cells) CSR array
+        Moves cells with masked points to their centre, see `thermography.fields.resampling.centring_matrix`.
+    """
+
+    points_mm: Array
+    valid: NDArray[np.bool_]
+    coverage: Array
+    centring: sparse.csr_array
+
+
+class CellSums(NamedTuple):
+    """Running mean and squared deviation of every cell over the frames that show it, changed in place.
+
+    Attributes
+    ----------
+    frames : (cells,) ndarray of int
+        Number of frames.
+    mean : (cells,) ndarray, degC
+    squares : (cells,) ndarray, K2
+        Sum of the squared deviations from the mean.
+    """
+
+    frames: Array
+    mean: Array
+    squares: Array
+
+
+def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> Samples:
+    """Lay out the sample points of every cell."""
+    steps = ((np.arange(_POINTS_PER_SIDE) + 0.5) / _POINTS_PER_SIDE - 0.5) * grid.cell_size_mm
+    across, down = (side.ravel() for side in np.meshgrid(steps, steps))
+    centres = grid.centres_mm.reshape(-1, 2)
+    points = np.stack([centres[:, :1] + across, centres[:, 1:] + down], axis=-1)
+    # The longer side of a pixel on the plan, by the inverse in closed form: a solver called for every point takes twenty times as long.
+    (a, b), (c, d) = np.moveaxis(registration.projection.jacobian(points.reshape(-1, 2)), 0, -1)
+    pixel_mm = (np.sqrt(np.maximum(a * a + b * b, c * c + d * d)) / np.abs(a * d - b * c)).reshape(points.shape[:2])
+    edge = np.minimum.reduce(
+        [points[..., 0], grid.width_mm - points[..., 0], points[..., 1], grid.height_mm - points[..., 1]]
+    )
+    # Interpolation between pixels reaches half a pixel farther than the lens's blur.
+    margin = (margin_px + 0.5) * pixel_mm
+    valid = (edge >= margin) & ~mask_discs(points, registration.masked, margin_mm=margin)
+    with np.errstate(invalid="ignore"):
+        offset = np.where(valid[..., None], points, 0.0).sum(axis=1) / valid.sum(axis=1)[:, None]
+    offset -= centres
+    coverage = valid.mean(axis=1).reshape(grid.shape)
+    return Samples(points, valid, coverage, centring_matrix(offset, coverage, grid))
+
+
+class _CellView(NamedTuple):
+    """A cell on the sensor, as affine map about one of its points: to a thousandth of a pixel for cells of 5 mm."""
+
+    x_mm: float
+    y_mm: float
+    column: float
+    row: float
+    column_by_x: float
+    column_by_y: float
+    row_by_x: float
+    row_by_y: float
+
+
+class CellWeights(NamedTuple):
+    """Weights of the pixels in the mean of every cell, for one place of the table.
+
+    Attributes
+    ----------
+    windows : (cells, 5) ndarray of unsigned int
+        First column, first row, number of columns and of rows of the pixels around a cell's points, and the place of the first one's
+        weight; no columns where an unmasked point is out of view.
+    weights : (pixels of all windows,) ndarray
+        Cell by cell, row by row; those of a cell sum to 1.
+    """
+
+    windows: Array
+    weights: Array
+
+
+@numba.njit(cache=True, nogil=True)
+def weigh_pixels(points: Array, valid: Array, shift: Array, lens: Array, shape: tuple[int, int]) -> CellWeights:
+    """Weigh the pixels around the points of every cell, each of which is interpolated between four pixels (bilinear)."""
+    places, windows, pixels = _place_points(points, valid, shift, lens, shape)
+    weights = np.zeros(pixels)
+    one = np.uint64(1)
+    for cell in range(len(points)):
+        left, top, columns, first = windows[cell, 0], windows[cell, 1], windows[cell, 2], windows[cell, 4]
+        if columns == 0:
+            continue
+        used = 0
+        for k in range(valid.shape[1]):
+            used += valid[cell, k]
+        for k in range(valid.shape[1]):
+            if valid[cell, k]:
+                column, row = places[cell, k, 0], places[cell, k, 1]
+                j, i = np.uint64(int(column)), np.uint64(int(row))
+                u, v = column - j, row - i
+                upper = first + (i - top) * columns + (j - left)
+                lower = upper + columns
+                below = v / used
+                above = 1 / used - below
+                weights[upper] += above - u * above
+                weights[upper + one] += u * above
+                weights[lower] += below - u * below
+                weights[lower + one] += u * below
+    return CellWeights(windows, weights)
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_points(
+    points: Array, valid: Array, shift: Array, lens: Array, shape: tuple[int, int]
+) -> tuple[Array, Array, int]:
+    """Columns and rows of all points, (cells, points, 2) px; the windows of the cells, as `CellWeights`; the pixels of all windows."""
+    places = np.empty(points.shape)
+    # Unsigned: negative indices would be counted from the end, and looking for them costs as much as the sums themselves.
+    windows = np.zeros((len(points), 5), np.uint64)
+    pixels = 0
+    for cell in range(len(points)):
+        view = _cell_view(points, cell, shift, lens)
+        left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+        for k in range(points.shape[1]):
+            x, y = points[cell, k, 0] - view.x_mm, points[cell, k, 1] - view.y_mm
+            column = view.column + x * view.column_by_x + y * view.column_by_y
+            row = view.row + x * view.row_by_x + y * view.row_by_y
+            places[cell, k, 0], places[cell, k, 1] = column, row
+            if valid[cell, k]:
+                left, right, top, bottom = min(left, column), max(right, column), min(top, row), max(bottom, row)
+        if 0 <= left <= right < shape[1] - 1 and 0 <= top <= bottom < shape[0] - 1:
+            columns, rows = int(right) - int(left) + 2, int(bottom) - int(top) + 2
+            windows[cell, 0], windows[cell, 1], windows[cell, 2] = int(left), int(top), columns
+            windows[cell, 3], windows[cell, 4] = rows, pixels
+            pixels += columns * rows
+    return places, windows, pixels
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cell_view(points: Array, cell: int, shift: Array, lens: Array) -> _CellView:
+    """The affine map about the middle one of a cell's points, of a table displaced by `shift`."""
+    middle = points.shape[1] // 2
+    x_mm, y_mm = points[cell, middle, 0], points[cell, middle, 1]
+    x, y = x_mm + shift[0], y_mm + shift[1]
+    c0, r0 = project_point(x, y, lens)
+    c1, r1 = project_point(x + 1.0, y, lens)
+    c2, r2 = project_point(x, y + 1.0, lens)
+    return _CellView(x_mm, y_mm, c0, r0, c1 - c0, c2 - c0, r1 - r0, r2 - r0)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_frame(counts: Array, calibration: Array, sampling: CellWeights, correction: float, sums: CellSums) -> None:
+    """Average one frame over every cell that it shows, and add it to the sums."""
+    frames, mean, squares = sums
+    windows, weights = sampling
+    temperatures = np.empty(len(windows))
+    for cell in range(len(windows)):
+        if windows[cell, 2] > 0:
+            temperatures[cell] = _temperature_of_mean(counts, windows[cell], weights, calibration)
+    for cell in range(len(windows)):
+        if windows[cell, 2] == 0:
+            continue
+        temperature = temperatures[cell]
+        if np.isnan(temperature):
+            temperature = _mean_temperature(counts, windows[cell], weights, calibration)
+        temperature += correction
+        frames[cell] += 1
+        step = temperature - mean[cell]
+        mean[cell] += step / frames[cell]
+        squares[cell] += step * (temperature - mean[cell])
+
+
+@numba.njit(cache=True, nogil=True)
+def _temperature_of_mean(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
+    """Temperature of the mean count of a cell, degC; NaN where the counts of its pixels differ too much for that."""
+    left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
+    total, low, high = 0.0, np.uint16(65535), np.uint16(0)
+    for i in range(top, top + rows):
+        for j in range(left, left + columns):
+            value = counts[i, j]
+            total += weights[place] * value
+            place += np.uint64(1)
+            low, high = min(low, value), max(high, value)
+    return _calibrate(calibration, total) if high - low <= _NARROW_COUNTS else np.nan
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_temperature(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
+    """Mean of the temperatures of the pixels of a cell, degC."""
+    left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
+    total = 0.0
+    for i in range(top, top + rows):
+        for j in range(left, left + columns):
+            # A pixel without a temperature counts only where it has a weight.
+            if weights[place] > 0:
+                total += weights[place] * calibration[counts[i, j]]
+            place += np.uint64(1)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _calibrate(calibration: Array, counts: float) -> float:
+    """Temperature of counts that need not be whole numbers, degC."""
+    low = min(int(counts), 65534)
+    part = counts - low
+    return (1 - part) * calibration[low] + part * calibration[low + 1]
+
+
+def on_plan(count: Array, mean: Array, samples: Samples, grid: PlanGrid) -> Array:
+    """Arrange cells on the plan, those with masked points moved to their centre."""
+    seen = (count > 0).reshape(grid.shape) & (samples.coverage >= LEAST_COVERAGE)
+    centred = mean + samples.centring @ mean
+    # Next to cells that were never in view the gradient is unknown.
+    complete = np.asarray((abs(samples.centring) @ (count == 0).astype(float)) == 0)
+    return np.where(seen, np.where(complete, centred, mean).reshape(grid.shape), np.nan)
+
 
 #: Frames in which the position of the table is less certain than this are left out of the fields, mm.
 _LARGEST_U_MM = 1.0
@@ -151,12 +393,11 @@ def reduce_moving_frames(
 
 @dataclass(frozen=True)
 class _BlockResult:
-    """The reduction of one block: mean and squared deviation of every cell, and the position of the table in every frame.
+    """The reduction of one block: the cells as of `CellSums`, and the place of the table in every frame.
 
     Attributes
     ----------
     count, mean, squares : (cells,) ndarray
-        As `thermography.fields.moving_sampling.CellSums`.
     shift_mm : (frames, 2) ndarray, mm
         Displacement (x, y) of the table; NaN where it is not located.
     u_mm : (frames,) ndarray, mm
@@ -223,14 +464,13 @@ def _reduce_blocks(
     results = store.load(blocks) if store is not None else []
     if progress is not None and results:
         progress(blocks[len(results) - 1].stop)
-    left = blocks[len(results) :]
     with open_pool(scheduler) as pool:
         shared = pool.share(prepared)
         stretches = (
             [block for portion in stretch for block in portion.blocks]
-            for stretch in cut_stretches(left, total=len(frames))
+            for stretch in cut_stretches(blocks[len(results) :], total=len(frames))
         )
-        tasks = ((stretch, (_reduce_stretch, _with_corrections(frames, stretch), shared)) for stretch in stretches)
+        tasks = ((stretch, (_reduce_stretch, gather_frames(frames, stretch), shared)) for stretch in stretches)
         for stretch, reduced in in_order(pool, tasks):
             for block, result in zip(stretch, reduced, strict=True):
                 results.append(result)
@@ -241,65 +481,33 @@ def _reduce_blocks(
     return results
 
 
-def _with_corrections(frames: FrameSeries, stretch: Sequence[Block]) -> list[tuple[FrameRun, CameraParameters, Array]]:
-    """Frames of every block with its camera parameters and corrections."""
-    return [
-        (FrameRun(frames.references[b.first : b.stop]), b.parameters, frames.correction_K[b.first : b.stop])
-        for b in stretch
-    ]
-
-
-def _reduce_stretch(
-    members: Sequence[tuple[FrameRun, CameraParameters, Array]], prepared: tuple[TableTracker, Samples]
-) -> list[_BlockResult]:
-    """Reduce the blocks of a stretch: the task of a thread or of a worker."""
-    return [_reduce_block(run, parameters, prepared, correction_K) for run, parameters, correction_K in members]
-
-
-def _reduce_block(
-    frames: FrameRun,
-    parameters: CameraParameters,
-    prepared: tuple[TableTracker, Samples],
-    correction_K: Array,
-) -> _BlockResult:
-    """Locate the table in every frame of a block and add the frame to the cells."""
+def _reduce_stretch(blocks: Sequence[BlockFrames], prepared: tuple[TableTracker, Samples]) -> list[_BlockResult]:
+    """Locate the table in every frame of some blocks and add the frame to their cells: the task of a thread or of a worker."""
     tracker, samples = prepared
-    rows, columns = tracker.registration.shape
-    calibration = temperature_from_counts(np.arange(65536.0), parameters)
-    cells = len(samples.valid)
-    sums = CellSums(np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells))
-    shift_mm, u_mm = np.full((len(frames), 2), np.nan), np.full(len(frames), np.nan)
-    discs = np.zeros(len(frames), np.int64)
-    previous = None
-    sampling = _Sampling(tracker, samples)
-    with WindowReader((slice(0, rows), slice(0, columns))) as reader:
-        for start, chunk in zip(
-            range(0, len(frames), CHUNK_FRAMES), reader.read_in_chunks(frames, CHUNK_FRAMES), strict=True
-        ):
-            for i, counts in enumerate(chunk, start):
+    shape, cells = tracker.registration.shape, len(samples.valid)
+    results = []
+    with WindowReader((slice(0, shape[0]), slice(0, shape[1]))) as reader:
+        for block, frames, _, correction_K in blocks:
+            calibration = temperature_from_counts(np.arange(65536.0), block.parameters)
+            sums = CellSums(np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells))
+            shift_mm, u_mm = np.full((len(frames), 2), np.nan), np.full(len(frames), np.nan)
+            discs = np.zeros(len(frames), np.int64)
+            previous, sampled_mm = None, np.full(2, np.nan)
+            chunks = reader.read_in_chunks(frames, CHUNK_FRAMES)
+            for i, counts in enumerate(counts for chunk in chunks for counts in chunk):
                 position = locate_table(counts, tracker, previous)
                 previous = None if position is None else position.shift_mm
                 if position is None:
                     continue
                 shift_mm[i], u_mm[i], discs[i] = position.shift_mm, position.u_mm, position.discs
-                if position.u_mm <= _LARGEST_U_MM:
-                    add_frame(counts, calibration, sampling.at(position.shift_mm), float(correction_K[i]), sums)
-    return _BlockResult(*sums, shift_mm, u_mm, discs)
-
-
-class _Sampling:
-    """Weights of the pixels where the table stands, computed again when it has moved."""
-
-    def __init__(self, tracker: TableTracker, samples: Samples) -> None:
-        self.tracker, self.samples = tracker, samples
-        self.shift_mm = np.full(2, np.nan)
-
-    def at(self, shift_mm: Array) -> CellWeights:
-        """Weights for a displacement (x, y) of the table, mm."""
-        if not np.hypot(*(shift_mm - self.shift_mm)) <= _STANDING_MM:
-            points, valid, shape = self.samples.points_mm, self.samples.valid, self.tracker.registration.shape
-            self.shift_mm, self.weights = shift_mm, weigh_pixels(points, valid, shift_mm, self.tracker.lens, shape)
-        return self.weights
+                if not position.u_mm <= _LARGEST_U_MM:
+                    continue
+                if not np.hypot(*(position.shift_mm - sampled_mm)) <= _STANDING_MM:
+                    sampled_mm = position.shift_mm
+                    weights = weigh_pixels(samples.points_mm, samples.valid, sampled_mm, tracker.lens, shape)
+                add_frame(counts, calibration, weights, float(correction_K[i]), sums)
+            results.append(_BlockResult(*sums, shift_mm, u_mm, discs))
+    return results
 
 
 def _assemble(
@@ -315,13 +523,13 @@ def _assemble(
     discs = np.concatenate([result.discs for result in results])
     if not discs.any():
         raise ReductionError(
-            "the table is found in no frame; check the fiducials, and [plan.axis] direction, along which it is looked for"
+            "the table is found in no frame; check the fiducials, and [plan.axis] direction, along which it is searched"
         )
     parts = _cycle_parts(frames, blocks, results, samples, grid)
     if not parts:
         times, bounds = frames.times, frames.bounds
         raise ReductionError(
-            f"no frame in which the table is found lies within a cycle: frames {times[0]} to {times[-1]}, "
+            f"no frame in which the table is found is within a cycle: frames {times[0]} to {times[-1]}, "
             f"cycles {bounds[0, 0]} to {bounds[-1, 1]}; check the time zones and the clock offset"
         )
     block_times = np.array([frames.mean_time(slice(block.first, block.stop)) for block in blocks])
@@ -329,7 +537,7 @@ def _assemble(
         parts,
         len(frames.bounds),
         grid,
-        [position_covariance(registration, grid)],
+        [registration.position_covariance(grid.centres_mm)],
         [samples.coverage],
         frames=_frame_variables(blocks, results, axis, samples, grid),
         frame_coordinates={"time": block_times, "frame_time": frames.times},
@@ -353,18 +561,25 @@ def _cycle_parts(
         if not located.size:
             continue
         times = frames.times[located]
-        part = CyclePart(cycle, 0, frames=int(located.size), first_time=times[0])
-        part.seconds = float(((times - times[0]) / np.timedelta64(1, "ns")).sum()) / 1e9
         count, mean, squares = _merge([result for _, result in of_cycle])
-        part.mean = on_plan(count, mean, samples, grid)
-        seen = np.isfinite(part.mean)
+        plan_mean = on_plan(count, mean, samples, grid)
+        seen = np.isfinite(plan_mean)
         with np.errstate(invalid="ignore", divide="ignore"):
             spread = np.sqrt(np.where(count > 1, squares / (count - 1), np.nan))
-        part.spread = np.where(seen, spread.reshape(grid.shape), np.nan)
-        part.noise_variance = np.where(seen, pixel_noise(part.mean, seen) ** 2, np.nan)
-        part.fell_back = np.zeros(grid.shape, bool)
-        part.count = np.where(seen, count.reshape(grid.shape), 0).astype(np.int32)
-        parts.append(part)
+        parts.append(
+            CyclePart(
+                cycle,
+                0,
+                frames=int(located.size),
+                first_time=times[0],
+                seconds=float(((times - times[0]) / np.timedelta64(1, "ns")).sum()) / 1e9,
+                mean=plan_mean,
+                spread=np.where(seen, spread.reshape(grid.shape), np.nan),
+                noise_variance=np.where(seen, pixel_noise(plan_mean, seen) ** 2, np.nan),
+                fell_back=np.zeros(grid.shape, bool),
+                count=np.where(seen, count.reshape(grid.shape), 0).astype(np.int32),
+            )
+        )
     return parts
 
 

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
-from thermography.io.frame_index.by_threads import usable_threads
+from thermography.common import Array, ThermographyError
+from thermography.io.sequence import usable_threads
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
@@ -77,99 +76,52 @@ class PlanWeights:
         return self._on_plan(variance)
 
     def resample(self, values: Array) -> Array:
-        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen.
-
-        A pixel without a value takes no part, as long as half of its cell has values.
-        """
+        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen."""
         cells = self.areas @ values.ravel()
         if np.isnan(cells).any():
-            cells = self._without_missing(values.ravel())
+            # Average over every cell of the pixels that have a value; NaN where they cover less than half of it.
+            pixels = values.ravel()
+            present = np.isfinite(pixels)
+            share = self.areas @ present.astype(float)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                cells = np.where(share >= LEAST_COVERAGE, self.areas @ np.where(present, pixels, 0.0) / share, np.nan)
         return self._on_plan(cells + self.centring @ cells)
-
-    def _without_missing(self, pixels: Array) -> Array:
-        """Average over every cell of the pixels that have a value; NaN where they cover less than half of it."""
-        present = np.isfinite(pixels)
-        share = self.areas @ present.astype(float)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean: Array = np.where(share >= LEAST_COVERAGE, self.areas @ np.where(present, pixels, 0.0) / share, np.nan)
-        return mean
 
     def average(self, values: Array) -> Array:
         """As `resample`, by area alone: for quantities that must not be extrapolated (variances)."""
         return self._on_plan(self.areas @ values.ravel())
 
     def _on_plan(self, cells: Array) -> Array:
-        plane: Array = np.where(self.coverage >= LEAST_COVERAGE, cells.reshape(self.grid.shape), np.nan)
-        return plane
+        return np.where(self.coverage >= LEAST_COVERAGE, cells.reshape(self.grid.shape), np.nan)
 
 
 def _row_squares(matrix: sparse.csr_array) -> Array:
     """Sum of the squares of every row."""
-    squares: Array = sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape) @ np.ones(
+    return sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape) @ np.ones(
         matrix.shape[1]
     )
-    return squares
 
 
 def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slice]:
-    """Window of the sensor that contains the plan: whole rows, because these are contiguous in the file.
-
-    Parameters
-    ----------
-    registration : Registration
-    grid : PlanGrid
-
-    Returns
-    -------
-    rows, columns : slice, px
-
-    Raises
-    ------
-    ThermographyError
-        No pixel lies on the plan.
-    """
+    """Window of the sensor that contains the plan: whole rows, because these are contiguous in the file."""
     outline = registration.to_sensor(grid.outline_mm(25))
     rows, columns = registration.shape
     top = max(int(np.floor(outline[:, 1].min())), 0)
     bottom = min(int(np.ceil(outline[:, 1].max())), rows - 1)
     if bottom < top:
-        raise ThermographyError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
+        raise ThermographyError("no pixel of the frame is on the plan; check the fiducials and the plan's size")
     return slice(top, bottom + 1), slice(0, columns)
 
 
 def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> PlanWeights:
-    """Weights of the pixels of a registered camera in the cells of the plan.
-
-    A pixel whose centre is nearer than `margin_px` to a fiducial or to the plan's edge has no weight, because the lens blurs what
-    lies beyond into it. A cell that is only partly seen is moved from the centre of its seen area to its own centre along the
-    gradient of the cells around it; otherwise a gradient of 10 K along the table would cause 15 mK in cells of which a millimetre is
-    masked.
-
-    Parameters
-    ----------
-    registration : Registration
-        Position of the pixels on the plan.
-    grid : PlanGrid
-        The plan.
-    margin_px : float, px
-        Width of the lens's blur; 2 px contain all but 1 % of an edge for common cameras.
-
-    Returns
-    -------
-    PlanWeights
-
-    Raises
-    ------
-    ThermographyError
-        No pixel lies on the plan.
-    """
+    """Weights of the pixels of a registered camera in the cells of the plan."""
     window = plan_window(registration, grid)
     if registration.is_picture:
         # The edge of the picture is the edge of nothing that could be blurred into it.
         margin_px = 0.0
     cell, pixel, area, x, y = _pieces(registration, grid, window, margin_px)
     if len(cell) == 0:
-        raise ThermographyError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
+        raise ThermographyError("no pixel of the frame is on the plan; check the fiducials and the plan's size")
     cells = grid.shape[0] * grid.shape[1]
     seen_area = np.bincount(cell, area, cells)
     coverage = (seen_area / grid.cell_size_mm**2).reshape(grid.shape).clip(0, 1)
@@ -315,23 +267,7 @@ def _add_piece(pieces: _Pieces, first: int, count: int, cell: int, number: int, 
 
 
 def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array:
-    """Correction that moves partly seen cells from the centre of their seen area to their own centre.
-
-    Parameters
-    ----------
-    offset_mm : (cells, 2) ndarray, mm
-        Centre of the seen area minus centre of the cell, (x, y); NaN for cells that are not seen.
-    coverage : (y, x) ndarray
-        Share of every cell that is seen unmasked, 0 to 1.
-    grid : PlanGrid
-        The plan.
-
-    Returns
-    -------
-    (cells, cells) CSR array
-        To be multiplied with the cells and added to them: minus the offset times the gradient of a plane fitted to the 3 x 3 cells
-        around each, both of which are linear in the cells. Empty rows for cells within 2 % of their centre.
-    """
+    """Correction that moves partly seen cells from the centre of their seen area to their own centre."""
     centres_mm = offset_mm + grid.centres_mm.reshape(-1, 2)
     seen = coverage.ravel() >= LEAST_COVERAGE
     off_centre = (np.abs(offset_mm) > 0.02 * grid.cell_size_mm).any(axis=1) & seen

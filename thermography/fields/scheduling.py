@@ -6,16 +6,24 @@ import ctypes
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from thermography.errors import ThermographyError
-from thermography.io.frame_index.by_threads import usable_threads
+import h5netcdf
+import xarray as xr
+from xarray.backends import BackendArray, H5NetCDFStore
+from xarray.backends.file_manager import PickleableFileManager
+from xarray.core import indexing
+
+from thermography.common import Array, ThermographyError
+from thermography.io.sequence import usable_threads
 
 if TYPE_CHECKING:
     from distributed import Client
+
 
 Task = TypeVar("Task")
 
@@ -51,23 +59,7 @@ class Pool:
 
 @contextmanager
 def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
-    """Open a pool of threads, or of the workers of a dask scheduler.
-
-    Parameters
-    ----------
-    scheduler : str or None
-        Address of a dask scheduler (``tcp://host:8786``) whose workers see the same files; None for threads.
-
-    Yields
-    ------
-    Pool
-        Closed at the end of the ``with`` block.
-
-    Raises
-    ------
-    SchedulerError
-        dask.distributed is not installed, or no scheduler with workers answers at the address.
-    """
+    """Open a pool of threads, or of the workers of a dask scheduler."""
     if scheduler is None:
         threads = usable_threads()
         with ThreadPoolExecutor(threads, "reduce") as executor:
@@ -119,8 +111,8 @@ def _cluster_pool(client: Client, scheduler: str, workers: int) -> Pool:
             ) from error
         except KilledWorker as error:
             raise SchedulerError(
-                f"scheduler {scheduler}: the same work ended {error.allowed_failures + 1} workers, most often for want of memory; "
-                "give each worker 1 GB or more, and look into its log"
+                f"scheduler {scheduler}: the same work ended {error.allowed_failures + 1} workers, usually because memory ran out; "
+                "give each worker 1 GB or more, and check its log"
             ) from error
         except CancelledError as error:
             raise SchedulerError(
@@ -138,11 +130,7 @@ def _on_worker(function: Callable[..., Task], *arguments: Any) -> Task:
 
 @cache
 def _keep_freed_memory() -> None:
-    """Let the C library of this process keep up to 64 MB of freed memory, as it does by itself elsewhere.
-
-    Workers of dask are started with MALLOC_TRIM_THRESHOLD_, with which glibc returns every array of some 100 kB at once and asks for it
-    again: a tenth of the time of a reduction goes into clearing its pages. Systems without glibc have no such setting.
-    """
+    """Let the C library of this process keep up to 64 MB of freed memory, as it does by itself elsewhere."""
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
@@ -156,20 +144,7 @@ def _returned(shared: Task) -> Task:
 
 
 def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Generator[tuple[Task, Any], None, None]:
-    """Compute one function call per task, in parallel.
-
-    Parameters
-    ----------
-    pool : Pool
-        From `open_pool`.
-    tasks : iterable of (task, (function, argument, ...))
-        The task itself may be any object; it is returned with its result.
-
-    Yields
-    ------
-    task, result
-        In the order of the tasks. Closing the generator early cancels the calls that are waiting.
-    """
+    """Compute one function call per task, in parallel."""
     waiting: deque[tuple[Task, Any]] = deque()
     try:
         for task, call in tasks:
@@ -183,3 +158,41 @@ def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Gener
     finally:
         for _, future in waiting:
             future.cancel()
+
+
+# Arrays that stay in their NetCDF file and are read when they are asked for.
+
+
+def open_stored(path: Path, reading: Callable[[], AbstractContextManager[None]], part_bytes: int) -> xr.Dataset:
+    """Open a NetCDF 4 file whose arrays are read when they are asked for, and not kept."""
+    # Files that xarray opens by their path may be closed for the next ones, and opened again.
+    kept = {"decode_vlen_strings": True, "rdcc_nbytes": part_bytes}
+    manager = PickleableFileManager(h5netcdf.File, str(path), mode="r", kwargs=kept)
+    try:
+        with reading():
+            dataset = xr.open_dataset(H5NetCDFStore(manager), decode_timedelta=False, cache=False)
+        lazy = {}
+        for name, variable in dataset.variables.items():
+            if name not in dataset.indexes:
+                stored = indexing.LazilyIndexedArray(_StoredArray(variable, reading))
+                lazy[name] = xr.Variable(variable.dims, stored, variable.attrs, variable.encoding)
+        dataset.update(lazy)
+    except BaseException:
+        manager.close()
+        raise
+    return dataset
+
+
+class _StoredArray(BackendArray):
+    """A variable in a file, read within a context."""
+
+    def __init__(self, variable: xr.Variable, reading: Callable[[], AbstractContextManager[None]]) -> None:
+        self.variable, self.reading = variable, reading
+        self.shape, self.dtype = variable.shape, variable.dtype
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> Array:
+        with self.reading():
+            return self.variable[key].values

@@ -6,39 +6,650 @@ displacement of camera or table (a knock) the plan is registered again, and the 
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from itertools import pairwise
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from thermography._typing import Array
-from thermography.fields.blocks import Block, cut_blocks
-from thermography.fields.checkpoint import Checkpoint, ParameterGroup, StoredCycle, describe_reduction
-from thermography.fields.cycle_fields import CyclePart, FinishedParts, assemble_fields
-from thermography.fields.following import Displacements, Knock, Obstructions, Registrations
-from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
-from thermography.fields.scheduling import Pool, in_order, open_pool
-from thermography.fields.tasks.spool import Spool
-from thermography.fields.tasks.stretches import (
-    Portion,
-    PortionResult,
-    add_sums,
-    choose_frames,
-    cut_stretches,
-    gather_frames,
-    reduce_portion,
-    reduce_stretch,
+from thermography.common import Array, ThermographyError
+from thermography.fields.blocks import (
+    NO_CYCLE,
+    Block,
+    BlockResult,
+    FrameRun,
+    FrameSeries,
+    Override,
+    ReductionError,
+    RegisteredSensor,
+    cut_blocks,
+    make_frame_series,
+    reduce_block,
 )
-from thermography.io.frame import FrameReference
-from thermography.registration.displacement import RegistrationSpan, zoom_and_turn
+from thermography.fields.cycle_fields import CyclePart, assemble_fields
+from thermography.fields.large_arrays import Spool, fill_array
+from thermography.fields.resampling import plan_weights, plan_window
+from thermography.fields.scheduling import Pool, in_order, open_pool
+from thermography.io.files import write_atomically
+from thermography.io.frame import CameraParameters, FrameReference
+from thermography.io.sequence import WindowReader
+from thermography.radiometry.averaging import MeanTemperature
+from thermography.radiometry.planck import calibrate
+from thermography.registration.displacement import (
+    KNOCK_PX,
+    SUSPECT_PX,
+    RegistrationSpan,
+    fiducial_displacement,
+    image_displacement,
+    monitor_fiducials,
+    register_after_knock,
+    search_displacement,
+    shift_registration,
+    zoom_and_turn,
+)
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
+
+# Finished cycles of a reduction on disk, to resume an interrupted run.
+
+_DESCRIPTION = "reduction.json"
+_KNOCKS = "knocks.json"
+_OPEN_CYCLE = "open.sums"
+_PIXELS = ("mean", "variance", "bound_K")
+_CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
+#: What is stored of a `CyclePart`, and of a `StoredCycle` as arrays and in the header.
+_PART = ("cycle", "span", "frames", "seconds")
+_PER_CYCLE = ("blocks", "stack", "shift_px")
+_REMARKS = ("first_frame", "stop_frame", "shaken", "obstructed", "baseline_px")
+
+
+class CheckpointError(ThermographyError):
+    """A checkpoint does not belong to this reduction; the message names it and the remedy."""
+
+
+@dataclass(frozen=True)
+class StoredCycle:
+    """The frames of one cycle under one registration, with those before it that belong to no cycle; finished or open.
+
+    Attributes
+    ----------
+    part : CyclePart
+        Cells of a finished cycle, or pixels of an open one.
+    first_frame, stop_frame : int
+        Frames `first_frame` to ``stop_frame - 1``.
+    blocks : (blocks, 4) ndarray of int
+        First frame, stop frame, cycle and registration span of every block.
+    stack : (blocks, y, x) ndarray of float32, degC
+        Field of every block.
+    shift_px : (frames,) ndarray, px
+        Displacement of every frame against its registration; NaN where unchecked.
+    shaken, obstructed : tuple of int
+        Frames that were displaced alone; frames in which something stands before the table.
+    baseline_px : (column, row, growth, turn), px
+        Bias of the fiducial monitor after the last frame.
+    """
+
+    part: CyclePart
+    first_frame: int
+    stop_frame: int
+    blocks: Array
+    stack: Array
+    shift_px: Array
+    shaken: tuple[int, ...] = ()
+    obstructed: tuple[int, ...] = ()
+    baseline_px: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+
+
+class Checkpoint:
+    """A folder to which finished cycles are written, each file complete or absent.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Created if it does not exist.
+    description : dict
+        Everything on which the result depends, as JSON; stored with the cycles, and compared before any of them is used again.
+
+    Raises
+    ------
+    CheckpointError
+        The folder holds cycles of another reduction.
+    """
+
+    def __init__(self, folder: str | Path, description: dict[str, Any]) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(description, sort_keys=True, default=str)
+        path = self.folder / _DESCRIPTION
+        if path.exists() and path.read_text(encoding="utf-8") != text:
+            before = json.loads(path.read_text(encoding="utf-8"))
+            differs = sorted(key for key in description if json.loads(text).get(key) != before.get(key))
+            raise CheckpointError(
+                f"{self.folder}: holds cycles of another reduction (other {', '.join(differs) or 'content'}); "
+                "remove the folder to start again"
+            )
+        write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+    def save(self, cycle: StoredCycle) -> None:
+        """Write a finished cycle, or replace the stored state of the open one."""
+        part = cycle.part
+        source, names = (part, _CELLS) if part.pixels is None else (part.pixels, _PIXELS)
+        arrays = {name: getattr(source, name) for name in names} | {name: getattr(cycle, name) for name in _PER_CYCLE}
+        header = {name: getattr(part, name) for name in _PART} | {"first_time": str(part.first_time)}
+        header |= {name: getattr(cycle, name) for name in _REMARKS}
+        name = f"frames_{cycle.first_frame:08d}.sums" if part.pixels is None else _OPEN_CYCLE
+        _write(self.folder / name, header, arrays)
+
+    def save_arrays(self, first: int, header: dict[str, Any], arrays: dict[str, Array]) -> None:
+        """Write arrays by name, and a JSON header, that belong to the blocks from index `first` on."""
+        _write(self.folder / f"blocks_{first:08d}.sums", header, arrays)
+
+    def load_arrays(self) -> list[tuple[dict[str, Any], dict[str, Array]]]:
+        """Headers and arrays that `save_arrays` has written, in the order of the blocks."""
+        return [_read(path) for path in sorted(self.folder.glob("blocks_*.sums"))]
+
+    def save_knock(self, index: int, span: int, displacement_px: list[float], by_image: bool) -> None:
+        """Store that the table was registered again from frame `index` on: the span before, the displacement, and what showed it."""
+        knocks, knock = self.knocks(), [index, span, displacement_px, by_image]
+        if knock not in knocks:
+            text = json.dumps([*knocks, knock])
+            write_atomically(self.folder / _KNOCKS, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+    def knocks(self) -> list[list[Any]]:
+        """Knocks stored so far: frame, span before, displacement (column, row, growth, turn) px, whether the image showed it."""
+        path = self.folder / _KNOCKS
+        return list(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else []
+
+    def load(self) -> Iterator[StoredCycle]:
+        """Yield the finished cycles in the order of time."""
+        return map(_load, sorted(self.folder.glob("frames_*.sums")))
+
+    def load_open(self) -> StoredCycle | None:
+        """Stored state of the last open cycle, if there is one."""
+        path = self.folder / _OPEN_CYCLE
+        return _load(path) if path.exists() else None
+
+
+def describe_reduction(
+    frames: FrameSeries, grid: PlanGrid, spans: Sequence[RegistrationSpan], *, block_s: float
+) -> dict[str, Any]:
+    """Describe a reduction by everything on which its result depends."""
+    digest = hashlib.sha256()
+    # Most frames share their parameters: their text is made once.
+    texts: dict[CameraParameters, str] = {}
+    for reference in frames.references:
+        camera = frames.override(reference)
+        if camera not in texts:
+            texts[camera] = str(camera)
+        digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{texts[camera]}".encode())
+    digest.update(np.ascontiguousarray(frames.correction_K, float).tobytes())
+    registrations = [
+        {"first": span.first_frame, "plan_to_sensor": span.registration.projection.plan_to_sensor.tolist()}
+        for span in spans
+    ]
+    return {
+        "frames": digest.hexdigest(),
+        "cycles": frames.bounds.astype(str).tolist(),
+        "plan": asdict(grid),
+        "registrations": registrations,
+        "block_s": block_s,
+    }
+
+
+def _write(path: Path, header: dict[str, Any], arrays: dict[str, Array]) -> None:
+    """Write a line of JSON, which gives names, types and shapes of the arrays, then the arrays themselves, one after the other."""
+    layout = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
+
+    def write_arrays(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            file.write(json.dumps({**header, "arrays": layout}).encode() + b"\n")
+            for array in arrays.values():
+                np.ascontiguousarray(array).tofile(file)
+
+    write_atomically(path, write_arrays)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
+    with path.open("rb") as file:
+        header = json.loads(file.readline())
+        arrays = {}
+        for name, (kind, shape) in header["arrays"].items():
+            arrays[name] = np.fromfile(file, kind, int(np.prod(shape))).reshape(shape)
+    return header, arrays
+
+
+def _load(path: Path) -> StoredCycle:
+    header, arrays = _read(path)
+    part = CyclePart(**{name: header[name] for name in _PART}, first_time=np.datetime64(header["first_time"]))
+    if all(name in arrays for name in _CELLS):
+        for name in _CELLS:
+            setattr(part, name, arrays[name])
+    else:
+        part.pixels = MeanTemperature(part.frames, *(arrays[name] for name in _PIXELS))
+    stored: dict[str, Any] = {name: arrays[name] for name in _PER_CYCLE} | {name: header[name] for name in _REMARKS}
+    return StoredCycle(part, **stored)
+
+
+# A still table followed over the frames: their displacements, a registration for every time between knocks, and
+# frames in which something stands before the table.
+
+#: Largest number of frames whose mean is registered after a knock, or examined where single frames have too little contrast.
+_MEAN_FRAMES = 8
+#: A displacement lasts if the first measurable one of this number of following frames shares it.
+_FOLLOWING_FRAMES = 3
+#: A sampled pixel is off if it differs by more than this, K, ...
+_OFF_K = 0.5
+#: ... and by more than this many standard deviations of its noise.
+_OFF_SIGMAS = 8.0
+#: A frame is obstructed if more than this share of the sampled pixels is off, beyond single bad pixels.
+_OFF_SHARE = 0.02
+#: An obstruction passes within this time, s, or this number of frames; what stays longer is a change of the scene.
+_PASSING_S, _PASSING_FRAMES = 300.0, 3
+#: Number of frames whose median is the first state of the table.
+_FIRST_FRAMES = 5
+#: Least number of sampled pixels for the comparison.
+_LEAST_PIXELS = 30
+
+
+@dataclass(frozen=True)
+class Knock:
+    """A lasting displacement from a frame on.
+
+    Attributes
+    ----------
+    frame : int
+        Index of the first displaced frame.
+    span : int
+        Registration span in which it occurs.
+    displacement_px : (4,) ndarray, px
+        (column, row, growth, turn), see `thermography.registration.displacement`.
+    by_image : bool
+        Whether the image of the table showed it, because the fiducials have no contrast.
+    """
+
+    frame: int
+    span: int
+    displacement_px: Array
+    by_image: bool
+
+
+class Registrations:
+    """Registration spans in the order of time, and what is derived from each of them.
+
+    Parameters
+    ----------
+    spans : sequence of RegistrationSpan
+        In order, the first one from frame 0 on.
+    grid : PlanGrid
+        The plan.
+
+    Attributes
+    ----------
+    spans : list of RegistrationSpan
+    sensors : list of RegisteredSensor
+        Weights and fiducial monitor for the reduction of blocks.
+    covariances : list of (y, x, 2, 2) ndarray, mm2
+        Of the position of every cell.
+    """
+
+    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid) -> None:
+        self.grid = grid
+        self.spans: list[RegistrationSpan] = []
+        self.sensors: list[RegisteredSensor] = []
+        self.covariances: list[Array] = []
+        for index, span in enumerate(spans):
+            self.insert(index, span)
+
+    def insert(self, index: int, span: RegistrationSpan) -> None:
+        """Insert a span before the one at `index`."""
+        registration, grid = span.registration, self.grid
+        # In parallel: the weights are compiled loops over pixels, the others many small steps of the interpreter.
+        with ThreadPoolExecutor(1) as executor:
+            monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
+            covariance = executor.submit(registration.position_covariance, grid.centres_mm)
+            sensor = RegisteredSensor(plan_weights(registration, grid), monitor.result())
+        self.spans.insert(index, span)
+        self.sensors.insert(index, sensor)
+        self.covariances.insert(index, covariance.result())
+
+    def stop_frame(self, index: int) -> int | None:
+        """First frame of the span after the one at `index`; None for the last."""
+        return self.spans[index + 1].first_frame if index + 1 < len(self.spans) else None
+
+
+class Displacements:
+    """Displacement of every frame against its registration.
+
+    Parameters
+    ----------
+    frames : FrameSeries
+        All frames.
+    registrations : Registrations
+        Their registrations, which grow by one for every knock.
+
+    Attributes
+    ----------
+    size_px : (frames,) ndarray, px
+        Root mean square displacement of the fiducials in every frame; NaN where it is not measured.
+    shaken : set of int
+        Frames that are displaced alone.
+    baseline_px : (4,) ndarray, px
+        Bias of the fiducial monitor against the exact displacement, from temperature gradients on the table.
+    """
+
+    def __init__(self, frames: FrameSeries, registrations: Registrations) -> None:
+        self.frames, self.registrations = frames, registrations
+        self.size_px = np.full(len(frames), np.nan)
+        self.shaken: set[int] = set()
+        self.baseline_px = np.zeros(4)
+        self._misses = 0
+
+    def find_knock(self, block: Block, monitored_px: Array) -> Knock | None:
+        """Measure the frames of a block up to the first one of a lasting displacement."""
+        if self.registrations.spans[block.span].registration.is_picture:
+            return None
+        sizes = np.linalg.norm(monitored_px - self.baseline_px, axis=1)
+        if (sizes <= SUSPECT_PX).all():
+            self.size_px[block.first : block.stop] = sizes
+            self._misses = 0
+            return None
+        for i, monitored in zip(range(block.first, block.stop), monitored_px, strict=True):
+            displacement = monitored - self.baseline_px
+            if not np.linalg.norm(displacement) <= SUSPECT_PX:
+                displacement, by_image = self._measure(i, block.span)
+                self._misses = self._misses + 1 if np.isnan(displacement).any() else 0
+                if np.linalg.norm(displacement) > KNOCK_PX:
+                    if self._lasts(i, block.span, displacement):
+                        return Knock(i, block.span, displacement, by_image)
+                    self.shaken.add(i)
+                elif np.isfinite(displacement + monitored).all():
+                    self.baseline_px = monitored - displacement
+            self.size_px[i] = np.linalg.norm(displacement)
+        return None
+
+    def span_after(self, knock: Knock) -> RegistrationSpan:
+        """Register the plan again on the mean of the frames after a knock; the baseline starts anew."""
+        old, grid = self.registrations.spans[knock.span].registration, self.registrations.grid
+        if knock.by_image:
+            registration = shift_registration(old, knock.displacement_px[:2])
+        else:
+            # The next few frames, up to the next span, that share the displacement.
+            stop = min(knock.frame + _MEAN_FRAMES, self.registrations.stop_frame(knock.span) or len(self.frames))
+            displaced = [
+                i
+                for i in range(knock.frame + 1, stop)
+                if _alike(self._measure(i, knock.span)[0], knock.displacement_px)
+            ]
+            temperature = self._mean([knock.frame, *displaced])
+            name = self.frames.name(knock.frame)
+            registration = register_after_knock(temperature, old, knock.displacement_px, grid, frame_name=name)
+        self.baseline_px = np.zeros(4)
+        column, row, growth, turn = knock.displacement_px.tolist()
+        return RegistrationSpan(knock.frame, registration, (column, row, growth, turn))
+
+    def unchecked_stretches(self, left_out: Array) -> list[tuple[int, int]]:
+        """First frame and end of stretches of unmeasured frames at whose end no frame nor the mean of several shows the registration."""
+        stretches = []
+        for index, span in enumerate(self.registrations.spans):
+            if span.registration.is_picture:
+                continue
+            stop = self.registrations.stop_frame(index) or len(self.frames)
+            chosen = [i for i in range(span.first_frame + 1, stop) if not left_out[i]]
+            measured = [i for i in chosen if np.isfinite(self.size_px[i])]
+            last = measured[-1] if measured else span.first_frame
+            after = [i for i in chosen if i > last]
+            if not after:
+                continue
+            mean = self._mean(after[-_MEAN_FRAMES:])
+            displacement = fiducial_displacement(mean, span.registration, self.registrations.grid)
+            if not np.linalg.norm(displacement) <= KNOCK_PX:
+                stretches.append((after[0], stop))
+        return stretches
+
+    def _lasts(self, i: int, span: int, displacement_px: Array) -> bool:
+        """Whether the first measurable one of the next few frames shares the displacement of a frame, or none can be measured."""
+        for following in range(i + 1, min(i + 1 + _FOLLOWING_FRAMES, len(self.frames))):
+            other, _ = self._measure(following, span)
+            if np.isfinite(other).all():
+                return _alike(other, displacement_px)
+        return True
+
+    def _measure(self, i: int, span: int) -> tuple[Array, bool]:
+        """Displacement of a frame, (4,) px, and whether the image of the table showed it, because the fiducials have no contrast."""
+        first, registration = self.registrations.spans[span].first_frame, self.registrations.spans[span].registration
+        temperature, grid = self.frames.temperature(i), self.registrations.grid
+        displacement = fiducial_displacement(temperature, registration, grid)
+        # After frames in which nothing is located, the slow ways are tried at frames 1, 2, 4, 8, ... of the stretch.
+        if np.isfinite(displacement).all() or i == first or self._misses & (self._misses - 1):
+            return displacement, False
+        reference = self.frames.temperature(first)
+        displacement = search_displacement(reference, temperature, registration, grid)
+        if np.isfinite(displacement).all():
+            return displacement, False
+        return image_displacement(reference, temperature, registration, grid), True
+
+    def _mean(self, chosen: Sequence[int]) -> Array:
+        """Mean temperature of some frames, (row, column) degC."""
+        return np.mean([self.frames.temperature(i) for i in chosen], axis=0, dtype=float)
+
+
+def _alike(displacement_px: Array, other_px: Array) -> bool:
+    """Whether a displacement is a knock, and the same as another one."""
+    size, other, difference = (
+        float(np.linalg.norm(vector)) for vector in (displacement_px, other_px, displacement_px - other_px)
+    )
+    return size > KNOCK_PX and difference < max(KNOCK_PX, 0.3 * other)
+
+
+def pixels_off(values: Array, lowest: Array, highest: Array, noise_K: float) -> Array:
+    """Share of the pixels of every frame that lie outside a range, apart from a change that all pixels share."""
+    middle = (lowest + highest) / 2
+    level = np.nanmedian(values - middle, axis=1, keepdims=True)
+    beyond = np.maximum(values - level - highest, lowest - values + level)
+    off = beyond > np.nanmax([_OFF_K, _OFF_SIGMAS * noise_K])
+    return off.mean(axis=1)
+
+
+class Obstructions:
+    """Frames of a series in which something stands before the table.
+
+    Parameters
+    ----------
+    frames : FrameSeries
+        All frames.
+    registrations : Registrations
+        Their registrations.
+
+    Attributes
+    ----------
+    found : set of int
+        Those frames so far.
+    """
+
+    def __init__(self, frames: FrameSeries, registrations: Registrations) -> None:
+        self.frames, self.registrations = frames, registrations
+        self.found: set[int] = set()
+        self._span = -1
+        self._state = np.empty(0)
+        self._until = 0
+
+    def examine(self, block: Block, result: BlockResult) -> None:
+        """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ."""
+        in_picture = self.registrations.spans[block.span].registration.is_picture
+        if in_picture or result.samples.shape[1] < _LEAST_PIXELS:
+            return
+        if block.span != self._span:
+            # Median of the first frames of a registration span, of which less than half may be obstructed.
+            stop = self.registrations.stop_frame(block.span) or len(self.frames)
+            more = range(block.stop, min(block.first + _FIRST_FRAMES, stop))
+            state: Array = np.median(
+                [*result.samples[:_FIRST_FRAMES], *(self._sample(i, block.span) for i in more)], axis=0
+            )
+            self._span, self._state = block.span, state
+        # Whether frames surely show the same as one before: `pixels_off` without medians, ten times as fast, by a stricter limit.
+        change = result.samples - self._state
+        change -= change.mean(axis=1, keepdims=True)
+        if bool(((np.abs(change) <= 0.8 * _OFF_K).mean(axis=1) >= 1 - _OFF_SHARE).all()):
+            self._state = result.samples[-1]
+            return
+        for i, values in zip(range(block.first, block.stop), result.samples, strict=True):
+            if pixels_off(values[None], self._state, self._state, result.noise_K)[0] > _OFF_SHARE and (
+                i < self._until or self._passes(i, values, block, result.noise_K)
+            ):
+                self.found.add(i)
+            else:
+                self._state = values
+
+    def _passes(self, i: int, values: Array, block: Block, noise_K: float) -> bool:
+        """Whether a later frame shows the table as before, and this one lies outside what both show."""
+        ahead = 1
+        while i + ahead < (self.registrations.stop_frame(block.span) or len(self.frames)):
+            seconds = (self.frames.times[i + ahead] - self.frames.times[i]) / np.timedelta64(1, "s")
+            if ahead > _PASSING_FRAMES and seconds > _PASSING_S:
+                break
+            later = self._sample(i + ahead, block.span)
+            if pixels_off(later[None], self._state, self._state, noise_K)[0] <= _OFF_SHARE:
+                lowest, highest = np.minimum(self._state, later), np.maximum(self._state, later)
+                self._until = i + ahead
+                return bool(pixels_off(values[None], lowest, highest, noise_K)[0] > _OFF_SHARE)
+            ahead = ahead + 1 if ahead < _PASSING_FRAMES else 2 * ahead
+        return False
+
+    def _sample(self, i: int, span: int) -> Array:
+        """Temperature of the sampled pixels in a frame, (points,) degC."""
+        sensor, reference = self.registrations.sensors[span], self.frames.references[i]
+        buffer = np.empty((1, *sensor.weights.used.shape), np.uint16)
+        with WindowReader(sensor.weights.window) as reader:
+            counts = reader.read([reference], buffer).ravel()[sensor.sampled]
+        return calibrate(counts, self.frames.override(reference))
+
+
+# Stretches of a recording: what a thread or a worker of a cluster reads and reduces at a time, and how the sums are
+# combined.
+
+#: Largest number of frames of a stretch: one to three seconds of work for video of 640 x 480 pixels.
+STRETCH_FRAMES = 4096
+#: A recording is divided into so many stretches at least, so that several workers end at about the same time, ...
+_LEAST_STRETCHES = 16
+#: ... but a cycle of no more than this number of frames is not divided.
+_UNDIVIDED_FRAMES = 512
+#: Largest numbers of blocks and of cycles of a stretch: fields and sums of so many are held in memory at a time.
+_MOST_BLOCKS, _MOST_CYCLES = 256, 8
+
+
+@dataclass(frozen=True)
+class Portion:
+    """Consecutive blocks of one cycle under one registration, or of no cycle; `whole` where no other portion belongs to the same."""
+
+    blocks: tuple[Block, ...]
+    whole: bool
+
+    @property
+    def first(self) -> Block:
+        """The first block, which tells cycle and registration."""
+        return self.blocks[0]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return self.blocks[-1].stop - self.blocks[0].first
+
+
+class BlockFrames(NamedTuple):
+    """A block with those of its frames that show the table, their times (frames,) datetime64 and their corrections (frames,) K."""
+
+    block: Block
+    frames: FrameRun
+    times: Array
+    correction_K: Array
+
+
+@dataclass(frozen=True)
+class PortionResult:
+    """What every block of a portion shows, and its share of the cycle: pixels, or cells of a whole one; None for frames of no cycle."""
+
+    blocks: tuple[BlockResult, ...]
+    part: CyclePart | None
+
+
+def cut_stretches(blocks: Sequence[Block], *, total: int, begun: tuple[int, int] | None = None) -> list[list[Portion]]:
+    """Divide blocks into stretches of about equal work, each within one registration."""
+    wanted = min(max(total // _LEAST_STRETCHES, 1), STRETCH_FRAMES)
+    longest = min(max(wanted, _UNDIVIDED_FRAMES), STRETCH_FRAMES)
+    stretches: list[list[Portion]] = []
+    frames = held = 0
+    for portion in _cut_portions(blocks, longest, begun):
+        number = len(portion.blocks)
+        if (
+            not stretches
+            or frames >= wanted
+            or frames + portion.frames > longest
+            or held + number > _MOST_BLOCKS
+            or len(stretches[-1]) == _MOST_CYCLES
+            or stretches[-1][0].first.span != portion.first.span
+        ):
+            stretches.append([])
+            frames = held = 0
+        stretches[-1].append(portion)
+        frames, held = frames + portion.frames, held + number
+    return stretches
+
+
+def _cut_portions(blocks: Sequence[Block], longest: int, begun: tuple[int, int] | None) -> Iterator[Portion]:
+    """Yield the blocks of every cycle and registration, divided where they are more than `longest` frames or the most blocks."""
+    for key, of_cycle in groupby(blocks, lambda block: (block.cycle, block.span)):
+        pieces: list[list[Block]] = []
+        for block in of_cycle:
+            if not pieces or block.stop - pieces[-1][0].first > longest or len(pieces[-1]) == _MOST_BLOCKS:
+                pieces.append([])
+            pieces[-1].append(block)
+        for piece in pieces:
+            yield Portion(tuple(piece), whole=len(pieces) == 1 and key != begun)
+
+
+def gather_frames(frames: FrameSeries, blocks: Iterable[Block]) -> list[BlockFrames]:
+    """Return the frames of blocks for `reduce_stretch`."""
+    return [choose_frames(frames, block, np.arange(block.first, block.stop)) for block in blocks]
+
+
+def choose_frames(frames: FrameSeries, block: Block, chosen: Array) -> BlockFrames:
+    """Return some frames of a block, (n,) indices, for `reduce_portion`."""
+    references = FrameRun([frames.references[i] for i in chosen])
+    return BlockFrames(block, references, frames.times[chosen], frames.correction_K[chosen])
+
+
+def reduce_stretch(
+    portions: Sequence[tuple[Sequence[BlockFrames], bool]], sensor: RegisteredSensor
+) -> list[PortionResult]:
+    """Read and reduce a stretch: the task of a thread or of a worker."""
+    return [reduce_portion(members, sensor, whole=whole) for members, whole in portions]
+
+
+def reduce_portion(members: Sequence[BlockFrames], sensor: RegisteredSensor, *, whole: bool) -> PortionResult:
+    """Read and reduce the blocks of a portion, and combine them one after the other."""
+    first = members[0].block
+    blocks: list[BlockResult] = []
+    part = CyclePart(first.cycle, first.span) if first.cycle != NO_CYCLE else None
+    for member in members:
+        reduced = reduce_block(member.frames, member.block.parameters, sensor)
+        temperature, correction_K = reduced.temperature, float(member.correction_K.mean())
+        if part is not None and temperature is not None:
+            part.add(replace(temperature, mean=temperature.mean + correction_K), member.times)
+        # The field is kept as the products hold it.
+        cells = (reduced.cells + correction_K).astype(np.float32)
+        blocks.append(replace(reduced, cells=cells, temperature=None))
+    if part is not None and whole:
+        part.finish(sensor.weights)
+    return PortionResult(tuple(blocks), part)
+
 
 #: Consecutive frames of one cycle within this time share one field of the frame stack, s.
 BLOCK_S = 10.0
@@ -84,15 +695,14 @@ def reduce_frames(
     scheduler : str or None
         Address of a dask scheduler whose workers see the same files; None for threads on the cores of this machine.
     checkpoint : str, Path or None
-        Folder for finished cycles with their sums of counts. A run that finds it resumes there, also within a long cycle;
-        `thermography.fields.checkpoint.recalibrate` calibrates the cycles again without the frames.
+        Folder for finished cycles. A run that finds it resumes there, also within a long cycle.
     progress : callable or None
         Called with the number of frames done since the last call.
 
     Returns
     -------
     xr.Dataset
-        Variables of `thermography.contract.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm, but for the total
+        Variables of `thermography.common.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm, but for the total
         uncertainties, which `thermography.fields.total_uncertainty.evaluate_uncertainty` adds; further `temperature_rate`,
         `quality_flag`, `position_u`, and as JSON texts the attributes `frames_outside_cycles` (their fields are in the stack),
         `knocks` (frame, shift in px, zoom, turn), `frames_shaken` (displaced alone, left out), `frames_obstructed` (something before
@@ -112,13 +722,18 @@ def reduce_frames(
     -----
     See ``docs/method/fields.md``; the average of counts is derived in `thermography.radiometry.averaging`.
     """
-    spans = _check_spans(
-        [RegistrationSpan(0, registration)] if isinstance(registration, Registration) else registration
-    )
+    spans = [RegistrationSpan(0, registration)] if isinstance(registration, Registration) else list(registration)
+    starts = [span.first_frame for span in spans]
+    if not starts or starts[0] != 0 or (np.diff(starts) <= 0).any():
+        raise ReductionError(f"registrations start at frames {starts}; they must start at 0 and rise")
     frames = make_frame_series(
         references, cycle_bounds, shape=spans[0].registration.shape, override=override, correction_K=correction_K
     )
-    _check_overlap(frames)
+    if (frames.cycles == NO_CYCLE).all():
+        raise ReductionError(
+            f"no frame is within a cycle: frames {frames.times[0]} to {frames.times[-1]}, "
+            f"cycles {frames.bounds[0, 0]} to {frames.bounds[-1, 1]}; check the time zones and the clock offset"
+        )
     store = None
     if checkpoint is not None:
         store = Checkpoint(checkpoint, describe_reduction(frames, grid, spans, block_s=block_s))
@@ -132,21 +747,6 @@ def reduce_frames(
     return reduction.dataset()
 
 
-def _check_spans(spans: Sequence[RegistrationSpan]) -> list[RegistrationSpan]:
-    starts = [span.first_frame for span in spans]
-    if not starts or starts[0] != 0 or (np.diff(starts) <= 0).any():
-        raise ReductionError(f"registrations start at frames {starts}; they must start at 0 and rise")
-    return list(spans)
-
-
-def _check_overlap(frames: FrameSeries) -> None:
-    if (frames.cycles == NO_CYCLE).all():
-        raise ReductionError(
-            f"no frame lies within a cycle: frames {frames.times[0]} to {frames.times[-1]}, "
-            f"cycles {frames.bounds[0, 0]} to {frames.bounds[-1, 1]}; check the time zones and the clock offset"
-        )
-
-
 def _reduce_until_knock(
     reduction: StillReduction, pool: Pool, first: int, *, block_s: float, progress: Callable[[int], None] | None
 ) -> int:
@@ -154,12 +754,11 @@ def _reduce_until_knock(
     frames, registrations = reduction.frames, reduction.registrations
     blocks = cut_blocks(frames, registrations.spans, block_s=block_s, first=first)
     sensors = [pool.share(sensor) for sensor in registrations.sensors]
-    keep_statistics = reduction.checkpoint is not None
     tasks = (
-        (stretch, (reduce_stretch, [(gather_frames(frames, p.blocks), p.whole) for p in stretch], sensors[span], keep_statistics))
-        for stretch in cut_stretches(blocks, total=len(frames), begun=reduction.cycles.begun)
+        (stretch, (reduce_stretch, [(gather_frames(frames, p.blocks), p.whole) for p in stretch], sensors[span]))
+        for stretch in cut_stretches(blocks, total=len(frames), begun=reduction.begun)
         for span in [stretch[0].first.span]
-    )  # fmt: skip
+    )
     with closing(in_order(pool, tasks)) as results:
         for stretch, reduced in results:
             for portion, result in zip(stretch, reduced, strict=True):
@@ -170,64 +769,6 @@ def _reduce_until_knock(
                 if knocked is not None:
                     return stop
     return len(frames)
-
-
-class _FrameStack:
-    """Blocks in the order of time, and the field of each, (y, x) degC."""
-
-    def __init__(self, folder: Path | None) -> None:
-        self.blocks: list[Block] = []
-        self.fields = Spool(folder)
-
-    def variables(self, size_px: Array, kept: Callable[[Block], Array]) -> dict[str, Any]:
-        """Variables along ``time``, from the displacement of every frame, (frames,) px, and the frames of each block that are used."""
-        shifts = np.array([_largest(size_px[kept(b)]) for b in self.blocks], np.float32)
-        return {
-            "frame_temperature": (("time", "y", "x"), self.fields.array()),
-            "frame_cycle": ("time", np.array([b.cycle + 1 for b in self.blocks], np.int32)),
-            "frame_count": ("time", np.array([len(kept(b)) for b in self.blocks], np.int32)),
-            "frame_shift": ("time", shifts),
-        }
-
-
-def _largest(values: Array) -> float:
-    measured = values[np.isfinite(values)]
-    return float(measured.max()) if measured.size else float("nan")
-
-
-class _Cycles:
-    """Finished cycles, and the open one with its sums of counts.
-
-    Attributes
-    ----------
-    finished : FinishedParts
-        In the order of time.
-    open : CyclePart or None
-        The last one, as long as it has pixels.
-    sums : list of ParameterGroup
-        Of the open cycle, or of the one that was finished last.
-    """
-
-    def __init__(self, folder: Path | None) -> None:
-        self.finished = FinishedParts(folder)
-        self.open: CyclePart | None = None
-        self.sums: list[ParameterGroup] = []
-
-    @property
-    def begun(self) -> tuple[int, int] | None:
-        """Cycle and registration of the open cycle, if there is one."""
-        return None if self.open is None else (self.open.cycle, self.open.span)
-
-    def add(self, part: CyclePart, sums: Sequence[ParameterGroup]) -> None:
-        """Add a portion to the open cycle, or begin its cycle; one that is finished already has no other portion."""
-        if part.pixels is None:
-            self.finished.append(part)
-        elif self.open is None:
-            self.open = part
-        else:
-            self.open.join(part)
-        for group in sums:
-            add_sums(self.sums, group)
 
 
 class StillReduction:
@@ -246,9 +787,12 @@ class StillReduction:
 
     Attributes
     ----------
-    registrations, displacement, obstructions, stack, cycles
-        Registrations including those after knocks; displacement of every frame; frames that do not show the table; blocks with their
-        fields; cycles with their sums.
+    registrations : Registrations
+        Including those after knocks.
+    blocks, fields : list of Block, Spool of (y, x) ndarray, degC
+        Blocks so far, and the field of each.
+    finished, open : Spool of CyclePart, CyclePart or None
+        Finished cycles, and the last one as long as it has pixels.
     stored_blocks, stored_frames, finished_frames : int
         Blocks of finished cycles, frames, and frames up to the end of the last finished cycle that the checkpoint holds.
     """
@@ -260,12 +804,17 @@ class StillReduction:
         self.registrations = Registrations(spans, grid)
         self.displacement = Displacements(frames, self.registrations)
         self.obstructions = Obstructions(frames, self.registrations)
-        folder = None if checkpoint is None else checkpoint.folder
-        self.stack = _FrameStack(folder)
-        self.cycles = _Cycles(folder)
-        self.stored_blocks = 0
-        self.stored_frames = 0
-        self.finished_frames = 0
+        self.folder = None if checkpoint is None else checkpoint.folder
+        self.blocks: list[Block] = []
+        self.fields: Spool[Array] = Spool(self.folder)
+        self.finished: Spool[CyclePart] = Spool(self.folder)
+        self.open: CyclePart | None = None
+        self.stored_blocks = self.stored_frames = self.finished_frames = 0
+
+    @property
+    def begun(self) -> tuple[int, int] | None:
+        """Cycle and registration of the open cycle, if there is one."""
+        return None if self.open is None else (self.open.cycle, self.open.span)
 
     def resume(self) -> int:
         """Load what an earlier run has stored; the first frame that is not done."""
@@ -278,22 +827,19 @@ class StillReduction:
             if cycle.first_frame != done:
                 break
             done = self._restore(cycle)
-        self.stored_blocks, self.finished_frames = len(self.stack.blocks), done
+        self.stored_blocks, self.finished_frames = len(self.blocks), done
         unfinished = self.checkpoint.load_open()
         if unfinished is not None and unfinished.first_frame == done:
             done = self._restore(unfinished)
-            self.cycles.sums = list(unfinished.groups)
         self.stored_frames = done
         return done
 
     def _restore(self, cycle: StoredCycle) -> int:
         """Take over a stored cycle; the first frame after it."""
-        for first, stop, number, span in cycle.blocks.tolist():
-            parameters = self.frames.override(self.frames.references[first])
-            self.stack.blocks.append(Block(first, stop, number, span, parameters))
-        for field in cycle.stack:
-            self.stack.fields.append(field)
-        self.cycles.add(cycle.part, ())
+        for (first, stop, number, span), field in zip(cycle.blocks.tolist(), cycle.stack, strict=True):
+            self.blocks.append(Block(first, stop, number, span, self.frames.override(self.frames.references[first])))
+            self.fields.append(field)
+        self._add_part(cycle.part)
         self.displacement.size_px[cycle.first_frame : cycle.stop_frame] = cycle.shift_px
         self.displacement.shaken.update(cycle.shaken)
         self.obstructions.found.update(cycle.obstructed)
@@ -307,29 +853,26 @@ class StillReduction:
             self.checkpoint.save_knock(knock.frame, knock.span, knock.displacement_px.tolist(), knock.by_image)
         self.registrations.insert(knock.span + 1, span)
 
-    def kept(self, block: Block) -> Array:
-        """Indices of the frames of a block that show the table where it is registered."""
-        left_out = self.left_out
-        return np.array([i for i in range(block.first, block.stop) if i not in left_out], int)
-
     @property
     def left_out(self) -> set[int]:
         """Frames so far that are shaken or obstructed."""
         return self.displacement.shaken | self.obstructions.found
 
-    def gather(self, portion: Portion, result: PortionResult) -> Block | None:
-        """Add a portion to the stack and to its cycle, up to the block of a knock, which is returned; the plan is then registered again.
+    def kept(self, block: Block) -> Array:
+        """Indices of the frames of a block that show the table where it is registered."""
+        left_out = self.left_out
+        return np.array([i for i in range(block.first, block.stop) if i not in left_out], int)
 
-        The first portion of another cycle or registration closes the open cycle. Where frames are left out, the others are read again.
-        """
+    def gather(self, portion: Portion, result: PortionResult) -> Block | None:
+        """Add a portion to the stack and to its cycle, up to the block of a knock, which is returned; the plan is then registered again."""
         kept: list[tuple[Block, Array]] = []
         complete, knocked = True, None
-        for block, view in zip(portion.blocks, result.views, strict=True):
-            knock = self.displacement.find_knock(block, view.displacement_px)
+        for block, reduced in zip(portion.blocks, result.blocks, strict=True):
+            knock = self.displacement.find_knock(block, reduced.displacement_px)
             if knock is not None:
                 knocked = block
                 break
-            self.obstructions.examine(block, view)
+            self.obstructions.examine(block, reduced)
             chosen = self.kept(block)
             complete = complete and len(chosen) == block.stop - block.first
             if len(chosen):
@@ -337,63 +880,68 @@ class StillReduction:
         if kept:
             if knocked is not None or not complete:
                 members = [choose_frames(self.frames, block, chosen) for block, chosen in kept]
-                sensor, statistics = self.registrations.sensors[portion.first.span], self.checkpoint is not None
-                whole = portion.whole and knocked is None
-                result = reduce_portion(members, sensor, statistics, whole=whole)
+                sensor = self.registrations.sensors[portion.first.span]
+                result = reduce_portion(members, sensor, whole=portion.whole and knocked is None)
             self._add([block for block, _ in kept], result)
         if knock is not None:
             self.register_again(knock)
         return knocked
 
     def _add(self, blocks: Sequence[Block], result: PortionResult) -> None:
-        """Add blocks and their sums."""
+        """Add blocks and their share of a cycle."""
         first = blocks[0]
-        if self.cycles.begun not in (None, (first.cycle, first.span)):
+        if self.begun not in (None, (first.cycle, first.span)):
             self.close()
-        self.stack.blocks.extend(blocks)
-        for view in result.views:
-            self.stack.fields.append(view.cells)
+        self.blocks.extend(blocks)
+        for reduced in result.blocks:
+            self.fields.append(reduced.cells)
         if result.part is None:
             return
-        self.cycles.add(result.part, result.sums)
+        self._add_part(result.part)
         if result.part.pixels is None:
             self._store_finished(result.part)
-        elif self.checkpoint is not None and blocks[-1].stop - self.stored_frames >= STORED_FRAMES:
-            self._store(self.checkpoint, self.cycles.open or result.part)
+        elif self.open is not None and blocks[-1].stop - self.stored_frames >= STORED_FRAMES:
+            self._store(self.open)
+
+    def _add_part(self, part: CyclePart) -> None:
+        """Add a share to the open cycle, or begin its cycle; one that is finished already has no other share."""
+        if part.pixels is None:
+            self.finished.append(part)
+        elif self.open is None:
+            self.open = part
+        else:
+            self.open.join(part)
 
     def close(self) -> None:
         """Finish the open cycle, if there is one, and store it."""
-        part = self.cycles.open
+        part, self.open = self.open, None
         if part is not None:
             part.finish(self.registrations.sensors[part.span].weights)
-            self.cycles.open = None
-            self.cycles.add(part, ())
+            self.finished.append(part)
             self._store_finished(part)
 
     def _store_finished(self, part: CyclePart) -> None:
         """Store the last cycle, which is finished."""
-        if self.checkpoint is not None:
-            self._store(self.checkpoint, part)
-            self.stored_blocks, self.finished_frames = len(self.stack.blocks), self.stored_frames
-        self.cycles.sums = []
+        self._store(part)
+        self.stored_blocks, self.finished_frames = len(self.blocks), self.stored_frames
 
-    def _store(self, checkpoint: Checkpoint, part: CyclePart) -> None:
+    def _store(self, part: CyclePart) -> None:
         """Store the last cycle, finished or open, with all blocks since the previous one."""
-        blocks = self.stack.blocks[self.stored_blocks :]
+        if self.checkpoint is None:
+            return
+        blocks = self.blocks[self.stored_blocks :]
         first, stop = self.finished_frames, blocks[-1].stop
-        column, row, growth, turn = self.displacement.baseline_px.tolist()
-        checkpoint.save(
+        self.checkpoint.save(
             StoredCycle(
                 part=part,
                 first_frame=first,
                 stop_frame=stop,
                 blocks=np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks]),
-                stack=np.stack(self.stack.fields[self.stored_blocks :]),
+                stack=np.stack(self.fields[self.stored_blocks :]),
                 shift_px=self.displacement.size_px[first:stop],
-                groups=tuple(self.cycles.sums),
                 shaken=tuple(sorted(i for i in self.displacement.shaken if first <= i < stop)),
                 obstructed=tuple(sorted(i for i in self.obstructions.found if first <= i < stop)),
-                baseline_px=(column, row, growth, turn),
+                baseline_px=tuple(self.displacement.baseline_px.tolist()),
             )
         )
         self.stored_frames = stop
@@ -402,22 +950,22 @@ class StillReduction:
         """Finish the open cycle and assemble the fields, the frame stack and the lists of frames with remarks."""
         self.close()
         frames, displacement = self.frames, self.displacement
-        left_out = np.isin(np.arange(len(frames)), [*self.left_out])
-        if not self.cycles.finished:
+        if not self.finished:
             raise ReductionError(
-                "no frame within a cycle shows the table where it is registered; check that nothing stands before the table"
+                "no frame within a cycle shows the table where it is registered; check that nothing is in front of the table"
             )
-        times = np.array([frames.mean_time(self.kept(block)) for block in self.stack.blocks])
+        kept = [self.kept(block) for block in self.blocks]
         fields = assemble_fields(
-            self.cycles.finished,
+            self.finished,
             len(frames.bounds),
             self.grid,
             self.registrations.covariances,
             [sensor.weights.coverage for sensor in self.registrations.sensors],
-            frames=self.stack.variables(displacement.size_px, self.kept),
-            frame_coordinates={"time": times},
-            folder=None if self.checkpoint is None else self.checkpoint.folder,
+            frames=self._frame_variables(kept),
+            frame_coordinates={"time": np.array([frames.mean_time(chosen) for chosen in kept])},
+            folder=self.folder,
         )
+        left_out = np.isin(np.arange(len(frames)), [*self.left_out])
         remarks = {
             "frames_outside_cycles": frames.names(frames.cycles == NO_CYCLE),
             "knocks": [self._knock(span, before) for before, span in pairwise(self.registrations.spans)],
@@ -425,11 +973,27 @@ class StillReduction:
             "frames_obstructed": [frames.name(i) for i in sorted(self.obstructions.found)],
             "frames_unchecked": frames.names(np.isnan(displacement.size_px) & ~left_out),
             "unchecked_stretches": [
-                {"first": frames.name(s.first), "last": frames.name(s.stop - 1), "frames": s.stop - s.first}
-                for s in displacement.unchecked_stretches(left_out)
+                {"first": frames.name(first), "last": frames.name(stop - 1), "frames": stop - first}
+                for first, stop in displacement.unchecked_stretches(left_out)
             ],
         }
         return fields.assign_attrs({name: json.dumps(value) for name, value in remarks.items()})
+
+    def _frame_variables(self, kept: Sequence[Array]) -> dict[str, Any]:
+        """Variables along ``time``, from the frames of each block that are used."""
+        shape = (len(self.fields), *self.grid.shape)
+        stack = fill_array(shape, np.float32, lambda some: self.fields[some], self.folder)
+        shifts = np.full(len(kept), np.nan, np.float32)
+        for k, chosen in enumerate(kept):
+            sizes = self.displacement.size_px[chosen]
+            if np.isfinite(sizes).any():
+                shifts[k] = np.nanmax(sizes)
+        return {
+            "frame_temperature": (("time", "y", "x"), stack),
+            "frame_cycle": ("time", np.array([block.cycle + 1 for block in self.blocks], np.int32)),
+            "frame_count": ("time", np.array([len(chosen) for chosen in kept], np.int32)),
+            "frame_shift": ("time", shifts),
+        }
 
     def _knock(self, span: RegistrationSpan, before: RegistrationSpan) -> dict[str, Any]:
         """What is reported of the knock before a registration span."""

@@ -2,12 +2,12 @@
 
 Pixels are compared with their CRC-32 where one is stored. Where none is, they are held against the frames before and after: what is
 damaged, or covered for one frame, lies far off both. The levels show what the camera adds to all pixels alike, see
-`thermography.radiometry.camera_correction`.
+`thermography.radiometry.camera`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,16 +15,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography._constants import MAD_TO_SIGMA
-from thermography._typing import Array
-from thermography.errors import ThermographyError
+from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
 from thermography.radiometry.planck import temperature_from_counts
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
-#: Blocks along a row: large enough that noise averages out, small enough that many lie beside the table.
+#: Blocks along a row: large enough that noise averages out, small enough that many lie outside the table.
 _BLOCKS_ACROSS = 24
 #: A pixel is off where it lies beyond both neighbours in time by this multiple of the noise, ...
 _OFF_SIGMAS = 10.0
@@ -39,7 +37,7 @@ _ORDINARY_MULTIPLE = 5.0
 _STRAY_K = 0.2
 #: ... and this share of the difference between its neighbours, so that the bend of a steep course is none.
 _STRAY_SHARE = 0.5
-#: Frames that follow one another are told in turn, the outermost last.
+#: Frames that follow one another are reported in turn, the outermost last.
 _STRAY_PASSES = 5
 #: Fewest frames that show what is ordinary.
 _LEAST_FRAMES = 8
@@ -47,8 +45,8 @@ _LEAST_FRAMES = 8
 _END_STRETCH = 2
 #: About this number of pixels gives noise (to 3 %) and common shift of two frames.
 _SAMPLE_PX = 1200
-#: Fewest blocks beside the table that tell the camera from the table.
-LEAST_BESIDE = 4
+#: Fewest blocks outside the table that tell the camera from the table.
+LEAST_SURROUNDING_BLOCKS = 4
 #: Width of the lens's blur at the table's edge, px.
 _MARGIN_PX = 4
 
@@ -95,25 +93,7 @@ def survey_frames(
     patch: tuple[slice, slice] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Survey:
-    """Read every frame of a series once.
-
-    Parameters
-    ----------
-    references : sequence of FrameReference
-        Frames of one size in the order of time.
-    override : callable
-        From a frame reference to the camera parameters to calibrate the frame with; by default the frame's own.
-    still : bool
-        Whether the scene stands still, so that pixels can be compared with the frames before and after.
-    patch : tuple of slice, or None
-        Rows and columns of pixels whose mean is wanted.
-    progress : callable or None
-        Called with the number of frames done since the last call.
-
-    Returns
-    -------
-    Survey
-    """
+    """Read every frame of a series once."""
     rows, columns = references[0].shape
     edge_px = max(columns // _BLOCKS_ACROSS, 1)
     frames: list[FrameReference] = []
@@ -121,22 +101,25 @@ def survey_frames(
     levels, patches, repeated, outside = [], [], [], []
     neighbours = _Neighbours(edge_px)
     previous: NDArray[np.uint16] | None = None
-    for reference, counts in _read(references):
-        if progress is not None:
-            progress(1)
-        if isinstance(counts, str):
-            damaged.append(RejectedFrame(reference.path, reference.index, counts))
-            continue
-        frames.append(reference)
-        parameters = override(reference)
-        levels.append(temperature_from_counts(_block_means(counts, edge_px), parameters).astype(np.float32))
-        if patch is not None:
-            patches.append(float(temperature_from_counts(counts[patch].mean(), parameters)))
-        repeated.append(previous is not None and np.array_equal(counts, previous))
-        outside.append(_outside(counts, reference))
-        if still and not repeated[-1]:
-            neighbours.add(len(frames) - 1, counts)
-        previous = counts
+    with open_pool() as pool:
+        for reference, counts in in_order(pool, ((reference, (_read_counts, reference)) for reference in references)):
+            if progress is not None:
+                progress(1)
+            if isinstance(counts, str):
+                damaged.append(RejectedFrame(reference.path, reference.index, counts))
+                continue
+            frames.append(reference)
+            parameters, limits = override(reference), reference.limits
+            means = _block_sums(counts, edge_px) / edge_px**2
+            levels.append(temperature_from_counts(means, parameters).astype(np.float32))
+            if patch is not None:
+                patches.append(float(temperature_from_counts(counts[patch].mean(), parameters)))
+            repeated.append(previous is not None and np.array_equal(counts, previous))
+            highest = limits.raw_maximum or 65535
+            outside.append(int(np.count_nonzero((counts < limits.raw_minimum) | (counts > highest))))
+            if still and not repeated[-1]:
+                neighbours.add(len(frames) - 1, counts)
+            previous = counts
     neighbours.finish()
     return Survey(
         frames=frames,
@@ -150,23 +133,12 @@ def survey_frames(
     )
 
 
-def _read(references: Sequence[FrameReference]) -> Iterator[tuple[FrameReference, NDArray[np.uint16] | str]]:
-    """Counts of every frame, read ahead; the reason where they cannot be read."""
-    with open_pool() as pool:
-        yield from in_order(pool, ((reference, (_read_counts, reference)) for reference in references))
-
-
 def _read_counts(reference: FrameReference) -> NDArray[np.uint16] | str:
+    """Counts of a frame; the reason where they cannot be read."""
     try:
         return reference.read_counts()
     except (ThermographyError, OSError) as error:
         return str(error)
-
-
-def _outside(counts: NDArray[np.uint16], reference: FrameReference) -> int:
-    """Pixels outside the range of counts in which the camera is calibrated."""
-    limits = reference.limits
-    return int(np.count_nonzero((counts < limits.raw_minimum) | (counts > (limits.raw_maximum or 65535))))
 
 
 class _Neighbours:
@@ -205,30 +177,29 @@ class _Neighbours:
         """Note the pixels of a frame of the window that are off two others, and take it out of the window if there are many."""
         index, counts = self._window[place]
         before, after = (self._window[other][1] for other in others)
-        limit, shift = _limit_and_shift(counts, before, after)
+        # Limit in counts beyond which a pixel is off, and the shift that all pixels have in common (a flat-field correction).
+        stride = max(int(np.sqrt(counts.size / _SAMPLE_PX)), 1)
+        some = (slice(None, None, stride), slice(None, None, stride))
+        x, b, a = (image[some].astype(np.int32) for image in (counts, before, after))
+        shift = int(np.median(x - np.clip(x, np.minimum(a, b), np.maximum(a, b))))
+        change = x - b
+        noise = MAD_TO_SIGMA * float(np.median(np.abs(change - np.median(change)))) / np.sqrt(2.0)
+        limit = int(np.ceil(_OFF_SIGMAS * max(noise, 1.0)))
         # The change between the two others goes on beyond the ends of the series.
         stretch = _END_STRETCH if end else 0
         flat = (counts.reshape(-1), before.reshape(-1), after.reshape(-1))
         if _count_off(*flat, limit, shift, stretch) < _LEAST_PIXELS:
             return
-        lower, upper = _surroundings(before, after)
+        # Smallest and largest count of the two within the reach of a vibration.
+        reach = np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8)
+        lower = cv2.erode(np.minimum(before, after), reach).astype(np.int32)
+        upper = cv2.dilate(np.maximum(before, after), reach).astype(np.int32)
         beyond = stretch * (upper - lower)
         level = counts.astype(np.int32) - shift
         off = (level > upper + beyond + limit) | (level < lower - beyond - limit)
         if np.count_nonzero(off) >= _LEAST_PIXELS:
             self.off[index] = _block_sums(off.view(np.uint8), self._edge_px)
             del self._window[place]
-
-
-def _limit_and_shift(counts: Array, before: Array, after: Array) -> tuple[int, int]:
-    """Limit in counts beyond which a pixel is off, and the shift that all pixels have in common (a flat-field correction)."""
-    stride = max(int(np.sqrt(counts.size / _SAMPLE_PX)), 1)
-    some = (slice(None, None, stride), slice(None, None, stride))
-    x, b, a = (image[some].astype(np.int32) for image in (counts, before, after))
-    shift = int(np.median(x - np.clip(x, np.minimum(a, b), np.maximum(a, b))))
-    change = x - b
-    noise = MAD_TO_SIGMA * float(np.median(np.abs(change - np.median(change)))) / np.sqrt(2.0)
-    return int(np.ceil(_OFF_SIGMAS * max(noise, 1.0))), shift
 
 
 @numba.njit(cache=True, nogil=True)
@@ -243,20 +214,6 @@ def _count_off(counts: Array, before: Array, after: Array, limit: int, shift: in
         beyond = factor * (high - low) + allowed
         off += np.int32((x > high + beyond) | (x < low - beyond))
     return int(off)
-
-
-def _surroundings(before: Array, after: Array) -> tuple[Array, Array]:
-    """Smallest and largest count of two frames within the reach of a vibration of every pixel."""
-    reach = np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8)
-    lower = cv2.erode(np.minimum(before, after), reach).astype(np.int32)
-    upper = cv2.dilate(np.maximum(before, after), reach).astype(np.int32)
-    return lower, upper
-
-
-def _block_means(counts: NDArray[np.uint16], edge_px: int) -> Array:
-    """Mean count of every block of pixels."""
-    means: Array = _block_sums(counts, edge_px) / edge_px**2
-    return means
 
 
 def _block_sums(image: Array, edge_px: int) -> Array:
@@ -290,34 +247,19 @@ class Blocks:
     ----------
     table : (rows, columns) ndarray of bool
         Blocks that the plan covers.
-    beside : (rows, columns) ndarray of bool
+    surroundings : (rows, columns) ndarray of bool
         Blocks that show nothing of the table in any frame.
     plan_px : (sensor rows, sensor columns) ndarray of bool
         Pixels that show a part of the plan in some frame.
     """
 
     table: NDArray[np.bool_]
-    beside: NDArray[np.bool_]
+    surroundings: NDArray[np.bool_]
     plan_px: NDArray[np.bool_]
 
 
 def locate_blocks(survey: Survey, registration: Registration, grid: PlanGrid, shifts_mm: Array) -> Blocks:
-    """Tell which blocks show the table.
-
-    Parameters
-    ----------
-    survey : Survey
-    registration : Registration
-        Of the table at rest.
-    grid : PlanGrid
-        The plan.
-    shifts_mm : (m, 2) ndarray, mm
-        Displacements (x, y) at which a moving table is seen; empty for a still one.
-
-    Returns
-    -------
-    Blocks
-    """
+    """Tell which blocks show the table."""
     rest = np.zeros(registration.shape, np.uint8)
     outline = grid.outline_mm(25)
 
@@ -337,26 +279,7 @@ def locate_blocks(survey: Survey, registration: Registration, grid: PlanGrid, sh
 
 
 def stray_frames(levels: Array, *, ends: bool) -> dict[int, float]:
-    """Frames whose table is warmer or colder than in the frames before and after: of another series, or taken with another setting.
-
-    Parameters
-    ----------
-    levels : (n, blocks) ndarray, K
-        Levels of the blocks that show the table, free of what all pixels have in common.
-    ends : bool
-        Whether the first and the last frame are judged as well, by the two next to them; a step of the camera's zero that `levels` contain
-        would make them stand out.
-
-    Returns
-    -------
-    dict of int to float
-        Root mean square over the blocks, K, by which a frame lies beyond the frames before and after, by its index.
-
-    Notes
-    -----
-    A table warms and cools steadily, so that a frame lies between its neighbours; a step of the camera's zero leaves it at one of them.
-    Frames that are found are taken out and the others judged again, as a stray frame makes its neighbours stand out.
-    """
+    """Frames whose table is warmer or colder than in the frames before and after: of another series, or taken with another setting."""
     kept, found = np.arange(len(levels)), dict[int, float]()
     for _ in range(_STRAY_PASSES):
         if kept.size < _LEAST_FRAMES:
@@ -392,34 +315,20 @@ def _beyond(levels: Array, *, ends: bool) -> tuple[Array, Array]:
 
 
 def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int, str]:
-    """Frames that the table tells from the frames before and after, or whose pixels leave the camera's range.
-
-    Parameters
-    ----------
-    survey : Survey
-    blocks : Blocks
-        Of `locate_blocks`.
-    still : bool
-        Whether the table stands still, so that its levels can be compared with those of the frames before and after.
-
-    Returns
-    -------
-    dict of int to str
-        Reason by index of the frame in the survey. Where most frames differ so, they are ordinary.
-    """
+    """Frames that the table tells from the frames before and after, or whose pixels leave the camera's range."""
     n = len(survey.frames)
     off = np.zeros(n, np.int64)
     for index, pixels in survey.off.items():
         off[index] = int(pixels[blocks.table].sum())
     found = {}
     for numbers, text in (
-        (survey.outside, "{} pixels lie outside the range in which the camera is calibrated"),
+        (survey.outside, "{} pixels are outside the range in which the camera is calibrated"),
         (off, "{} pixels of the table differ from the frames before and after it"),
     ):
         limit = max(_LEAST_PIXELS, _ORDINARY_MULTIPLE * float(np.quantile(numbers, 0.75)))
         found.update(
             {
-                int(i): f"{text.format(numbers[i])}: damaged, covered, or of another series"
+                int(i): f"{text.format(numbers[i])}: damaged, covered, or from another series"
                 for i in np.flatnonzero(numbers >= limit)
             }
         )
@@ -430,16 +339,14 @@ def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int
 
 def _strays(survey: Survey, blocks: Blocks, kept: NDArray[np.int64]) -> dict[int, str]:
     """Reason by index for those of the kept frames whose table is warmer or colder than in the frames before and after."""
-    table, beside = (survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.beside))
-    table, beside = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, beside))
+    table, surroundings = (
+        survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.surroundings)
+    )
+    table, surroundings = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, surroundings))
     if table.shape[1] == 0:
         return {}
-    examined = beside.shape[1] >= LEAST_BESIDE
+    examined = surroundings.shape[1] >= LEAST_SURROUNDING_BLOCKS
     if examined:
-        table = table - np.median(beside - np.median(beside, axis=0), axis=1, keepdims=True)
-    return {
-        int(
-            kept[i]
-        ): f"the table lies {beyond:.2g} K off the frames before and after it: of another series, or of another setting"
-        for i, beyond in stray_frames(table, ends=examined).items()
-    }
+        table = table - np.median(surroundings - np.median(surroundings, axis=0), axis=1, keepdims=True)
+    reason = "the table differs by {:.2g} K from the frames before and after it: from another series, or with another setting"
+    return {int(kept[i]): reason.format(beyond) for i, beyond in stray_frames(table, ends=examined).items()}

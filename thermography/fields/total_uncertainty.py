@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from thermography._typing import Array
-from thermography.fields.cycle_fields import annotate, reference_cycle
-from thermography.fields.surfaces import Surface
-from thermography.fields.tasks.pieces import in_pieces
-from thermography.fields.tasks.spool import empty_array, give_back
+from thermography.common import Array, ThermographyError
+from thermography.fields.cycle_fields import PARTLY_SEEN_BELOW, SURFACE_EDGE, annotate, rate, reference_cycle
+from thermography.fields.large_arrays import empty_array, give_back, in_pieces
 from thermography.io.frame import CameraParameters
-from thermography.radiometry.planck import override
+from thermography.radiometry.emissivity import EmissivityEstimate, KnownState, estimate_emissivity
+from thermography.radiometry.planck import (
+    ZERO_CELSIUS_K,
+    count_line,
+    counts_from_temperature,
+    override,
+    signal_slope,
+    temperature_from_counts,
+)
 from thermography.radiometry.uncertainty import (
     FIRST_ORDER_TOLERANCE,
     InputUncertainty,
@@ -24,7 +31,145 @@ from thermography.radiometry.uncertainty import (
     monte_carlo_ratio,
     reading_sensitivity,
     rise_scale_contributions,
+    root_sum_square,
 )
+from thermography.registration.plan import Polygon
+
+# Surfaces of the table with an emissivity of their own: their cells, and their temperatures calibrated with it.
+
+
+@dataclass(frozen=True, eq=False)
+class EmissivityRegion:
+    """A part of the table with an emissivity of its own, such as bare steel next to paint.
+
+    Attributes
+    ----------
+    outline : Polygon
+        Name and corners, plan mm.
+    emissivity, emissivity_u : float
+        Emissivity, above 0 and up to 1, and its standard uncertainty.
+    """
+
+    outline: Polygon
+    emissivity: float
+    emissivity_u: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Cells of the plan that share an emissivity.
+
+    Attributes
+    ----------
+    name : str
+        Name of the region; empty for the rest of the table.
+    emissivity, emissivity_u : float
+        Emissivity and its standard uncertainty.
+    cells : (y, x) ndarray of bool
+        Its cells.
+    """
+
+    name: str
+    emissivity: float
+    emissivity_u: float
+    cells: NDArray[np.bool_]
+
+
+def find_surfaces(
+    fields: xr.Dataset, regions: Sequence[EmissivityRegion], *, emissivity: float, emissivity_u: float
+) -> tuple[list[Surface], NDArray[np.bool_]]:
+    """Divide the plan into surfaces of one emissivity each."""
+    x_mm, y_mm = fields["x"].values, fields["y"].values
+    owner = np.zeros((len(y_mm), len(x_mm)), int)
+    mixed = np.zeros(owner.shape, bool)
+    for number, region in enumerate(regions, start=1):
+        share = region.outline.cell_shares(x_mm, y_mm)
+        owner[share == 1.0] = number
+        mixed = np.where(share == 1.0, False, mixed | (share > 0.0))
+    spread = ndimage.maximum_filter(owner, 3, mode="nearest") != ndimage.minimum_filter(owner, 3, mode="nearest")
+    edge = mixed | spread
+    # A partly seen cell was moved to its centre along a gradient that its neighbours across the edge take part in.
+    edge |= ndimage.binary_dilation(edge, np.ones((3, 3))) & (fields["coverage"].values < PARTLY_SEEN_BELOW)
+    surfaces = [Surface("", emissivity, emissivity_u, (owner == 0) & ~edge)]
+    for number, region in enumerate(regions, start=1):
+        cells = (owner == number) & ~edge
+        if not cells.any():
+            raise ThermographyError(
+                f"region {region.outline.name}: no cell lies inside and away from its edge, where the lens blurs both surfaces; "
+                "give a larger region, at least three cells wide, or smaller cells"
+            )
+        surfaces.append(Surface(region.outline.name, region.emissivity, region.emissivity_u, cells))
+    return surfaces, edge
+
+
+def calibrate_surfaces(
+    fields: xr.Dataset,
+    surfaces: Sequence[Surface],
+    edge: NDArray[np.bool_],
+    parameters: Mapping[str, Sequence[CameraParameters]],
+) -> xr.Dataset:
+    """Calibrate the surfaces of a field with their own emissivity."""
+    changed = fields.copy()
+    # Change of the temperature by its own emissivity per change of that by the emissivity it was calibrated with.
+    scale = np.ones(fields["temperature"].shape)
+    for name in ("temperature", "frame_temperature"):
+        along = str(fields[name].dims[0])
+        values = fields[name].values.astype(float)
+        for surface in surfaces[1:]:
+            for k, one in enumerate(parameters[along]):
+                before = values[k][surface.cells]
+                counts = counts_from_temperature(before, one)
+                after = temperature_from_counts(counts, one, emissivity=surface.emissivity)
+                values[k][surface.cells] = after
+                if along == "cycle":
+                    slope, own_slope = (signal_slope(celsius + ZERO_CELSIUS_K, one) for celsius in (before, after))
+                    scale[k][surface.cells] = one.emissivity / surface.emissivity * slope / own_slope
+        changed[name] = fields[name].copy(data=np.where(edge, np.nan, values).astype(np.float32))
+    for name in ("temperature_noise_u", "temperature_rise_noise_u", "temperature_spread"):
+        changed[name] = fields[name].copy(data=np.where(edge, np.nan, fields[name].values * scale).astype(np.float32))
+    mean = changed["temperature"].values.astype(float)
+    rise = mean - mean[reference_cycle(mean)]
+    changed["temperature_rise"] = fields["temperature_rise"].copy(data=rise.astype(np.float32))
+    rates = rate(mean, fields["cycle_time"].values).astype(np.float32)
+    changed["temperature_rate"] = fields["temperature_rate"].copy(data=rates)
+    flags = fields["quality_flag"].values | np.where(edge, SURFACE_EDGE, 0).astype(np.uint8)
+    changed["quality_flag"] = fields["quality_flag"].copy(data=flags)
+    return changed
+
+
+def measure_emissivity(
+    fields: xr.Dataset,
+    outline: Polygon,
+    states: Sequence[tuple[int, float, float]],
+    parameters: CameraParameters,
+    *,
+    camera_scale: float,
+) -> EmissivityEstimate:
+    """Estimate the emissivity of a region from two cycles in which a contact sensor has measured its temperature."""
+    inside = outline.cell_shares(fields["x"].values, fields["y"].values) == 1.0
+    inside = ndimage.binary_erosion(inside, np.ones((3, 3)))
+    known = []
+    for cycle, celsius, celsius_u in states:
+        if cycle not in fields["cycle"].values:
+            raise ThermographyError(f"region {outline.name}: there is no cycle {cycle}; name a measured one")
+        field = fields.sel(cycle=cycle)
+        seen = inside & np.isfinite(field["temperature"].values)
+        if not seen.any():
+            raise ThermographyError(f"region {outline.name}: cycle {cycle} shows no cell of it away from its edge")
+        counts = counts_from_temperature(field["temperature"].values[seen], parameters)
+        u_K = float(np.sqrt(np.mean(field["temperature_noise_u"].values[seen].astype(float) ** 2) / seen.sum()))
+        gain, _ = count_line(parameters)
+        slope = float(gain * signal_slope(celsius + ZERO_CELSIUS_K, parameters))
+        known.append(KnownState(float(counts.mean()), u_K * slope, celsius, celsius_u))
+    estimate = estimate_emissivity(known[0], known[1], parameters)
+    u = float(np.hypot(estimate.emissivity_u, estimate.emissivity * camera_scale))
+    if estimate.quality == "undetermined":
+        raise ThermographyError(
+            f"region {outline.name}: the two states give an emissivity of {estimate.emissivity:.3g} with a standard uncertainty of "
+            f"{u:.2g}, which is not sufficient; check their temperatures, or take states that differ more"
+        )
+    return EmissivityEstimate(estimate.emissivity, u, estimate.reflected_temperature_degC, estimate.quality)
+
 
 #: Temperatures at which the common uncertainty is evaluated; between them it is interpolated, to better than a thousandth.
 _GRID = 33
@@ -71,20 +216,7 @@ class ShownRange:
 
 
 def find_range(fields: xr.Dataset, cells: NDArray[np.bool_]) -> ShownRange | None:
-    """Find the range of temperatures and rises of a surface.
-
-    Parameters
-    ----------
-    fields : Dataset
-        ``temperature`` (degC) and ``temperature_rise`` (K), (cycle, y, x).
-    cells : (y, x) ndarray of bool
-        Of the surface.
-
-    Returns
-    -------
-    ShownRange or None
-        None where no cycle shows any of the cells.
-    """
+    """Find the range of temperatures and rises of a surface."""
     shape = fields["temperature"].shape
     lowest, highest = np.full((2, shape[0]), np.nan)
     start, count, rises = 0.0, 0, [np.inf, -np.inf]
@@ -111,27 +243,7 @@ def _pieces(fields: xr.Dataset) -> Iterator[tuple[slice, Array, Array]]:
 
 
 def compare_with_monte_carlo(shown: ShownRange, parameters: CameraParameters, inputs: InputUncertainty) -> Nonlinearity:
-    """Compare first order with a propagation of distributions over the temperatures of one surface.
-
-    Parameters
-    ----------
-    shown : ShownRange
-        What it shows, from `find_range`.
-    parameters : CameraParameters
-        With the emissivity of the surface.
-    inputs : InputUncertainty
-        With the uncertainty of that emissivity.
-
-    Returns
-    -------
-    Nonlinearity
-        1 throughout where no input is uncertain.
-
-    Raises
-    ------
-    RadiometryError
-        Where an input is too uncertain for a temperature to be stated.
-    """
+    """Compare first order with a propagation of distributions over the temperatures of one surface."""
     start, low, high = shown.start_degC, shown.lowest_rise_K, shown.highest_rise_K
     # Without a rise there is nothing to compare; one of 1 K stands for what would be measured.
     far = start + max(high, 1.0) if high >= -low else start + min(low, -1.0)
@@ -157,39 +269,7 @@ def evaluate_uncertainty(
     *,
     surfaces: Sequence[Surface] = (),
 ) -> xr.Dataset:
-    """Add the total standard uncertainty of temperatures and rises to reduced fields.
-
-    Parameters
-    ----------
-    fields : Dataset
-        From `thermography.fields.still.reduce_frames` or `thermography.fields.moving.reduce_moving_frames`; ``camera_correction_u``
-        (cycle,), K, where the zero of the camera was corrected.
-    parameters : sequence of CameraParameters
-        With which every cycle was calibrated.
-    inputs : InputUncertainty, optional
-        Standard uncertainties of the inputs; by default those of a painted surface in a workshop and a common bolometer camera.
-    surfaces : sequence of Surface
-        Surfaces with an emissivity of their own, as they were calibrated; by default the whole plan is one.
-
-    Returns
-    -------
-    Dataset
-        The fields with ``temperature_u`` and ``temperature_rise_u`` (cycle, y, x), K, and ``rise_scale_u`` (y, x), 1: the part of the
-        uncertainty of a rise that is the same share of every rise of a cell.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter makes the measurement formula meaningless, or an input is too uncertain for a temperature to be stated.
-
-    Notes
-    -----
-    Law of propagation of uncertainty (JCGM 100:2008, 5.2), corrected where a propagation of distributions (JCGM 101:2008) differs by more
-    than `thermography.radiometry.uncertainty.FIRST_ORDER_TOLERANCE`. An error that all frames share changes a rise r about the
-    temperature T by r c'(T), with the contribution c of `thermography.radiometry.uncertainty.common_contributions`; noise and
-    registration are independent of it, and so is what the correction or the drift of the camera's zero leaves in every cycle but the
-    first. See ``docs/method/fields.md``.
-    """
+    """Add the total standard uncertainty of temperatures and rises to reduced fields."""
     inputs = inputs or InputUncertainty()
     shape, dims = fields["temperature"].shape, fields["temperature"].dims
     parts = _parts(fields, parameters, inputs, surfaces)
@@ -203,9 +283,10 @@ def evaluate_uncertainty(
             if not cells.any():
                 continue
             t, r = temperature[cells], rise[cells]
-            common[cells] = part.curves.u_K(t)
-            share = part.curves.rise_scale_u(t - 0.5 * r)
-            rise_common[cells] = np.hypot(share * r, part.curves.per_reading(t) * drift_K[some][np.nonzero(cells)[0]])
+            common[cells] = np.interp(t, part.grid, part.u)
+            share = np.interp(t - 0.5 * r, part.grid, part.scale)
+            drift = np.interp(t, part.grid, part.sensitivity) * drift_K[some][np.nonzero(cells)[0]]
+            rise_common[cells] = np.hypot(share * r, drift)
             part.shares.append((float(np.sum(share)), share.size))
         # A cell that the first cycle does not show has a temperature and no rise: the noise of its rise is NaN, and so is the total.
         total_u[some] = np.hypot(noise, common)
@@ -226,18 +307,29 @@ def evaluate_uncertainty(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Cells of a surface in the cycles that were calibrated with one set of parameters.
+    """Cells of a surface in the cycles that were calibrated with one set of parameters, and what they share, tabulated.
 
     Attributes
     ----------
-    cells, cycles : (y, x) and (cycle,) which they are
-    curves : what they share
-    shares : sum and number of the common uncertainties of their rises, as shares of the rise, piece by piece
+    cells, cycles : (y, x) and (cycle,) ndarray of bool
+    grid : (n,) ndarray, degC
+        Temperatures of the table.
+    u : (n,) ndarray, K
+        Common standard uncertainty of temperatures.
+    scale : (n,) ndarray
+        Common standard uncertainty of rises about a temperature, as a share of the rise.
+    sensitivity : (n,) ndarray
+        Error of a temperature per error of what the camera reads.
+    shares : list
+        Sum and number of the shares `scale` of the cells, piece by piece.
     """
 
     cells: NDArray[np.bool_]
     cycles: NDArray[np.bool_]
-    curves: _Curves
+    grid: Array
+    u: Array
+    scale: Array
+    sensitivity: Array
     shares: list[tuple[float, int]] = field(default_factory=list)
 
 
@@ -254,56 +346,28 @@ def _parts(
         own = replace(inputs, emissivity=surface.emissivity_u)
         cameras = [override(camera, emissivity=surface.emissivity) if surface.name else camera for camera in parameters]
         compared = compare_with_monte_carlo(shown, cameras[0], own)
-        for camera, cycles in _cycles_by_parameters(cameras):
+        for camera in dict.fromkeys(cameras):
+            cycles = np.array([one == camera for one in cameras])
             seen = cycles & np.isfinite(shown.lowest_degC)
-            if seen.any():
-                low, high = float(shown.lowest_degC[seen].min()), float(shown.highest_degC[seen].max())
-                parts.append(_Part(surface.cells, cycles, _curves(low, high, camera, own, compared)))
+            if not seen.any():
+                continue
+            low, high = float(shown.lowest_degC[seen].min()), float(shown.highest_degC[seen].max())
+            grid = np.linspace(low, max(high, low + 1.0), _GRID)
+            u, scale = (
+                np.zeros(_GRID) + root_sum_square(contributions(grid, camera, own))
+                for contributions in (common_contributions, rise_scale_contributions)
+            )
+            _, sensitivity = reading_sensitivity(grid, camera)
+            # Corrected where first order fails.
+            factor = np.interp(grid, compared.temperature_degC, _beyond_tolerance(compared.ratio))
+            scale *= _beyond_tolerance(np.array(compared.rise_ratio))
+            parts.append(_Part(surface.cells, cycles, grid, u * factor, scale, sensitivity))
     return parts
-
-
-@dataclass(frozen=True, eq=False)
-class _Curves:
-    """What all cells of a surface share as a function of temperature, tabulated."""
-
-    grid: Array
-    u: Array
-    scale: Array
-    sensitivity: Array
-
-    def u_K(self, temperature: Array) -> Array:
-        """Common standard uncertainty of temperatures."""
-        return np.interp(temperature, self.grid, self.u)
-
-    def rise_scale_u(self, middle: Array) -> Array:
-        """Common standard uncertainty of rises about a temperature, as a share of the rise."""
-        return np.interp(middle, self.grid, self.scale)
-
-    def per_reading(self, temperature: Array) -> Array:
-        """Error of a temperature per error of what the camera reads."""
-        return np.interp(temperature, self.grid, self.sensitivity)
-
-
-def _curves(
-    low: float, high: float, parameters: CameraParameters, inputs: InputUncertainty, compared: Nonlinearity
-) -> _Curves:
-    """Tabulate the common uncertainty between two temperatures, corrected where first order fails."""
-    grid = np.linspace(low, max(high, low + 1.0), _GRID)
-    u = _root_sum_square(common_contributions(grid, parameters, inputs), grid)
-    scale = _root_sum_square(rise_scale_contributions(grid, parameters, inputs), grid)
-    _, sensitivity = reading_sensitivity(grid, parameters)
-    factor = np.interp(grid, compared.temperature_degC, _beyond_tolerance(compared.ratio))
-    return _Curves(grid, u * factor, scale * _beyond_tolerance(np.array(compared.rise_ratio)), sensitivity)
 
 
 def _beyond_tolerance(ratio: Array) -> Array:
     """Factor by which first order is corrected: 1 within the tolerance."""
     return np.where(np.abs(ratio - 1.0) > FIRST_ORDER_TOLERANCE, ratio, 1.0)
-
-
-def _cycles_by_parameters(parameters: Sequence[CameraParameters]) -> list[tuple[CameraParameters, NDArray[np.bool_]]]:
-    """Every set of parameters with the cycles that were calibrated with it, (cycle,)."""
-    return [(camera, np.array([one == camera for one in parameters])) for camera in dict.fromkeys(parameters)]
 
 
 def _drift(fields: xr.Dataset, parameters: Sequence[CameraParameters], inputs: InputUncertainty) -> Array:
@@ -326,7 +390,3 @@ def _mean(temperature: xr.DataArray) -> float:
     sums = [(np.nansum(some), np.count_nonzero(~np.isnan(some))) for _, some in in_pieces(temperature)]
     total, count = (sum(one) for one in zip(*sums, strict=True))
     return float(temperature.dtype.type(total / count))
-
-
-def _root_sum_square(parts: dict[str, Array], grid: Array) -> Array:
-    return np.sqrt(np.sum([part**2 for part in parts.values()] or [np.zeros_like(grid)], axis=0))

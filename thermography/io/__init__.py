@@ -1,1 +1,1 @@
-"""Reads and writes files: radiometric JPEG, FFF, SEQ and CSQ, stacks of fields as zarr, maps as OpenEXR."""
+"""Frames of many files without their pixels: one object per frame, or columns for the frames of a long sequence."""

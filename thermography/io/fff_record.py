@@ -36,7 +36,8 @@ from thermography.io.frame import (
 )
 
 MAGIC = b"FFF\0"
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+#: First bytes of packed samples.
+SIGNATURES: dict[Encoding, bytes] = {"png": b"\x89PNG\r\n\x1a\n", "jpegls": b"\xff\xd8\xff\xf7"}
 HEADER_SIZE = 0x40
 ENTRY_SIZE = 32
 CAMERA_RECORD = 0x20
@@ -53,6 +54,17 @@ MAXIMUM_CAMERA_INFO = 0x4000
 PARAMETER_BYTES = ((0x20, 0x40), (0x58, 0x64), (0x70, 0x84), (0x308, 0x310))
 SETTING_BYTES = ((0x98, 0xB0), (0x338, 0x340), (0x45C, 0x466))
 IDENTITY_BYTES = (0xD4, 0x1B8)
+#: Texts of camera and lens: attribute of `CameraIdentity` -> offset and width, bytes; and the field of view of the lens.
+IDENTITY_TEXTS = {
+    "model": (0xD4, 32),
+    "part": (0xF4, 16),
+    "serial": (0x104, 16),
+    "software": (0x114, 16),
+    "lens_model": (0x170, 32),
+    "lens_part": (0x190, 16),
+    "lens_serial": (0x1A0, 16),
+}
+FIELD_OF_VIEW = 0x1B4
 LIMIT_BYTES = ((0x90, 0x98), (0x310, 0x314))
 TIME_BYTES = (0x384, 0x38E)
 #: Temperatures without a name, and the table of those with one: its first entry, the length of an entry, and the name in it.
@@ -73,8 +85,7 @@ def _room(size: int) -> NDArray[np.uint8]:
     """Memory of this thread, (size,)."""
     if getattr(_own, "room", _NO_ROOM).size < size:
         _own.room = np.empty(size, np.uint8)
-    room: NDArray[np.uint8] = _own.room[:size]
-    return room
+    return _own.room[:size]
 
 
 class FffSource:
@@ -109,20 +120,10 @@ class FffSource:
             start, available = self.segments[0]
             self.file.seek(start + offset)
             return self.file.read(max(0, min(length, available - offset)))
-        pieces = []
-        for start, available in self.segments:
-            if offset < available and length > 0:
-                self.file.seek(start + offset)
-                pieces.append(self.file.read(min(length, available - offset)))
-                length -= len(pieces[-1])
-            offset = max(0, offset - available)
-        return b"".join(pieces)
+        return bytes(self.read_once(offset, length))
 
     def read_once(self, offset: int, length: int, *, kept: bool = True) -> memoryview:
-        """Return `length` bytes from `offset` of the record, or fewer at its end, read to their place without a copy between.
-
-        Bytes that are not to be kept stand in memory of this thread, which the next call overwrites.
-        """
+        """Return `length` bytes from `offset` of the record, or fewer at its end, read to their place without a copy between."""
         size = max(0, min(length, self.size - offset))
         room = np.empty(size, np.uint8) if kept or size > _MOST_ROOM else _room(size)
         data, filled = memoryview(room), 0  # type: ignore[arg-type]
@@ -161,18 +162,12 @@ class Directory:
 
     Attributes
     ----------
-    records : mapping of int to (offset, length)
-        Place of the first record of each type, bytes from the start of the FFF record.
-    slots : mapping of int to int
-        Slot of the directory that lists this record.
+    records, slots : mapping of int
+        Place (offset, length) of the first record of each type, bytes from the start of the FFF record, and the slot that lists it.
     order : {"<", ">"}
-        Byte order of header and directory.
-    table : bytes
-        The directory as stored.
-    end : int
-        End of the last record, bytes.
-    declared_length : int
-        Length of the FFF record as its header declares it, bytes; 0 for none.
+        Byte order of header and directory, which `table` holds as stored.
+    end, declared_length : int
+        End of the last record, and length of the FFF record as its header declares it, bytes; 0 for none.
     """
 
     records: Mapping[int, tuple[int, int]]
@@ -189,18 +184,7 @@ class Directory:
 
 
 def is_fff_header(data: bytes) -> bool:
-    r"""Return whether bytes are a plausible FFF header; the magic `FFF\0` alone also occurs among pixels.
-
-    Parameters
-    ----------
-    data : bytes
-        At least `HEADER_SIZE` bytes; fewer are never a header.
-
-    Returns
-    -------
-    bool
-        True if magic, version and directory position are plausible.
-    """
+    r"""Return whether bytes are a plausible FFF header; the magic `FFF\0` alone also occurs among pixels."""
     if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
         return False
     order = _byte_order(data)
@@ -211,23 +195,7 @@ def is_fff_header(data: bytes) -> bool:
 
 
 def read_directory(source: FffSource) -> Directory:
-    """Read header and directory of one FFF record.
-
-    Parameters
-    ----------
-    source : FffSource
-        Bytes of the record.
-
-    Returns
-    -------
-    Directory
-        Places of the records by type.
-
-    Raises
-    ------
-    FlirFormatError
-        Where the magic, the version or the directory violates the format.
-    """
+    """Read header and directory of one FFF record."""
     # One read covers header and directory of nearly all files.
     head = source.read(0, HEADER_SIZE + 33 * ENTRY_SIZE)
     if head[:4] != MAGIC:
@@ -280,7 +248,7 @@ def _byte_order(head: bytes) -> str | None:
 
 
 def _find_record(source: FffSource, directory: Directory, kind: int, name: str) -> tuple[int, int]:
-    """Return offset and length of a mandatory record."""
+    """Return offset and length of a mandatory record, bytes."""
     if kind not in directory.records:
         present = ", ".join(f"0x{k:02X}" for k in directory.records) or "none"
         raise source.error(HEADER_SIZE, f"{name} (type 0x{kind:02X}) in the directory", f"types {present}")
@@ -288,20 +256,7 @@ def _find_record(source: FffSource, directory: Directory, kind: int, name: str) 
 
 
 def damaged_records(source: FffSource, directory: Directory) -> list[int]:
-    """Return the types of the records whose bytes differ from their checksum.
-
-    Parameters
-    ----------
-    source : FffSource
-        Bytes of the record.
-    directory : Directory
-        Its directory, from `read_directory`.
-
-    Returns
-    -------
-    list of int
-        Types whose CRC-32 differs from the one in the directory; records without a checksum are not tested.
-    """
+    """Return the types of the records whose bytes differ from their checksum."""
     return [
         kind
         for kind, (offset, length) in directory.records.items()
@@ -315,25 +270,7 @@ def _differs(data: bytes | memoryview, checksum: int) -> bool:
 
 
 def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]:
-    """Return the place of the camera-information record.
-
-    Parameters
-    ----------
-    source : FffSource
-        Bytes of the record.
-    directory : Directory
-        Its directory, from `read_directory`.
-
-    Returns
-    -------
-    tuple of int
-        Offset from the start of the FFF record and length, bytes.
-
-    Raises
-    ------
-    FlirFormatError
-        Where the record is missing or too short to hold the calibration.
-    """
+    """Return the place of the camera-information record."""
     offset, length = _find_record(source, directory, CAMERA_RECORD, "camera information")
     if length < _MINIMUM_CAMERA_INFO:
         raise source.error(offset, f"camera information of at least {_MINIMUM_CAMERA_INFO} bytes", f"{length} bytes")
@@ -341,46 +278,34 @@ def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]
 
 
 def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
-    """Read the camera-information record.
-
-    Parameters
-    ----------
-    source : FffSource
-        Bytes of the record.
-    place : tuple of int
-        Offset and length of the camera information, bytes, from `find_camera_info`.
-
-    Returns
-    -------
-    FrameHeader
-        Parameters, time, camera, ranges, settings and housekeeping; fields beyond the end of an old record are 0 or NaT.
-
-    Raises
-    ------
-    FlirFormatError
-        Where the record is truncated or has no byte-order mark.
-    """
+    """Read the camera-information record."""
     offset, length = place
     info = source.take(offset, length, "camera information")
-    order = "<" if info[:2] == b"\x02\x00" else ">" if info[:2] == b"\x00\x02" else None
-    if order is None:
-        raise source.error(offset, "the byte-order mark 2 of the camera information", info[:2].hex(" "))
+    order = _order_of_record(source, offset, info, "the camera information")
     parameters, notes = parse_parameters(order, _join(info, PARAMETER_BYTES))
     time, utc_offset = _time(order, info)
-    limits = _limits(order, _join(info, LIMIT_BYTES))
-    settings = parse_settings(order, _join(info.ljust(FIRST_SENSOR, b"\0"), SETTING_BYTES))
-    camera = _identity(order, info[slice(*IDENTITY_BYTES)])
-    housekeeping = _housekeeping(order, info)
+    # Temperatures inside the camera, K.
+    names = sensor_names(info)
+    values = [struct.unpack_from(order + "f", info, FIRST_SENSOR + SENSOR_SIZE * i)[0] for i in range(len(names))]
+    unnamed = struct.unpack_from(order + "4f", info, UNNAMED_BYTES[0]) if len(info) >= UNNAMED_BYTES[1] else ()
     return FrameHeader(
         parameters=parameters,
         time=time,
         utc_offset_minutes=utc_offset,
-        camera=camera,
-        limits=limits,
-        settings=settings,
-        housekeeping=housekeeping,
+        camera=_identity(order, info[slice(*IDENTITY_BYTES)]),
+        limits=_limits(order, _join(info, LIMIT_BYTES)),
+        settings=parse_settings(order, _join(info.ljust(FIRST_SENSOR, b"\0"), SETTING_BYTES)),
+        housekeeping=select_temperatures(names, values, unnamed),
         notes=notes,
     )
+
+
+def _order_of_record(source: FffSource, offset: int, data: bytes, name: str) -> str:
+    """Return the struct prefix of a record, which begins with the number 2 in its byte order."""
+    order = {b"\x02\x00": "<", b"\x00\x02": ">"}.get(data[:2])
+    if order is None:
+        raise source.error(offset, f"the byte-order mark 2 of {name}", data[:2].hex(" "))
+    return order
 
 
 def _join(info: bytes, places: tuple[tuple[int, int], ...]) -> bytes:
@@ -389,15 +314,7 @@ def _join(info: bytes, places: tuple[tuple[int, int], ...]) -> bytes:
 
 @lru_cache(maxsize=256)
 def parse_parameters(order: str, data: bytes) -> tuple[CameraParameters, tuple[str, ...]]:
-    """Return the parameters, and notes on them; cached because the frames of a sequence share them.
-
-    Parameters
-    ----------
-    order : {"<", ">"}
-        Byte order of the camera information.
-    data : bytes
-        The bytes `PARAMETER_BYTES` of the camera information.
-    """
+    """Return the parameters, and notes on them; cached because the frames of a sequence share them."""
     *ambient, r1, b, f, alpha1, alpha2, beta1, beta2, x, o, r2 = struct.unpack(order + "16fif", data)
     notes: tuple[str, ...] = ()
     if ambient[7] > 2:
@@ -415,15 +332,7 @@ def _limits(order: str, data: bytes) -> CalibratedRange:
 
 @lru_cache(maxsize=256)
 def parse_settings(order: str, data: bytes) -> CameraSettings:
-    """Return the settings of the camera.
-
-    Parameters
-    ----------
-    order : {"<", ">"}
-        Byte order of the camera information.
-    data : bytes
-        The bytes `SETTING_BYTES` of the camera information.
-    """
+    """Return the settings of the camera."""
     *temperatures, raw_median, raw_range, focus, frame_rate = struct.unpack(order + "6f2If4xH", data)
     return CameraSettings(*[focus, frame_rate, *temperatures, raw_median, raw_range])
 
@@ -431,20 +340,12 @@ def parse_settings(order: str, data: bytes) -> CameraSettings:
 @lru_cache(maxsize=256)
 def _identity(order: str, data: bytes) -> CameraIdentity:
     """Return camera and lens from the bytes `IDENTITY_BYTES` of the camera information."""
-
-    def text(offset: int, width: int) -> str:
-        return data[offset - 0xD4 : offset - 0xD4 + width].split(b"\0")[0].decode("latin-1").strip()
-
-    return CameraIdentity(
-        model=text(0xD4, 32),
-        part=text(0xF4, 16),
-        serial=text(0x104, 16),
-        software=text(0x114, 16),
-        lens_model=text(0x170, 32),
-        lens_part=text(0x190, 16),
-        lens_serial=text(0x1A0, 16),
-        field_of_view_deg=struct.unpack_from(order + "f", data, 0x1B4 - 0xD4)[0],
-    )
+    begin = IDENTITY_BYTES[0]
+    texts = {
+        name: data[offset - begin : offset - begin + width].split(b"\0")[0].decode("latin-1").strip()
+        for name, (offset, width) in IDENTITY_TEXTS.items()
+    }
+    return CameraIdentity(**texts, field_of_view_deg=struct.unpack_from(order + "f", data, FIELD_OF_VIEW - begin)[0])
 
 
 def _time(order: str, info: bytes) -> tuple[np.datetime64, int]:
@@ -455,14 +356,6 @@ def _time(order: str, info: bytes) -> tuple[np.datetime64, int]:
     if seconds == 0:
         return np.datetime64("NaT", "ms"), -west
     return np.datetime64(seconds * 1000 + milliseconds % 1000, "ms"), -west
-
-
-def _housekeeping(order: str, info: bytes) -> dict[str, float]:
-    """Return the temperatures inside the camera, K."""
-    names = sensor_names(info)
-    values = [struct.unpack_from(order + "f", info, FIRST_SENSOR + SENSOR_SIZE * i)[0] for i in range(len(names))]
-    unnamed = struct.unpack_from(order + "4f", info, UNNAMED_BYTES[0]) if len(info) >= UNNAMED_BYTES[1] else ()
-    return select_temperatures(names, values, unnamed)
 
 
 def sensor_names(info: bytes) -> list[str]:
@@ -477,22 +370,7 @@ def sensor_names(info: bytes) -> list[str]:
 
 
 def select_temperatures(names: Sequence[str], values: Sequence[float], unnamed: Sequence[float]) -> dict[str, float]:
-    """Return the temperatures among the housekeeping values; the table also holds raw readings and times, which are left out.
-
-    Parameters
-    ----------
-    names : sequence of str
-        From `sensor_names`.
-    values : sequence of float
-        One per name.
-    unnamed : sequence of float
-        Values that stand without names, used where no named one is a temperature.
-
-    Returns
-    -------
-    dict of str to float
-        Temperatures inside the camera, K.
-    """
+    """Return the temperatures among the housekeeping values; the table also holds raw readings and times, which are left out."""
     readings = {
         name: value
         for name, value in zip(names, values, strict=True)
@@ -502,25 +380,7 @@ def select_temperatures(names: Sequence[str], values: Sequence[float], unnamed: 
 
 
 def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
-    """Read the header of the raw image: place, packing and number of its samples.
-
-    Parameters
-    ----------
-    source : FffSource
-        Bytes of the record.
-    directory : Directory
-        Its directory, from `read_directory`.
-
-    Returns
-    -------
-    SampleLocation
-        Place, packing, byte order and shape of the samples.
-
-    Raises
-    ------
-    FlirFormatError
-        Where the raw image is missing, truncated, or claims an impossible number of pixels.
-    """
+    """Read the header of the raw image: place, packing and number of its samples."""
     record = _find_record(source, directory, RAW_RECORD, "a raw image")
     offset, length = record
     if length <= RAW_HEADER_SIZE:
@@ -530,17 +390,12 @@ def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
         raise source.error(
             offset, f"the {RAW_HEADER_SIZE} bytes of a raw image's header", f"{len(head)} before the end"
         )
-    order = "<" if head[:2] == b"\x02\x00" else ">" if head[:2] == b"\x00\x02" else None
-    if order is None:
-        raise source.error(offset, "the byte-order mark 2 of a raw image", head[:2].hex(" "))
+    order = _order_of_record(source, offset, head, "a raw image")
     columns, rows = struct.unpack_from(order + "2H", head, 2)
     if not 0 < rows * columns <= _MAX_PIXELS:
         raise source.error(offset + 2, f"1 to {_MAX_PIXELS} pixels", f"{columns} x {rows}")
-    encoding: Encoding = "raw"
-    if head[RAW_HEADER_SIZE:] == PNG_SIGNATURE:
-        encoding = "png"
-    elif head[RAW_HEADER_SIZE : RAW_HEADER_SIZE + 4] == b"\xff\xd8\xff\xf7":
-        encoding = "jpegls"
+    start = head[RAW_HEADER_SIZE:]
+    encoding: Encoding = next((name for name, first in SIGNATURES.items() if start.startswith(first)), "raw")
     length -= RAW_HEADER_SIZE
     if encoding == "raw" and length < 2 * rows * columns:
         raise source.error(offset, f"{columns} x {rows} samples of 2 bytes", f"a record with {length} bytes of samples")
@@ -558,35 +413,14 @@ def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
 
 
 def read_counts(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16]:
-    """Read the samples of the raw image.
-
-    Parameters
-    ----------
-    source : FffSource
-        Bytes of the record.
-    samples : SampleLocation
-        Place and packing of the samples, from `locate_samples`.
-
-    Returns
-    -------
-    (row, column) ndarray of uint16
-        Counts in native byte order; read-only for every packing.
-
-    Raises
-    ------
-    FlirFormatError
-        Where the samples are truncated, differ from the CRC-32 that the directory states, or do not decode as PNG or JPEG-LS.
-    """
+    """Read the samples of the raw image."""
     counts = _decode(source, samples, _read_samples(source, samples))
     counts.flags.writeable = False
     return counts
 
 
 def _read_samples(source: FffSource, samples: SampleLocation) -> memoryview:
-    """Return the bytes of the samples, fewer at the end of the record, after comparing the record with its checksum.
-
-    Packed ones are overwritten by the next call in this thread.
-    """
+    """Return the bytes of the samples, fewer at the end of the record, after comparing the record with its checksum."""
     (offset, length), kept = samples.record, samples.encoding == "raw"
     if not samples.checksum or length > 2 * _MAX_PIXELS:
         return source.read_once(samples.offset, min(samples.length, 2 * _MAX_PIXELS), kept=kept)
@@ -615,7 +449,8 @@ def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDA
     # Writers pad the stream to a multiple of 8 bytes; after the last frame of a file the padding may be missing.
     if samples.encoding == "jpegls":
         return _decode_jpegls(source, samples, bytes(data))
-    from thermography.io.png16 import PngError, decode_png  # compiled: loaded with the first PNG
+
+    from thermography.io.png16 import PngError, decode_png  # compiled: frames of other kinds are read without it
 
     try:
         return decode_png(data, samples.shape, little_endian=samples.little_endian)

@@ -8,11 +8,16 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from thermography.common import ThermographyError
 from thermography.io.fff_record import (
     HEADER_SIZE,
     MAGIC,
@@ -25,12 +30,17 @@ from thermography.io.fff_record import (
     read_header,
 )
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
-from thermography.io.frame_index.by_threads import call_by_threads, opening_threads
-from thermography.io.frame_index.flir_frame import FlirFrameReference
-from thermography.io.frame_index.frame_list import FrameList, FrameTable, order_by_time
+from thermography.io.sequence import (
+    FlirFrameReference,
+    FrameList,
+    FrameTable,
+    call_by_threads,
+    opening_threads,
+    order_by_time,
+)
 
 if TYPE_CHECKING:
-    from thermography.io.frame_index.header_scan import FlirTable
+    from thermography.io.header_scan import FlirTable
 
 #: Frames are read together where the file has room for this number of them: fewer are read one by one before the code is loaded.
 FEWEST_FRAMES = 256
@@ -39,30 +49,16 @@ _FRONT, _WINDOW = 1 << 14, 1 << 10
 
 
 class FlirReader:
-    """Reader of radiometric JPEG, FFF, SEQ and CSQ files, see `thermography.io.frame_readers.FrameReader`."""
+    """Reader of radiometric JPEG, FFF, SEQ and CSQ files, see `thermography.io.other_cameras.FrameReader`."""
 
     name = "FLIR radiometric JPEG, FFF, SEQ or CSQ"
 
     def recognises(self, path: Path, start: bytes) -> bool:
-        """Return whether a file starts as a JPEG or an FFF record.
-
-        Parameters
-        ----------
-        path : Path
-        start : bytes
-            Its first bytes.
-        """
+        """Return whether a file starts as a JPEG or an FFF record."""
         return start[:2] == b"\xff\xd8" or start[:4] == MAGIC
 
     def index(self, path: Path, options: object) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
-        """Yield the frames of a file in its order; damaged ones as `RejectedFrame`, those of a long sequence together.
-
-        Parameters
-        ----------
-        path : Path
-        options : object
-            Not used: the files hold everything.
-        """
+        """Yield the frames of a file in its order; damaged ones as `RejectedFrame`, those of a long sequence together."""
         with path.open("rb", buffering=0) as file:
             yield from _walk(file, path)
 
@@ -142,7 +138,7 @@ def index_frames(
     -----
     A file or frame that cannot be used is returned in `rejected`, never raised, so that one damaged file does not stop a series.
     The frames of a sequence are found from the ends of their records, because the magic of a header also occurs among pixels. The
-    headers of every frame are read and checked, those of a long sequence compiled (`thermography.io.frame_index.header_scan`); pixels
+    headers of every frame are read and checked, those of a long sequence compiled (`thermography.io.sequence`); pixels
     and their checksums are checked when they are read. What was found of 20,000 frames or more is kept in the user's cache, or in the
     folder that ``THERMOFUSE_CACHE`` names, and taken from there while size, time of change, first and last bytes of the file are the same.
 
@@ -152,25 +148,32 @@ def index_frames(
     >>> frames, rejected[0].reason
     ([], "[Errno 2] No such file or directory: 'does_not_exist.seq'")
     """
-    frames: list[FrameReference | FrameTable] = []
-    rejected: list[RejectedFrame] = []
-    files = list(map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths))
-    for results in call_by_threads(_index_file, files, opening_threads(files)):
-        for result in results:
-            (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
-    kept, repeated = order_by_time(frames)
-    return kept, rejected + repeated
+    files = [paths] if isinstance(paths, str | os.PathLike) else paths
+    return index_files(files, lambda path: FlirReader().index(path, None))
 
 
-def _index_file(path: Path) -> list[FlirFrameReference | FrameTable | RejectedFrame]:
-    """List the frames of one file in its order; the fault of a whole file is its last entry."""
-    found: list[FlirFrameReference | FrameTable | RejectedFrame] = []
-    try:
-        with path.open("rb", buffering=0) as file:
-            found.extend(_walk(file, path))
-    except (OSError, FlirFormatError) as error:
-        found.append(RejectedFrame(path, 0, str(error)))
-    return found
+def index_files(
+    paths: Iterable[str | os.PathLike[str]],
+    walk: Callable[[Path], Iterable[FrameReference | FrameTable | RejectedFrame]],
+    *,
+    fatal: tuple[type[Exception], ...] = (),
+) -> tuple[FrameList, list[RejectedFrame]]:
+    """List the frames that `walk` yields of every file, by threads; of a file that cannot be used, only a fatal error is raised."""
+
+    def of_file(path: Path) -> list[FrameReference | FrameTable | RejectedFrame]:
+        found: list[FrameReference | FrameTable | RejectedFrame] = []
+        try:
+            found.extend(walk(path))
+        except fatal:
+            raise
+        except (OSError, ThermographyError) as error:
+            found.append(RejectedFrame(path, 0, str(error)))
+        return found
+
+    files = list(map(Path, paths))
+    results = [each for some in call_by_threads(of_file, files, opening_threads(files)) for each in some]
+    frames, repeated = order_by_time(each for each in results if not isinstance(each, RejectedFrame))
+    return frames, [each for each in results if isinstance(each, RejectedFrame)] + repeated
 
 
 def index_sequence(
@@ -178,39 +181,8 @@ def index_sequence(
 ) -> tuple[list[FrameReference], list[RejectedFrame], int]:
     """List the frames of a sequence from a byte on, so that one that is still being recorded is not read from its beginning again.
 
-    Parameters
-    ----------
-    path : str or path-like
-        SEQ, CSQ or FFF file.
-    start : int
-        Byte to begin at: 0, or where the last call says to go on.
-    index : int
-        Index of the first frame from there on.
-    growing : bool
-        Whether the file is still being written: its last frame may lack its end and waits for the next call.
-
-    Returns
-    -------
-    frames : list of FrameReference
-        In the order of the file.
-    rejected : list of RejectedFrame
-        Damaged frames between them.
-    following : int
-        Byte at which the next call begins.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder, "begun.seq")
-    ...     _ = path.write_bytes(b"FFF")
-    ...     index_sequence(path, growing=True)
-    ([], [], 0)
+    Returned are the frames in the order of the file, damaged ones between them, and the byte at which the next call begins. `index` is
+    that of the first frame from `start` on; of a `growing` file the last frame may lack its end and waits for the next call.
     """
     path = Path(path)
     with path.open("rb", buffering=0) as file:
@@ -280,14 +252,18 @@ def _walk_sequence(
     notes: tuple[str, ...] = ()
     while start < size:
         source = FffSource(file, path, ((start, size - start),))
-        run = None
+        run: FlirTable | None = None
         try:
             directory = read_directory(source)
             end, following = _next_frame(file, start, size, directory)
             source = FffSource(file, path, ((start, end - start),))
             reference = _reference(source, directory, index)
             yield replace(reference, notes=notes + reference.notes) if notes else reference
-            run = _scan(file, reference, size) if end == following < size else None
+            # A file with few frames is read without the compiled scan.
+            if end == following < size and size - end >= FEWEST_FRAMES * (end - start):
+                from thermography.io.header_scan import scan_table  # compiled: few frames are read without it
+
+                run = scan_table(file, reference, size)
         except FlirFormatError as error:
             yield RejectedFrame(path, index, str(error))
             end = following = _find_header(file, start + HEADER_SIZE, size)
@@ -304,15 +280,6 @@ def _walk_sequence(
         start, index = following, index + 1
 
 
-def _scan(file: BinaryIO, reference: FlirFrameReference, size: int) -> FlirTable | None:
-    """Return the frames that follow one and are laid out as it is; a file with few frames is read without the compiled scan."""
-    if size - sum(reference.segments[0]) < FEWEST_FRAMES * reference.segments[0][1]:
-        return None
-    from thermography.io.frame_index.header_scan import scan_table
-
-    return scan_table(file, reference, size)
-
-
 def _holds_data(file: BinaryIO, offset: int, length: int) -> bool:
     """Return whether a gap holds anything but zeros, by its first 64 kB."""
     file.seek(offset)
@@ -320,11 +287,7 @@ def _holds_data(file: BinaryIO, offset: int, length: int) -> bool:
 
 
 def _next_frame(file: BinaryIO, start: int, size: int, directory: Directory) -> tuple[int, int]:
-    """Return the end of the frame that starts at `start`, and the start of the next frame (offsets in the file).
-
-    A frame ends after its last record, or at its declared length. Where no frame follows there, the next header decides: after
-    the end it means padding, before the end it means that this frame is truncated.
-    """
+    """Return the end of the frame that starts at `start`, and the start of the next frame (offsets in the file)."""
     end = start + directory.end
     for candidate in (end, start + directory.declared_length):
         if candidate == size or (end <= candidate < size and _header_at(file, candidate)):
@@ -355,10 +318,7 @@ def _find_header(file: BinaryIO, offset: int, size: int) -> int:
 
 
 def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
-    r"""Return the segments of the FFF record in a radiometric JPEG, whose first bytes are read already, in their order.
-
-    Each APP1 segment holds `FLIR\0 01 index last` and up to 65524 bytes; the segments may come in any order.
-    """
+    """Return the segments of the FFF record in a radiometric JPEG, whose first bytes are read already, in their order."""
     pieces: dict[int, tuple[int, int]] = {}
     size = file.seek(0, os.SEEK_END)
     last, offset, window, begin = -1, 2, front, 0
@@ -390,3 +350,86 @@ def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
     if missing:
         raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segments 0 to {last}, found no {missing}")
     return tuple(pieces[index] for index in range(last + 1))
+
+
+# What FLIR cameras store in addition to the pixels: the spots and areas that were set on the screen, and the visible-light
+# picture.
+
+_TOOLS_RECORD, _PICTURE_RECORD, _OVERLAY_RECORD = 0x21, 0x0E, 0x2A
+#: Header of the measurement tools, and of each tool, bytes.
+_TOOLS_HEADER, _TOOL_HEADER = 12, 0x24
+#: Number of a tool -> its name and the meaning of its coordinates, as far as files show it.
+_KINDS = {1: ("spot", ("column", "row")), 2: ("area", ("column", "row", "width", "height"))}
+#: Largest records of these kinds; a damaged length must not cost memory.
+_LARGEST_TOOLS, _LARGEST_PICTURE = 1 << 16, 1 << 26
+
+
+@dataclass(frozen=True)
+class MeasurementRegion:
+    """A measurement tool set in the camera: label on the screen, kind ("spot", "area", "tool 3") and coordinates by name, px from 0."""
+
+    label: str
+    kind: str
+    place: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class VisiblePicture:
+    """The visible-light picture of a frame, (row, column, 3) uint8 red, green, blue.
+
+    Attributes
+    ----------
+    scale : float
+        Field of view of the picture over that of the sensor; 0 where the file does not say it.
+    offset_px : (int, int)
+        Shift (column, row) of the sensor's middle in the picture, as stored.
+    """
+
+    pixels: NDArray[np.uint8]
+    scale: float
+    offset_px: tuple[int, int]
+
+
+def read_measurement_regions(frame: FlirFrameReference) -> list[MeasurementRegion]:
+    """Read the spots and areas that a frame stores."""
+    data = _record(frame, _TOOLS_RECORD, _LARGEST_TOOLS)
+    regions: list[MeasurementRegion] = []
+    if data is None or data[:2] != b"\1\0":
+        return regions
+    at = _TOOLS_HEADER
+    while at + _TOOL_HEADER <= len(data):
+        length, coordinates, kind = (struct.unpack_from("<H", data, at + place)[0] for place in (0, 4, 10))
+        if not _TOOL_HEADER + coordinates <= length <= len(data) - at or coordinates % 2 or coordinates == 0:
+            break
+        values = struct.unpack_from(f"<{coordinates // 2}H", data, at + _TOOL_HEADER)
+        label = data[at + _TOOL_HEADER + coordinates : at + length].decode("utf-16-le", "replace").split("\0")[0]
+        name, meanings = _KINDS.get(kind, (f"tool {kind}", ()))
+        if len(meanings) != len(values):
+            meanings = tuple(f"value {i + 1}" for i in range(len(values)))
+        regions.append(MeasurementRegion(label, name, dict(zip(meanings, values, strict=True))))
+        at += length
+    return regions
+
+
+def read_visible_picture(frame: FlirFrameReference) -> VisiblePicture | None:
+    """Read the visible-light picture of a frame."""
+    data = _record(frame, _PICTURE_RECORD, _LARGEST_PICTURE)
+    if data is None:
+        return None
+    start = max(data.find(b"\xff\xd8\xff"), data.find(b"\x89PNG"))
+    pixels = cv2.imdecode(np.frombuffer(data[max(start, 0) :], np.uint8), cv2.IMREAD_COLOR) if start >= 0 else None
+    if pixels is None:
+        raise FlirFormatError(f"{frame.path}: the visible-light picture of frame {frame.index} is damaged")
+    overlay = _record(frame, _OVERLAY_RECORD, _LARGEST_TOOLS)
+    scale, column, row = (0.0, 0, 0) if overlay is None or len(overlay) < 8 else struct.unpack_from("<fhh", overlay)
+    return VisiblePicture(np.asarray(pixels[..., ::-1], np.uint8), float(scale), (int(column), int(row)))
+
+
+def _record(frame: FlirFrameReference, kind: int, largest: int) -> bytes | None:
+    """Return the bytes of the first record of a kind, None where there is none or its length is not credible."""
+    with frame.path.open("rb", buffering=0) as file:
+        source = FffSource(file, frame.path, frame.segments)
+        place = read_directory(source).records.get(kind)
+        if place is None or not 0 < place[1] <= largest:
+            return None
+        return bytes(source.take(*place, "annotations"))

@@ -6,6 +6,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
+from dataclasses import astuple
 from pathlib import Path
 
 import cv2
@@ -13,8 +14,20 @@ import imagecodecs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermography.errors import ThermographyError
-from thermography.io.fff_record import CAMERA_RECORD, ENTRY_SIZE, HEADER_SIZE, MAGIC, RAW_HEADER_SIZE, RAW_RECORD
+from thermography.common import ThermographyError
+from thermography.io.fff_record import (
+    CAMERA_RECORD,
+    ENTRY_SIZE,
+    FIELD_OF_VIEW,
+    HEADER_SIZE,
+    IDENTITY_TEXTS,
+    LIMIT_BYTES,
+    MAGIC,
+    PARAMETER_BYTES,
+    RAW_HEADER_SIZE,
+    RAW_RECORD,
+    SETTING_BYTES,
+)
 from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Encoding, Frame
 
 _CAMERA_INFO_SIZE = 2476
@@ -89,7 +102,15 @@ def write_jpeg(
     >>> str(frame.time), bool((frame.counts == counts).all())
     ('2026-03-09T06:33:47.125', True)
     """
-    frame = _frame(counts, parameters, time, camera, limits, housekeeping, utc_offset_minutes)
+    frame = Frame(
+        counts=np.asarray(counts),
+        parameters=parameters,
+        time=np.asarray(time, "datetime64[ms]").reshape(1)[0],
+        camera=camera or CameraIdentity(),
+        limits=limits or CalibratedRange(),
+        housekeeping=dict(housekeeping or {}),
+        utc_offset_minutes=utc_offset_minutes,
+    )
     record = _encode_record(frame, encoding=encoding)
     pieces = [record[start : start + _SEGMENT_PAYLOAD] for start in range(0, len(record), _SEGMENT_PAYLOAD)]
     if len(pieces) > 256:
@@ -98,7 +119,11 @@ def write_jpeg(
         )
     segments = [_segment(_exif(frame))]
     segments += [_segment(b"FLIR\0\1" + bytes((index, len(pieces) - 1)) + piece) for index, piece in enumerate(pieces)]
-    Path(path).write_bytes(b"\xff\xd8" + b"".join(segments) + _preview(frame.counts)[2:])
+    # The visible picture: grey, scaled from the lowest to the highest count.
+    low, high = int(frame.counts.min()), int(frame.counts.max())
+    grey = ((frame.counts.astype(np.float32) - low) * (255 / max(high - low, 1))).astype(np.uint8)
+    encoded: bytes = cv2.imencode(".jpg", grey)[1].tobytes()
+    Path(path).write_bytes(b"\xff\xd8" + b"".join(segments) + encoded[2:])
 
 
 def write_sequence(
@@ -157,29 +182,15 @@ def write_sequence(
     return count
 
 
-def _frame(
-    counts: ArrayLike,
-    parameters: CameraParameters,
-    time: np.datetime64 | str,
-    camera: CameraIdentity | None,
-    limits: CalibratedRange | None,
-    housekeeping: Mapping[str, float] | None,
-    utc_offset_minutes: int,
-) -> Frame:
-    return Frame(
-        counts=np.asarray(counts),
-        parameters=parameters,
-        time=np.asarray(time, "datetime64[ms]").reshape(1)[0],
-        camera=camera or CameraIdentity(),
-        limits=limits or CalibratedRange(),
-        housekeeping=dict(housekeeping or {}),
-        utc_offset_minutes=utc_offset_minutes,
-    )
-
-
 def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     """Return one FFF record: directory at 0x40 big-endian, records little-endian, the raw image last."""
-    _check_counts(frame.counts)
+    counts = frame.counts
+    if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
+        raise ThermographyError(
+            f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}"
+        )
+    if not all(0 < length < 65536 for length in counts.shape):
+        raise ThermographyError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
     info = _camera_info(frame)
     raw = _raw_record(frame.counts, encoding)
     info_offset = HEADER_SIZE + _SLOTS * ENTRY_SIZE
@@ -198,95 +209,28 @@ def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     return bytes(head) + info + raw
 
 
-def _check_counts(counts: NDArray[np.uint16]) -> None:
-    """Raise a ThermographyError unless the counts are a two-dimensional array of uint16."""
-    if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
-        raise ThermographyError(
-            f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}"
-        )
-    if not all(0 < length < 65536 for length in counts.shape):
-        raise ThermographyError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
-
-
 def _camera_info(frame: Frame) -> bytes:
     """Return the camera-information record; values that the frame does not hold are 0."""
     info = bytearray(_CAMERA_INFO_SIZE)
     rows, columns = frame.counts.shape
-    p, limits, camera = frame.parameters, frame.limits, frame.camera
+    p, limits, settings = frame.parameters, frame.limits, frame.settings
     struct.pack_into("<3H", info, 0, 2, columns, rows)
-    struct.pack_into(
-        "<8f",
-        info,
-        0x20,
-        p.emissivity,
-        p.object_distance_m,
-        p.reflected_temperature_K,
-        p.atmospheric_temperature_K,
-        p.window_temperature_K,
-        p.window_transmission,
-        p.stored_transmission,
-        p.relative_humidity,
-    )
-    struct.pack_into("<3f", info, 0x58, p.planck_r1, p.planck_b, p.planck_f)
-    struct.pack_into(
-        "<5f",
-        info,
-        0x70,
-        p.atmosphere_alpha1,
-        p.atmosphere_alpha2,
-        p.atmosphere_beta1,
-        p.atmosphere_beta2,
-        p.atmosphere_x,
-    )
-    settings = frame.settings
-    struct.pack_into(
-        "<8f",
-        info,
-        0x90,
-        limits.maximum_K,
-        limits.minimum_K,
-        settings.clip_maximum_K,
-        settings.clip_minimum_K,
-        settings.warn_maximum_K,
-        settings.warn_minimum_K,
-        settings.saturated_maximum_K,
-        settings.saturated_minimum_K,
-    )
-    texts = (
-        (0xD4, 32, camera.model),
-        (0xF4, 16, camera.part),
-        (0x104, 16, camera.serial),
-        (0x114, 16, camera.software),
-        (0x170, 32, camera.lens_model),
-        (0x190, 16, camera.lens_part),
-        (0x1A0, 16, camera.lens_serial),
-    )
-    for offset, width, text in texts:
+    values = astuple(p)
+    stored = struct.pack("<16fif", *values[:11], *values[13:], round(p.planck_o), p.planck_r2)
+    _put(info, PARAMETER_BYTES, stored)
+    stored = struct.pack("<2f2H", limits.maximum_K, limits.minimum_K, limits.raw_minimum, limits.raw_maximum)
+    _put(info, LIMIT_BYTES, stored)
+    focus, frame_rate, *temperatures, median, width = astuple(settings)
+    if not width:
+        low, high = int(frame.counts.min()), int(frame.counts.max())
+        median, width = (low + high) // 2, high - low
+    _put(info, SETTING_BYTES, struct.pack("<6f2If4xH", *temperatures, median, width, focus, round(frame_rate)))
+    for name, (offset, room) in IDENTITY_TEXTS.items():
         # One byte less than the field: readers expect the terminating zero.
-        struct.pack_into(f"{width - 1}s", info, offset, text.encode("latin-1", "replace"))
-    struct.pack_into("<f", info, 0x1B4, camera.field_of_view_deg)
-    struct.pack_into("<if2H", info, 0x308, round(p.planck_o), p.planck_r2, limits.raw_minimum, limits.raw_maximum)
-    low, high = int(frame.counts.min()), int(frame.counts.max())
-    display = (settings.raw_median, settings.raw_range) if settings.raw_range else ((low + high) // 2, high - low)
-    struct.pack_into("<2I", info, 0x338, *display)
-    struct.pack_into("<f4xH", info, 0x45C, settings.focus_distance_m, round(settings.frame_rate_Hz))
+        struct.pack_into(f"{room - 1}s", info, offset, getattr(frame.camera, name).encode("latin-1", "replace"))
+    struct.pack_into("<f", info, FIELD_OF_VIEW, frame.camera.field_of_view_deg)
     _pack_time(info, frame)
-    _pack_housekeeping(info, frame)
-    return bytes(info)
-
-
-def _pack_time(info: bytearray, frame: Frame) -> None:
-    """Write UTC seconds, milliseconds and minutes west; nothing for NaT."""
-    if np.isnat(frame.time):
-        return
-    milliseconds = int(frame.time.astype("datetime64[ms]").astype(np.int64))
-    if not 1000 <= milliseconds < 2**32 * 1000:
-        raise ThermographyError(f"time {frame.time}: a FLIR file stores times from 1970 to 2106 only")
-    struct.pack_into("<2Ih", info, 0x384, milliseconds // 1000, milliseconds % 1000, -frame.utc_offset_minutes)
-
-
-def _pack_housekeeping(info: bytearray, frame: Frame) -> None:
-    """Write the camera temperatures with the frame's time."""
+    # Write the camera temperatures with the frame's time.
     seconds, milliseconds = struct.unpack_from("<2I", info, 0x384)
     room = (_CAMERA_INFO_SIZE - 0x47C) // 28
     if len(frame.housekeeping) > room:
@@ -297,6 +241,23 @@ def _pack_housekeeping(info: bytearray, frame: Frame) -> None:
                 f"housekeeping {name!r} = {value}: expected an ASCII name of 1 to 15 letters and 150 to 450 K"
             )
         struct.pack_into("<f16s2I", info, 0x47C + 28 * slot, value, name.encode(), seconds, milliseconds)
+    return bytes(info)
+
+
+def _put(info: bytearray, places: tuple[tuple[int, int], ...], data: bytes) -> None:
+    """Write bytes to several places of the camera information, one after the other."""
+    for start, stop in places:
+        info[start:stop], data = data[: stop - start], data[stop - start :]
+
+
+def _pack_time(info: bytearray, frame: Frame) -> None:
+    """Write UTC seconds, milliseconds and minutes west; nothing for NaT."""
+    if np.isnat(frame.time):
+        return
+    milliseconds = int(frame.time.astype("datetime64[ms]").astype(np.int64))
+    if not 1000 <= milliseconds < 2**32 * 1000:
+        raise ThermographyError(f"time {frame.time}: a FLIR file stores times from 1970 to 2106 only")
+    struct.pack_into("<2Ih", info, 0x384, milliseconds // 1000, milliseconds % 1000, -frame.utc_offset_minutes)
 
 
 def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
@@ -313,19 +274,16 @@ def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
         # Cameras store the samples in the byte order of the record although PNG samples are big-endian, hence the swap.
         samples = cv2.imencode(".png", native.byteswap(), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
     elif encoding == "jpegls":
-        samples = _without_spiff(bytes(imagecodecs.jpegls_encode(native)))
+        # Without the encoder's SPIFF segments: the cameras write the frame header first.
+        stream = bytes(imagecodecs.jpegls_encode(native))
+        offset = 2
+        while stream[offset : offset + 2] == b"\xff\xe8":
+            offset += 2 + int.from_bytes(stream[offset + 2 : offset + 4], "big")
+        samples = stream[:2] + stream[offset:]
         samples += bytes(-len(samples) % 8)
     else:
         raise ThermographyError(f"encoding {encoding!r}: expected 'raw', 'png' or 'jpegls'")
     return bytes(head) + samples
-
-
-def _without_spiff(stream: bytes) -> bytes:
-    """Return a JPEG-LS stream without the encoder's SPIFF segments; the cameras write the frame header first."""
-    offset = 2
-    while stream[offset : offset + 2] == b"\xff\xe8":
-        offset += 2 + int.from_bytes(stream[offset + 2 : offset + 4], "big")
-    return stream[:2] + stream[offset:]
 
 
 def _segment(payload: bytes) -> bytes:
@@ -349,11 +307,3 @@ def _exif(frame: Frame) -> bytes:
         entries += struct.pack("<HHI", tag, 2, len(value)) + place
         data += value if len(value) > 4 else b""
     return b"Exif\0\0II*\0" + struct.pack("<IH", 8, len(texts)) + entries + bytes(4) + data
-
-
-def _preview(counts: NDArray[np.uint16]) -> bytes:
-    """Return a grey JPEG of the frame, scaled from its lowest to its highest count."""
-    low, high = int(counts.min()), int(counts.max())
-    grey = ((counts.astype(np.float32) - low) * (255 / max(high - low, 1))).astype(np.uint8)
-    encoded: bytes = cv2.imencode(".jpg", grey)[1].tobytes()
-    return encoded

@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 
 Encoding = Literal["raw", "png", "jpegls"]
 Segments = tuple[tuple[int, int], ...]
@@ -161,12 +161,8 @@ class SampleLocation:
 
     Attributes
     ----------
-    encoding : {"raw", "png", "jpegls"}
-        Packing of the pixels: plain 16-bit samples, 16-bit grey PNG, or JPEG-LS.
     offset, length : int
         First byte, counted from the start of the FFF record, and number of bytes.
-    little_endian : bool
-        Byte order of the samples.
     shape : tuple of int
         (rows, columns).
     record : (offset, length)
@@ -243,41 +239,10 @@ class Frame(FrameHeader):
 
 @dataclass(frozen=True)
 class PlainSamples:
-    """Place of pixels that stand in a file as they are: 16 bits each, row by row.
-
-    Attributes
-    ----------
-    offset : int
-        First byte in the file.
-    little_endian : bool
-        Byte order.
-    """
+    """Place of pixels that stand in a file as they are: 16 bits each, row by row, from `offset` bytes on."""
 
     offset: int
     little_endian: bool
-
-
-class StoredPixels(Protocol):
-    """What reading pixels needs to know of a frame; `FrameReference` and `thermography.fields.tasks.frame_run.PlainFrame` tell it."""
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-
-    @property
-    def index(self) -> int:
-        """Index of the frame in the file, from 0."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
-
-    @property
-    def plain_samples(self) -> PlainSamples | None:
-        """Where the pixels stand as they are; None where they must be read as a whole."""
-
-    def read_counts(self) -> NDArray[np.uint16]:
-        """Read the pixels, (row, column) uint16."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,6 +282,40 @@ class FrameReference(FrameHeader, ABC):
         """Read the frame with its pixels; raise as `read_counts` does."""
         header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
         return Frame(**header, counts=self.read_counts(), source=str(self.path), index=self.index)
+
+
+@dataclass(frozen=True)
+class PlainFrame:
+    """A frame whose pixels stand in a file as they are.
+
+    Attributes
+    ----------
+    path : Path
+    index : int
+    shape : (int, int)
+    plain_samples : PlainSamples
+        As of `FrameReference`.
+    """
+
+    path: Path
+    index: int
+    shape: tuple[int, int]
+    plain_samples: PlainSamples
+
+    def read_counts(self) -> NDArray[np.uint16]:
+        """Read the pixels, (row, column) uint16; raise an OSError where the file is shorter."""
+        kind = np.dtype("<u2" if self.plain_samples.little_endian else ">u2")
+        rows, columns = self.shape
+        counts = np.fromfile(self.path, kind, rows * columns, offset=self.plain_samples.offset)
+        if counts.size < rows * columns:
+            raise OSError(
+                f"{self.path}: frame {self.index} ends early; the file has become shorter since it was indexed"
+            )
+        return counts.astype(np.uint16).reshape(self.shape)
+
+
+#: What reading pixels takes.
+StoredPixels = FrameReference | PlainFrame
 
 
 @dataclass(frozen=True)

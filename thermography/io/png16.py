@@ -1,11 +1,4 @@
-"""Decodes the 16-bit grey PNG in which FLIR cameras pack samples, four times as fast as libpng.
-
-The format is ISO/IEC 15948 (PNG) with filter method 0; the zlib stream is inflated by libdeflate.
-
-Filters 1, 3 and 4 predict a pixel from its left one, so that a row cannot be computed in parallel. A row can, however, begin as soon as the
-row above is one pixel ahead: the pixels of many rows that lie on one anti-diagonal do not depend on one another. They are written side by
-side into a tile, one row of which is one anti-diagonal, and computed together, whatever the filter of each row.
-"""
+"""The 16-bit grey PNG in which FLIR cameras pack samples, decoded four times as fast as by libpng."""
 
 from __future__ import annotations
 
@@ -18,10 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
-from thermography.io.fff_record import PNG_SIGNATURE
+from thermography.common import Array, ThermographyError
 
+#: Length of the signature, by which the samples were recognised.
+_SIGNATURE_BYTES = 8
 _GREY_16_BIT = (16, 0, 0, 0, 0)
 _BYTES_PER_PIXEL = 2
 #: Inflated lines, one buffer per thread, because fresh memory for every image costs a fifth of its decoding.
@@ -43,31 +36,7 @@ class PngError(ThermographyError):
 
 
 def decode_png(data: bytes | memoryview, shape: tuple[int, int], *, little_endian: bool = False) -> NDArray[np.uint16]:
-    """Decode a PNG of 16-bit grey samples.
-
-    Parameters
-    ----------
-    data : bytes or memoryview
-        The PNG from its signature on; bytes after its IEND chunk are ignored.
-    shape : tuple of int
-        (rows, columns) that the image must have; a file that claims another size is refused before memory is allocated.
-    little_endian : bool
-        Whether the samples are stored in little-endian order, against the standard, as some cameras do.
-
-    Returns
-    -------
-    (row, column) ndarray of uint16
-        Samples in native byte order.
-
-    Raises
-    ------
-    PngError
-        Where the PNG is damaged, or not a 16-bit grey image of this shape without interlacing.
-
-    References
-    ----------
-    ISO/IEC 15948:2004, clause 9 (filtering) and clause 11 (chunks).
-    """
+    """Decode a PNG of 16-bit grey samples."""
     rows, columns = shape
     pieces = _image_data(data, shape)
     packed = pieces[0] if len(pieces) == 1 else b"".join(pieces)
@@ -90,9 +59,7 @@ def decode_png(data: bytes | memoryview, shape: tuple[int, int], *, little_endia
 def _image_data(data: bytes | memoryview, shape: tuple[int, int]) -> list[memoryview]:
     """Return the contents of the IDAT chunks after checking every chunk's length and CRC."""
     data = memoryview(data)
-    pieces, start = [], len(PNG_SIGNATURE)
-    if data[: len(PNG_SIGNATURE)] != PNG_SIGNATURE:
-        raise PngError("the signature of a PNG", data[:8].hex(" "))
+    pieces, start = [], _SIGNATURE_BYTES
     while True:
         if start + 12 > len(data):
             raise PngError("a PNG that ends with IEND", f"{len(data)} bytes without it")
@@ -103,7 +70,7 @@ def _image_data(data: bytes | memoryview, shape: tuple[int, int]) -> list[memory
         computed = imagecodecs.deflate_crc32(data[start + 4 : end - 4])  # type: ignore[arg-type]
         if computed != struct.unpack_from(">I", data, end - 4)[0]:
             raise PngError(f"PNG chunk {kind!r} with its CRC", "another one: the samples are damaged")
-        if start == len(PNG_SIGNATURE):
+        if start == _SIGNATURE_BYTES:
             header = struct.unpack_from(">2I5B", data, start + 8) if kind == b"IHDR" and length == 13 else None
             expected = (shape[1], shape[0], *_GREY_16_BIT)
             if header != expected:
@@ -159,12 +126,7 @@ def _add_above(line: Array, above: Array, out: Array) -> None:  # pragma: no cov
 def _undo_together(
     lines: Array, out: Array, first: int, masks: Array, tile: Array, stretches: Array, mixed: Array
 ) -> None:  # pragma: no cover - compiled
-    """Undo the filters of some lines, which are the rows from `first` on, stretch by stretch of the anti-diagonals.
-
-    `tile` has one row per anti-diagonal, in 64-bit words; `stretches` and `mixed` are for copies. Inlined, because that compiles faster.
-    Row k of the lines is k + 1 columns behind the anti-diagonal, the row above them 0. Where a row has not begun, the tile holds zeros, as
-    the prediction at the left edge wants; what it holds after a row has ended is not used.
-    """
+    """Undo the filters of some lines, which are the rows from `first` on, stretch by stretch of the anti-diagonals."""
     columns = out.shape[1] // _BYTES_PER_PIXEL
     rows = len(lines) // (1 + out.shape[1])
     pixels, mixed_pixels, mixed_words = stretches.view(np.uint16), mixed.view(np.uint16), mixed.view(np.uint64)
@@ -204,11 +166,7 @@ def _undo_diagonals(tile: Array, number: int, masks: Array) -> None:  # pragma: 
 
 @njit(cache=True, nogil=True, inline="always")
 def _paeth(left: np.uint8, up: np.uint8, corner: np.uint8) -> np.uint8:  # pragma: no cover - compiled
-    """Of left, up and corner the nearest to left + up - corner; of equally near ones the left one, then the one above.
-
-    The higher of left and up is nearest where the corner is above the lower by no more than half of what it is below the higher, the lower
-    in the opposite case, else the corner: all in bytes, of which a processor computes twice as many at a time as of longer numbers.
-    """
+    """Of left, up and corner the nearest to left + up - corner; of equally near ones the left one, then the one above."""
     lower, higher = min(left, up), max(left, up)
     above, below = np.uint8(max(corner, lower) - lower), np.uint8(higher - min(corner, higher))
     nearest = lower if below <= np.uint8(above >> 1) else corner

@@ -10,7 +10,8 @@ import json
 import os
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,49 +20,35 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from thermography.io.flir import FlirFrameReference, index_frames
-from thermography.io.flir_annotations import read_measurement_regions, read_visible_picture
-from thermography.io.frame import CameraParameters, FlirFormatError, FrameReference, RejectedFrame
-from thermography.io.frame_index.by_threads import call_by_threads, usable_threads
-from thermography.io.frame_index.frame_list import FrameList, frame_times
+from thermography.io.flir import FlirFrameReference, index_frames, read_measurement_regions, read_visible_picture
+from thermography.io.frame import CameraParameters, FlirFormatError, FrameReference
+from thermography.io.sequence import FrameList, call_by_threads, frame_times, usable_threads
 from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
 
-#: Camera parameter -> (name in a Dataset, units, units_metadata).
-_PARAMETERS: dict[str, tuple[str, str, str]] = {
-    "emissivity": ("emissivity", "1", ""),
-    "object_distance_m": ("object_distance", "m", ""),
-    "reflected_temperature_K": ("reflected_temperature", "K", "temperature: on_scale"),
-    "atmospheric_temperature_K": ("atmospheric_temperature", "K", "temperature: on_scale"),
-    "window_temperature_K": ("window_temperature", "K", "temperature: on_scale"),
-    "window_transmission": ("window_transmission", "1", ""),
-    "stored_transmission": ("stored_transmission", "1", ""),
-    "relative_humidity": ("relative_humidity", "1", ""),
-    "planck_r1": ("planck_r1", "1", ""),
-    "planck_b": ("planck_b", "K", "temperature: on_scale"),
-    "planck_f": ("planck_f", "1", ""),
-    "planck_o": ("planck_o", "1", ""),
-    "planck_r2": ("planck_r2", "1", ""),
-    "atmosphere_alpha1": ("atmosphere_alpha1", "m-0.5", ""),
-    "atmosphere_alpha2": ("atmosphere_alpha2", "m-0.5", ""),
-    "atmosphere_beta1": ("atmosphere_beta1", "m-0.5", ""),
-    "atmosphere_beta2": ("atmosphere_beta2", "m-0.5", ""),
-    "atmosphere_x": ("atmosphere_x", "1", ""),
+_UNITS = {"object_distance_m": "m", "planck_b": "K", "atmosphere_x": "1"}
+#: Camera parameter -> (name in a Dataset, units).
+_PARAMETERS: dict[str, tuple[str, str]] = {
+    each.name: (
+        each.name.removesuffix("_K").removesuffix("_m"),
+        _UNITS.get(each.name, "K" if each.name.endswith("_K") else "m-0.5" if "atmosphere_" in each.name else "1"),
+    )
+    for each in fields(CameraParameters)
 }
-#: Option -> camera parameter, and what is added to the option to give it.
-_OPTIONS: dict[str, tuple[str, float]] = {
-    "emissivity": ("emissivity", 0.0),
-    "object_distance_m": ("object_distance_m", 0.0),
-    "reflected_temperature_degC": ("reflected_temperature_K", ZERO_CELSIUS_K),
-    "atmospheric_temperature_degC": ("atmospheric_temperature_K", ZERO_CELSIUS_K),
-    "relative_humidity": ("relative_humidity", 0.0),
-    "window_transmission": ("window_transmission", 0.0),
-    "window_temperature_degC": ("window_temperature_K", ZERO_CELSIUS_K),
+#: Option, temperatures in degC -> camera parameter.
+_OPTIONS = {
+    name.replace("_K", "_degC"): name
+    for name in (
+        "emissivity",
+        "object_distance_m",
+        "reflected_temperature_K",
+        "atmospheric_temperature_K",
+        "relative_humidity",
+        "window_transmission",
+        "window_temperature_K",
+    )
 }
-_TEMPERATURE = {
-    "long_name": "surface temperature",
-    "units": "degC",
-    "units_metadata": "temperature: on_scale",
-}
+_ON_SCALE = {"units_metadata": "temperature: on_scale"}
+_TEMPERATURE = {"long_name": "surface temperature", "units": "degC", **_ON_SCALE}
 
 
 class FlirBackendEntrypoint(BackendEntrypoint):
@@ -155,7 +142,7 @@ class FlirAccessor:
             An override is unknown or has no meaning, or the Dataset lacks counts or a parameter.
         """
         dataset, changes = self._dataset, _parameter_changes(overrides)
-        lacking = [name for name in ("counts", *(name for name, *_ in _PARAMETERS.values())) if name not in dataset]
+        lacking = [name for name in ("counts", *(name for name, _ in _PARAMETERS.values())) if name not in dataset]
         if lacking:
             raise RadiometryError(
                 f"the Dataset has no {', '.join(lacking)}; open the file with engine='flir' and keep them"
@@ -215,13 +202,15 @@ def _parameter_changes(overrides: dict[str, float | None]) -> dict[str, float]:
     if unknown:
         raise RadiometryError(f"{', '.join(unknown)}: no such parameter; there are {', '.join(_OPTIONS)}")
     return {
-        _OPTIONS[name][0]: float(value) + _OPTIONS[name][1] for name, value in overrides.items() if value is not None
+        _OPTIONS[name]: float(value) + (ZERO_CELSIUS_K if name.endswith("_degC") else 0.0)
+        for name, value in overrides.items()
+        if value is not None
     }
 
 
 def _stored_parameters(dataset: xr.Dataset) -> list[CameraParameters]:
     """Return the camera parameters that a Dataset holds: one set, or one per frame where any of them varies."""
-    values = {field: dataset[name].values for field, (name, *_) in _PARAMETERS.items()}
+    values = {field: dataset[name].values for field, (name, _) in _PARAMETERS.items()}
     count = max((value.size for value in values.values() if value.ndim), default=1)
     spread = {field: np.broadcast_to(value, count) for field, value in values.items()}
     return [CameraParameters(**{field: float(value[i]) for field, value in spread.items()}) for i in range(count)]
@@ -241,7 +230,13 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, flo
     if not frames:
         reason = rejected[0].reason if rejected else "no files were given"
         raise FlirFormatError(f"no FLIR frame can be read: {reason}")
-    _check_shapes(frames)
+    shapes = frames.shapes()
+    for place in np.flatnonzero((shapes != shapes[0]).any(axis=1))[:1]:
+        other = frames[int(place)]
+        raise FlirFormatError(
+            f"{other.path}: frame {other.index} has (rows, columns) {other.shape}, {frames[0].path} has "
+            f"{frames[0].shape}; open the files of each camera separately"
+        )
     if rejected:
         text = f"{len(rejected)} files or frames could not be used, the first: {rejected[0].reason}"
         warnings.warn(text, UserWarning, stacklevel=3)
@@ -255,38 +250,48 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, flo
     counts, temperature = (
         xr.Variable(("time", "row", "column"), indexing.LazilyIndexedArray(stack), attrs, chunks)
         for stack, attrs in (
-            (_FrameStack(frames, np.uint16, _Counts()), {"long_name": "counts of the detector", "units": "1"}),
-            (_FrameStack(frames, np.float32, _Temperatures(sets, which)), _TEMPERATURE),
+            (_FrameStack(frames, np.uint16, _read_counts), {"long_name": "counts of the detector", "units": "1"}),
+            (_FrameStack(frames, np.float32, partial(_read_temperature, sets=sets, which=which)), _TEMPERATURE),
         )
     )
+    inside = np.stack(list(readings.values()), axis=-1) if readings else np.empty((len(frames), 0))
+    of_camera = {"long_name": "temperatures inside the camera", "units": "K", **_ON_SCALE}
+    rows, columns = first.shape
+    notes = [f"{frame.path}: frame {frame.index}: {note}" for frame in frames.noted() for note in frame.notes]
+    unused = [{"path": str(each.path), "index": each.index, "reason": each.reason} for each in rejected]
+    # One variable per camera parameter: a scalar, or along time where it varies.
+    variables = {}
+    for field, (name, units) in _PARAMETERS.items():
+        values = np.array([getattr(parameters, field) for parameters in sets])
+        attrs = {"units": units, **(_ON_SCALE if units == "K" else {})}
+        constant = (values == values[0]).all()
+        variables[name] = xr.Variable((), values[0], attrs) if constant else xr.Variable("time", values[which], attrs)
     dataset = xr.Dataset(
         {
             "counts": counts,
             "temperature": temperature,
-            **_parameter_variables(sets, which),
-            "camera_temperature": _camera_temperatures(readings, len(frames)),
+            **variables,
+            "camera_temperature": xr.Variable(("time", "sensor"), inside, of_camera),
         },
-        coords={**_coordinates(frames), "sensor": ("sensor", np.array(list(readings), dtype=object))},
+        coords={
+            "time": ("time", frame_times(frames), {"standard_name": "time", "units_metadata": "leap_seconds: utc"}),
+            "row": ("row", np.arange(rows), {"long_name": "sensor row", "units": "1"}),
+            "column": ("column", np.arange(columns), {"long_name": "sensor column", "units": "1"}),
+            "source": ("time", frames.files()),
+            "frame": ("time", frames.numbers(), {"long_name": "index in the file, from 0"}),
+            "sensor": ("sensor", np.array(list(readings), dtype=object)),
+        },
         attrs={
-            **_attributes(frames, rejected),
+            "Conventions": "CF-1.11",
+            "camera": json.dumps(asdict(first.camera)),
+            "calibrated_range": json.dumps(asdict(first.limits)),
+            "notes": json.dumps(list(dict.fromkeys(notes))),
+            "rejected": json.dumps(unused),
             "measurement_regions": json.dumps([asdict(region) for region in regions]),
         },
     )
     dataset["time"].encoding = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
     return dataset
-
-
-def _check_shapes(frames: FrameList) -> None:
-    """Raise an error where frames differ in size."""
-    shapes = frames.shapes()
-    others = np.flatnonzero((shapes != shapes[0]).any(axis=1))
-    if not others.size:
-        return
-    first, other = frames[0], frames[int(others[0])]
-    raise FlirFormatError(
-        f"{other.path}: frame {other.index} has (rows, columns) {other.shape}, {first.path} has "
-        f"{first.shape}; open the files of each camera separately"
-    )
 
 
 class _FrameStack(BackendArray):
@@ -319,69 +324,13 @@ class _FrameStack(BackendArray):
         return stack
 
 
-class _Counts:
-    """Reads the counts of a frame."""
-
-    def __call__(self, frame: FrameReference, index: int) -> np.ndarray:
-        """Return (row, column) uint16."""
-        return frame.read_counts()
+def _read_counts(frame: FrameReference, index: int) -> np.ndarray:
+    """Return (row, column) uint16."""
+    return frame.read_counts()
 
 
-@dataclass(frozen=True)
-class _Temperatures:
-    """Reads and calibrates a frame with one of several sets of parameters."""
-
-    sets: Sequence[CameraParameters]
-    which: np.ndarray
-
-    def __call__(self, frame: FrameReference, index: int) -> np.ndarray:
-        """Return (row, column) float32, degC."""
-        return calibrate(frame.read_counts(), self.sets[self.which[index]])
-
-
-def _parameter_variables(sets: Sequence[CameraParameters], which: np.ndarray) -> dict[str, xr.Variable]:
-    """Return one variable per camera parameter: a scalar, or along time where it varies."""
-    variables = {}
-    for field, (name, units, metadata) in _PARAMETERS.items():
-        values = np.array([getattr(parameters, field) for parameters in sets])
-        attrs = {"units": units, **({"units_metadata": metadata} if metadata else {})}
-        constant = (values == values[0]).all()
-        variables[name] = xr.Variable((), values[0], attrs) if constant else xr.Variable("time", values[which], attrs)
-    return variables
-
-
-def _camera_temperatures(readings: dict[str, np.ndarray], frames: int) -> xr.Variable:
-    """Return the temperatures inside the camera (time, sensor), K; NaN where a frame does not store one."""
-    values = list(readings.values())
-    attrs = {
-        "long_name": "temperatures inside the camera",
-        "units": "K",
-        "units_metadata": "temperature: on_scale",
-    }
-    table = np.stack(values, axis=-1) if values else np.empty((frames, 0))
-    return xr.Variable(("time", "sensor"), table, attrs)
-
-
-def _coordinates(frames: FrameList) -> dict[str, Any]:
-    rows, columns = frames[0].shape
-    return {
-        "time": ("time", frame_times(frames), {"standard_name": "time", "units_metadata": "leap_seconds: utc"}),
-        "row": ("row", np.arange(rows), {"long_name": "sensor row", "units": "1"}),
-        "column": ("column", np.arange(columns), {"long_name": "sensor column", "units": "1"}),
-        "source": ("time", frames.files()),
-        "frame": ("time", frames.numbers(), {"long_name": "index in the file, from 0"}),
-    }
-
-
-def _attributes(frames: FrameList, rejected: list[RejectedFrame]) -> dict[str, str]:
-    notes = list(
-        dict.fromkeys(f"{frame.path}: frame {frame.index}: {note}" for frame in frames.noted() for note in frame.notes)
-    )
-    unused = [{"path": str(each.path), "index": each.index, "reason": each.reason} for each in rejected]
-    return {
-        "Conventions": "CF-1.11",
-        "camera": json.dumps(asdict(frames[0].camera)),
-        "calibrated_range": json.dumps(asdict(frames[0].limits)),
-        "notes": json.dumps(notes),
-        "rejected": json.dumps(unused),
-    }
+def _read_temperature(
+    frame: FrameReference, index: int, *, sets: Sequence[CameraParameters], which: np.ndarray
+) -> np.ndarray:
+    """Return (row, column) float32, degC, with one of several sets of parameters."""
+    return calibrate(frame.read_counts(), sets[which[index]])

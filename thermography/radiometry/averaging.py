@@ -13,8 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
+from thermography.common import Array
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import ZERO_CELSIUS_K, count_line
 
@@ -26,26 +25,11 @@ CHUNK_FRAMES = 8
 _TILE_PX = 2048
 #: Deviations from the first frame below this are near: their squares are summed in 32 bits. A power of two.
 _NEAR = 2048
-#: Maximum number of frames of one `Accumulator`. The largest sum of near squares, 1000 * 2047**2 = 4.19e9, fits uint32 (below 2**32 =
-#: 4.29e9), and the largest sum of deviations, 1000 * 65535 = 6.6e7, fits int32.
-_MAX_FRAMES = 1000
 
 
 @dataclass(frozen=True)
 class CountStatistics:
-    """Sums of counts over frames that share their parameters; whole numbers, so that merging is exact in any order.
-
-    Attributes
-    ----------
-    frames : int
-        Number of frames.
-    total : ndarray of uint64
-        Sum of the counts of each pixel.
-    squares : ndarray of uint64
-        Sum of the squared counts of each pixel.
-    lowest, highest : ndarray of uint16
-        Smallest and largest count of each pixel.
-    """
+    """Sums of counts over frames that share their parameters; whole numbers per pixel."""
 
     frames: int
     total: NDArray[np.uint64]
@@ -53,36 +37,13 @@ class CountStatistics:
     lowest: NDArray[np.uint16]
     highest: NDArray[np.uint16]
 
-    def merge(self, other: CountStatistics) -> CountStatistics:
-        """Return the statistics of both sets of frames together."""
-        return CountStatistics(
-            self.frames + other.frames,
-            self.total + other.total,
-            self.squares + other.squares,
-            np.minimum(self.lowest, other.lowest),
-            np.maximum(self.highest, other.highest),
-        )
-
-    @property
-    def mean(self) -> Array:
-        """Mean count of each pixel, float64."""
-        return self.total / self.frames
-
-    @property
-    def variance(self) -> Array:
-        """Mean squared deviation of each pixel from its mean (divided by the number of frames), counts squared."""
-        # About the smallest count and in whole numbers: with the squares of the counts themselves, nearly all digits would cancel.
-        lowest = self.lowest.astype(np.uint64)
-        total = self.total - np.uint64(self.frames) * lowest
-        squares = self.squares + np.uint64(self.frames) * lowest * lowest - np.uint64(2) * lowest * self.total
-        return np.maximum(squares / self.frames - (total / self.frames) ** 2, 0.0)
-
 
 class Accumulator:
     """Sums of counts that grow by chunks of frames, so that a block of up to 1000 frames needs the memory of one chunk.
 
     The deviations from the first frame are summed: they and nearly all their squares fit 32 bits, of which a processor adds twice as
-    many at once as of 64. Where a pixel deviates further, the squares of its tile are summed in 64 bits.
+    many at once as of 64. Where a pixel deviates further, the squares of its tile are summed in 64 bits. The largest sum of squares in 32
+    bits, 1000 * 2047**2 = 4.19e9, is below 2**32 = 4.29e9, and the largest sum of deviations is 1000 * 65535 = 6.6e7.
 
     Parameters
     ----------
@@ -100,26 +61,7 @@ class Accumulator:
         )
 
     def add(self, counts: NDArray[np.uint16]) -> None:
-        """Add frames.
-
-        Parameters
-        ----------
-        counts : (time, ...) ndarray of uint16
-            One or more frames of the shape of this accumulator, counts.
-
-        Raises
-        ------
-        ThermographyError
-            Where shape or type differ, there is no frame, or the sum of all frames exceeds 1000.
-        """
-        if counts.dtype != np.uint16 or len(counts) == 0 or counts.shape[1:] != self.shape:
-            raise ThermographyError(
-                f"counts: expected frames of {self.shape} uint16, got {counts.shape} {counts.dtype}"
-            )
-        if self.frames + len(counts) > _MAX_FRAMES:
-            raise ThermographyError(
-                f"counts: {self.frames + len(counts)} frames, but the sums hold {_MAX_FRAMES}; merge the statistics of several accumulators"
-            )
+        """Add frames."""
         flat = np.ascontiguousarray(counts).reshape(len(counts), -1)
         if self.frames == 0:
             for reference in (self.first, self.lowest, self.highest):
@@ -128,9 +70,7 @@ class Accumulator:
         self.frames += len(flat)
 
     def statistics(self) -> CountStatistics:
-        """Return the statistics of the frames added so far; raise a ThermographyError where there is none."""
-        if self.frames == 0:
-            raise ThermographyError("no frame has been added")
+        """Return the statistics of the frames added so far."""
         total, squares = _sums(self.frames, self.first, self.deviations, self.squares, self.far_squares)
         shape = self.shape
         return CountStatistics(
@@ -165,10 +105,7 @@ def _add(
 
 @numba.njit(cache=True, nogil=True)
 def _add_limits(first: Array, a: Array, b: Array, c: Array, d: Array, lowest: Array, highest: Array) -> np.uint16:
-    """Update smallest and largest counts; return the bitwise or of all deviations from the first frame.
-
-    `_NEAR` is a power of two, so the result is below it if and only if every deviation so far is.
-    """
+    """Update smallest and largest counts; return the bitwise or of all deviations from the first frame."""
     reach = np.uint16(0)
     for i in range(len(first)):
         low = min(lowest[i], min(min(a[i], b[i]), min(c[i], d[i])))
@@ -184,7 +121,7 @@ def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: 
     # The difference of two unsigned counts wraps around where it is negative. Its lower 16 bits, read as int16, are the signed deviation
     # if that lies within -2**15 to 2**15 - 1: it does, being below _NEAR = 2**11 in size, and so does the sum of four, below 2**13.
     # In 16 bits a processor handles twice as many pixels at once as in 32. A square is below 2**22, so it needs 32 bits; for the sum of
-    # all squares see _MAX_FRAMES.
+    # all squares see `Accumulator`.
     for i in range(len(first)):
         w, x = np.int16(a[i] - first[i]), np.int16(b[i] - first[i])
         y, z = np.int16(c[i] - first[i]), np.int16(d[i] - first[i])
@@ -225,15 +162,12 @@ class MeanTemperature:
 
     Attributes
     ----------
-    frames : int
-        Number of frames.
     mean : ndarray of float64
-        Mean temperature, degC, over the frames in which the pixel had one; NaN where a count was below that of any temperature in all.
+        degC, over the frames in which the pixel had a temperature; NaN where it had one in none.
     variance : ndarray of float64
         Mean squared deviation from the mean (divided by the number of frames), K^2.
     bound_K : ndarray of float64
-        Bound on the error of the mean from averaging counts to second order, K. Where it exceeds `AVERAGING_LIMIT_K`, the frames
-        should be calibrated one by one.
+        Bound on the error of the mean, K; beyond `AVERAGING_LIMIT_K` the frames should be calibrated one by one.
     """
 
     frames: int
@@ -242,10 +176,7 @@ class MeanTemperature:
     bound_K: Array
 
     def merge(self, other: MeanTemperature) -> MeanTemperature:
-        """Return mean and variance of both sets of frames together.
-
-        Source: T. F. Chan, G. H. Golub and R. J. LeVeque, The American Statistician 37 (1983) 242-247.
-        """
+        """Return mean and variance of both sets of frames together."""
         frames = self.frames + other.frames
         difference = other.mean - self.mean
         share = other.frames / frames
@@ -262,37 +193,7 @@ class MeanTemperature:
 def mean_temperature(
     statistics: CountStatistics, parameters: CameraParameters, *, used: NDArray[np.bool_] | None = None
 ) -> MeanTemperature:
-    """Return mean and variance of the temperature from sums of counts, without reading the frames again.
-
-    Parameters
-    ----------
-    statistics : CountStatistics
-        Sums over frames that share `parameters`.
-    parameters : CameraParameters
-        Parameters to calibrate these frames with.
-    used : ndarray of bool, optional
-        Pixels to evaluate, of the shape of the frames; the others are returned as zero. All by default.
-
-    Returns
-    -------
-    MeanTemperature
-        Mean (degC), variance (K^2) and error bound (K), of the shape of the frames.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter makes the measurement formula meaningless.
-
-    Notes
-    -----
-    With T(n) the calibration curve, T1, T2 and T3 its derivatives, and m and v the mean and variance of the counts n, Taylor's theorem
-    about m gives
-
-        mean(T) = T(m) + T2(m) v / 2 + r,  abs(r) <= max(abs(T3)) mean(abs(n - m)^3) / 6 <= abs(T3(lowest)) v max(abs(n - m)) / 6,
-
-    because abs(T3) falls with the counts, and the third absolute moment is at most the variance times the largest deviation. The
-    variance of the temperature is T1(m)^2 v. See ``docs/method/radiometry.md``.
-    """
+    """Return mean and variance of the temperature from sums of counts, without reading the frames again."""
     p = parameters
     gain, offset = count_line(p)
     curve = np.array([p.planck_r1 / p.planck_r2, p.planck_b, p.planck_f, gain, offset - gain * p.planck_o])
@@ -350,10 +251,7 @@ def _mean_temperature(
 
 @numba.njit(cache=True, nogil=True)
 def _derivatives(counts: float, curve: Array) -> tuple[float, float, float]:
-    """Return the temperature (degC) and its first two derivatives by the counts (K/count, K/count^2); NaN below any temperature.
-
-    T = B / ln(a / s + F) with s = (counts - offset) / gain = S + O, where `curve` is a = R1 / R2, B, F, gain and offset.
-    """
+    """Return the temperature (degC) and its first two derivatives by the counts (K/count, K/count^2); NaN below any temperature."""
     a, b, f, gain, offset = curve
     s = (counts - offset) / gain
     if s <= 0 or a / s + f <= 1:

@@ -26,15 +26,7 @@ _MAX_U = 0.1
 
 @dataclass(frozen=True)
 class KnownState:
-    """Mean counts of a region at a known temperature.
-
-    Attributes
-    ----------
-    counts, counts_u : float
-        Mean counts of the region and their standard uncertainty.
-    temperature_degC, temperature_u_K : float
-        Temperature of the surface, degC, and its standard uncertainty, K.
-    """
+    """Mean counts of a region at a known temperature, degC, each with its standard uncertainty (counts, K)."""
 
     counts: float
     counts_u: float
@@ -44,17 +36,10 @@ class KnownState:
 
 @dataclass(frozen=True)
 class EmissivityEstimate:
-    """Emissivity of a region.
+    """Emissivity of a region with its standard uncertainty, and the reflected apparent temperature, degC, that agrees with the first state.
 
-    Attributes
-    ----------
-    emissivity, emissivity_u : float
-        Estimate and standard uncertainty, without unit.
-    reflected_temperature_degC : float
-        Reflected apparent temperature that agrees with the first state, degC; NaN for an emissivity of 0.99 or more or 0 or less.
-    quality : {"usable", "too_reflective", "undetermined"}
-        "too_reflective": the emissivity may be below 0.5. "undetermined": the standard uncertainty exceeds 0.1, or the states
-        contradict every emissivity from 0 to 1.
+    "too_reflective": the emissivity may be below 0.5. "undetermined": its standard uncertainty exceeds 0.1, or the states contradict every
+    emissivity from 0 to 1.
     """
 
     emissivity: float
@@ -64,32 +49,7 @@ class EmissivityEstimate:
 
 
 def estimate_emissivity(first: KnownState, second: KnownState, parameters: CameraParameters) -> EmissivityEstimate:
-    """Estimate the emissivity of a region from two states of known temperature.
-
-    Parameters
-    ----------
-    first, second : KnownState
-        Counts of the region and its temperature from a contact sensor, or from a region of known emissivity at the same temperature.
-        The reflected radiation must be the same in both states; it need not be known.
-    parameters : CameraParameters
-        Parameters of both states; emissivity and reflected apparent temperature are not used.
-
-    Returns
-    -------
-    EmissivityEstimate
-        Emissivity with its standard uncertainty, the reflected apparent temperature (degC), and a class.
-
-    Raises
-    ------
-    RadiometryError
-        Where both states have the same temperature, or a parameter makes the measurement formula meaningless.
-
-    Notes
-    -----
-    The reflected radiation cancels in the difference of the measurement formula for the two states,
-    N2 - N1 = tau_w tau e (S(T2) - S(T1)). The uncertainty is that of the law of propagation for uncorrelated inputs (JCGM 100:2008,
-    5.1.2) with the two counts and the two temperatures as inputs.
-    """
+    """Estimate the emissivity of a region from two states of known temperature."""
     check_parameters(parameters)
     path = parameters.window_transmission * transmission(parameters)
     kelvin = np.array([first.temperature_degC, second.temperature_degC]) + ZERO_CELSIUS_K

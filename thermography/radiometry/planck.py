@@ -14,16 +14,16 @@ See ``docs/method/radiometry.md`` and W. Minkina and S. Dudzik, Infrared Thermog
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
-from thermography.io.frame import CameraParameters
+from thermography.common import Array, ThermographyError
+from thermography.io.frame import CameraParameters, FrameHeader
 
 ZERO_CELSIUS_K = 273.15
 #: FLIR's model of the air may exceed 1 a little where its constants were fitted to another path.
@@ -122,50 +122,13 @@ _table = lru_cache(maxsize=16)(_Table)
 def temperature_from_counts(
     counts: ArrayLike, parameters: CameraParameters, *, emissivity: ArrayLike | None = None
 ) -> NDArray[np.float64]:
-    """Convert counts that need not be whole numbers to surface temperature.
-
-    Parameters
-    ----------
-    counts : array, any shape
-        Signal of the detector, counts.
-    parameters : CameraParameters
-        Parameters of the measurement formula.
-    emissivity : array that broadcasts with counts, optional
-        Emissivity of each pixel, above 0 and up to 1; that of the parameters by default.
-
-    Returns
-    -------
-    ndarray of float64
-        Surface temperature of the broadcast shape, degC; NaN where no temperature gives these counts.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter or an emissivity makes the formula meaningless.
-    """
+    """Convert counts that need not be whole numbers to surface temperature."""
     gain, offset = _stored_line(parameters) if emissivity is None else count_line(parameters, emissivity)
     return temperature_of_signal((np.asarray(counts, np.float64) - offset) / gain, parameters)
 
 
 def temperature_of_signal(signal: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
-    """Return the temperature of a black body with a given signal: the inverse of `black_body_signal`.
-
-    Parameters
-    ----------
-    signal : array, any shape
-        Signal S of a black body in front of the lens, counts.
-    parameters : CameraParameters
-        Only the Planck constants are used.
-
-    Returns
-    -------
-    ndarray of float64
-        Temperature, degC; NaN where no temperature gives this signal.
-
-    Notes
-    -----
-    T = B / ln(R1 / (R2 (S + O)) + F), in kelvin.
-    """
+    """Return the temperature of a black body with a given signal: the inverse of `black_body_signal`."""
     p = parameters
     above_zero = np.asarray(signal, np.float64) + p.planck_o
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -177,66 +140,20 @@ def temperature_of_signal(signal: ArrayLike, parameters: CameraParameters) -> ND
 def counts_from_temperature(
     temperature: ArrayLike, parameters: CameraParameters, *, emissivity: ArrayLike | None = None
 ) -> NDArray[np.float64]:
-    """Return the counts that a surface of a given temperature produces: the inverse of `temperature_from_counts`.
-
-    Parameters
-    ----------
-    temperature : array, any shape
-        Surface temperature, degC.
-    parameters : CameraParameters
-        Parameters of the measurement formula.
-    emissivity : array that broadcasts with temperature, optional
-        Emissivity of each pixel; that of the parameters by default.
-
-    Returns
-    -------
-    ndarray of float64
-        Counts of the broadcast shape, not rounded.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter or an emissivity makes the formula meaningless.
-    """
+    """Return the counts that a surface of a given temperature produces: the inverse of `temperature_from_counts`."""
     gain, offset = count_line(parameters, emissivity)
     return gain * black_body_signal(np.asarray(temperature, np.float64) + ZERO_CELSIUS_K, parameters) + offset
 
 
 def black_body_signal(temperature_K: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
-    """Return the signal of a black body directly in front of the lens.
-
-    Parameters
-    ----------
-    temperature_K : array, any shape
-        Temperature of the black body, K.
-    parameters : CameraParameters
-        Only the Planck constants are used.
-
-    Returns
-    -------
-    ndarray of float64
-        S(T) = R1 / (R2 (exp(B / T) - F)) - O, counts (FLIR's form of Planck's law for the band of the camera).
-    """
+    """Return the signal of a black body directly in front of the lens."""
     p = parameters
     exponential = np.exp(p.planck_b / np.asarray(temperature_K, np.float64))
     return p.planck_r1 / (p.planck_r2 * (exponential - p.planck_f)) - p.planck_o
 
 
 def signal_slope(temperature_K: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
-    """Return the derivative of the signal of a black body by its temperature.
-
-    Parameters
-    ----------
-    temperature_K : array, any shape
-        Temperature of the black body, K.
-    parameters : CameraParameters
-        Only the Planck constants are used.
-
-    Returns
-    -------
-    ndarray of float64
-        dS/dT, counts/K.
-    """
+    """Return the derivative of the signal of a black body by its temperature."""
     p, kelvin = parameters, np.asarray(temperature_K, np.float64)
     exponential = np.exp(p.planck_b / kelvin)
     return p.planck_r1 / p.planck_r2 * exponential * p.planck_b / (kelvin * (exponential - p.planck_f)) ** 2
@@ -245,27 +162,7 @@ def signal_slope(temperature_K: ArrayLike, parameters: CameraParameters) -> NDAr
 def count_line(
     parameters: CameraParameters, emissivity: ArrayLike | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return gain and offset of the straight line counts = gain * S(T_object) + offset.
-
-    Parameters
-    ----------
-    parameters : CameraParameters
-        Parameters of the measurement formula.
-    emissivity : array, any shape, optional
-        Emissivity, above 0 and up to 1; that of the parameters by default.
-
-    Returns
-    -------
-    gain : ndarray of float64
-        tau_w tau e, without unit, of the shape of the emissivity.
-    offset : ndarray of float64
-        Signal of reflections, air and window, counts, of the shape of the emissivity.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter or an emissivity makes the formula meaningless.
-    """
+    """Return gain and offset of the straight line counts = gain * S(T_object) + offset."""
     check_parameters(parameters)
     p = parameters
     e = np.asarray(p.emissivity if emissivity is None else emissivity, np.float64)
@@ -297,37 +194,13 @@ def line_of_signals(
     air: Array,
     window: Array,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return gain and offset of the measurement formula from fractions and signals.
-
-    Parameters
-    ----------
-    emissivity, tau, tau_window : arrays that broadcast together
-        Emissivity, transmission of the air and of the window, 0 to 1.
-    reflected, air, window : arrays that broadcast with them
-        Signals of black bodies at the reflected, the air's and the window's temperature, counts.
-
-    Returns
-    -------
-    gain, offset : ndarray of float64
-        As of `count_line`, of the broadcast shape.
-    """
+    """Return gain and offset of the measurement formula from fractions and signals."""
     offset = tau_window * (tau * (1 - emissivity) * reflected + (1 - tau) * air) + (1 - tau_window) * window
     return np.asarray(tau_window * tau * emissivity), np.asarray(offset)
 
 
 def transmission(parameters: CameraParameters) -> float:
-    """Return the transmission of the air between object and camera that the measurement formula uses.
-
-    Parameters
-    ----------
-    parameters : CameraParameters
-        Parameters of the measurement formula.
-
-    Returns
-    -------
-    float
-        The stored transmission if it is above 0, otherwise that of `path_transmission`; 0 to 1.
-    """
+    """Return the transmission of the air between object and camera that the measurement formula uses."""
     p = parameters
     if p.stored_transmission > 0:
         return p.stored_transmission
@@ -335,29 +208,7 @@ def transmission(parameters: CameraParameters) -> float:
 
 
 def path_transmission(parameters: CameraParameters) -> float:
-    """Return the transmission of the air from distance, humidity and air temperature.
-
-    Parameters
-    ----------
-    parameters : CameraParameters
-        Only distance, humidity, air temperature and the atmosphere constants are used.
-
-    Returns
-    -------
-    float
-        Transmission of the whole path, 0 to 1.
-
-    Notes
-    -----
-    FLIR's model: with the distance d (m), the air temperature t (degC) and the water content of the air
-    w = humidity * exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), in g/m3,
-
-        tau = X exp(-sqrt(d) (alpha1 + beta1 sqrt(w))) + (1 - X) exp(-sqrt(d) (alpha2 + beta2 sqrt(w))).
-
-    References
-    ----------
-    W. Minkina and S. Dudzik, Infrared Thermography: Errors and Uncertainties, Wiley, 2009.
-    """
+    """Return the transmission of the air from distance, humidity and air temperature."""
     p = parameters
     return float(air_transmission(p.object_distance_m, p.relative_humidity, p.atmospheric_temperature_K, p))
 
@@ -368,20 +219,7 @@ def air_transmission(
     atmospheric_temperature_K: Array | float,
     parameters: CameraParameters,
 ) -> NDArray[np.float64]:
-    """Return the transmission of the air for several distances and conditions; see `path_transmission`.
-
-    Parameters
-    ----------
-    object_distance_m, relative_humidity, atmospheric_temperature_K : arrays that broadcast together
-        Length of the path, m; humidity, 0 to 1; temperature of the air, K.
-    parameters : CameraParameters
-        Only the atmosphere constants are used.
-
-    Returns
-    -------
-    ndarray of float64
-        Transmission of the whole path, 0 to 1, of the broadcast shape.
-    """
+    """Return the transmission of the air for several distances and conditions; see `path_transmission`."""
     p = parameters
     celsius = atmospheric_temperature_K - ZERO_CELSIUS_K
     # Damaged constants may lead anywhere; `check_parameters` judges the transmission that they give.
@@ -396,26 +234,7 @@ def air_transmission(
 
 
 def override(parameters: CameraParameters, **changes: float) -> CameraParameters:
-    """Return camera parameters with some of them replaced.
-
-    Parameters
-    ----------
-    parameters : CameraParameters
-        Parameters to start from.
-    **changes : float
-        New values by name of the parameter, in its unit.
-
-    Returns
-    -------
-    CameraParameters
-        A changed copy. A stored transmission belongs to the stored distance, humidity and air temperature: where one of these changes
-        and no transmission is given, it is cleared.
-
-    Raises
-    ------
-    RadiometryError
-        Where a name is not that of a parameter.
-    """
+    """Return camera parameters with some of them replaced."""
     names = [field.name for field in fields(CameraParameters)]
     for name in changes:
         if name not in names:
@@ -426,18 +245,7 @@ def override(parameters: CameraParameters, **changes: float) -> CameraParameters
 
 
 def check_parameters(parameters: CameraParameters) -> None:
-    """Raise an error if the measurement formula is meaningless with these parameters.
-
-    Parameters
-    ----------
-    parameters : CameraParameters
-        Parameters of the measurement formula.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter is not finite or outside its range; the message lists all of them.
-    """
+    """Raise an error if the measurement formula is meaningless with these parameters."""
     if faults := _faults(parameters):
         raise RadiometryError("; ".join(faults) + "; override the wrong values of the file")
 
@@ -479,3 +287,59 @@ def _faults(parameters: CameraParameters) -> tuple[str, ...]:
             "expected a fraction above 0 and up to 1"
         )
     return tuple(faults)
+
+
+# Replaces stored camera parameters by those of the campaign: constants and logged series.
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterLog:
+    """A camera parameter logged over time: increasing times, UTC, and finite values in the unit of the parameter, both (n,)."""
+
+    times: NDArray[np.datetime64]
+    values: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        times, values = np.asarray(self.times), np.asarray(self.values, np.float64)
+        if times.shape != values.shape or times.ndim != 1 or times.size == 0:
+            raise RadiometryError(
+                f"log of a parameter: expected as many times as values, got {times.shape} and {values.shape}"
+            )
+        if not (np.diff(times) > np.timedelta64(0)).all() or not np.isfinite(values).all():
+            raise RadiometryError(
+                "log of a parameter: expected increasing times and finite values; sort the log and remove gaps"
+            )
+
+    def interpolate(self, time: np.datetime64) -> float:
+        """Interpolate linearly to a time."""
+        times = np.asarray(self.times).astype("datetime64[ms]")
+        if np.isnat(time) or not times[0] <= time <= times[-1]:
+            raise RadiometryError(f"frame at {time}: the log reaches from {times[0]} to {times[-1]} only; extend it")
+        milliseconds = (times - times[0]).astype(np.int64)
+        return float(np.interp((time - times[0]).astype("timedelta64[ms]").astype(np.int64), milliseconds, self.values))
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """Camera parameters of each frame: those of the file, replaced by constants and by logged values at the time of the frame.
+
+    Attributes
+    ----------
+    constants : mapping of str to float
+        Values by name of the parameter, in its unit.
+    logs : mapping of str to ParameterLog
+        Logs by name of the parameter; they take precedence over constants.
+
+    Examples
+    --------
+    >>> at_22_degC = Overrides(constants={"reflected_temperature_K": 295.15})
+    """
+
+    constants: Mapping[str, float] = field(default_factory=dict)
+    logs: Mapping[str, ParameterLog] = field(default_factory=dict)
+
+    def __call__(self, frame: FrameHeader) -> CameraParameters:
+        """Return the parameters to calibrate a frame with."""
+        logged = {name: log.interpolate(frame.time) for name, log in self.logs.items()}
+        changes = {**self.constants, **logged}
+        return override(frame.parameters, **changes) if changes else frame.parameters

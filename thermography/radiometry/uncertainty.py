@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
+from thermography.common import Array, ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
@@ -121,12 +120,12 @@ class TemperatureBudget:
     @property
     def common_u(self) -> Array:
         """Standard uncertainty from the inputs that all frames share, K."""
-        return _root_sum_square(self.common)
+        return root_sum_square(self.common)
 
     @property
     def per_frame_u(self) -> Array:
         """Standard uncertainty from noise and quantisation, which are independent between frames, K."""
-        return _root_sum_square(self.per_frame)
+        return root_sum_square(self.per_frame)
 
     @property
     def total_u(self) -> Array:
@@ -200,27 +199,7 @@ def temperature_uncertainty(
 def common_contributions(
     temperature: ArrayLike, parameters: CameraParameters, inputs: InputUncertainty
 ) -> dict[str, Array]:
-    """Return what each input that all frames share contributes to the uncertainty of temperatures.
-
-    Parameters
-    ----------
-    temperature : array, any shape
-        Surface temperature, degC; NaN where there is none.
-    parameters : CameraParameters
-        Parameters with which it was calibrated.
-    inputs : InputUncertainty
-        Standard uncertainties of the inputs; those of 0 are left out.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Sensitivity coefficient, with its sign, times standard uncertainty, K, of the shape of the temperature.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter makes the measurement formula meaningless.
-    """
+    """Return what each input that all frames share contributes to the uncertainty of temperatures."""
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
     signal = black_body_signal(kelvin, parameters)
     slope = signal_slope(kelvin, parameters)
@@ -229,7 +208,12 @@ def common_contributions(
     for name in _RANGES:
         u = getattr(inputs, name)
         if u > 0:
-            gain_slope, offset_slope = _line_slopes(parameters, name, u)
+            # Derivatives of gain and offset of `count_line` by one parameter.
+            value = getattr(parameters, name)
+            lowest, highest = _RANGES[name]
+            low, high = max(value - u, lowest), min(value + u, highest)
+            above, below = (count_line(override(parameters, **{name: changed})) for changed in (high, low))
+            gain_slope, offset_slope = (above[0] - below[0]) / (high - low), (above[1] - below[1]) / (high - low)
             common[name] = -(offset_slope + signal * gain_slope) / (gain * slope) * u
     if inputs.camera_offset_K > 0 or inputs.camera_scale > 0:
         reading, per_reading = reading_sensitivity(temperature, parameters)
@@ -239,104 +223,17 @@ def common_contributions(
 
 
 def reading_sensitivity(temperature: ArrayLike, parameters: CameraParameters) -> tuple[Array, Array]:
-    """Return what the camera reads of a black body of the same signal, and the sensitivity of a surface temperature to that reading.
-
-    Parameters
-    ----------
-    temperature : array, any shape
-        Surface temperature, degC.
-    parameters : CameraParameters
-        Parameters with which it was calibrated.
-
-    Returns
-    -------
-    reading : ndarray of float64
-        Temperature of a black body directly in front of the lens, degC.
-    sensitivity : ndarray of float64
-        Change of the surface temperature per change of the reading, about 1 / emissivity, without unit.
-    """
+    """Return what the camera reads of a black body of the same signal, and the sensitivity of a surface temperature to that reading."""
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
     gain, offset = count_line(parameters)
     reading = temperature_of_signal(gain * black_body_signal(kelvin, parameters) + offset, parameters)
     return reading, signal_slope(reading + ZERO_CELSIUS_K, parameters) / (gain * signal_slope(kelvin, parameters))
 
 
-def temperature_rise_uncertainty(
-    temperature: ArrayLike,
-    reference: ArrayLike,
-    parameters: CameraParameters,
-    inputs: InputUncertainty | None = None,
-    *,
-    reference_parameters: CameraParameters | None = None,
-    frames: ArrayLike = 1,
-    reference_frames: ArrayLike = 1,
-) -> TemperatureBudget:
-    """Return the standard uncertainty of the rise of a surface from one temperature to another, with its budget.
-
-    Parameters
-    ----------
-    temperature, reference : arrays that broadcast together
-        Temperatures after and before the rise, degC.
-    parameters : CameraParameters
-        Parameters with which `temperature` was calibrated.
-    inputs : InputUncertainty, optional
-        Standard uncertainties of the inputs; defaults as in `temperature_uncertainty`.
-    reference_parameters : CameraParameters, optional
-        Parameters with which `reference` was calibrated; the same by default.
-    frames, reference_frames : int or array
-        Numbers of frames that were averaged.
-
-    Returns
-    -------
-    TemperatureBudget
-        Contributions, common, per-frame and combined standard uncertainty of the rise, K, of the broadcast shape.
-
-    Raises
-    ------
-    RadiometryError
-        Where a parameter makes the measurement formula meaningless.
-
-    Notes
-    -----
-    The errors of the common inputs are the same in both temperatures (correlation 1), so their contributions are subtracted before they
-    are squared (JCGM 100:2008, 5.2.2, note 1); noise and quantisation are independent, and the drift of the camera's zero between both
-    does not cancel.
-    """
-    later = temperature_uncertainty(temperature, parameters, inputs, frames=frames)
-    earlier = temperature_uncertainty(reference, reference_parameters or parameters, inputs, frames=reference_frames)
-    common = {name: later.common[name] - earlier.common[name] for name in later.common}
-    drift_K = (inputs or InputUncertainty()).camera_drift_K
-    if drift_K > 0:
-        common["camera_drift_K"] = drift_K * reading_sensitivity(temperature, parameters)[1]
-    per_frame = {name: np.hypot(later.per_frame[name], earlier.per_frame[name]) for name in later.per_frame}
-    return TemperatureBudget(common, per_frame)
-
-
 def rise_scale_contributions(
     temperature: ArrayLike, parameters: CameraParameters, inputs: InputUncertainty
 ) -> dict[str, Array]:
-    """Return what each common input contributes to the relative uncertainty of rises about a temperature.
-
-    Parameters
-    ----------
-    temperature : array, any shape
-        Middle of the rises, degC.
-    parameters : CameraParameters
-        Parameters with which it was calibrated.
-    inputs : InputUncertainty
-        Standard uncertainties of the inputs.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Error of a rise as a share of the rise, with its sign, without unit, of the shape of the temperature. An error of 1 % of the
-        emissivity is about 1 %.
-
-    Notes
-    -----
-    The derivative of `common_contributions` by the temperature: over the few kelvins of a test a common error changes a rise in
-    proportion; the share itself falls by about 1 % of its size per kelvin.
-    """
+    """Return what each common input contributes to the relative uncertainty of rises about a temperature."""
     middle = np.asarray(temperature, np.float64)
     parts = common_contributions(np.stack([middle - 0.5, middle + 0.5]), parameters, inputs)
     return {name: part[1] - part[0] for name, part in parts.items()}
@@ -350,40 +247,7 @@ def monte_carlo_ratio(
     *,
     seed: int = 1,
 ) -> tuple[Array, float]:
-    """Return how the common uncertainty by propagation of distributions compares with that of first order.
-
-    Parameters
-    ----------
-    temperature : (n,) array, degC
-        Surface temperatures.
-    rise : (float, float), degC
-        Two different temperatures, before and after a rise.
-    parameters : CameraParameters
-        Parameters with which they were calibrated.
-    inputs : InputUncertainty
-        Standard uncertainties of the inputs, at least one of them above 0.
-    seed : int
-        Of the draws.
-
-    Returns
-    -------
-    of_temperature : (n,) ndarray
-        Half the width of the interval about the temperature that holds 95 % of the draws, over that of a normal distribution with the
-        standard uncertainty of first order; 1 where the formula is linear enough.
-    of_rise : float
-        The same of the rise.
-
-    Raises
-    ------
-    RadiometryError
-        Where the emissivity is not above two of its standard uncertainties, so that the interval has no upper end.
-
-    Notes
-    -----
-    JCGM 101:2008, clauses 5 to 8: normal distributions, those of fractions and of the distance truncated to their range. The interval
-    is compared and not the standard deviation, which does not exist where the distribution of an emissivity reaches towards 0; it lies
-    about the stated value, because that is what it is printed with.
-    """
+    """Return how the common uncertainty by propagation of distributions compares with that of first order."""
     p = parameters
     if p.emissivity <= 2 * inputs.emissivity:
         raise RadiometryError(
@@ -403,8 +267,8 @@ def monte_carlo_ratio(
     drawn = temperature_of_signal(signal, p)
     common = common_contributions(kelvin - ZERO_CELSIUS_K, p, inputs)
     error = drawn - (kelvin - ZERO_CELSIUS_K)
-    of_temperature = _half_width(error[:, :-2]) / _root_sum_square({name: part[:-2] for name, part in common.items()})
-    of_rise = _half_width(error[:, -1] - error[:, -2]) / _root_sum_square(
+    of_temperature = _half_width(error[:, :-2]) / root_sum_square({name: part[:-2] for name, part in common.items()})
+    of_rise = _half_width(error[:, -1] - error[:, -2]) / root_sum_square(
         {name: part[-1] - part[-2] for name, part in common.items()}
     )
     return of_temperature, float(of_rise)
@@ -439,18 +303,6 @@ def _draw_lines(
     return line_of_signals(draw("emissivity"), tau, draw("window_transmission"), *signals)
 
 
-def _root_sum_square(parts: dict[str, Array]) -> Array:
+def root_sum_square(parts: dict[str, Array]) -> Array:
+    """Return the root of the sum of the squares of contributions, 0 without any."""
     return np.sqrt(np.sum([part**2 for part in parts.values()], axis=0))
-
-
-def _line_slopes(parameters: CameraParameters, name: str, u: float) -> tuple[Array, Array]:
-    """Return the derivatives of gain and offset of `count_line` by one parameter.
-
-    They are secants over plus and minus one standard uncertainty inside the range of the parameter (JCGM 100:2008, 5.1.3, note 2), which
-    stay finite at a distance of 0 m, where the transmission depends on the square root of the distance.
-    """
-    value = getattr(parameters, name)
-    lowest, highest = _RANGES[name]
-    low, high = max(value - u, lowest), min(value + u, highest)
-    above, below = (count_line(override(parameters, **{name: changed})) for changed in (high, low))
-    return (above[0] - below[0]) / (high - low), (above[1] - below[1]) / (high - low)

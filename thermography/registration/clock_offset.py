@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
+from thermography.common import Array, ThermographyError
 
 #: The observed travel of the table must be at least this many times the uncertainty of its position.
 _LEAST_TRAVEL = 20.0
@@ -39,6 +38,8 @@ _LOSS_SCALE_MM = 0.5
 _GRID_MM = 1.0
 #: Range, s, and number of steps either way of the profile of the misfit over the offset.
 _PROFILE_S, _PROFILE_STEPS = 4.0, 30
+#: Least mean squared residual, mm2: noise-free positions fit to rounding.
+_LEAST_MISFIT_MM2 = 1e-30
 #: Feeds tried, as multiples of the median feed that the readings require at least.
 _FEEDS = np.geomspace(1.0, 20.0, 40)
 #: Feeds are fitted from this one on, mm/s.
@@ -61,16 +62,12 @@ class ClockOffset:
         At the middle of the frames, with its standard uncertainty.
     rate, rate_u : float, s/s
         Seconds that the camera's clock gains per second; zero where the record is shorter than an hour.
-    start_mm : float, mm
-        Axis position at which the table was registered.
-    feed_mm_per_min : float, mm/min
-        Feed between target positions; fitted where it was not given.
+    start_mm, feed_mm_per_min : float
+        Axis position at which the table was registered, and feed between target positions; fitted where it was not given.
     rms_mm : float, mm
         Root mean square of observed minus commanded position.
-    frames : int
-        Number of frames used.
     rivals_s : tuple of float, s
-        Other offsets that the motion fits about equally well: a periodic test, of which the offset nearest to the expected one was taken.
+        Other offsets that fit about equally well (periodic test); the nearest to the expected one was taken.
     """
 
     offset_s: float
@@ -96,43 +93,7 @@ def estimate_clock_offset(
     search_s: float = 900.0,
     expected_s: float = 0.0,
 ) -> ClockOffset:
-    """Estimate the offset of the camera's clock against the machine's from the observed and the commanded motion of the table.
-
-    Parameters
-    ----------
-    frame_time : (frames,) array of datetime64
-        UTC by the camera's clock.
-    table_mm, table_u_mm : (frames,) array, mm
-        Displacement of the table along the axis from any zero, and its standard uncertainty; NaN where the table was not located.
-    reading_time : (readings,) array of datetime64
-        UTC of the laser readings by the machine's clock, in any order; NaT is left out.
-    target_mm : (readings,) array, mm
-        Target position of every reading.
-    feed_mm_per_min : float or None, mm/min
-        Feed between target positions; None fits it.
-    reading_phase : float
-        Phase of the dwell at which readings are taken, see `commanded_position`. The motion alone cannot distinguish it from a
-        clock offset: an error of half a dwell here is an error of half a dwell of the offset.
-    search_s, expected_s : float, s
-        Offsets from ``expected_s - search_s`` to ``expected_s + search_s`` are considered.
-
-    Returns
-    -------
-    ClockOffset
-        Its uncertainty is estimated by leaving out groups of frames, so that it includes errors of the motion model that differ
-        between parts of the test.
-
-    Raises
-    ------
-    ClockError
-        The table is not observed to travel, too few frames overlap with the readings, or two offsets fit about equally well of which none
-        lies within half a period of the expected one.
-
-    Notes
-    -----
-    See ``docs/method/registration.md``. Delete-a-group jackknife: B. Efron, R. J. Tibshirani, An Introduction to the Bootstrap (1993),
-    ch. 11.
-    """
+    """Estimate the offset of the camera's clock against the machine's from the observed and the commanded motion of the table."""
     frame_s, origin = _seconds(frame_time)
     reading_s, _ = _seconds(reading_time, origin)
     table, table_u, target = (np.asarray(values, float) for values in (table_mm, table_u_mm, target_mm))
@@ -162,26 +123,7 @@ def estimate_clock_offset(
 def commanded_position(
     time_s: Array, reading_s: Array, target_mm: Array, feed_mm_s: float, *, reading_phase: float = 1.0
 ) -> Array:
-    """Axis position during a positioning test: dwell at a target position, take the reading, move on at the feed, dwell.
-
-    Parameters
-    ----------
-    time_s : ndarray, s
-        Times at which the position is wanted, any shape.
-    reading_s : (readings,) ndarray, s
-        Times of the readings, rising.
-    target_mm : (readings,) ndarray, mm
-        Target positions.
-    feed_mm_s : float, mm/s
-        Feed between targets; where it is too slow, the table arrives at the time of the next reading.
-    reading_phase : float
-        Phase of the dwell at which the reading is taken: 0 on arrival, 1 just before the move, as a controller with a dwell time does.
-
-    Returns
-    -------
-    ndarray, mm
-        Of the shape of `time_s`; NaN before the first and after the last reading, where the motion of the machine is unknown.
-    """
+    """Axis position during a positioning test: dwell at a target position, take the reading, move on at the feed, dwell."""
     interval = np.diff(reading_s)
     dwell = np.maximum(interval - np.abs(np.diff(target_mm)) / feed_mm_s, 0.0)
     leave = reading_s[:-1] + (1 - reading_phase) * dwell
@@ -220,18 +162,10 @@ def _check_travel(table: Array, table_u: Array, target: Array) -> None:
 
 @dataclass(frozen=True)
 class _Motion:
-    """Observed against commanded motion.
+    """Observed against commanded motion; a feed of None, mm/s, is fitted.
 
     The parameters of the model, (4,), are the offset (s), the zero of the observed position (mm), the feed (mm/s) and the clock
     rate (s/s).
-
-    Attributes
-    ----------
-    frame_s, table_mm : (frames,) ndarray, s and mm
-    reading_s, target_mm : (readings,) ndarray, s and mm
-    feed_mm_s : float or None, mm/s
-        None: fitted.
-    reading_phase : float
     """
 
     frame_s: Array
@@ -270,8 +204,7 @@ class _Motion:
         commanded = commanded_position(
             machine_s, self.reading_s, self.target_mm, feed, reading_phase=self.reading_phase
         )
-        residual: Array = self.table_mm - zero - commanded
-        return residual
+        return self.table_mm - zero - commanded
 
     def misfit(self, parameters: Array) -> float:
         """Mean squared residual, mm2, residuals limited to `_FAR_MM`."""
@@ -322,7 +255,7 @@ def _search(motion: _Motion, expected_s: float, search_s: float) -> tuple[float,
     best = int(np.argmin(misfits))
     if misfits[best] > 0.9 * _FAR_MM:
         raise ClockError(
-            f"frames and readings do not meet within {search_s:g} s of an offset of {expected_s:g} s; check the time zones (all times "
+            f"frames and readings do not overlap within {search_s:g} s of an offset of {expected_s:g} s; check the time zones (all times "
             "are UTC), or give clock_offset"
         )
     apart = np.abs(offsets - offsets[best]) > _ONE_MINIMUM_S
@@ -354,7 +287,12 @@ def _search_misfit(motion: _Motion, offset: float, feed_mm_s: float) -> float:
 
 def _fit(motion: _Motion, offset: float) -> tuple[Array, Array]:
     """Parameters fitted near an offset, and their standard uncertainties, (4,) each."""
-    solutions = _indistinguishable_fits(motion, offset)
+    # Fits near an offset whose misfits differ by less than three standard deviations, (fits, 4), best first.
+    fits = np.array([motion.fit(start) for start in _starts(motion, offset)])
+    misfits = np.array([motion.misfit(parameters) for parameters in fits])
+    order = np.argsort(misfits)
+    alike = misfits[order] <= misfits[order[0]] * (1 + 9 / len(motion.table_mm))
+    solutions = fits[order[alike]]
     best = solutions[0]
     frames = len(motion.table_mm)
     groups = np.array_split(np.arange(frames), min(_GROUPS, frames // 5))
@@ -368,20 +306,8 @@ def _fit(motion: _Motion, offset: float) -> tuple[Array, Array]:
     return best, u
 
 
-def _indistinguishable_fits(motion: _Motion, offset: float) -> Array:
-    """Fits near an offset whose misfits differ by less than three standard deviations, (fits, 4), best first."""
-    fits = np.array([motion.fit(start) for start in _starts(motion, offset)])
-    misfits = np.array([motion.misfit(parameters) for parameters in fits])
-    order = np.argsort(misfits)
-    alike = misfits[order] <= misfits[order[0]] * (1 + 9 / len(motion.table_mm))
-    return fits[order[alike]]
-
-
 def _starts(motion: _Motion, offset: float) -> list[Array]:
-    """Parameters to start from: the best of a grid of offsets and feeds, and the outermost ones that fit about equally well.
-
-    Frames at a few phases of the motion only (every 10 s of a motion of 6 s) determine a combination of feed and offset.
-    """
+    """Parameters to start from: the best of a grid of offsets and feeds, and the outermost ones that fit about equally well."""
     steps = np.arange(-4.0, 4.25, 0.5)
     grid = np.array([(offset + step, 0.0, feed, 0.0) for feed in motion.feeds for step in steps])
     misfits = motion.centre(grid)
@@ -403,17 +329,12 @@ def _formal_u(motion: _Motion, best: Array) -> Array:
 
 
 def _profile_u(motion: _Motion, best: Array, step_s: float) -> float:
-    """Standard uncertainty of the offset from its profile likelihood, all other parameters fitted at every offset, s.
-
-    Frames that always meet the motion at the same phases determine a combination of feed and offset only, or observe the table at
-    rest only: then a whole range of offsets fits equally well, which neither the curvature at the best one nor the jackknife shows.
-    Offsets are weighted by ``exp(-chi2 / 2)``; they lie about `step_s` apart near the best one and farther apart away from it.
-    """
+    """Standard uncertainty of the offset from its profile likelihood, all other parameters fitted at every offset, s."""
     growth = np.linspace(0.0, 1.0, _PROFILE_STEPS)
     away = step_s * (_PROFILE_S / step_s) ** growth
     offsets = best[0] + np.concatenate([-away[::-1], [0.0], away])
     misfits = np.array([_profile_misfit(motion, offset, best) for offset in offsets])
-    least = misfits.min()
+    least = max(misfits.min(), _LEAST_MISFIT_MM2)
     likelihood = np.exp(-0.5 * len(motion.table_mm) * (misfits - least) / least)
     variance = np.trapezoid(likelihood * (offsets - best[0]) ** 2, offsets) / np.trapezoid(likelihood, offsets)
     return float(np.sqrt(variance))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography._constants import MAD_TO_SIGMA
-from thermography._robust import scatter_by_median
-from thermography._typing import Array
+from thermography.common import MAD_TO_SIGMA, Array, ThermographyError, scatter_by_median
 from thermography.registration.plan import Fiducial, PlanGrid
 
 #: Widths of the structuring element, px; each width detects discs with diameters of 0.2 to 0.8 of it.
@@ -21,44 +20,24 @@ _ELLIPSE_TOLERANCE = 0.12
 _LEAST_CONTRAST = 2.0
 #: Spots with a larger ratio of axes are not accepted as discs.
 _LARGEST_ASPECT = 4.0
+#: Standard uncertainty of the centroid of a detected spot, before the disc is located, px.
+SPOT_U_PX = 0.2
 #: Smallest area of a spot, px.
 _LEAST_AREA_PX = 12
 
 
 @dataclass(frozen=True)
-class Spot:
-    """An elliptic spot in a frame.
-
-    Attributes
-    ----------
-    column_px, row_px : float, px
-        Centroid.
-    area_px : float
-        Number of pixels.
-    contrast_K : float, K
-        Apparent temperature against the surroundings; negative where the spot looks colder.
-    """
-
-    column_px: float
-    row_px: float
-    area_px: float
-    contrast_K: float
-
-
-@dataclass(frozen=True)
 class LocatedDisc:
-    """A disc fiducial located in a frame.
+    """An elliptic spot detected in a frame, or a disc fiducial located there.
 
     Attributes
     ----------
     column_px, row_px : float, px
-        Centroid of the disc's image.
+        Centroid of the image.
     u_px : float, px
-        Standard uncertainty of either coordinate from pixel noise.
-    area_px : float
-        Area of the image in pixels; NaN where it was not measured.
-    contrast_K : float, K
-        Apparent temperature against the table around the disc; NaN where it was not measured.
+        Standard uncertainty of either coordinate: of a disc from pixel noise, of a spot `SPOT_U_PX`.
+    area_px, contrast_K : float, px and K
+        Number of pixels, and apparent temperature against the surroundings, negative where colder; NaN where not measured.
     """
 
     column_px: float
@@ -68,28 +47,10 @@ class LocatedDisc:
     contrast_K: float
 
 
-def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[Spot]:
-    """Detect elliptic spots of unknown position and size that are colder or warmer than their surroundings.
-
-    Parameters
-    ----------
-    temperature : (row, column) ndarray, degC
-        One frame, or the mean of several where the contrast is low.
-    limit : int
-        Largest number of spots to return.
-
-    Returns
-    -------
-    list of Spot
-        Strongest contrast first.
-
-    Notes
-    -----
-    Black and white top-hat transforms (J. Serra, Image Analysis and Mathematical Morphology, 1982) at four widths lift spots from
-    their background; connected components above half their peak are compared with the ellipse of their second moments.
-    """
+def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[LocatedDisc]:
+    """Detect elliptic spots of unknown position and size that are colder or warmer than their surroundings."""
     smooth = cv2.GaussianBlur(np.nan_to_num(temperature).astype(np.float32), (0, 0), 0.8)
-    found: list[tuple[bool, Spot]] = []
+    found: list[tuple[bool, LocatedDisc]] = []
     for width in _KERNEL_WIDTHS_PX:
         kernel = np.ones((width, width), np.uint8)
         black_hat = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel) - smooth
@@ -98,7 +59,7 @@ def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[
             found.extend(_spots_in(top_hat, sign, width))
     # Of one spot at several widths that with the strongest contrast is kept, and one that is cut only where no other is whole.
     found.sort(key=lambda item: (item[0], -abs(item[1].contrast_K)))
-    distinct: list[Spot] = []
+    distinct: list[LocatedDisc] = []
     for _, spot in found:
         reach = 0.6 * np.sqrt(spot.area_px / np.pi)
         if all(np.hypot(spot.column_px - s.column_px, spot.row_px - s.row_px) > reach for s in distinct):
@@ -106,7 +67,7 @@ def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[
     return sorted(distinct, key=lambda spot: -abs(spot.contrast_K))[:limit]
 
 
-def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[tuple[bool, Spot]]:
+def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[tuple[bool, LocatedDisc]]:
     """Elliptic spots of a top-hat transform with a structuring element of `width` px, and whether the noise cuts them above half height."""
     noise = scatter_by_median(top_hat)
     least = float(np.median(top_hat)) + 6 * max(noise, 1e-3)
@@ -124,12 +85,12 @@ def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[tup
         peak = float(np.percentile(values[values > 0], 80))
         spot = _ellipse(values > peak / 2, sign * peak)
         if spot is not None:
-            placed = Spot(spot.column_px + left, spot.row_px + top, spot.area_px, spot.contrast_K)
+            placed = replace(spot, column_px=spot.column_px + left, row_px=spot.row_px + top)
             spots.append((least > peak / 2, placed))
     return spots
 
 
-def _ellipse(mask: NDArray[np.bool_], contrast_K: float) -> Spot | None:
+def _ellipse(mask: NDArray[np.bool_], contrast_K: float) -> LocatedDisc | None:
     """The mask as a spot, if its area is that of the ellipse with the same second moments."""
     rows, columns = np.nonzero(mask)
     area = len(rows)
@@ -140,7 +101,7 @@ def _ellipse(mask: NDArray[np.bool_], contrast_K: float) -> Spot | None:
     expected = 4 * np.pi * np.sqrt(axes[0] * axes[1])
     if abs(expected / area - 1) > _ELLIPSE_TOLERANCE or np.sqrt(axes[1] / axes[0]) > _LARGEST_ASPECT:
         return None
-    return Spot(float(columns.mean()), float(rows.mean()), float(area), contrast_K)
+    return LocatedDisc(float(columns.mean()), float(rows.mean()), SPOT_U_PX, float(area), contrast_K)
 
 
 def locate_disc(
@@ -152,31 +113,7 @@ def locate_disc(
     *,
     reach_px: float = 3.0,
 ) -> LocatedDisc | str:
-    """Locate a disc near its predicted position by the centroid of its coverage, from 0 (table) to 1 (disc) in every pixel.
-
-    Coverage is the temperature between two planes, one fitted to the table around the disc and one to the disc's inside, so that
-    neither a temperature gradient on the table nor the sign of the contrast moves the centroid.
-
-    Parameters
-    ----------
-    temperature : (row, column) ndarray, degC
-        One frame.
-    fiducial : Fiducial
-        The disc: its plan position and diameter.
-    grid : PlanGrid
-        The plan, whose edge bounds the table around the disc.
-    predicted_px : (2,) ndarray, px
-        Position (column, row) to start from.
-    jacobian : (2, 2) ndarray, px/mm
-        Derivative of the sensor position (column, row) by the plan position (x, y) there.
-    reach_px : float, px
-        Largest distance of the centroid from the start.
-
-    Returns
-    -------
-    LocatedDisc or str
-        The disc, or the reason why it was not located, as the predicate of a sentence.
-    """
+    """Locate a disc near its predicted position by the centroid of its coverage, from 0 (table) to 1 (disc) in every pixel."""
     radius_mm = fiducial.diameter_mm / 2
     to_mm = np.linalg.inv(jacobian)
     half = np.ceil(2.3 * radius_mm * np.linalg.norm(jacobian, axis=1)).astype(int) + 1
@@ -264,3 +201,78 @@ def _robust_plane(basis: Array, values: NDArray[np.floating], mask: NDArray[np.b
             break
         kept = keep
     return plane, noise
+
+
+# ArUco markers: they identify the table plan and hint where its discs are; the discs alone determine the
+# registration.
+
+#: 50 patterns of 4 x 4 squares, the coarsest dictionary of OpenCV: thermograms have few pixels.
+DICTIONARY = cv2.aruco.DICT_4X4_50
+#: Hints come from an affine map of the plan, which three markers determine. It neglects perspective and serves as a hint only.
+_LEAST_MARKERS = 3
+#: Widths of the surroundings against which the contrast is stretched, px: a third and two thirds of a marker of 30 px.
+_SURROUNDINGS_PX = (10.0, 20.0)
+#: Grey levels per standard deviation of the surroundings, of 256, and the blur before, px.
+_GREY_PER_DEVIATION, _BLUR_PX = 60.0, 0.7
+#: Contrast below this many standard deviations of the noise is not stretched any further.
+_LEAST_DEVIATION = 2.0
+
+
+class MarkerError(ThermographyError):
+    """The markers in the frame belong to another plan; the message names both and the remedy."""
+
+
+def detect_markers(temperature: Array) -> dict[int, Array]:
+    """Detect ArUco markers in a thermogram, dark on bright or bright on dark."""
+    parameters = cv2.aruco.DetectorParameters()
+    # Paint of low emissivity swaps dark and bright. A pattern with a wrong square is rejected rather than corrected to a similar marker.
+    parameters.detectInvertedMarker = True
+    parameters.errorCorrectionRate = 0.0
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
+    detected: dict[int, Array] = {}
+    for picture in _pictures(np.nan_to_num(temperature, nan=float(np.nanmean(temperature)))):
+        quadrilaterals, numbers, _ = detector.detectMarkers(picture)
+        if numbers is not None:
+            for number, corners in zip(numbers.ravel(), quadrilaterals, strict=True):
+                detected.setdefault(int(number), corners.reshape(4, 2).mean(axis=0))
+    return detected
+
+
+def _pictures(temperature: Array) -> Iterator[NDArray[np.uint8]]:
+    """The thermogram in 256 grey levels: stretched as a whole, then against its surroundings, where a tenth of a kelvin shows."""
+    low, high = np.percentile(temperature, (1, 99))
+    yield np.round(255 * np.clip((temperature - low) / max(high - low, 1e-6), 0, 1)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(temperature.astype(np.float32), (0, 0), _BLUR_PX)
+    # Neighbouring pixels differ by noise, but for the few at edges.
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(smooth, axis=1)))) / np.sqrt(2)
+    for width in _SURROUNDINGS_PX:
+        lifted = smooth - cv2.GaussianBlur(smooth, (0, 0), width)
+        deviation = np.sqrt(cv2.GaussianBlur(lifted**2, (0, 0), width))
+        grey = 128 + _GREY_PER_DEVIATION * lifted / np.maximum(deviation, max(_LEAST_DEVIATION * noise, 1e-6))
+        yield np.clip(grey, 0, 255).astype(np.uint8)
+
+
+def identify_plan(temperature: Array, fiducials: Sequence[Fiducial]) -> list[Fiducial]:
+    """Compare the markers in a frame with those of the plan, and derive hints for the discs from them."""
+    discs = [fiducial for fiducial in fiducials if fiducial.marker is None]
+    listed = {fiducial.marker: fiducial for fiducial in fiducials if fiducial.marker is not None}
+    if not listed:
+        return discs
+    detected = detect_markers(temperature)
+    common = sorted(listed.keys() & detected.keys())
+    if detected and not common:
+        raise MarkerError(
+            f"the frames show the markers {', '.join(map(str, sorted(detected)))}, "
+            f"the plan lists {', '.join(map(str, sorted(listed)))}: this is another table; name its fiducial file"
+        )
+    if len(common) < _LEAST_MARKERS:
+        return discs
+    plan = np.array([(listed[number].x_mm, listed[number].y_mm, 1.0) for number in common])
+    affine, _, rank, _ = np.linalg.lstsq(plan, np.array([detected[number] for number in common]))
+    if rank < 3:
+        return discs
+    hints = np.array([(disc.x_mm, disc.y_mm, 1.0) for disc in discs]) @ affine
+    return [
+        replace(disc, column_px=float(column), row_px=float(row)) if disc.hint_px is None else disc
+        for disc, (column, row) in zip(discs, hints, strict=True)
+    ]

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from thermography._typing import Array
+from thermography.common import Array
 from thermography.registration.discs import LocatedDisc
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import Projection, parameter_jacobian
@@ -69,17 +69,7 @@ _BORDER_PX = 12
 
 @dataclass(frozen=True)
 class RegistrationSpan:
-    """A registration and the frames for which it holds: from one frame to the first frame of the next span.
-
-    Attributes
-    ----------
-    first_frame : int
-        Index of the first frame.
-    registration : Registration
-        Of the still table in these frames.
-    displacement_px : (column, row, growth, turn), px
-        Displacement that made the registration necessary; zeros for the first one.
-    """
+    """A registration, the first frame for which it holds, and the displacement (column, row, growth, turn), px, that made it necessary."""
 
     first_frame: int
     registration: Registration
@@ -111,39 +101,13 @@ class FiducialMonitor:
     arms: Array
 
     def displacements(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
-        """Displacement of the fiducials in every frame: the shift by medians over the discs, growth and turn by their mean.
-
-        Parameters
-        ----------
-        counts : (time, row, column) ndarray of uint16
-            Raw counts of the window for which the monitor was prepared.
-        noise_counts : float
-            Standard deviation of the noise of a pixel, counts.
-
-        Returns
-        -------
-        (time, 4) ndarray, px
-            (column, row, growth, turn); NaN where fewer than three discs show.
-        """
+        """Displacement of the fiducials in every frame: the shift by medians over the discs, growth and turn by their mean."""
         least = _LEAST_SIGNIFICANCE * noise_counts * self.noise_gain
         return _displacements(_disc_sums(counts, self.places, self.weights), least, self.arms)
 
 
 def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> FiducialMonitor:
-    """Prepare the monitor for the fiducials of a registration that lie within a window of the sensor.
-
-    Parameters
-    ----------
-    registration : Registration
-    grid : PlanGrid
-        The plan, whose edge bounds the table around the discs.
-    window : (slice, slice)
-        Rows and columns of the sensor, px.
-
-    Returns
-    -------
-    FiducialMonitor
-    """
+    """Prepare the monitor for the fiducials of a registration that lie within a window of the sensor."""
     places, weights, gains, arms, start = [], [np.empty((3, 0), np.float32)], [], [], 0
     middle, radius = (np.zeros(2), 1.0) if registration.is_picture else _middle(registration)
     origin = np.array([window[1].start, window[0].start])
@@ -265,59 +229,14 @@ def _fit_displacement(places: Array, moved: Array, registration: Registration) -
     return np.array([shift.real, shift.imag, stretch.real, stretch.imag])
 
 
-def _displaced(places: Array, displacement_px: Array, registration: Registration) -> Array:
-    """Places (n, 2) px after a displacement."""
-    middle, radius = _middle(registration)
-    column, row, growth, turn = displacement_px
-    arms = (places - middle) / radius
-    moved: Array = places + (column, row) + arms @ np.array([[growth, turn], [-turn, growth]])
-    return moved
-
-
 def zoom_and_turn(displacement_px: Sequence[float] | Array, registration: Registration) -> tuple[float, float]:
-    """Change of scale and rotation of a displacement.
-
-    Parameters
-    ----------
-    displacement_px : (4,) ndarray or sequence, px
-        (column, row, growth, turn) against `registration`.
-    registration : Registration
-        Before the displacement.
-
-    Returns
-    -------
-    zoom : float
-        Scale over that before; 1 for no change.
-    turn_deg : float, deg
-        Rotation from the columns' axis to the rows' axis (clockwise in the image).
-    """
+    """Change of scale and rotation of a displacement."""
     stretch = 1 + complex(*displacement_px[2:]) / _middle(registration)[1]
     return float(abs(stretch)), float(np.angle(stretch, deg=True))
 
 
 def fiducial_displacement(temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Displacement of the fiducials of one frame, each located near its registered place.
-
-    Parameters
-    ----------
-    temperature : (row, column) ndarray, degC
-        One frame.
-    registration : Registration
-        Against which the displacement is measured.
-    grid : PlanGrid
-        The plan.
-
-    Returns
-    -------
-    (4,) ndarray, px
-        (column, row, growth, turn); NaN where fewer than half of the registered fiducials (or three) are located within 12 px and
-        agree, or where they are so faint that the displacement is uncertain by more than 0.1 px.
-
-    Notes
-    -----
-    Least median of squares (P. J. Rousseeuw, J. Am. Stat. Assoc. 79 (1984) 871-880) finds the fiducials that agree, so that some that
-    are covered, or taken for other spots, have no influence.
-    """
+    """Displacement of the fiducials of one frame, each located near its registered place."""
     listed = list(registration.fiducials.values())
     located, _ = locate_fiducials(temperature, listed, registration.projection, grid=grid, reach_px=_REACH_PX)
     before = registration.located
@@ -340,27 +259,7 @@ def _displacement_u(located: Iterable[LocatedDisc]) -> float:
 
 
 def search_displacement(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Displacement of the table by any distance: the plan is registered anew, near where the image as a whole has moved to.
-
-    Parameters
-    ----------
-    reference, temperature : (row, column) ndarray, degC
-        A frame for which the registration holds, and the frame whose displacement is wanted.
-    registration : Registration
-        Of the reference.
-    grid : PlanGrid
-        The plan.
-
-    Returns
-    -------
-    (4,) ndarray, px
-        (column, row, growth, turn); NaN where the plan is not located, or fewer than half of its fiducials, or not as this plan.
-
-    Notes
-    -----
-    The start is the maximum of the masked normalised cross-correlation (D. Padfield, IEEE Trans. Image Process. 21 (2012) 2706-2718)
-    of the band-passed images.
-    """
+    """Displacement of the table by any distance: the plan is registered anew, near where the image as a whole has moved to."""
     start = np.array([*_coarse_shift(reference, temperature), 0.0, 0.0])
     try:
         found = register(temperature, _moved_hints(registration, start), grid=grid)
@@ -398,27 +297,7 @@ def _band_pass(frame: Array) -> NDArray[np.float32]:
 
 
 def image_displacement(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Displacement of the image of the table between two frames, as a shift.
-
-    Parameters
-    ----------
-    reference, temperature : (row, column) ndarray, degC
-        The registered frame, and the frame whose displacement is wanted.
-    registration : Registration
-        Of the reference. Its discs are masked, because the reflections on them may change.
-    grid : PlanGrid
-        The plan.
-
-    Returns
-    -------
-    (4,) ndarray, px
-        (column, row, 0, 0); NaN where the images correlate by less than 0.8, or where both show less than half of the table.
-
-    Notes
-    -----
-    Maximum of the enhanced correlation coefficient (G. D. Evangelidis, E. Z. Psarakis, IEEE Trans. PAMI 30 (2008) 1858-1865) of the
-    masked images. Phase correlation fails on smooth thermal fields: it returns no shift whatever the shift is.
-    """
+    """Displacement of the image of the table between two frames, as a shift."""
     mask = _table_mask(registration, grid)
     images = [_band_pass(frame) for frame in (temperature, reference)]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
@@ -466,30 +345,7 @@ def _table_mask(registration: Registration, grid: PlanGrid) -> NDArray[np.uint8]
 def register_after_knock(
     temperature: Array, old: Registration, displacement_px: Array, grid: PlanGrid, *, frame_name: str
 ) -> Registration:
-    """Register the table again after a knock; the old positions, displaced, are the hints.
-
-    Parameters
-    ----------
-    temperature : (row, column) ndarray, degC
-        First frame after the knock, or the mean of several.
-    old : Registration
-        Before the knock.
-    displacement_px : (4,) ndarray, px
-        Displacement (column, row, growth, turn) against `old`.
-    grid : PlanGrid
-        The plan.
-    frame_name : str
-        Names the frame in messages.
-
-    Returns
-    -------
-    Registration
-
-    Raises
-    ------
-    RegistrationError
-        The plan is not located any more.
-    """
+    """Register the table again after a knock; the old positions, displaced, are the hints."""
     try:
         return register(temperature, _moved_hints(old, displacement_px), grid=grid, lens=old.lens)
     except RegistrationError as error:
@@ -503,24 +359,16 @@ def register_after_knock(
 def _moved_hints(old: Registration, displacement_px: Array) -> list[Fiducial]:
     """The fiducials on the table, with their displaced places as pixel hints."""
     places = old.to_sensor(np.array([(disc.x_mm, disc.y_mm) for disc in old.masked]))
-    moved = _displaced(places, displacement_px, old)
+    # Places (n, 2) px after a displacement.
+    middle, radius = _middle(old)
+    column, row, growth, turn = displacement_px
+    arms = (places - middle) / radius
+    moved: Array = places + (column, row) + arms @ np.array([[growth, turn], [-turn, growth]])
     return [replace(disc, column_px=float(c), row_px=float(r)) for disc, (c, r) in zip(old.masked, moved, strict=True)]
 
 
 def shift_registration(registration: Registration, shift_px: Array) -> Registration:
-    """Shift a registration on the sensor.
-
-    Parameters
-    ----------
-    registration : Registration
-    shift_px : (2,) ndarray, px
-        Shift (column, row) of the image of the table.
-
-    Returns
-    -------
-    Registration
-        Its covariance contains the standard uncertainty of the shift, 0.1 px in either coordinate.
-    """
+    """Shift a registration on the sensor."""
     shift = (float(shift_px[0]), float(shift_px[1]))
     move = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     old = registration.projection
@@ -530,21 +378,17 @@ def shift_registration(registration: Registration, shift_px: Array) -> Registrat
         name: replace(disc, column_px=disc.column_px + shift[0], row_px=disc.row_px + shift[1])
         for name, disc in registration.located.items()
     }
+    # Covariance of the fitted parameters that moves all fiducials together by `_IMAGE_SHIFT_U_PX`, independently in both coordinates.
+    centres = np.array([(disc.x_mm, disc.y_mm) for disc in registration.fiducials.values()])
+    by_parameter = parameter_jacobian(registration.projection, centres, len(registration.covariance) - 8)(centres)
+    both = np.tile(_IMAGE_SHIFT_U_PX * np.eye(2), (len(centres), 1))
+    parameters, *_ = np.linalg.lstsq(by_parameter.reshape(2 * len(centres), -1), both, rcond=None)
+    covariance: Array = parameters @ parameters.T
     return replace(
         registration,
         projection=projection,
         homography=np.linalg.inv(projection.plan_to_sensor),
         located=located,
         model=f"{registration.model}, shifted by the image of the table",
-        covariance=registration.covariance + _shift_covariance(registration),
+        covariance=registration.covariance + covariance,
     )
-
-
-def _shift_covariance(registration: Registration) -> Array:
-    """Covariance of the fitted parameters that moves all fiducials together by `_IMAGE_SHIFT_U_PX`, independently in both coordinates."""
-    centres = np.array([(disc.x_mm, disc.y_mm) for disc in registration.fiducials.values()])
-    by_parameter = parameter_jacobian(registration.projection, centres, len(registration.covariance) - 8)(centres)
-    both = np.tile(_IMAGE_SHIFT_U_PX * np.eye(2), (len(centres), 1))
-    parameters, *_ = np.linalg.lstsq(by_parameter.reshape(2 * len(centres), -1), both, rcond=None)
-    covariance: Array = parameters @ parameters.T
-    return covariance

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from skimage.measure import points_in_poly
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
+from thermography.common import Array, ThermographyError
 
 _REQUIRED_COLUMNS = ("name", "x_mm", "y_mm", "diameter_mm")
 _HINT_COLUMNS = ("column_px", "row_px")
 _MARKER_COLUMN = "marker"
-#: Markers in the dictionary `thermography.registration.markers.DICTIONARY`.
+#: Markers in the dictionary `thermography.registration.discs.DICTIONARY`.
 _MARKER_COUNT = 50
 
 
@@ -198,12 +198,8 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     Fiducial(name='F2', x_mm=660.0, y_mm=20.0, diameter_mm=16.0, column_px=None, row_px=None, marker=None)
     """
     path = Path(path)
-    try:
-        fiducials = _read_rows(path)
-    except UnicodeDecodeError as error:
-        raise FiducialError(f"{path}: byte {error.start} is not UTF-8; save the file as CSV in UTF-8") from None
-    except csv.Error as error:
-        raise FiducialError(f"{path}: is not CSV ({error}); save the file as CSV in UTF-8") from None
+    lines = read_lines(path, _REQUIRED_COLUMNS, FiducialError, optional=_HINT_COLUMNS)
+    fiducials = [_parse(path, line, row) for line, row in lines if any(row.values())]
     discs = sum(fiducial.marker is None for fiducial in fiducials)
     points = sum(fiducial.is_point for fiducial in fiducials)
     if discs < 4:
@@ -216,38 +212,30 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     return fiducials
 
 
-def _read_rows(path: Path) -> list[Fiducial]:
-    """Return the fiducials of every line that is not empty."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file)
-        header = [column.strip() for column in reader.fieldnames or []]
-        missing = [column for column in _REQUIRED_COLUMNS if column not in header]
-        if missing:
-            raise FiducialError(
-                f"{path}:1: no column {', '.join(missing)}; "
-                f"the first line must read {','.join(_REQUIRED_COLUMNS + _HINT_COLUMNS)} (the last two may be left out)"
-            )
-        reader.fieldnames = header
-        return [_parse(path, reader.line_num, row) for row in reader if any(row.values())]
+def read_lines(
+    path: Path, columns: Sequence[str], error: type[Exception], *, optional: Sequence[str] = ()
+) -> list[tuple[int, dict[str, str]]]:
+    """Return the lines of a CSV file of named places, each with its number; raise `error` where it is no such file."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            header = [column.strip() for column in reader.fieldnames or []]
+            missing = [column for column in columns if column not in header]
+            if missing:
+                left_out = " (the last two may be left out)" if optional else ""
+                raise error(
+                    f"{path}:1: no column {', '.join(missing)}; the first line must read {','.join((*columns, *optional))}{left_out}"
+                )
+            reader.fieldnames = header
+            return [(reader.line_num, row) for row in reader]
+    except UnicodeDecodeError as fault:
+        raise error(f"{path}: byte {fault.start} is not UTF-8; save the file as CSV in UTF-8") from None
+    except csv.Error as fault:
+        raise error(f"{path}: is not CSV ({fault}); save the file as CSV in UTF-8") from None
 
 
 def mask_discs(points_mm: Array, fiducials: Sequence[Fiducial], *, margin_mm: Array | float) -> NDArray[np.bool_]:
-    """Tell which plan points lie on a fiducial or near its rim, where a pixel does not show the table's temperature.
-
-    Parameters
-    ----------
-    points_mm : (..., 2) ndarray, mm
-        Plan points (x, y).
-    fiducials : sequence of Fiducial
-        Discs and markers.
-    margin_mm : float or (...) ndarray, mm
-        Distance from the rim up to which a point is masked.
-
-    Returns
-    -------
-    (...) ndarray of bool
-        True where masked.
-    """
+    """Tell which plan points lie on a fiducial or near its rim, where a pixel does not show the table's temperature."""
     masked = np.zeros(points_mm.shape[:-1], bool)
     across, down = np.ascontiguousarray(np.moveaxis(points_mm, -1, 0))
     for disc in fiducials:
@@ -304,3 +292,65 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
             f"{path}:{line}: {column} = {text!r} is not a number; write it with a decimal point and no unit"
         )
     return value
+
+
+# Polygons on the table plan: which points lie inside, and how much of every plan cell.
+
+#: Points per cell and side by which a polygon's share of a cell is counted.
+_POINTS_PER_SIDE = 10
+
+
+class PolygonError(ThermographyError):
+    """A polygon encloses nothing or does not lie on the seen plan; the message names it and its place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon:
+    """A named simple polygon on the table plan.
+
+    Attributes
+    ----------
+    corners_mm : (n, 2) ndarray, mm
+        Corners (x, y) in order, at least three, either sense; the last one is joined to the first.
+
+    Examples
+    --------
+    >>> triangle = Polygon("triangle", [(0, 0), (100, 0), (0, 50)])
+    >>> triangle.contains([(20, 20), (90, 40)])
+    array([ True, False])
+    """
+
+    name: str
+    corners_mm: Array
+
+    def __post_init__(self) -> None:
+        corners = np.asarray(self.corners_mm, float)
+        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+            raise PolygonError(
+                f"{self.name}: corners have shape {corners.shape}; a polygon needs at least three (x, y) in mm"
+            )
+        object.__setattr__(self, "corners_mm", corners)
+
+    def contains(self, points_mm: ArrayLike) -> NDArray[np.bool_]:
+        """Tell which plan points lie inside."""
+        points = np.asarray(points_mm, float)
+        inside: NDArray[np.bool_] = points_in_poly(points.reshape(-1, 2), self.corners_mm)
+        return inside.reshape(points.shape[:-1])
+
+    def cell_shares(self, x_mm: Array, y_mm: Array) -> Array:
+        """Share of the area of every cell that lies inside, counted by 10 x 10 points per cell."""
+        cell_mm = float(x_mm[1] - x_mm[0])
+        low, high = self.corners_mm.min(axis=0), self.corners_mm.max(axis=0)
+        columns = np.flatnonzero((x_mm + cell_mm / 2 > low[0]) & (x_mm - cell_mm / 2 < high[0]))
+        rows = np.flatnonzero((y_mm + cell_mm / 2 > low[1]) & (y_mm - cell_mm / 2 < high[1]))
+        shares = np.zeros((len(y_mm), len(x_mm)))
+        if rows.size and columns.size:
+            steps = ((np.arange(_POINTS_PER_SIDE) + 0.5) / _POINTS_PER_SIDE - 0.5) * cell_mm
+            x, y = np.meshgrid((x_mm[columns, None] + steps).ravel(), (y_mm[rows, None] + steps).ravel())
+            inside = self.contains(np.stack([x, y], axis=-1))
+            per_cell = inside.reshape(len(rows), _POINTS_PER_SIDE, len(columns), _POINTS_PER_SIDE)
+            shares[np.ix_(rows, columns)] = per_cell.mean(axis=(1, 3))
+        if not shares.any():
+            extent = f"x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} mm"
+            raise PolygonError(f"{self.name}: ({extent}) holds no part of the plan; give its corners in plan mm")
+        return shares

@@ -10,18 +10,153 @@ Photogrammetric Engineering 37 (1971) 855-866, in OpenCV's convention)::
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numba
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from thermography._typing import Array
-from thermography.errors import ThermographyError
+from thermography.common import Array, ThermographyError
+
+# Intrinsic parameters of a lens from a calibration, and the file in which OpenCV writes them.
+
+#: Names that a file may give to the camera matrix and to the coefficients: those of OpenCV's calibration samples, and short ones.
+_MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "K")
+_COEFFICIENT_NAMES = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D")
+#: Largest relative difference of the focal lengths along columns and rows: the pixels of a sensor are square.
+_SQUARE = 0.01
+#: A calibration is a page of text, with the views that it was made from a hundred.
+_MOST_BYTES = 200_000
+
+
+class LensError(ThermographyError):
+    """A lens file does not hold a calibration that can be used; the message names file, entry and remedy."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsic parameters from a lens calibration, in OpenCV's convention.
+
+    Attributes
+    ----------
+    focal_length_px : float, px
+        Unit of the normalised image coordinates.
+    principal_point_px : (column, row), px
+        Centre of the distortion.
+    distortion : (k1, k2, p1, p2)
+        Of the normalised image coordinates.
+    size_px : (int, int) or None
+        (columns, rows) of the frames that the calibration was made with; None where it is not stated.
+    """
+
+    focal_length_px: float
+    principal_point_px: tuple[float, float]
+    distortion: tuple[float, float, float, float]
+    size_px: tuple[int, int] | None = None
+
+
+def read_lens(path: str | Path) -> Lens:
+    """Read a lens calibration as OpenCV writes it."""
+    path = Path(path)
+    entries = _read_entries(path)
+    matrix = _entry(entries, path, _MATRIX_NAMES, 9).reshape(3, 3)
+    coefficients = _entry(entries, path, _COEFFICIENT_NAMES, None)
+    size = None
+    if {"image_width", "image_height"} <= entries.keys():
+        width, height = (_entry(entries, path, (name,), 1)[0] for name in ("image_width", "image_height"))
+        if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
+            raise LensError(
+                f"{path}: image_width {width:g} and image_height {height:g} px are not the size of a frame; correct them"
+            )
+        size = (int(width), int(height))
+    along, across = float(matrix[0, 0]), float(matrix[1, 1])
+    if not (np.isfinite(matrix).all() and min(along, across) > 0 and abs(along / across - 1) < _SQUARE):
+        raise LensError(
+            f"{path}: camera_matrix has focal lengths {along:g} and {across:g} px; the pixels of a sensor are square: both are positive "
+            f"and agree to {_SQUARE:.0%} in a calibration that succeeded"
+        )
+    if len(coefficients) < 4 or not np.isfinite(coefficients).all() or coefficients[4:].any():
+        raise LensError(
+            f"{path}: distortion_coefficients = {coefficients.tolist()}; give k1, k2, p1, p2, and calibrate without more "
+            "(flag CALIB_FIX_K3)"
+        )
+    k1, k2, p1, p2 = coefficients[:4].tolist()
+    return Lens(float(np.sqrt(along * across)), (float(matrix[0, 2]), float(matrix[1, 2])), (k1, k2, p1, p2), size)
+
+
+class _MatrixLoader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):  # type: ignore[misc]
+    """Builds plain values only; a matrix of OpenCV is a mapping."""
+
+
+_MatrixLoader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+
+
+def _read_entries(path: Path) -> dict[str, Any]:
+    """Names and values of a file. OpenCV's own parser ends the process on some damaged files."""
+    content = path.read_bytes() if path.stat().st_size <= _MOST_BYTES else b""
+    if not content or b"\0" in content or b"<!DOCTYPE" in content:
+        raise LensError(
+            f"{path}: not a calibration: plain text of at most {_MOST_BYTES} bytes is expected; write it as OpenCV's YAML, XML or JSON"
+        )
+    try:
+        text = content.decode().lstrip()
+        if text.startswith("<"):
+            entries = {child.tag: _plain(child) for child in ElementTree.fromstring(text)}
+        elif text.startswith("{"):
+            entries = json.loads(text)
+        else:
+            # OpenCV writes the version of YAML as no other does.
+            entries = yaml.load(text.removeprefix("%YAML:1.0"), _MatrixLoader)
+    except (ValueError, TypeError, RecursionError, yaml.YAMLError, ElementTree.ParseError) as error:
+        raise LensError(
+            f"{path}: cannot be parsed ({error}); write the calibration as OpenCV's YAML, XML or JSON"
+        ) from None
+    if not isinstance(entries, dict):
+        raise LensError(f"{path}: holds no named entries; write the calibration as OpenCV's YAML, XML or JSON")
+    return entries
+
+
+def _plain(element: ElementTree.Element) -> Any:
+    """Value of an XML element: a mapping of its children, or the words of its text."""
+    if len(element):
+        return {child.tag: _plain(child) for child in element}
+    return (element.text or "").split()
+
+
+def _entry(entries: dict[str, Any], path: Path, names: tuple[str, ...], count: int | None) -> Array:
+    """The first entry of these names that the file holds, as numbers (n,)."""
+    name = next((name for name in names if name in entries), None)
+    if name is None:
+        raise LensError(f"{path}: no entry {names[0]}; write the calibration as OpenCV's samples do")
+    try:
+        values = _numbers(entries[name])
+    except (TypeError, ValueError) as error:
+        raise LensError(f"{path}: {name} is damaged ({error}); write the calibration again") from None
+    if count is not None and values.size != count:
+        raise LensError(f"{path}: {name} holds {values.size} numbers instead of {count}; write the calibration again")
+    return values
+
+
+def _numbers(value: Any) -> Array:
+    """All numbers (n,) of a value: a matrix of OpenCV, lists of lists, or one number."""
+    if not isinstance(value, dict):
+        return np.array(value, float).ravel()
+    rows, columns, numbers = (_numbers(value.get(key, [])) for key in ("rows", "cols", "data"))
+    if rows.size != 1 or columns.size != 1 or rows[0] * columns[0] != numbers.size:
+        raise ValueError(f"{numbers.size} numbers do not fill its rows and columns")
+    return numbers
+
 
 #: Lens models in ascending order: name, and number of the distortion coefficients (k1, k2, p1, p2) that are fitted.
 LENS_MODELS: tuple[tuple[str, int], ...] = (("homography", 0), ("homography+k1", 1), ("homography+k1,k2,p1,p2", 4))
@@ -42,19 +177,7 @@ _UNDISTORTION_STEPS, _UNDISTORTION_TOLERANCE = 40, 1e-11
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def project_point(x: float, y: float, lens: Array) -> tuple[float, float]:
-    """Project one plan point to the sensor; for compiled loops.
-
-    Parameters
-    ----------
-    x, y : float, mm
-        Plan point.
-    lens : (16,) ndarray
-        `Projection.as_array`.
-
-    Returns
-    -------
-    column, row : float, px
-    """
+    """Project one plan point to the sensor; for compiled loops."""
     w = lens[6] * x + lens[7] * y + lens[8]
     u = ((lens[0] * x + lens[1] * y + lens[2]) / w - lens[10]) / lens[9]
     v = ((lens[3] * x + lens[4] * y + lens[5]) / w - lens[11]) / lens[9]
@@ -97,21 +220,7 @@ def _undistort_point(column: float, row: float, lens: Array) -> tuple[float, flo
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def locate_point(column: float, row: float, lens: Array, sensor_to_plan: Array) -> tuple[float, float]:
-    """Locate one sensor point on the plan; for compiled loops.
-
-    Parameters
-    ----------
-    column, row : float, px
-        Sensor point.
-    lens : (16,) ndarray
-        `Projection.as_array`.
-    sensor_to_plan : (3, 3) ndarray
-        `Projection.sensor_to_plan`.
-
-    Returns
-    -------
-    x, y : float, mm
-    """
+    """Locate one sensor point on the plan; for compiled loops."""
     u, v = _undistort_point(column, row, lens)
     m = sensor_to_plan
     w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
@@ -200,19 +309,12 @@ class Projection:
         ]
         return np.stack(columns, axis=-1)
 
+    def px_per_mm(self, points_mm: Array) -> Array:
+        """Scale of the image at plan points, (...) px/mm: root of the ratio of areas."""
+        return np.sqrt(np.abs(np.linalg.det(self.jacobian(points_mm))))
+
     def disc_centroids(self, centres_mm: Array, radii_mm: Array) -> Array:
-        """Centroids of the images of discs, which perspective shifts from the images of their centres.
-
-        Parameters
-        ----------
-        centres_mm : (n, 2) ndarray, mm
-        radii_mm : (n,) ndarray, mm
-
-        Returns
-        -------
-        (n, 2) ndarray, px
-            Centroid (column, row) of the polygon through the images of 24 points on the rim.
-        """
+        """Centroids of the images of discs, which perspective shifts from the images of their centres."""
         rim_mm = centres_mm[:, None, :] + radii_mm[:, None, None] * np.stack([_RIM.real, _RIM.imag], axis=-1)
         rim = self.to_sensor(rim_mm)
         origin = rim[:, :1]
@@ -220,8 +322,7 @@ class Projection:
         cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
         moment, area = ((a + b) * cross[..., None]).sum(axis=1), 3 * cross.sum(axis=1)[:, None]
         # A disc of no diameter is a point, and has no perspective shift.
-        centroid: Array = origin[:, 0] + np.divide(moment, area, out=np.zeros_like(moment), where=area != 0)
-        return centroid
+        return origin[:, 0] + np.divide(moment, area, out=np.zeros_like(moment), where=area != 0)
 
 
 @dataclass(frozen=True)
@@ -243,15 +344,6 @@ class DiscObservations:
     radii_mm: Array
     u_px: Array
 
-    def without(self, index: int) -> DiscObservations:
-        """All observations but the one at `index`."""
-        return DiscObservations(
-            *(
-                np.delete(values, index, axis=0)
-                for values in (self.points_px, self.centres_mm, self.radii_mm, self.u_px)
-            )
-        )
-
     def select(self, chosen: NDArray[np.bool_]) -> DiscObservations:
         """The observations that are True in `chosen`, (n,)."""
         return DiscObservations(
@@ -260,70 +352,26 @@ class DiscObservations:
 
     def residuals_px(self, projection: Projection) -> Array:
         """Observed minus projected centroids, (n, 2) px."""
-        residuals: Array = self.points_px - projection.disc_centroids(self.centres_mm, self.radii_mm)
-        return residuals
+        return self.points_px - projection.disc_centroids(self.centres_mm, self.radii_mm)
 
     def residuals_mm(self, projection: Projection) -> Array:
         """Observed minus listed positions on the plan, (n, 2) mm; the perspective shift of a centroid is no residual."""
-        residuals: Array = np.linalg.solve(
-            projection.jacobian(self.centres_mm), self.residuals_px(projection)[..., None]
-        )[..., 0]
-        return residuals
+        return np.linalg.solve(projection.jacobian(self.centres_mm), self.residuals_px(projection)[..., None])[..., 0]
 
 
 def fit_homography(observations: DiscObservations, ideal: Projection) -> Projection:
-    """Fit a homography to four or more discs behind a given distortion: the start of `fit_projection`.
-
-    Parameters
-    ----------
-    observations : DiscObservations
-        Four or more discs, not on one line.
-    ideal : Projection
-        Gives distortion, focal length and principal point; its homography is ignored.
-
-    Returns
-    -------
-    Projection
-        `ideal` with the homography of least squares on the sensor, unweighted.
-
-    Raises
-    ------
-    ThermographyError
-        The discs lie on one line, so that no homography is determined.
-
-    Notes
-    -----
-    R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2nd ed. (2004), ch. 4, as implemented in OpenCV.
-    """
+    """Fit a homography to four or more discs behind a given distortion: the start of `fit_projection`."""
     undistorted_px = ideal.undistort(observations.points_px).astype(float)
     matrix, _ = cv2.findHomography(observations.centres_mm.astype(float), undistorted_px, 0)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
         raise ThermographyError(
-            "the fiducials lie on a line or on one spot; spread at least four over both sides of the plan"
+            "the fiducials are collinear or coincide; spread at least four over both sides of the plan"
         )
     return replace(ideal, plan_to_sensor=matrix)
 
 
 def fit_projection(observations: DiscObservations, start: Projection, coefficients: int) -> Projection:
-    """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt).
-
-    Parameters
-    ----------
-    observations : DiscObservations
-    start : Projection
-        Start of the iteration; its focal length, its principal point and its distortion beyond `coefficients` are kept.
-    coefficients : int
-        Number of distortion coefficients to fit: 0, 1 (k1) or 4 (k1, k2, p1, p2).
-
-    Returns
-    -------
-    Projection
-
-    Notes
-    -----
-    A fitted coefficient takes part as one more observation, zero with a standard uncertainty of `LENS_SPREAD` (Bayesian least squares;
-    JCGM 101:2008, 4.11.2): with many discs it decides nothing, with four or five it keeps the fit determined.
-    """
+    """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt)."""
     pack, unpack = _parameters(start, observations.centres_mm, coefficients)
     # The perspective shift of the centroids hardly changes during the fit and is held fixed.
     shift = start.disc_centroids(observations.centres_mm, observations.radii_mm) - start.to_sensor(
@@ -339,24 +387,7 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
 
 
 def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:
-    """Fit every lens model that the discs determine, and choose the simplest that no richer one clearly improves on.
-
-    A richer model is chosen if it lowers the leave-one-out error, weighted by the uncertainties of the discs, below 75 %. Six discs or
-    fewer cannot tell, and k1 is fitted against its spread among lenses.
-
-    Parameters
-    ----------
-    observations : DiscObservations
-    start : Projection
-        From `fit_homography`.
-
-    Returns
-    -------
-    projection : Projection
-        The fit of the chosen model.
-    coefficients : int
-        Its number of distortion coefficients, see `LENS_MODELS`.
-    """
+    """Fit every lens model that the discs determine, and choose the simplest that no richer one clearly improves on."""
     best, best_count, best_error = fit_projection(observations, fit_projection(observations, start, 0), 0), 0, np.inf
     if len(observations.u_px) < _LEAST_FOR_CHOICE:
         return fit_projection(observations, best, 1), 1
@@ -372,26 +403,7 @@ def select_lens_model(observations: DiscObservations, start: Projection) -> tupl
 
 
 def leave_one_out_mm(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
-    """Distance by which each disc is missed by the fit to all other discs.
-
-    Parameters
-    ----------
-    observations : DiscObservations
-    projection : Projection
-        The fit to all discs.
-    coefficients : int
-        Number of its fitted distortion coefficients.
-
-    Returns
-    -------
-    (n,) ndarray, mm
-        On the plan; NaN where the other discs would not determine the fit.
-
-    Notes
-    -----
-    The PRESS residual ``(I - H_ii)^-1 r_i`` from the leverage H_ii of each disc (D. M. Allen, Technometrics 16 (1974) 125-127). It
-    equals n repeated fits as long as the projection is linear over the residuals, which are hundredths of a pixel.
-    """
+    """Distance by which each disc is missed by the fit to all other discs."""
     count = len(observations.u_px)
     if 2 * (count - 1) < 8:
         return np.full(count, np.nan)
@@ -407,26 +419,7 @@ def prediction_errors_px(
     *,
     fitted: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, Array]:
-    """Error by which each disc is missed by a fit that it takes no part in, and the covariance of that error.
-
-    Parameters
-    ----------
-    observations : DiscObservations
-        Discs of the fit, and others.
-    projection : Projection
-        The fit.
-    coefficients : int
-        Number of its fitted distortion coefficients.
-    fitted : (n,) ndarray of bool or None
-        Which discs took part in the fit; None for all. Of these, the fit to the others is taken.
-
-    Returns
-    -------
-    errors_px : (n, 2) ndarray, px
-        Observed minus predicted centroid.
-    covariances : (n, 2, 2) ndarray
-        Of the errors divided by the uncertainty of their disc.
-    """
+    """Error by which each disc is missed by a fit that it takes no part in, and the covariance of that error."""
     fitted = np.ones(len(observations.u_px), bool) if fitted is None else fitted
     jacobian = _weighted_jacobian(observations, projection, coefficients)
     part = jacobian[fitted].reshape(2 * int(fitted.sum()), -1)
@@ -440,22 +433,7 @@ def prediction_errors_px(
 
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
-    """Derivative of the sensor position by the fitted parameters, as a function of the plan point.
-
-    Parameters
-    ----------
-    projection : Projection
-        Where to take the derivative.
-    centres_mm : (n, 2) ndarray, mm
-        The discs of the fit; their mean and extent normalise the homography.
-    coefficients : int
-        Number of fitted distortion coefficients.
-
-    Returns
-    -------
-    callable
-        From plan points (m, 2) mm to (m, 2, 8 + coefficients) px per unit of the parameters, by central differences.
-    """
+    """Derivative of the sensor position by the fitted parameters, as a function of the plan point."""
     pack, unpack = _parameters(projection, centres_mm, coefficients)
     parameters = pack(projection)
     steps = 1e-6 * np.maximum(np.abs(parameters), 1e-2)
@@ -471,23 +449,7 @@ def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: 
 
 
 def variance_factor(observations: DiscObservations, projection: Projection, coefficients: int) -> tuple[float, float]:
-    """Reduced chi-square of the residuals, and its degrees of freedom.
-
-    Parameters
-    ----------
-    observations : DiscObservations
-    projection : Projection
-        The fit.
-    coefficients : int
-        Number of its fitted distortion coefficients.
-
-    Returns
-    -------
-    factor : float
-        1 at least: residuals smaller than the centroids' uncertainty prove nothing about the list of places.
-    freedom : float
-        Two per disc, less the trace of the leverage; 0 where the discs only just determine the fit.
-    """
+    """Reduced chi-square of the residuals, and its degrees of freedom."""
     jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
     information = jacobian.T @ jacobian
     used = float(np.trace(np.linalg.pinv(information + _prior_information(coefficients)) @ information))
@@ -501,27 +463,9 @@ def variance_factor(observations: DiscObservations, projection: Projection, coef
 def parameter_covariance(
     observations: DiscObservations, projection: Projection, coefficients: int, *, factor: float
 ) -> Array:
-    """Covariance of the parameters.
-
-    Parameters
-    ----------
-    observations : DiscObservations
-    projection : Projection
-        The fit.
-    coefficients : int
-        Number of distortion coefficients that are uncertain: those fitted, and those that were taken as zero.
-    factor : float
-        `variance_factor` of the residuals (Birge ratio squared; R. T. Birge, Phys. Rev. 40 (1932) 207-227).
-
-    Returns
-    -------
-    (8 + coefficients, 8 + coefficients) ndarray
-        In the units of `parameter_jacobian`: ``(J^T J / factor + P)^-1`` with rows of J divided by the uncertainty of the discs and P
-        the inverse squares of `LENS_SPREAD`.
-    """
+    """Covariance of the parameters."""
     jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
-    covariance: Array = np.linalg.pinv(jacobian.T @ jacobian / factor + _prior_information(coefficients))
-    return covariance
+    return np.linalg.pinv(jacobian.T @ jacobian / factor + _prior_information(coefficients))
 
 
 def _prior_information(coefficients: int) -> Array:
@@ -532,8 +476,7 @@ def _prior_information(coefficients: int) -> Array:
 def _weighted_jacobian(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
     """Derivative of the discs' sensor positions by the parameters over their uncertainty, (n, 2, parameters)."""
     derivative = parameter_jacobian(projection, observations.centres_mm, coefficients)(observations.centres_mm)
-    weighted: Array = derivative / observations.u_px[:, None, None]
-    return weighted
+    return derivative / observations.u_px[:, None, None]
 
 
 def _parameters(

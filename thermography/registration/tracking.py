@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography._typing import Array
+from thermography.common import Array
 from thermography.registration.plan import PlanGrid
 from thermography.registration.projection import locate_point, project_point
 from thermography.registration.register import Registration
@@ -78,12 +77,10 @@ class TablePosition:
     ----------
     shift_mm : (2,) ndarray, mm
         Displacement (x, y) on the plan from the registered position.
-    u_mm : float, mm
-        Standard uncertainty of the displacement along either coordinate.
+    u_mm, scatter_u_mm : float, mm
+        Standard uncertainty along either coordinate, and its part from the scatter of the discs, without that of the registration.
     discs : int
         Number of discs used.
-    scatter_u_mm : float, mm
-        The part of `u_mm` that the scatter of the discs shows, without what the registration contributes to all of them.
     """
 
     shift_mm: Array
@@ -93,29 +90,19 @@ class TablePosition:
 
 
 def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *, reach_mm: float) -> TableTracker:
-    """Prepare the tracking of a table that moves along one direction.
-
-    Parameters
-    ----------
-    registration : Registration
-        Of the table in one position.
-    grid : PlanGrid
-        The plan.
-    direction : (2,) ndarray
-        Direction (x, y) on the plan along which the table is displaced, of any length.
-    reach_mm : float, mm
-        Largest displacement either way from the registered position.
-
-    Returns
-    -------
-    TableTracker
-    """
+    """Prepare the tracking of a table that moves along one direction."""
     discs = np.array([(d.x_mm, d.y_mm, d.diameter_mm / 2) for d in registration.fiducials.values()])
     centres, radii = discs[:, :2], discs[:, 2:]
     unit = np.asarray(direction, float) / np.hypot(*direction)
     along = np.linspace(-reach_mm, reach_mm, 31)
     displaced = centres + (along[:, None] * unit)[:, None, :]
     projection = registration.projection
+    # Standard uncertainty that the discs of one displacement share, root mean square over those in view, (m,) mm, for (m, n, 2) places.
+    places = registration.to_sensor(displaced)
+    in_view = ((places >= 0) & (places <= np.array(registration.shape[::-1]) - 1.0)).all(axis=-1)
+    # Without any disc in view the table is not located there, and any value serves.
+    in_view |= ~np.any(in_view, axis=1)[:, None]
+    common: Array = np.sqrt(np.mean(registration.position_u(displaced) ** 2, axis=1, where=in_view))
     return TableTracker(
         registration=registration,
         discs=discs,
@@ -126,40 +113,14 @@ def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *
         bias_px=projection.disc_centroids(centres, discs[:, 2]) - projection.to_sensor(centres),
         margin_px=3 * np.linalg.norm(projection.jacobian(centres), axis=-1) * radii,
         common_mm=along,
-        common_u_mm=_common_u(registration, displaced),
+        common_u_mm=common,
     )
-
-
-def _common_u(registration: Registration, places_mm: Array) -> Array:
-    """Standard uncertainty that the discs of one displacement share, root mean square over those in view, (m,) mm, for (m, n, 2) places."""
-    places = registration.to_sensor(places_mm)
-    in_view = ((places >= 0) & (places <= np.array(registration.shape[::-1]) - 1.0)).all(axis=-1)
-    # Without any disc in view the table is not located there, and any value serves.
-    in_view |= ~np.any(in_view, axis=1)[:, None]
-    common: Array = np.sqrt(np.mean(registration.position_u(places_mm) ** 2, axis=1, where=in_view))
-    return common
 
 
 def locate_table(
     counts: NDArray[np.uint16], tracker: TableTracker, previous_mm: Array | None = None
 ) -> TablePosition | None:
-    """Locate the table in one frame.
-
-    Parameters
-    ----------
-    counts : (row, column) ndarray of uint16
-        Raw counts: the contrast and the position of the discs need no calibration.
-    tracker : TableTracker
-        From `make_tracker`.
-    previous_mm : (2,) ndarray, mm, or None
-        Displacement in the previous frame, tried first; None, or a displacement that does not hold any more, searches the whole
-        reach.
-
-    Returns
-    -------
-    TablePosition or None
-        None where fewer than two discs are located.
-    """
+    """Locate the table in one frame."""
     near = None if previous_mm is None else _refine(counts, tracker, previous_mm)
     if near is not None and _is_reliable(near, counts, tracker):
         return near
@@ -184,7 +145,7 @@ def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Arr
     """Mean displacement of the discs located near a predicted displacement; None where fewer than two agree."""
     shifts = _displacements(
         counts, tracker.discs, tracker.bias_px, tracker.lens, tracker.registration.projection.sensor_to_plan,
-        tracker.size_mm, np.asarray(predicted_mm, float), _LEAST_CONTRAST,
+        tracker.size_mm, np.asarray(predicted_mm, float),
     )  # fmt: skip
     if len(shifts) < 2:
         return None
@@ -262,52 +223,14 @@ def _coarse_contrast(counts: Array, x: float, y: float, radius: float, lens: Arr
     return (inside - ring) / _COARSE_POINTS
 
 
-class _DiscView(NamedTuple):
-    """A disc on the sensor near its predicted position: its local affine map, and its zones on the plan around its centre.
-
-    The inverse Jacobian is (x by column, x by row; y by column, y by row), mm/px. Pixels within `core_mm` show the disc alone, those
-    within `rim_mm` any part of it, those between `rim_mm` and `outer_mm` the table around it. `x_mm`, `y_mm` is the disc's listed
-    position: the ring lies on the table wherever the table is.
-    """
-
-    column: float
-    row: float
-    x_by_column: float
-    x_by_row: float
-    y_by_column: float
-    y_by_row: float
-    area_px: float
-    radius_mm: float
-    core_mm: float
-    rim_mm: float
-    outer_mm: float
-    blur_mm: float
-    columns_per_mm: float
-    rows_per_mm: float
-    x_mm: float
-    y_mm: float
-
-
-class _Patch(NamedTuple):
-    """First and last pixel of a window of the sensor, and the centre to which offsets are taken."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-    column: float
-    row: float
-
-
 @numba.njit(cache=True, nogil=True)
 def _displacements(
-    counts: Array, discs: Array, bias_px: Array, lens: Array, sensor_to_plan: Array, size: tuple[float, float], shift: Array,
-    least_contrast: float,
+    counts: Array, discs: Array, bias_px: Array, lens: Array, sensor_to_plan: Array, size: tuple[float, float], shift: Array
 ) -> Array:  # fmt: skip
     """Displacements of the discs that are located near `shift`, (m, 2) mm: `discs.locate_disc` without robust fits."""
     displacements, located = np.zeros((len(discs), 2)), 0
     for d in range(len(discs)):
-        column, row, found = _locate_disc(counts, _disc_view(discs[d], shift, lens), size, least_contrast)
+        column, row, found = _locate_disc(counts, discs[d], shift, lens, size)
         if found:
             x, y = locate_point(column - bias_px[d, 0], row - bias_px[d, 1], lens, sensor_to_plan)
             displacements[located, 0], displacements[located, 1] = x - discs[d, 0], y - discs[d, 1]
@@ -316,31 +239,27 @@ def _displacements(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _disc_view(disc: Array, shift: Array, lens: Array) -> _DiscView:
-    """A disc (x, y, radius) of a table displaced by `shift`, mm, as the lens images it."""
+def _locate_disc(
+    counts: Array, disc: Array, shift: Array, lens: Array, size: tuple[float, float]
+) -> tuple[float, float, bool]:
+    """Centroid (column, row) px of one disc (x, y, radius) by repeated centroids of its coverage, and whether it is located."""
+    height, width = counts.shape
     x, y, radius = disc[0] + shift[0], disc[1] + shift[1], disc[2]
-    c0, r0 = project_point(x, y, lens)
+    start_column, start_row = project_point(x, y, lens)
     cx, rx = project_point(x + 0.5, y, lens)
     cy, ry = project_point(x, y + 0.5, lens)
-    column_by_x, row_by_x, column_by_y, row_by_y = 2 * (cx - c0), 2 * (rx - r0), 2 * (cy - c0), 2 * (ry - r0)
+    column_by_x, row_by_x = 2 * (cx - start_column), 2 * (rx - start_row)
+    column_by_y, row_by_y = 2 * (cy - start_column), 2 * (ry - start_row)
     determinant = column_by_x * row_by_y - column_by_y * row_by_x
+    # mm/px: x by column, x by row, y by column, y by row.
+    to_mm = (row_by_y / determinant, -column_by_y / determinant, -row_by_x / determinant, column_by_x / determinant)
+    per_mm = (np.hypot(column_by_x, column_by_y), np.hypot(row_by_x, row_by_y))
+    area_px = np.pi * radius * radius * abs(determinant)
     blur = 1.5 * max(np.hypot(row_by_y, row_by_x), np.hypot(column_by_y, column_by_x)) / abs(determinant)
-    outer = 2.2 * radius + blur
-    return _DiscView(
-        c0, r0, row_by_y / determinant, -column_by_y / determinant, -row_by_x / determinant, column_by_x / determinant,
-        np.pi * radius * radius * abs(determinant), radius, max(radius - blur, 0.45 * radius), radius + blur, outer, blur,
-        np.hypot(column_by_x, column_by_y), np.hypot(row_by_x, row_by_y), disc[0], disc[1],
-    )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def _locate_disc(
-    counts: Array, view: _DiscView, size: tuple[float, float], least_contrast: float
-) -> tuple[float, float, bool]:
-    """Centroid (column, row) px of one disc by repeated centroids of its coverage, and whether it is located."""
-    height, width = counts.shape
-    column, row = view.column, view.row
-    half_columns, half_rows = view.outer_mm * view.columns_per_mm, view.outer_mm * view.rows_per_mm
+    # Pixels within the core show the disc alone, those within the rim any part of it, those beyond the table around it, mm.
+    core, rim, outer = max(radius - blur, 0.45 * radius), radius + blur, 2.2 * radius + blur
+    half_columns, half_rows = outer * per_mm[0], outer * per_mm[1]
+    column, row = start_column, start_row
     for _ in range(8):
         # Also where the lens shows no such place: what is not a number, or too large for an integer, gives no patch.
         if not (
@@ -348,59 +267,57 @@ def _locate_disc(
             and 0 <= row - half_rows <= row + half_rows < height
         ):
             return column, row, False
-        patch = _patch_around(column, row, view.outer_mm, view)
-        if patch.left < 0 or patch.top < 0 or patch.right >= width or patch.bottom >= height:
+        patch = _patch_around(column, row, outer, per_mm)
+        if patch[0] < 0 or patch[1] < 0 or patch[2] >= width or patch[3] >= height:
             return column, row, False
-        plane, contrast, noise = _contrast(counts, patch, view, size)
-        if not abs(contrast) > least_contrast * noise:
+        plane, contrast, noise = _contrast(counts, patch, (column, row), to_mm, (core, rim, outer, blur), disc, size)
+        if not abs(contrast) > _LEAST_CONTRAST * noise:
             return column, row, False
-        within_rim = _patch_around(column, row, view.rim_mm, view)
-        total, moment_c, moment_r = _moments(counts, within_rim, view, plane, contrast)
-        if not 0.6 * view.area_px < total < 1.4 * view.area_px:
+        within_rim = _patch_around(column, row, rim, per_mm)
+        total, moment_c, moment_r = _moments(counts, within_rim, (column, row), to_mm, rim, plane, contrast)
+        if not 0.6 * area_px < total < 1.4 * area_px:
             return column, row, False
         column += moment_c / total
         row += moment_r / total
         # The next step would be less than a thousandth of a step as small as this.
         if abs(moment_c / total) + abs(moment_r / total) < 0.03:
             break
-    near = abs(column - view.column) + abs(row - view.row) <= 2.5 * np.sqrt(view.area_px / np.pi)
+    near = abs(column - start_column) + abs(row - start_row) <= 2.5 * np.sqrt(area_px / np.pi)
     return column, row, near
 
 
 @numba.njit(cache=True, nogil=True)
-def _patch_around(column: float, row: float, reach_mm: float, view: _DiscView) -> _Patch:
-    """The pixels around a centre that lie within some distance on the plan."""
-    half_columns, half_rows = int(reach_mm * view.columns_per_mm) + 2, int(reach_mm * view.rows_per_mm) + 2
+def _patch_around(column: float, row: float, reach_mm: float, per_mm: tuple[float, float]) -> tuple[int, int, int, int]:
+    """First and last column and row (left, top, right, bottom) of the pixels within some distance on the plan."""
+    half_columns, half_rows = int(reach_mm * per_mm[0]) + 2, int(reach_mm * per_mm[1]) + 2
     left, top = round(column) - half_columns, round(row) - half_rows
-    return _Patch(left, top, left + 2 * half_columns, top + 2 * half_rows, column, row)
+    return left, top, left + 2 * half_columns, top + 2 * half_rows
 
 
 @numba.njit(cache=True, nogil=True)
-def _plan_offset(view: _DiscView, u: float, v: float) -> tuple[float, float]:
-    """Offset (x, y) mm on the plan for an offset (column, row) px on the sensor."""
-    return view.x_by_column * u + view.x_by_row * v, view.y_by_column * u + view.y_by_row * v
-
-
-@numba.njit(cache=True, nogil=True)
-def _contrast(counts: Array, patch: _Patch, view: _DiscView, size: tuple[float, float]) -> tuple[Array, float, float]:
+def _contrast(
+    counts: Array, patch: tuple[int, int, int, int], centre: tuple[float, float], to_mm: tuple[float, float, float, float],
+    zones: tuple[float, float, float, float], disc: Array, size: tuple[float, float],
+) -> tuple[Array, float, float]:  # fmt: skip
     """Plane through the ring around a disc, contrast of the disc to it, and noise of the ring; NaN where there are too few pixels."""
-    core, rim, outer, blur = view.core_mm, view.rim_mm, view.outer_mm, view.blur_mm
+    core, rim, outer, blur = zones
     # Sums over the ring of the products of (1, column, row), and of these with the counts.
     su, sv, suu, suv, svv = 0.0, 0.0, 0.0, 0.0, 0.0
     ring_sum, ring_u, ring_v, squares, ring_n = 0.0, 0.0, 0.0, 0.0, 0
     core_sum, core_c, core_r, core_n = 0.0, 0.0, 0.0, 0
     # Unsigned: a signed index costs a comparison with zero for every pixel.
-    for i in range(np.uint64(patch.top), np.uint64(patch.bottom + 1)):
-        for j in range(np.uint64(patch.left), np.uint64(patch.right + 1)):
-            u, v = np.int64(j) - patch.column, np.int64(i) - patch.row
-            x, y = _plan_offset(view, u, v)
+    for i in range(np.uint64(patch[1]), np.uint64(patch[3] + 1)):
+        for j in range(np.uint64(patch[0]), np.uint64(patch[2] + 1)):
+            u, v = np.int64(j) - centre[0], np.int64(i) - centre[1]
+            x, y = to_mm[0] * u + to_mm[1] * v, to_mm[2] * u + to_mm[3] * v
             distance = x * x + y * y
             value = float(counts[i, j])
             if distance < core * core:
                 core_sum, core_c, core_r, core_n = core_sum + value, core_c + u, core_r + v, core_n + 1
                 continue
             in_ring = rim * rim < distance < outer * outer
-            if in_ring and blur < view.x_mm + x < size[0] - blur and blur < view.y_mm + y < size[1] - blur:
+            # By the listed place: the ring lies on the table wherever the table is.
+            if in_ring and blur < disc[0] + x < size[0] - blur and blur < disc[1] + y < size[1] - blur:
                 su, sv, suu, suv, svv = su + u, sv + v, suu + u * u, suv + u * v, svv + v * v
                 ring_sum, ring_u, ring_v = ring_sum + value, ring_u + u * value, ring_v + v * value
                 ring_n += 1
@@ -416,15 +333,16 @@ def _contrast(counts: Array, patch: _Patch, view: _DiscView, size: tuple[float, 
 
 @numba.njit(cache=True, nogil=True)
 def _moments(
-    counts: Array, patch: _Patch, view: _DiscView, plane: Array, contrast: float
-) -> tuple[float, float, float]:
+    counts: Array, patch: tuple[int, int, int, int], centre: tuple[float, float], to_mm: tuple[float, float, float, float],
+    rim: float, plane: Array, contrast: float,
+) -> tuple[float, float, float]:  # fmt: skip
     """Sum and first moments (column, row) of the coverage of a disc, 1 within it and 0 around it."""
     total, moment_c, moment_r = 0.0, 0.0, 0.0
-    for i in range(np.uint64(patch.top), np.uint64(patch.bottom + 1)):
-        for j in range(np.uint64(patch.left), np.uint64(patch.right + 1)):
-            u, v = np.int64(j) - patch.column, np.int64(i) - patch.row
-            x, y = _plan_offset(view, u, v)
-            if x * x + y * y < view.rim_mm * view.rim_mm:
+    for i in range(np.uint64(patch[1]), np.uint64(patch[3] + 1)):
+        for j in range(np.uint64(patch[0]), np.uint64(patch[2] + 1)):
+            u, v = np.int64(j) - centre[0], np.int64(i) - centre[1]
+            x, y = to_mm[0] * u + to_mm[1] * v, to_mm[2] * u + to_mm[3] * v
+            if x * x + y * y < rim * rim:
                 coverage = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
                 # The disc has a uniform temperature, the table around it a gradient: the contrast varies over the disc.
                 coverage /= 1 - (plane[1] * u + plane[2] * v) / contrast

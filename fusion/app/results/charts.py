@@ -2,174 +2,160 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource
+import xarray as xr
+from bokeh.events import Tap
+from bokeh.models import ColorBar, ColumnDataSource, DataRange1d, GlyphRenderer, HoverTool, LinearColorMapper
+from bokeh.plotting import figure
 
-from fusion.app.elements import heading, paragraph
-from fusion.app.results.products import Products
-from fusion.app.results.selection import CYCLE, HOURS, POSITION, Linker, Selection
-from fusion.products.grouped import group, has
-from fusion.report.charts import drift, iso230, readings
-from fusion.report.charts.style import Chart
-from fusion.report.findings import drift_u_note, iso230_values, quoted_window
-from interferometry.figures import ACCENT, hours_since_start
+from fusion.app import parts as ui
+from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
+from fusion.report.campaign import (
+    DECIDED_BEFORE,
+    describe_candidates,
+    describe_evidence,
+    describe_model,
+    errors_table,
+    steps_table,
+)
+from fusion.report.charts import readings
+from fusion.report.charts.plan import (
+    Layer,
+    add_cells,
+    draw_hotspots,
+    draw_line,
+    draw_map,
+    draw_sensors,
+    extent_of,
+    new_plan,
+)
+from fusion.report.charts.readings import cycle_map
+from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
+from fusion.report.conclusions import action, conclude, describe_anomaly, next_steps, step_phrase
+from fusion.report.record import draw_record
+from fusion.report.wording import (
+    Table,
+    anomaly_cause,
+    anomaly_figures,
+    anomaly_place,
+    conditional,
+    drift_u_note,
+    effect_words,
+    iso230_values,
+    join,
+    moment,
+    number,
+    p_words,
+    place,
+    quoted_window,
+    step_errors,
+)
+from fusion.results.axis import AnomalyPart
+from fusion.results.loop import AxisLoop, RecordLoop
+from fusion.results.store import DamagedProductError, group, has
+from interferometry.plots import ACCENT, INK, hours_since_start
+from thermography.fields.cycle_fields import plan_unit
 
 
 def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
-    """Return a chart of the report with its caption and what is seen, in words.
-
-    Parameters
-    ----------
-    chart : Chart
-        Of `fusion.report.charts`.
-    caption : str
-        What it shows.
-    """
-    return pn.Column(
-        paragraph(caption),
-        pn.pane.Bokeh(chart.figure, sizing_mode="stretch_width"),
-        paragraph(chart.seen, kind="note"),
-        sizing_mode="stretch_width",
+    """Return a chart of the report with its caption and what is seen, in words."""
+    return ui.column(
+        ui.paragraph(caption), pn.pane.Bokeh(chart.figure, sizing_mode="stretch_width"), ui.note(chart.seen)
     )
 
 
-def reading_hours(products: Products) -> np.ndarray | None:
-    """Return the mean time of the readings of every cycle, h since the first reading; None without times.
+def shown_if(chart: Chart | None, caption: str) -> ui.Parts:
+    """Return a chart with its caption where there is one."""
+    return [] if chart is None else [shown(chart, caption)]
 
-    Parameters
-    ----------
-    products : Products
-        Of a run.
-    """
+
+def reading_hours(products: Products) -> np.ndarray | None:
+    """Return the mean time of the readings of every cycle, h since the first reading; None without times."""
     read = products.deviations
     if read is None or np.isnat(read["time"].values).all():
         return None
     return np.asarray(hours_since_start(read).mean(["direction", "target"]).values, float)
 
 
-def laser_charts(products: Products, selection: Selection, linker: Linker) -> list[pn.viewable.Viewable]:
-    """Return the charts of the readings, and say which are missing.
-
-    Parameters
-    ----------
-    products : Products
-        Of a run.
-    selection : Selection
-        Of the page.
-    linker : Linker
-        Links every chart to the selection.
-    """
-    read, joint = products.deviations, products.drift
-    if read is None:
-        return [
-            paragraph(
-                "This run has no readings of a laser: there is no profile, no drift and no ISO 230-2 value.",
-                kind="note",
-            )
-        ]
-    parts: list[pn.viewable.Viewable] = []
-    if joint is None:
-        parts.append(
-            paragraph(
-                "The readings have no times: profile and drift cannot be told apart and are not shown.", kind="note"
-            )
-        )
+def laser_charts(products: Products, selection: Selection, linker: Linker) -> ui.Parts:
+    """Return the charts of the readings, and say which are missing."""
+    if products.deviations is None:
+        return [ui.note("This run has no readings of a laser: there is no profile, no drift and no ISO 230-2 value.")]
+    if products.drift is None:
+        parts = [ui.note("The readings have no times: profile and drift cannot be told apart and are not shown.")]
     else:
-        parts += _drift_charts(products, selection, linker)
-    return [*parts, *_standard_charts(products, linker)]
+        parts = _drift_charts(products.deviations, products.drift, products, selection, linker)
+    return [*parts, *_standard_charts(products.deviations, products, linker)]
 
 
-def _drift_charts(products: Products, selection: Selection, linker: Linker) -> list[pn.viewable.Viewable]:
+def _drift_charts(
+    read: xr.Dataset, joint: xr.Dataset, products: Products, selection: Selection, linker: Linker
+) -> ui.Parts:
     """Profile, drift over time, drift as a map, and the readings of the chosen position."""
-    read, joint = products.deviations, products.drift
-    assert read is not None and joint is not None
-    profile, course, field = (
-        drift.plot_profile(joint, read["position"]),
-        drift.plot_drift(joint, read),
-        drift.plot_drift_map(joint, read["position"]),
-    )
+    position = read["position"]
+    profile, course = readings.plot_profile(joint, position), readings.plot_drift(joint, read)
+    field = readings.plot_drift_map(joint, position)
     linker.link(profile.figure, x=POSITION)
     linker.link(course.figure, x=HOURS)
     linker.link(field.figure, x=CYCLE, y=POSITION)
-    _highlight(products, selection, course)
-    note = drift_u_note(products.results.iso230)
+    _highlight(read, joint, selection, course)
+    band = f"with its 95 % band ({drift_u_note(products.results.iso230)})"
     return [
-        heading("Profile and drift", level=3),
-        shown(
-            profile,
-            f"Deviation along the axis without drift, with its 95 % band ({note}). A click chooses the position.",
-        ),
+        ui.heading("Profile and drift", level=3),
+        shown(profile, f"Deviation along the axis without drift, {band}. A click chooses the position."),
         shown(course, "Drift of every position over time; thick: the chosen position. A click chooses the cycle."),
         shown(field, "Drift over cycle and position. A click chooses both."),
-        PositionHistory(products, selection, linker).view,
+        position_history(read, joint, selection, linker),
     ]
 
 
-def _highlight(products: Products, selection: Selection, course: Chart) -> None:
+def _highlight(read: xr.Dataset, joint: xr.Dataset, selection: Selection, course: Chart) -> None:
     """Draw the drift of the chosen position over the others."""
-    read, joint = products.deviations, products.drift
-    assert read is not None and joint is not None
     hours, lines = hours_since_start(read).mean("direction"), joint["drift"].mean("direction")
 
     def data() -> dict[str, np.ndarray]:
-        if selection.target is None:
-            return {"x": np.array([]), "y": np.array([])}
-        chosen = {"target": selection.target}
-        return {"x": hours.sel(chosen).values, "y": lines.sel(chosen).values}
+        return {"x": hours.sel(target=selection.target).values, "y": lines.sel(target=selection.target).values}
 
     source = ColumnDataSource(data())
     course.figure.line("x", "y", source=source, line_color=ACCENT, line_width=3)
     selection.watch(lambda: source.update(data=data()), "target")
 
 
-class PositionHistory:
-    """The readings of the chosen position over time.
+def position_history(read: xr.Dataset, joint: xr.Dataset, selection: Selection, linker: Linker) -> pn.viewable.Viewable:
+    """Return the readings of the chosen position over time, which follow the choice."""
+    view = ui.column()
+    unlink: list[Callable[[], None]] = []
 
-    Parameters
-    ----------
-    products : Products
-        Of a run with readings that have times.
-    selection : Selection
-        Of the page.
-    linker : Linker
-        Links the chart.
-    """
+    def show() -> None:
+        while unlink:
+            unlink.pop()()
+        if selection.target is not None:
+            chart = readings.plot_history(read, joint, selection.target)
+            unlink.append(linker.link(chart.figure, x=HOURS))
+            view[:] = [shown(chart, "Readings of the chosen position, with profile and drift through them.")]
 
-    def __init__(self, products: Products, selection: Selection, linker: Linker) -> None:
-        self._products, self._selection, self._linker = products, selection, linker
-        self._unlink: Callable[[], None] = lambda: None
-        self.view = pn.Column(sizing_mode="stretch_width")
-        selection.watch(self._show, "target")
-        self._show()
-
-    def _show(self) -> None:
-        read, joint, target = self._products.deviations, self._products.drift, self._selection.target
-        if read is None or joint is None or target is None:
-            self.view[:] = []
-            return
-        chart = readings.plot_history(read, joint, target)
-        self._unlink()
-        self._unlink = self._linker.link(chart.figure, x=HOURS)
-        self.view[:] = [shown(chart, "Readings of the chosen position, with profile and drift through them.")]
+    selection.watch(show, "target")
+    show()
+    return view
 
 
-def _standard_charts(products: Products, linker: Linker) -> list[pn.viewable.Viewable]:
+def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui.Parts:
     """The test by ISO 230-2, and its values along the test."""
-    read, part = products.deviations, products.results.iso230
-    assert read is not None
+    part = products.results.iso230
     if part is None:
         return []
     window = quoted_window(part)
     values = ", ".join(f"{symbol} = {value}" for symbol, value in iso230_values(window).items())
-    parts: list[pn.viewable.Viewable] = [
-        heading("ISO 230-2", level=3),
-        paragraph(f"{window.window[:1].upper()}{window.window[1:]}: {values} (k = 2)."),
+    parts: ui.Parts = [
+        ui.heading("ISO 230-2", level=3),
+        ui.paragraph(f"{window.window[:1].upper()}{window.window[1:]}: {values} (k = 2)."),
     ]
     if has(read, "settled"):
-        chart = iso230.plot_test(group(read, "settled"), read["position"])
+        chart = readings.plot_test(group(read, "settled"), read["position"])
         linker.link(chart.figure, x=POSITION)
         parts.append(shown(chart, f"Means ± 2 s of both approaches, {window.window}."))
     windows = group(read, "iso")
@@ -179,3 +165,374 @@ def _standard_charts(products: Products, linker: Linker) -> list[pn.viewable.Vie
         linker.link(chart.figure, x=CYCLE)
         parts.append(shown(chart, "A, R and B of windows of five cycles along the test. A click chooses the cycle."))
     return parts
+
+
+# The closed loop step by step: residual before, scores of the candidates, effect added, residual after.
+
+
+def table_of(shown_table: Table, caption: str) -> pn.viewable.Viewable:
+    """Return a table of the report."""
+    return ui.table(shown_table.titles, [row.cells for row in shown_table.rows], caption=caption)
+
+
+def loop_steps(products: Products, linker: Linker) -> ui.Parts:
+    """Return the closed loop step by step, in the words of the report, or say why there is none."""
+    results = products.results
+    loop = results.loop
+    if loop is None:
+        lacks = [warning.message for warning in results.warnings if warning.code.startswith("too_")]
+        return [ui.note(" ".join(["There is no model of the drift in this run.", *lacks]))]
+    answers = [one for one in conclude(results) if one.question in ("How sure", "What remains")]
+    parts = [
+        *(ui.paragraph(f"{one.question}: {one.text}") for one in answers),
+        table_of(errors_table(loop), "Errors of predicting what was held out"),
+        ui.note(DECIDED_BEFORE),
+    ]
+    if isinstance(loop, RecordLoop):
+        parts += [ui.heading("Steps", level=3), table_of(steps_table(loop), "Declared model and added effects")]
+        charts = {} if products.fusion is None else draw_record(products.fusion)
+        parts += [shown(chart, name.partition("_")[0].capitalize()) for name, chart in charts.items()]
+    else:
+        caption = "Coefficients, what was not tried and not admitted"
+        numbers = ui.table(("Coefficient", "Value (k = 2)"), describe_model(loop), caption=caption)
+        parts += [*_rounds(products, loop, linker), ui.heading("The model in numbers", level=3), numbers]
+    return [*parts, ui.heading("What to do next", level=3), *(ui.paragraph(step) for step in next_steps(results)[:6])]
+
+
+def _require_same_run(products: Products, loop: AxisLoop, stored: xr.Dataset) -> None:
+    """Refuse a fusion.nc whose last effects are not the steps of results.json."""
+    # An effect that entered more than once has its place behind its name.
+    kept = [re.sub(r" \d+$", "", str(name)) for name in stored["effect"].values]
+    steps = [step.effect for step in loop.steps]
+    if len(kept) < len(steps) or kept[len(kept) - len(steps) :] != steps:
+        raise DamagedProductError(
+            f"{products.folder / 'fusion.nc'}: its effects are not the steps of results.json; put the files of one run back, or run the "
+            "campaign again"
+        )
+
+
+def _rounds(products: Products, loop: AxisLoop, linker: Linker) -> ui.Parts:
+    """Every round of the search: what was left, who was tried, what entered."""
+    stored, read, time = products.loop, products.deviations, products.results.time
+
+    def linked_map(values: xr.DataArray, label: str, caption: str) -> pn.viewable.Viewable:
+        """A map of cycle and position, each position about its mean."""
+        assert read is not None
+        about = values.mean("direction")
+        chart = cycle_map(about - about.mean("cycle"), read["position"], f"{label} / µm")
+        linker.link(chart.figure, x=CYCLE, y=POSITION)
+        return shown(chart, f"{caption}. A click chooses cycle and position.")
+
+    if stored is not None:
+        _require_same_run(products, loop, stored)
+    parts: ui.Parts = []
+    candidates = describe_candidates(loop)
+    for entered in range(max(len(loop.steps) + 1, len(loop.search))):
+        turn, later = entered + 1, loop.steps[entered:]
+        parts.append(ui.heading(f"Round {turn}", level=3))
+        if stored is not None and entered <= len(loop.steps):
+            names = join([effect_words(step.effect).name for step in later])
+            left = f"Residual before this round: that of the final model with {names} put back, each position about its mean"
+            left = left if later else "What the final model leaves"
+            parts.append(linked_map(effects_left(stored, loop, entered), "residual", left))
+        scores = [row.cells[1:] for row in candidates.rows if row.cells[0] == str(turn)]
+        if scores:
+            caption = f"Best candidate of every effect in round {turn}, gains in log-likelihood"
+            parts.append(ui.table(candidates.titles[1:], scores, caption=caption))
+        if not later:
+            parts.append(ui.paragraph("No further effect entered."))
+            continue
+        step = later[0]
+        phrase = f"{step_phrase(step, time, record=False)}, {p_words(step.p_value)}; {step_errors(step)}"
+        entry = "Entered" if step.confirmed else "Entered, not confirmed"
+        parts.append(ui.paragraph(f"{entry}: {phrase}. {action(step, time, record=False)}"))
+        if stored is not None:
+            part = stored["contribution"].isel(effect=stored.sizes["effect"] - len(later)).drop_vars("effect")
+            added = f"Added: {effect_words(step.effect).name}, {number(step.rms_um, 2)} µm rms, each position about its mean"
+            parts.append(linked_map(part, "contribution", added))
+    return parts
+
+
+def effects_left(stored: xr.Dataset, loop: AxisLoop, entered: int) -> xr.DataArray:
+    """Return the residual of the final model with the effects that had not entered yet put back (cycle, direction, target), um."""
+    first = stored.sizes["effect"] - len(loop.steps) + entered
+    later = stored["contribution"].isel(effect=slice(first, None))
+    return stored["residual_final"] + later.sum("effect", skipna=False)
+
+
+# The thermal map with its cycles, and the temperature of chosen places over time.
+
+#: Milliseconds from cycle to cycle while it plays.
+_PLAY_MS = 400
+#: Most places whose temperature is shown over time.
+_MOST_PLACES = 8
+
+
+class ThermalView:
+    """The map of a run with a camera, and the places over time below it."""
+
+    def __init__(self, products: Products, selection: Selection, linker: Linker) -> None:
+        self._products, self._selection, self._linker = products, selection, linker
+        self._fields = products.camera
+        self._unit = plan_unit(self._fields)
+        self._layers = {layer.words: layer for layer in products.layers}
+        limits = {"start": int(products.cycles[0]), "end": int(products.cycles[-1]), "value": selection.cycle}
+        self._quantity = pn.widgets.Select(label="Quantity", options=list(self._layers), width=240)
+        self._player = pn.widgets.Player(
+            label="Cycle", interval=_PLAY_MS, loop_policy="once", show_loop_controls=False, sizing_mode="stretch_width",
+            visible_buttons=["first", "previous", "pause", "play", "next", "last"], **limits,
+        )  # fmt: skip
+        self._cycle = pn.widgets.IntInput(label="Go to cycle", width=110, **limits)
+        self._told = ui.markup("")
+        self._marks = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []})
+        self._chosen = ColumnDataSource({"x": [], "y": []})
+        self._map = self._draw()
+        self._history = ui.column()
+        self._unlink: Callable[[], None] = lambda: None
+        label = f"square of / {self._unit} (0: a cell)"
+        self._size = pn.widgets.FloatInput(label=label, value=0.0, start=0.0, width=200)
+        middles = {axis: round(float(self._fields[axis].values.mean()), 1) for axis in "xy"}
+        self._x, self._y = (
+            pn.widgets.FloatInput(label=f"{axis} / {self._unit}", value=middle, width=110)
+            for axis, middle in middles.items()
+        )
+        self._add = pn.widgets.Button(label="Add place", align="end")
+        self._places = pn.widgets.MultiChoice(label="Places over time", options=[], sizing_mode="stretch_width")
+        self._connect()
+        self._show_target()
+        self._show_cycle()
+        self._show_places()
+
+    @property
+    def view(self) -> pn.viewable.Viewable:
+        """The map, its cycle, and the places over time."""
+        legend = (
+            "A click on the map adds a place to the chart below. White line: the measured axis; ring: the chosen position; one colour "
+            "scale for all cycles."
+        )
+        chart = pn.pane.Bokeh(self._map, sizing_mode="stretch_width")
+        controls = pn.FlexBox(self._x, self._y, self._size, self._add)
+        quantity = pn.FlexBox(self._quantity, self._cycle)
+        return ui.column(
+            quantity, self._player, self._told, chart, ui.note(legend), controls, self._places, self._history
+        )
+
+    def _connect(self) -> None:
+        """Let widgets, map and selection follow each other."""
+        self._quantity.param.watch(lambda event: ui.schedule_update(self._show_layer), "value")
+        self._player.param.watch(lambda event: self._choose(event.new), "value")
+        self._cycle.param.watch(lambda event: self._choose(event.new), "value")
+        self._add.on_click(lambda event: self._add_place(self._x.value, self._y.value))
+        self._places.param.watch(lambda event: self._keep(event.new), "value")
+        self._selection.watch(self._show_cycle, "cycle")
+        self._selection.watch(self._show_target, "target")
+        self._selection.watch(self._show_places, "places")
+        self._map.on_event(Tap, lambda event: self._add_place(event.x, event.y))
+
+    @property
+    def _layer(self) -> Layer:
+        return self._layers[self._quantity.value]
+
+    def _draw(self) -> figure:
+        """Draw the map of the chosen cycle with the measured line, the hotspots, the chosen position and the places."""
+        fields, results = self._fields, self._products.results
+        values = self._products.map_of(self._layer, self._selection.cycle)
+        scale, _ = self._products.scale(self._layer)
+        drawn = draw_map(values, extent_of(fields), self._layer, scale, unit=self._unit)
+        if "target_x" in fields:
+            read = self._products.deviations
+            draw_line(drawn, fields, None if read is None else read["position"])
+        draw_hotspots(drawn, results.hotspots or (), self._unit)
+        draw_sensors(drawn, results.sensors or ())
+        to_scale(drawn, drawn.select_one("cells"), downwards=self._unit == "px")
+        draw_ring(drawn, self._chosen)
+        square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
+        drawn.scatter("x", "y", source=self._marks, **square)
+        return drawn
+
+    def _choose(self, cycle: int | None) -> None:
+        """Choose the cycle with a number, or the nearest that there is."""
+        if cycle is not None:
+            cycles = self._products.cycles
+            self._selection.cycle = int(cycles[int(np.argmin(np.abs(cycles - cycle)))])
+
+    def _show_cycle(self) -> None:
+        """Show the chosen cycle."""
+        cycle = self._selection.cycle
+        self._player.value = self._cycle.value = cycle
+        values = self._products.map_of(self._layer, cycle)
+        self._map.select_one("cells").data_source.data = {"image": [values.astype(np.float32)]}
+        self._told.object = ui.paragraph_markup(self._words(values), kind="note")
+
+    def _words(self, values: np.ndarray) -> str:
+        """Say what the map shows, for readers who do not see it."""
+        fields, layer, time = self._fields, self._layer, self._products.results.time
+        when = moment(fields["cycle_time"].sel(cycle=[self._selection.cycle]).values[0], time.zone if time else None)
+        head = f"Cycle {self._selection.cycle} ({when}), {layer.words}: "
+        if not np.isfinite(values).any():
+            return head + "no cell is seen."
+        at_row, at_column = np.unravel_index(np.nanargmax(values), values.shape)
+        unit = "" if layer.unit == "1" else f" {layer.unit}"
+        _, whole = self._products.scale(layer)
+        beyond = " The colour scale is that of evenly spaced cycles; a value beyond it is light blue."
+        return (
+            f"{head}{number(float(np.nanmin(values)))} to {number(float(np.nanmax(values)))}{unit}, largest at "
+            f"{place(float(fields['x'][at_column]), float(fields['y'][at_row]), self._unit)}.{'' if whole else beyond}"
+        )
+
+    def _show_layer(self) -> None:
+        """Show another quantity on its own scale."""
+        layer, (scale, _) = self._layer, self._products.scale(self._layer)
+        mapper = self._map.select_one(LinearColorMapper)
+        mapper.update(palette=palette(layer.colours), low=scale["low"], high=scale["high"])
+        self._map.select_one(ColorBar).title = f"{layer.words} / {layer.unit}"
+        hover = self._map.select_one({"type": HoverTool, "name": "reading"})
+        tip = (layer.words, f"@image{{0.{'0' * layer.decimals}}} {'' if layer.unit == '1' else layer.unit}")
+        hover.tooltips = [*hover.tooltips[:2], tip]
+        self._show_cycle()
+        self._show_places()
+
+    def _show_target(self) -> None:
+        """Ring the chosen position."""
+        at = target_place(self._fields, self._selection.target)
+        self._chosen.data = {"x": [], "y": []} if at is None else {"x": [at[0]], "y": [at[1]]}
+
+    def _add_place(self, x_mm: float | None, y_mm: float | None) -> None:
+        """Add a place inside the plan, as far as there are colours left."""
+        if x_mm is None or y_mm is None or len(self._selection.places) >= _MOST_PLACES:
+            return
+        left, right, bottom, top = extent_of(self._fields)
+        if left <= x_mm <= right and bottom <= y_mm <= top:
+            size = float(self._size.value or 0.0)
+            self._selection.add(Place(round(float(x_mm), 1), round(float(y_mm), 1), size, self._unit))
+
+    def _keep(self, words: list[str]) -> None:
+        """Remove the places that were removed from the list."""
+        kept = [place for place in self._selection.places if place.words in words]
+        if kept != self._selection.places:
+            self._selection.places = kept
+
+    def _show_places(self) -> None:
+        """Draw the chosen quantity at the places over time."""
+        places = self._selection.places
+        names = [place.words for place in places]
+        self._places.param.update(options=names, value=names)
+        colours = [CATEGORIES[k % len(CATEGORIES)] for k in range(len(places))]
+        x, y = [place.x_mm for place in places], [place.y_mm for place in places]
+        self._marks.data = {"x": x, "y": y, "name": names, "colour": colours}
+        if not places:
+            self._history[:] = [ui.note("No place is chosen: click on the map, or type x and y.")]
+            return
+        quantity = f"{self._layer.words} / {self._layer.unit}"
+        drawn = new_figure(x="time / h", y=quantity, height=300)
+        told = []
+        for k, one in enumerate(places):
+            values, cells = self._products.place_over_time(self._layer, *one[:3])
+            add_series(drawn, self._products.field_hours, values, name=one.words, **of_rank(k))
+            known = values[np.isfinite(values)]
+            span = f"{number(float(known.min()))} to {number(float(known.max()))}" if known.size else "no value"
+            told.append(f"{one.words} (mean of {cells} cells): {span}" if cells > 1 else f"{one.words}: {span}")
+        self._unlink()
+        self._unlink = self._linker.link(drawn, x=HOURS)
+        seen = ui.note(f"{quantity[:1].upper()}{quantity[1:]} over time. {'; '.join(told)}.")
+        self._history[:] = [pn.pane.Bokeh(drawn, sizing_mode="stretch_width"), seen]
+
+
+def to_scale(drawn: figure, cells: GlyphRenderer, *, downwards: bool = False) -> None:
+    """Show a millimetre of the plan as long in both directions, whatever the width of the screen."""
+    drawn.x_range = DataRange1d(renderers=[cells], range_padding=0.03)
+    drawn.y_range = DataRange1d(renderers=[cells], range_padding=0.03, flipped=downwards)
+
+
+def draw_cells(
+    field: xr.DataArray, mapper: LinearColorMapper, name: str, unit: str, *, height: int
+) -> tuple[figure, GlyphRenderer]:
+    """Draw a field (y, x) on the plan with its colour bar."""
+    extent = extent_of(field.to_dataset(name=name))
+    drawn = new_plan(extent, height=height)
+    cells = add_cells(drawn, field.values, extent, mapper, [(name, f"@image{{0.00}} {unit}")])
+    to_scale(drawn, cells)
+    add_colour_bar(drawn, mapper, f"{name} / {unit}")
+    return drawn, cells
+
+
+def draw_ring(drawn: figure, source: ColumnDataSource) -> None:
+    """Ring a position, to be seen on any colour."""
+    for colour, width in ((INK, 5), ("#ffffff", 2.5)):
+        drawn.scatter("x", "y", source=source, marker="circle", size=15, fill_color=None, line_color=colour, line_width=width)  # fmt: skip
+
+
+def target_place(fields: xr.Dataset | None, target: int | None) -> tuple[float, float] | None:
+    """Return the place of a target on the plan (x, y), mm or px; None where the camera did not see it."""
+    if fields is None or target is None or "target_x" not in fields or target not in fields["target"].values:
+        return None
+    here = fields[["target_x", "target_y"]].sel(target=target)
+    return float(here["target_x"]), float(here["target_y"])
+
+
+# Positions that stand out, as cards with the field of the camera around each.
+
+#: Half the side of the part of the field that a card shows, mm.
+_AROUND_MM = 60.0
+
+
+def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
+    """Return one card for each position that stands out, or say that there is none."""
+    anomalies = products.results.anomalies
+    if anomalies is None:
+        lacks = "that needs readings with times, of several positions and cycles."
+        return [ui.note(f"Whether a position stands out was not examined: {lacks}")]
+    if not anomalies:
+        return [ui.paragraph("No position stands out from the others, at a family-wise error of 5 %.")]
+    return [_card(products, selection, anomaly) for anomaly in anomalies]
+
+
+def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.viewable.Viewable:
+    """Return what stands out, what it rests on, what to inspect, and the field around it."""
+    evidence = describe_evidence(anomaly.evidence)
+    sentence = conditional(describe_anomaly(anomaly), products.results.inputs, *anomaly_figures(anomaly))
+    place = anomaly_place(anomaly)
+    show = pn.widgets.Button(label=f"Show position {anomaly.target} everywhere")
+    show.on_click(lambda event: selection.param.update(target=anomaly.target))
+    parts = [
+        ui.heading(f"{place[:1].upper()}{place[1:]}: {anomaly_cause(anomaly)}", level=3),
+        ui.paragraph(f"{sentence} It stands out by {evidence['stands_out']}."),
+        *([ui.paragraph("For:"), ui.bullets(evidence["support"])] if evidence["support"] else []),
+        *([ui.paragraph("Against:"), ui.bullets(evidence["against"])] if evidence["against"] else []),
+        ui.paragraph(f"What to inspect: {evidence['check']}"),
+        show,
+    ]
+    around = _field_around(products, selection, anomaly.target)
+    told = pn.Column(*parts, min_width=300, styles={"flex": "3 1 340px"})
+    seen = pn.Column(*around, min_width=280, styles={"flex": "2 1 300px"})
+    return pn.FlexBox(told, seen, css_classes=["card-of-position"])
+
+
+def _field_around(products: Products, selection: Selection, target: int) -> ui.Parts:
+    """Return the rise about a position in the chosen cycle, on one scale for all cycles."""
+    unseen = [ui.note("The camera did not see this position.")]
+    at = target_place(products.fields, target)
+    if at is None:
+        return unseen
+    around = {axis: slice(middle - _AROUND_MM, middle + _AROUND_MM) for axis, middle in zip("xy", at, strict=True)}
+    about = products.camera["temperature_rise"].sel(around)
+    if min(about.sizes["x"], about.sizes["y"]) < 2:
+        return unseen
+    layer = next(layer for layer in products.layers if layer.variable == "temperature_rise")
+    scale, _ = products.scale(layer)
+    mapper = LinearColorMapper(palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
+    drawn, cells = draw_cells(about.sel(cycle=selection.cycle), mapper, "rise", "K", height=300)
+    draw_ring(drawn, ColumnDataSource({"x": at[:1], "y": at[1:]}))
+    told = ui.markup("")
+
+    def show() -> None:
+        values = about.sel(cycle=selection.cycle).values
+        cells.data_source.data = {"image": [values.astype(np.float32)]}
+        seen = values[np.isfinite(values)]
+        span = f"{number(float(seen.min()))} to {number(float(seen.max()))} K" if seen.size else "not seen"
+        text = f"Rise within {_AROUND_MM:.0f} mm of the position in cycle {selection.cycle}: {span}."
+        told.object = ui.paragraph_markup(text, kind="note")
+
+    selection.watch(show, "cycle")
+    show()
+    return [pn.pane.Bokeh(drawn, sizing_mode="stretch_width"), told]

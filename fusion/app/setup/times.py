@@ -3,37 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import panel as pn
+from bokeh.models import ColumnDataSource
 
-from fusion.alignment.align import camera_on_laser_clock
-from fusion.alignment.zone_shift import covered_share, likely_zone_shift
-from fusion.campaign.logged_tables import read_drivers
-from fusion.errors import FusionError
-from fusion.starting.folder import FolderContent
-from fusion.starting.kinds import Kind
-from fusion.starting.time_bars import Recording
-from interferometry.errors import InterferometryError
-from interferometry.io.readers import read_deviations, read_environment
-from thermography.errors import ThermographyError
-from thermography.io.frame_readers import index_recordings
+from fusion.analysis.alignment.align import camera_on_laser_clock, covered_share, likely_zone_shift
+from fusion.app.parts import column, heading, markup, paragraph_markup
+from fusion.app.setup.plan import TEAL
+from fusion.campaign.logs import read_drivers
+from fusion.common import FusionError
+from fusion.pipeline.inspect import FolderContent, Kind, Recording
+from fusion.report.charts.style import new_figure
+from interferometry.common import InterferometryError
+from interferometry.io.readings import read_deviations, read_environment
+from interferometry.plots import ACCENT
+from thermography.common import ThermographyError
+from thermography.io.other_cameras import index_recordings
 
 FRAMES, READINGS = "frames", "readings"
 
 
-@dataclass(frozen=True)
-class Bar:
-    """A stretch of a recording without a gap.
-
-    Attributes
-    ----------
-    name : str
-        Recording.
-    start, end : datetime64
-        UTC, on the laser's clock.
-    """
+class Bar(NamedTuple):
+    """A stretch of a recording without a gap, UTC on the laser's clock."""
 
     name: str
     start: np.datetime64
@@ -41,42 +36,25 @@ class Bar:
 
 
 def recordings_of(content: FolderContent) -> list[Recording]:
-    """Return what was recorded when, each by its own clock; files without times or with faults are left out, as the table names them.
-
-    Parameters
-    ----------
-    content : FolderContent
-        What the folder holds.
-    """
+    """Return what was recorded when, each by its own clock; files without times or with faults are left out, as the table names them."""
     found = []
     if content.frames and not content.of_temperatures:
         frames, _ = index_recordings(content.frame_files)
         found.append(Recording(FRAMES, np.array([frame.time for frame in frames], "datetime64[ns]")))
-    readers: tuple[tuple[str, Kind, Callable[[Path], object]], ...] = (
+    readers: tuple[tuple[str, Kind, Callable[[Path], Any]], ...] = (
         (READINGS, Kind.DEVIATIONS, read_deviations),
         ("environment", Kind.ENVIRONMENT, read_environment),
         ("drivers", Kind.DRIVERS, read_drivers),
     )
     for name, kind, read in readers:
         for one in content.of(kind)[:1]:
-            try:
-                table = read(one.path)
-            except (FusionError, InterferometryError, ThermographyError):
-                continue
-            found.append(Recording(name, np.asarray(table["time"].values, "datetime64[ns]").ravel()))  # type: ignore[index]
+            with suppress(FusionError, InterferometryError, ThermographyError):
+                found.append(Recording(name, read(one.path)["time"].values.astype("datetime64[ns]").ravel()))
     return [one for one in found if one.stretches()]
 
 
 def shifted(recordings: Sequence[Recording], clock_offset_s: float) -> list[Bar]:
-    """Return the recordings as bars on the laser's clock.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Each by its own clock.
-    clock_offset_s : float, s
-        Camera clock minus laser clock.
-    """
+    """Return the recordings as bars on the laser's clock."""
     bars = []
     for one in recordings:
         times = camera_on_laser_clock(one.times, clock_offset_s) if one.name == FRAMES else one.times
@@ -85,15 +63,7 @@ def shifted(recordings: Sequence[Recording], clock_offset_s: float) -> list[Bar]
 
 
 def coverage(recordings: Sequence[Recording], clock_offset_s: float) -> str:
-    """Say how much of the readings lies between the frames.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Each by its own clock.
-    clock_offset_s : float, s
-        Camera clock minus laser clock.
-    """
+    """Say how much of the readings lies between the frames."""
     both = _frames_and_readings(recordings)
     if both is None:
         return ""
@@ -103,19 +73,7 @@ def coverage(recordings: Sequence[Recording], clock_offset_s: float) -> str:
 
 
 def estimate(recordings: Sequence[Recording]) -> float | None:
-    """Return the clock offset by whole quarter hours that two time zones would explain, s.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Each by its own clock.
-
-    Returns
-    -------
-    float or None
-        None where no such offset brings the frames over the readings better than none does. An offset by seconds is estimated by the run,
-        from frames that show the table moving.
-    """
+    """Return the clock offset by whole quarter hours that two time zones would explain, s."""
     both = _frames_and_readings(recordings)
     return None if both is None else likely_zone_shift(both[1], both[0])
 
@@ -123,3 +81,63 @@ def estimate(recordings: Sequence[Recording]) -> float | None:
 def _frames_and_readings(recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray] | None:
     named = {one.name: np.sort(one.times[~np.isnat(one.times)]) for one in recordings}
     return (named[FRAMES], named[READINGS]) if FRAMES in named and READINGS in named else None
+
+
+# Time bars of all recordings on one axis, with the offset of the camera's clock as a slider.
+
+#: A slider reaches this far to both sides at least, s: clocks that nobody set differ by minutes.
+_REACH_S = 600.0
+
+
+class TimesView:
+    """What was recorded when; `on_offset` takes a chosen clock offset, s."""
+
+    def __init__(self, on_offset: Callable[[float], None]) -> None:
+        self._recordings: Sequence[Recording] = ()
+        self._on_offset = on_offset
+        self._filling = False
+        self._bars = ColumnDataSource({"name": [], "start": [], "end": [], "colour": []})
+        self._slider = pn.widgets.FloatSlider(
+            label="Camera clock minus laser clock (s)", start=-_REACH_S, end=_REACH_S, step=1.0, sizing_mode="stretch_width"
+        )  # fmt: skip
+        self._take = pn.widgets.Button(label="Take the estimate", visible=False)
+        self._told, self._picture = markup(""), column()
+        self._slider.param.watch(lambda event: self._chosen(event.new), "value")
+        self._take.on_click(lambda event: self._chosen(estimate(self._recordings) or 0.0))
+        title = heading("Recordings on one clock", level=3)
+        self.view = column(title, self._picture, self._slider, self._told, self._take)
+
+    def show(self, recordings: Sequence[Recording], clock_offset_s: float) -> None:
+        """Show recordings."""
+        self._recordings = recordings
+        names = list(dict.fromkeys(one.name for one in recordings))
+        self.view.visible = bool(names)
+        self._slider.visible = FRAMES in names and len(names) > 1
+        if not names:
+            return
+        drawn = new_figure(x="UTC", y="", x_type="datetime", y_range=names[::-1], height=70 + 34 * len(names))
+        drawn.hbar(y="name", left="start", right="end", height=0.5, source=self._bars, color="colour")
+        drawn.ygrid.grid_line_color = None
+        self.move(clock_offset_s)
+        self._picture[:] = [pn.pane.Bokeh(drawn, sizing_mode="stretch_width")]
+
+    def move(self, clock_offset_s: float) -> None:
+        """Show the recordings with another offset."""
+        self._filling = True
+        reach = max(_REACH_S, 1.5 * abs(clock_offset_s))
+        self._slider.param.update(start=-reach, end=reach, value=clock_offset_s)
+        self._filling = False
+        bars = shifted(self._recordings, clock_offset_s)
+        columns = {name: [getattr(bar, name) for bar in bars] for name in ("name", "start", "end")}
+        self._bars.data = columns | {"colour": [ACCENT if bar.name == FRAMES else TEAL for bar in bars]}
+        likely = estimate(self._recordings)
+        self._take.visible = likely is not None and likely != clock_offset_s
+        told = coverage(self._recordings, clock_offset_s)
+        if self._take.visible:
+            told += f" The clocks look as in two time zones: estimated offset {likely:g} s."
+        self._told.object = paragraph_markup(told.strip(), kind="warning" if self._take.visible else "note")
+
+    def _chosen(self, clock_offset_s: float) -> None:
+        if not self._filling:
+            self.move(clock_offset_s)
+            self._on_offset(clock_offset_s)

@@ -10,16 +10,14 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
-from fusion.attribution.family_wise import LEVEL
-from fusion.products.grouped import group, has
-from fusion.products.results import Results
-from fusion.report.attribution_section import leading_region
-from fusion.report.charts import attribution, drift, iso230, neighbours, plan, prediction, readings, sensors, timeline
-from fusion.report.charts import loop as closed_loop
-from fusion.report.charts.embedding import EmbeddedChart, embed
-from fusion.report.charts.style import Chart
-from fusion.report.charts.thermal_map import MapControls, plot_thermal_map
-from interferometry.figures import evaluate_common_start, hours_since_start
+from fusion.analysis.attribution.significance import LEVEL
+from fusion.report.campaign import leading_region
+from fusion.report.charts import model, plan, readings
+from fusion.report.charts.plan import MapControls, plot_thermal_map
+from fusion.report.charts.style import Chart, EmbeddedChart, embed
+from fusion.results.results import Results
+from fusion.results.store import group, has
+from interferometry.plots import evaluate_common_start, hours_since_start
 
 
 class Drawn(NamedTuple):
@@ -37,56 +35,26 @@ class Drawn(NamedTuple):
     thermal_map: MapControls | None = None
 
     def with_more(self, more: Drawn) -> Drawn:
-        """Return these charts and others.
-
-        Parameters
-        ----------
-        more : Drawn
-            The others.
-        """
+        """Return these charts and others."""
         return Drawn(self.charts | more.charts, more.thermal_map or self.thermal_map)
 
 
 def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
-    """Draw all charts of a campaign's report.
-
-    Parameters
-    ----------
-    results : Results
-        Results of the run.
-    datasets : mapping
-        As for `fusion.report.html.render_report`.
-
-    Returns
-    -------
-    Drawn
-    """
+    """Draw all charts of a campaign's report."""
     fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
     drawn = draw_measured(fields, deviations, None if fused is None else fused.to_dataset())
     correlation = results.correlation
     if fused is not None and correlation is not None and "correlation" in fused.children:
-        drawn = drawn.with_more(draw_attributed(fused, correlation.source.part, correlation.least_p))
+        drawn = drawn.with_more(draw_attributed(fused, correlation.source.part, correlation.p_resolution))
     if deviations is not None:
-        readings = xr.Dataset() if fused is None else fused.to_dataset()
-        drawn = drawn.with_more(draw_modelled(deviations, readings, {one.target for one in results.anomalies or ()}))
+        found = xr.Dataset() if fused is None else fused.to_dataset()
+        drawn = drawn.with_more(draw_modelled(deviations, found, {one.target for one in results.anomalies or ()}))
     position = None if deviations is None else deviations["position"]
     return drawn.with_more(draw_placed(results, fields, position, datasets.get("sensors")))
 
 
 def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fused: xr.Dataset | None = None) -> Drawn:
-    """Draw what was measured and evaluated before anything is modelled.
-
-    Parameters
-    ----------
-    fields, deviations : Dataset, optional
-        Contents of fields.nc and deviations.nc.
-    fused : Dataset, optional
-        Both on one clock, the root of fusion.nc; what was found beside them is not looked at.
-
-    Returns
-    -------
-    Drawn
-    """
+    """Draw what was measured and evaluated before anything is modelled."""
     charts: dict[str, Chart] = {}
     if fields is not None:
         charts["rise_history"] = plan.plot_rise_history(fields)
@@ -101,41 +69,18 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fuse
 
 
 def draw_attributed(fused: xr.DataTree, channel: str, least_p: float | None) -> Drawn:
-    """Draw where drift and field agree.
-
-    Parameters
-    ----------
-    fused : DataTree
-        Content of fusion.nc with its groups of the correlation; the model's are not looked at.
-    channel : str
-        Part of the drift whose source is the leading one.
-    least_p : float or None
-        Least p-value that the cycles allow.
-
-    Returns
-    -------
-    Drawn
-    """
+    """Draw where drift and field agree."""
     return Drawn(embed(_correlation_charts(fused, channel, least_p)))
 
 
 def draw_modelled(deviations: xr.Dataset, fused: xr.Dataset, standing_out: Set[int]) -> Drawn:
-    """Draw what a model of the drift found, and the positions that stand out.
-
-    Parameters
-    ----------
-    deviations : Dataset
-        Content of deviations.nc.
-    fused : Dataset
-        Root of fusion.nc; without the variables of the loop, none of its charts is drawn.
-    standing_out : set of int
-        Targets that stand out.
-
-    Returns
-    -------
-    Drawn
-    """
-    charts = _anomaly_charts(deviations, standing_out) if has(deviations, "drift") else {}
+    """Draw what a model of the drift found, and the positions that stand out."""
+    charts: dict[str, Chart] = {}
+    if has(deviations, "drift"):
+        joint = group(deviations, "drift")
+        shown = min(standing_out, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
+        charts["history"] = readings.plot_history(deviations, joint, shown)
+        charts["anomalies"] = readings.plot_position_scatter(joint, deviations["position"], standing_out)
     if has(fused, "loop"):
         charts |= _loop_charts(group(fused, "loop"), deviations)
     return Drawn(embed(charts))
@@ -144,27 +89,11 @@ def draw_modelled(deviations: xr.Dataset, fused: xr.Dataset, standing_out: Set[i
 def draw_placed(
     results: Results, fields: xr.Dataset | None, position: xr.DataArray | None, logged: xr.Dataset | None
 ) -> Drawn:
-    """Draw the thermal map with all places that were found on it, and the contact sensors.
-
-    Parameters
-    ----------
-    results : Results
-        Results of the run.
-    fields : Dataset, optional
-        Content of fields.nc.
-    position : DataArray, optional
-        Nominal position of the targets, mm.
-    logged : Dataset, optional
-        Content of sensors.nc.
-
-    Returns
-    -------
-    Drawn
-    """
+    """Draw the thermal map with all places that were found on it, and the contact sensors."""
     charts: dict[str, Chart] = {}
     controls = None
     if logged is not None:
-        charts["sensors"] = sensors.plot_sensors(logged)
+        charts["sensors"] = plan.plot_sensors(logged)
     if fields is not None:
         charts["thermal_map"], controls = plot_thermal_map(
             fields, results.hotspots or (), position, sensors=results.sensors or ()
@@ -176,7 +105,7 @@ def _clock_charts(fused: xr.Dataset, deviations: xr.Dataset | None) -> dict[str,
     """The charts of both recordings on one clock."""
     charts: dict[str, Chart] = {}
     if "time" in fused:
-        charts["timeline"] = timeline.plot_timeline(fused)
+        charts["timeline"] = readings.plot_timeline(fused)
     if "local_rise" in fused:
         charts["axis_temperature"] = plan.plot_axis_temperature(fused)
         if deviations is not None:
@@ -187,16 +116,16 @@ def _clock_charts(fused: xr.Dataset, deviations: xr.Dataset | None) -> dict[str,
 def _reading_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     """The charts that need neither the times of the readings nor their drift."""
     position, shifted, sides = deviations["position"], evaluate_common_start(deviations), _sides(deviations)
+    from_start = "deviation from a common start"
     return {
         **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in sides},
-        **{
-            f"common_start_{side}": readings.plot_cycles(shifted, side, quantity="deviation from a common start")
-            for side in sides
-        },
-        "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
-        "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
-        "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
-        **({"iso230": iso230.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}),
+        **{f"common_start_{side}": readings.plot_cycles(shifted, side, quantity=from_start) for side in sides},
+        "scatter": readings.plot_scatter_comparison(group(deviations, "comparison"), position),
+        "mean_differences": readings.plot_mean_differences(group(deviations, "neighbours"), position),
+        "chart": readings.plot_reference_chart(group(deviations, "chart"), position),
+        **(
+            {"iso230": readings.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}
+        ),
     }
 
 
@@ -212,25 +141,15 @@ def _drift_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     windows = group(deviations, "iso")
     both: dict[str, Chart] = {}
     if len(_sides(deviations)) == 2:
-        both["reversal"] = drift.plot_reversal(joint, position)
+        both["reversal"] = readings.plot_reversal(joint, position)
         # The last window is the whole test.
         both |= {"windows": readings.plot_windows(windows)} if windows.sizes["window"] > 1 else {}
     return {
-        "deviation_map": drift.plot_deviation_map(deviations),
-        "drift_map": drift.plot_drift_map(joint, position),
-        "drift": drift.plot_drift(joint, deviations),
-        "profile": drift.plot_profile(joint, position),
+        "deviation_map": readings.plot_deviation_map(deviations),
+        "drift_map": readings.plot_drift_map(joint, position),
+        "drift": readings.plot_drift(joint, deviations),
+        "profile": readings.plot_profile(joint, position),
         **both,
-    }
-
-
-def _anomaly_charts(deviations: xr.Dataset, standing_out: Set[int]) -> dict[str, Chart]:
-    """The charts of the positions that stand out."""
-    joint = group(deviations, "drift")
-    shown = min(standing_out, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
-    return {
-        "history": readings.plot_history(deviations, joint, shown),
-        "anomalies": drift.plot_position_scatter(joint, deviations["position"], standing_out),
     }
 
 
@@ -238,36 +157,34 @@ def _correlation_charts(fused: xr.DataTree, channel: str, least_p: float | None)
     """The maps of the leading part of the drift, the modes, the clusters, and the leading region by target."""
     maps = fused.children["correlation"]
     cells, position = maps.to_dataset(), fused.to_dataset()["position"]
-    charts = {"clusters": attribution.plot_clusters(maps.children["clusters"].to_dataset())}
-    if bool((cells["p_value"].sel(channel=channel) <= attribution.LEAST_SHOWN).any()):
-        charts["significance"] = attribution.plot_significance(cells, channel)
+    charts = {"clusters": model.plot_clusters(maps.children["clusters"].to_dataset())}
+    if bool((cells["p_value"].sel(channel=channel) <= model.LEAST_SHOWN).any()):
+        charts["significance"] = model.plot_significance(cells, channel)
     if bool((cells["p_value"].sel(channel=channel) <= LEVEL).any()):
-        charts["sensitivity"] = attribution.plot_sensitivity(cells, channel)
+        charts["sensitivity"] = model.plot_sensitivity(cells, channel)
     if "modes" in maps.children:
         modes = maps.children["modes"].to_dataset()
-        charts |= {
-            f"mode_{mode}": attribution.plot_mode(modes, int(mode), channel, least_p) for mode in modes["mode"].values
-        }
+        charts |= {f"mode_{mode}": model.plot_mode(modes, int(mode), channel, least_p) for mode in modes["mode"].values}
     if "target_regions" in maps.children:
         region, targets = leading_region(maps), maps.children["target_regions"].to_dataset()
-        charts["region_targets"] = attribution.plot_region_targets(targets, region, position)
+        charts["region_targets"] = model.plot_region_targets(targets, region, position)
     return charts
 
 
 def _loop_charts(loop: xr.Dataset, deviations: xr.Dataset) -> dict[str, Chart]:
     """The charts of the closed loop."""
     charts = {
-        "residual_direction": closed_loop.plot_residual_direction(loop, deviations),
-        "residual_spectrum": closed_loop.plot_residual_spectrum(loop),
-        "residual_events": closed_loop.plot_residual_events(loop, deviations),
-        "contributions": closed_loop.plot_contributions(loop, deviations),
+        "residual_direction": model.plot_residual_direction(loop, deviations),
+        "residual_spectrum": model.plot_residual_spectrum(loop),
+        "residual_events": model.plot_residual_events(loop, deviations),
+        "contributions": model.plot_contributions(loop, deviations),
     }
     if "held_out_error_final" in loop and bool(loop["held_out_error_final"].notnull().any()):
-        charts["held_out_errors"] = closed_loop.plot_held_out_errors(loop, deviations)
-        charts["held_out_positions"] = closed_loop.plot_held_out_positions(loop, deviations)
-        charts["predicted_measured"] = closed_loop.plot_predicted_measured(loop, deviations)
+        charts["held_out_errors"] = model.plot_held_out_errors(loop, deviations)
+        charts["held_out_positions"] = model.plot_held_out_positions(loop, deviations)
+        charts["predicted_measured"] = model.plot_predicted_measured(loop, deviations)
     hours = hours_since_start(deviations).mean(["direction", "target"]).values
     for step in range(loop.sizes.get("step", 0)):
         errors = xr.Dataset({name: loop[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})
-        charts[f"block_errors_{step}"] = prediction.plot_block_errors(errors, hours, "cycle")
+        charts[f"block_errors_{step}"] = model.plot_block_errors(errors, hours, "cycle")
     return charts

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import xarray as xr
-from bokeh.models import ColorMapper, GlyphRenderer, LinearColorMapper
+from bokeh.models import Arrow, ColorMapper, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper, NormalHead
 from bokeh.plotting import figure
 
 from fusion.report.charts.style import (
+    CATEGORIES,
+    DIVERGING,
+    SEQUENTIAL,
     Chart,
+    Tips,
     add_band,
     add_colour_bar,
     add_hover,
@@ -21,10 +26,12 @@ from fusion.report.charts.style import (
     palette,
     span_words,
 )
-from fusion.report.wording import number
-from interferometry.figures import ACCENT, INK
+from fusion.report.wording import join, number, place
+from fusion.results.axis import HotspotPart
+from fusion.results.parts import ContactSensorPart
+from interferometry.plots import ACCENT, INK
 from thermography.fields.cycle_fields import plan_unit
-from thermography.fields.tasks.pieces import in_pieces
+from thermography.fields.large_arrays import in_pieces
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
@@ -32,94 +39,50 @@ _STEP_PER_K = 32
 _LEAST_HOURS = 0.1
 
 
-def extent_of(cells: xr.Dataset) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top of the cells of the plan, mm.
+#: Left, right, bottom and top of a plan, mm or px.
+Extent: TypeAlias = tuple[float, float, float, float]
 
-    Parameters
-    ----------
-    cells : Dataset
-        With ``x`` and ``y``, the middles of the cells (mm).
-    """
+
+def extent_of(cells: xr.Dataset) -> Extent:
+    """Return left, right, bottom and top of the cells of the plan, mm."""
     x, y = cells["x"].values, cells["y"].values
     half = float(np.median(np.diff(x))) / 2
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
-def new_plan(
-    extent: tuple[float, float, float, float], *, title: str = "", height: int = 260, unit: str = "mm"
-) -> figure:
-    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both; of a picture, y downwards.
-
-    Parameters
-    ----------
-    extent : tuple of float
-        Left, right, bottom, top, mm.
-    title : str
-        Above the legend.
-    height : int
-        CSS px.
-    unit : str
-        Of the plan: mm, or px where the picture is the plan.
-    """
+def new_plan(extent: Extent, *, title: str = "", height: int = 260, unit: str = "mm") -> figure:
+    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both; of a picture, y downwards."""
     left, right, bottom, top = extent
     y_range = (top, bottom) if unit == "px" else (bottom, top)
-    drawn = new_figure(
-        x=f"x / {unit}", y=f"y / {unit}", title=title, height=height, x_range=(left, right), y_range=y_range
-    )
+    ranges: dict[str, Any] = {"x_range": (left, right), "y_range": y_range}
+    drawn = new_figure(x=f"x / {unit}", y=f"y / {unit}", title=title, height=height, **ranges)
     drawn.match_aspect = True
     drawn.grid.grid_line_color = None
     return drawn
 
 
 def add_cells(
-    drawn: figure,
-    values: np.ndarray,
-    extent: tuple[float, float, float, float],
-    mapper: ColorMapper,
-    tips: Sequence[tuple[str, str]],
-    **layers: np.ndarray,
+    drawn: figure, values: np.ndarray, extent: Extent, mapper: ColorMapper, tips: Tips, **layers: np.ndarray
 ) -> GlyphRenderer:
-    """Draw values on the plan; NaN show what is below.
-
-    Parameters
-    ----------
-    drawn : figure
-        From `new_plan`.
-    values : (y, x) ndarray
-        As coloured by `mapper`.
-    extent : tuple of float
-        Left, right, bottom, top, mm.
-    mapper : ColorMapper
-        Its colours.
-    tips : sequence of (str, str)
-        Name and Bokeh format; ``@image`` is the value, further ones are the names of `layers`.
-    **layers : (y, x) ndarray
-        Further values under the pointer.
-    """
+    """Draw values on the plan; NaN show what is below."""
     left, right, bottom, top = extent
-    source = {
-        "image": [values.astype(np.float32)],
-        **{name: [more.astype(np.float32)] for name, more in layers.items()},
-    }
-    cells = drawn.image(
-        "image", x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, source=source, level="image"
-    )
+    source = {name: [each.astype(np.float32)] for name, each in {"image": values, **layers}.items()}
+    place = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom}
+    cells = drawn.image("image", **place, color_mapper=mapper, source=source, level="image")
     add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), *tips], [cells])
     return cells
 
 
+def add_names(drawn: figure, x: Any, y: Any, names: Any, **options: Any) -> None:
+    """Write names on a map, light on dark, which reads on every colour."""
+    drawn.text(
+        x, y, names, text_color="#ffffff", text_font_size="12px", background_fill_color=INK, background_fill_alpha=0.75, padding=2,
+        **options,
+    )  # fmt: skip
+
+
 def plot_registration(fields: xr.Dataset) -> Chart:
-    """Draw the reference frame, in sensor pixels, with every located fiducial.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Content of fields.nc.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the reference frame, in sensor pixels, with every located fiducial."""
     frame = fields["reference_frame"].values
     rows, columns = frame.shape
     low, high = np.nanpercentile(frame[_on_plan(fields, frame.shape)], [1, 99])
@@ -128,40 +91,23 @@ def plot_registration(fields: xr.Dataset) -> Chart:
     drawn.match_aspect = True
     drawn.grid.grid_line_color = None
     rounded = np.round(frame * _STEP_PER_K) / _STEP_PER_K
-    picture = drawn.image(
-        [rounded.astype(np.float32)],
-        x=-0.5,
-        y=-0.5,
-        dw=columns,
-        dh=rows,
-        color_mapper=mapper,
-        level="image",
-    )
+    place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}
+    picture = drawn.image([rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
     add_hover(drawn, [("column", "$x{0}"), ("row", "$y{0}"), ("temperature", "@image{0.00} °C")], [picture])
     names = [str(name) for name in fields["fiducial_name"].values]
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
-    source = {"column": column, "row": row, "name": names, "residual": fields["fiducial_residual"].values}
-    rings = drawn.scatter(
-        "column", "row", source=source, marker="circle", size=13, fill_alpha=0.0, line_color="#7fe3ff", line_width=2
-    )
-    drawn.text(
-        "column", "row", "name", source=source, x_offset=9, y_offset=-4, text_color="#ffffff", text_font_size="11px",
-        background_fill_color=INK, background_fill_alpha=0.75, padding=2,
-    )  # fmt: skip
+    residual = fields["fiducial_residual"].values
+    source = {"column": column, "row": row, "name": names, "residual": residual}
+    looks = {"marker": "circle", "size": 13, "fill_alpha": 0.0, "line_color": "#7fe3ff", "line_width": 2}
+    rings = drawn.scatter("column", "row", source=source, **looks)
+    add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
     add_hover(drawn, [("fiducial", "@name"), ("residual", "@residual{0.000} mm")], [rings])
     add_colour_bar(drawn, mapper, "temperature / °C", place="right")
-    residual = fields["fiducial_residual"].values
     seen = (
         f"Frame of {columns} by {rows} pixels with {len(names)} located fiducials; their residuals are up to "
         f"{number(float(np.nanmax(residual)), 2)} mm."
     )
-    data: dict[str, Sequence[str] | np.ndarray] = {
-        "fiducial": names,
-        "column / px": column,
-        "row / px": row,
-        "residual / mm": residual,
-    }
-    return Chart(drawn, seen, data)
+    return Chart(drawn, seen, {"fiducial": names, "column / px": column, "row / px": row, "residual / mm": residual})
 
 
 def _on_plan(fields: xr.Dataset, shape: tuple[int, ...]) -> np.ndarray:
@@ -178,16 +124,8 @@ def _hours(fields: xr.Dataset) -> np.ndarray:
 
 
 def plot_rise_history(fields: xr.Dataset) -> Chart:
-    """Draw the rise of the table over the test: mean over the plan, with its coolest and hottest tenth; a cycle without a field is a gap.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Content of fields.nc.
-
-    Returns
-    -------
-    Chart
+    """Draw the rise of the table over the test: mean over the plan, with its coolest and hottest tenth; a cycle
+    without a field is a gap.
     """
     rise = fields["temperature_rise"]
     hours = _hours(fields)
@@ -219,17 +157,7 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
 
 
 def plot_axis_temperature(fused: xr.Dataset) -> Chart:
-    """Draw the rise of the table along the measured line, one line for every cycle.
-
-    Parameters
-    ----------
-    fused : Dataset
-        Content of fusion.nc, with ``local_rise`` (K; cycle, direction, target) and ``position`` (mm; target).
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the rise of the table along the measured line, one line for every cycle."""
     order = np.argsort(fused["position"].values, kind="stable")
     place = fused["position"].values[order].astype(float)
     rise = fused["local_rise"].mean("direction").transpose("cycle", "target").values[:, order]
@@ -243,30 +171,12 @@ def plot_axis_temperature(fused: xr.Dataset) -> Chart:
         f"Rise of the table under the measured line in {cycle.size} cycles: {span_words(rise, 'K')}; in the last cycle it is largest at "
         f"{place[int(np.nanargmax(last))]:g} mm ({number(float(np.nanmax(last)))} K)."
     )
-    columns = {
-        "cycle": np.repeat(cycle, place.size),
-        "position / mm": np.tile(place, cycle.size),
-        "rise / K": rise[shown].ravel(),
-    }
-    return Chart(drawn, seen, columns)
+    columns = {"cycle": np.repeat(cycle, place.size), "position / mm": np.tile(place, cycle.size)}
+    return Chart(drawn, seen, {**columns, "rise / K": rise[shown].ravel()})
 
 
 def plot_drift_temperature(fused: xr.Dataset, drift: xr.Dataset) -> Chart:
-    """Draw the drift of every position against the rise of the table below it, one line for each position in the order of the cycles.
-
-    A loop instead of a line means that temperature and drift do not move together: a lag, or heat from elsewhere.
-
-    Parameters
-    ----------
-    fused : Dataset
-        Content of fusion.nc, with ``local_rise`` (K; cycle, direction, target) and ``position`` (mm; target).
-    drift : Dataset
-        Group ``drift`` of deviations.nc.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the drift of every position against the rise of the table below it, one line for each position in the order of the cycles."""
     order = np.argsort(fused["position"].values, kind="stable")
     place = fused["position"].values[order].astype(float)
     rise = fused["local_rise"].mean("direction").transpose("target", "cycle").values[order]
@@ -287,3 +197,266 @@ def plot_drift_temperature(fused: xr.Dataset, drift: xr.Dataset) -> Chart:
         "drift / µm": moved.ravel(),
     }
     return Chart(drawn, seen, columns)
+
+
+# Contact sensors over time, and the camera at the same places.
+
+
+def plot_sensors(sensors: xr.Dataset) -> Chart:
+    """Draw the rise of every contact sensor, and that of the camera at its place where there is one."""
+    start = sensors["time"].values[0]
+    if "camera_time" in sensors:
+        start = min(start, sensors["camera_time"].values[0])
+    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340, legend_columns=5)
+    add_zero_line(drawn)
+    rows: list[tuple[str, str, np.ndarray, np.ndarray]] = []
+    said = []
+    for k, name in enumerate(sensors["sensor"].values):
+        one, colour = sensors.sel(sensor=name), CATEGORIES[k % len(CATEGORIES)]
+        hours = _hours_since(sensors["time"].values, start)
+        sound = (sensors["time"].values < one["fault_time"].values) | (not bool(one["is_faulty"]))
+        add_series(drawn, hours[sound], one["rise"].values[sound], name=str(name), colour=colour)
+        if not sound.all():
+            label = f"{name} after its fault (not used)"
+            looks: dict[str, Any] = {"colour": colour, "dash": "dotted", "width": 1.0}
+            add_series(drawn, hours[~sound], one["rise"].values[~sound], name=label, **looks)
+        said.append(f"{name} {number(float(one['rise'].values[sound][-1]), 2)} K")
+        rows.append((str(name), "contact sensor", hours, one["rise"].values))
+        if "camera_rise" in sensors and bool(one["camera_rise"].notnull().any()):
+            at = _hours_since(sensors["camera_time"].values, start)
+            looks = {"colour": colour, "dash": "dashed", "width": 1.2}
+            add_series(drawn, at, one["camera_rise"].values, name=f"camera at {name}", **looks)
+            rows.append((str(name), "camera", at, one["camera_rise"].values))
+    every = sensors["rise"].where(sensors["time"] < sensors["fault_time"].fillna(np.datetime64("2262-01-01", "ns")))
+    seen = f"Rise of {len(said)} contact sensors: {span_words(every, 'K')}; at the end of its use {join(said)}."
+    headings = ("sensor", "source", "time / h", "rise / K")
+    columns = zip(*(np.broadcast_arrays(*row) for row in rows), strict=True)
+    return Chart(drawn, seen, {name: np.concatenate(parts) for name, parts in zip(headings, columns, strict=True)})
+
+
+def _hours_since(times: np.ndarray, start: np.datetime64) -> np.ndarray:
+    return np.asarray((times - start) / np.timedelta64(1, "h"), float)
+
+
+# The thermal map: the table on its plan, cycle by cycle, with a menu of quantities.
+
+#: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
+_MAP_BUDGET = 3_000_000
+_MISSING = -32768
+#: A colour outside the scale, for values beyond its ends.
+_BEYOND = "#7fe3ff"
+#: Usual width of the map on a page, and largest height of a picture, CSS px.
+_WIDTH, _MOST_HEIGHT = 900, 720
+#: Room about the plan, as a share of its length, so that a ring at its rim is whole.
+_ROOM = 0.025
+
+
+class Layer(NamedTuple):
+    """A quantity of the map.
+
+    Attributes
+    ----------
+    variable : str
+        Its name in fields.nc.
+    words, unit : str
+        As they are shown; "1" for a number without unit.
+    decimals : int
+        That are shown.
+    colours : str
+        Name of its scale.
+    """
+
+    variable: str
+    words: str
+    unit: str
+    decimals: int
+    colours: str
+
+
+#: Quantities of the map, the first one shown first.
+LAYERS = (
+    Layer("temperature_rise", "rise", "K", 2, SEQUENTIAL),
+    Layer("temperature", "temperature", "°C", 2, SEQUENTIAL),
+    Layer("temperature_rate", "rate", "K/h", 2, DIVERGING),
+    Layer("temperature_rise_u", "standard uncertainty of the rise", "K", 3, SEQUENTIAL),
+    Layer("count", "frames averaged", "1", 0, SEQUENTIAL),
+)
+
+
+class MapControls(NamedTuple):
+    """What the reader can choose of the map, and what the page says of it.
+
+    Attributes
+    ----------
+    quantities : list of str
+        Entries of the menu.
+    cycles : list of int
+        Cycles that the slider goes through.
+    note : str
+        What was thinned or averaged; empty where nothing was.
+    """
+
+    quantities: list[str]
+    cycles: list[int]
+    note: str
+
+
+def plot_thermal_map(
+    fields: xr.Dataset,
+    hotspots: Sequence[HotspotPart] = (),
+    position: xr.DataArray | None = None,
+    *,
+    sensors: Sequence[ContactSensorPart] = (),
+) -> tuple[Chart, MapControls]:
+    """Draw the plan of the table with measured line, targets and hotspots."""
+    shown = [layer for layer in LAYERS if layer.variable in fields]
+    kept, note = _thin(fields[[layer.variable for layer in shown]])
+    unit = plan_unit(fields)
+    steps = {layer.words: _in_steps(kept[layer.variable].values, layer) for layer in shown}
+    scales = [scale_of(kept[layer.variable].values, layer) for layer in shown]
+    last = kept[shown[0].variable].values[-1]
+    drawn = draw_map(last, extent_of(kept), shown[0], scales[0], unit=unit)
+    if "target_x" in fields:
+        draw_line(drawn, fields, position)
+    draw_hotspots(drawn, hotspots, unit)
+    draw_sensors(drawn, sensors)
+    flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
+    more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
+    drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
+    cycle = int(kept["cycle"][-1])
+    chart = Chart(drawn, _seen(kept, last, hotspots, cycle), _columns(kept, shown, cycle))
+    return chart, MapControls([layer.words for layer in shown], kept["cycle"].values.tolist(), note)
+
+
+def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[str, Any], *, unit: str = "mm") -> figure:
+    """Draw one quantity in one cycle on the plan of the table."""
+    left, right, bottom, top = extent
+    room = _ROOM * (right - left)
+    # A table is longer than wide; a picture is drawn about as high as it is on a screen.
+    height = 330 if unit == "mm" else int(min(_MOST_HEIGHT, 60 + _WIDTH * values.shape[0] / values.shape[1]))
+    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=height, unit=unit)
+    mapper = LinearColorMapper(
+        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
+        name="scale",
+    )  # fmt: skip
+    cells = drawn.image(
+        [values.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
+    )  # fmt: skip
+    tip = (layer.words, f"@image{{0.{'0' * layer.decimals}}} {layer.unit}")
+    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), tip], [cells])
+    drawn.select_one(HoverTool).name = "reading"
+    add_colour_bar(drawn, mapper, f"{layer.words} / {layer.unit}")
+    drawn.below[-1].name = "bar"
+    return drawn
+
+
+def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
+    """Return the fields within the budget: every n-th cycle, then averages of blocks of cells; and the sentence that says so."""
+    layers, cycles = len(fields.data_vars), fields.sizes["cycle"]
+    x, y = fields.sizes["x"], fields.sizes["y"]
+    note = []
+    block = int(np.ceil(np.sqrt(max(1.0, x * y * layers * min(cycles, 25) / _MAP_BUDGET))))
+    every = int(np.ceil((x // block) * (y // block) * layers * cycles / _MAP_BUDGET))
+    chosen = sorted({*range(0, cycles, every), cycles - 1})
+    fields = (fields.isel(cycle=chosen) if every > 1 else fields).load()
+    if block > 1:
+        fields = fields.coarsen(x=block, y=block, boundary="trim").mean(keep_attrs=True)
+        note.append(f"The map shows means of {block} × {block} cells")
+    if every > 1:
+        note.append(f"{'' if note else 'The map shows '}{len(chosen)} of {cycles} cycles")
+    return fields, f"{', '.join(note)}; fields.nc holds all." if note else ""
+
+
+def _in_steps(values: np.ndarray, layer: Layer) -> np.ndarray:
+    """Return values as 16-bit steps of the last decimal that is shown; cells without a value hold the lowest number."""
+    steps = np.round(values.astype(float) * 10.0**layer.decimals)
+    return np.where(np.isfinite(steps), np.clip(steps, -32767, 32767), _MISSING).astype(np.int16)
+
+
+def scale_of(values: np.ndarray, layer: Layer) -> dict[str, Any]:
+    """Return how a quantity is shown: its step, its words, and one colour scale for all cycles."""
+    finite = values[np.isfinite(values)].astype(float)
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    inner_low, inner_high = np.percentile(finite, [0.1, 99.9]) if finite.size else (0.0, 1.0)
+    if high - low > 3 * (inner_high - inner_low) > 0:
+        low, high = float(inner_low), float(inner_high)
+    if layer.colours == DIVERGING:
+        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    unit = "" if layer.unit == "1" else layer.unit
+    return {
+        "name": layer.words, "unit": unit, "step": 10.0**-layer.decimals, "decimals": layer.decimals, "low": low,
+        "high": high if high > low else low + 1.0, "palette": palette(layer.colours),
+    }  # fmt: skip
+
+
+def draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
+    """Draw the measured line with an arrow to its positive end, its targets, and the numbers of the first and the last."""
+    targets = fields["target"].values
+    order = np.arange(targets.size)
+    if position is not None:
+        order = np.argsort(position.sel(target=targets).values, kind="stable")
+    x, y = fields["target_x"].values[order], fields["target_y"].values[order]
+    for colour, width in ((INK, 4), ("#ffffff", 1.6)):  # dark under light reads on every colour
+        drawn.line(x, y, line_color=colour, line_width=width)
+        drawn.scatter(x, y, marker="circle", size=width + 3, color=colour)
+    if x.size > 1:
+        head = NormalHead(size=11, fill_color="#ffffff", line_color=INK)
+        along = np.array([x[-1] - x[-2], y[-1] - y[-2]])
+        along *= 1.6 * _ROOM * (drawn.x_range.end - drawn.x_range.start) / (np.hypot(*along) or 1.0)
+        ends = {"x_start": x[-1], "y_start": y[-1], "x_end": x[-1] + along[0], "y_end": y[-1] + along[1]}
+        drawn.add_layout(Arrow(**ends, end=head, line_color="#ffffff", line_width=2))
+    named = sorted({0, x.size - 1})
+    add_names(drawn, x[named], y[named], [f"{targets[order[k]]}" for k in named], y_offset=-7, text_align="center")
+
+
+def draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
+    """Ring the peak of every hotspot and write its name."""
+    if not hotspots:
+        return
+    x, y = ([getattr(spot, f"{axis}_{unit}") for spot in hotspots] for axis in "xy")
+    _add_marks(drawn, x, y, "circle", 19)
+    names = [spot.name or f"hotspot {place}" for place, spot in enumerate(hotspots, start=1)]
+    middle = np.mean([drawn.x_range.start, drawn.x_range.end])
+    add_names(drawn, x, y, names, y_offset=-13, text_align=["right" if at > middle else "left" for at in x])
+
+
+def draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
+    """Mark the places of the contact sensors by squares with their names; faulty ones are crossed."""
+    for marker, used in (("square", True), ("square_x", False)):
+        shown = [sensor for sensor in sensors if sensor.used is used]
+        if not shown:
+            continue
+        x, y = [sensor.x_mm for sensor in shown], [sensor.y_mm for sensor in shown]
+        _add_marks(drawn, x, y, marker, 11)
+        names = [sensor.name for sensor in shown]
+        add_names(drawn, x, y, names, y_offset=16, text_align="center", text_baseline="middle")
+
+
+def _add_marks(drawn: figure, x: Sequence[float], y: Sequence[float], marker: str, size: int) -> None:
+    """Draw hollow marks, light on dark, which reads on every colour."""
+    for colour, width in ((INK, 4), ("#ffffff", 2)):
+        drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width)
+
+
+def _seen(kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], cycle: int) -> str:
+    """Say what the map shows when the page opens."""
+    if not np.isfinite(last).any():
+        return f"Plan of the table in cycle {cycle}: no cell is seen."
+    row, column = np.unravel_index(np.nanargmax(last), last.shape)
+    count = len(hotspots)
+    marked = f"; {count} {'hotspot is' if count == 1 else 'hotspots are'} ringed" if count else ""
+    return (
+        f"Plan of the table: in cycle {cycle} the rise is {number(float(np.nanmin(last)))} to {number(float(np.nanmax(last)))} K, largest "
+        f"at {place(float(kept['x'][column]), float(kept['y'][row]), plan_unit(kept))}{marked}."
+    )
+
+
+def _columns(kept: xr.Dataset, shown: Sequence[Layer], cycle: int) -> dict[str, np.ndarray]:
+    """Return the cells of the last cycle, one row each."""
+    x, y = np.meshgrid(kept["x"].values, kept["y"].values)
+    units = {layer.words: "" if layer.unit == "1" else f" / {layer.unit}" for layer in shown}
+    values = {
+        f"{layer.words}, cycle {cycle}{units[layer.words]}": kept[layer.variable].values[-1].ravel() for layer in shown
+    }
+    unit = plan_unit(kept)
+    return {f"x / {unit}": x.ravel(), f"y / {unit}": y.ravel(), **values}

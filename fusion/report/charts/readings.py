@@ -2,41 +2,357 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence, Set
+
 import numpy as np
 import xarray as xr
+from bokeh.layouts import column
+from bokeh.models import BoxAnnotation, LayoutDOM, LinearColorMapper, Whisker
+from bokeh.models.sources import ColumnDataSource
+from bokeh.plotting import figure
 
 from fusion.report.charts.style import (
+    CATEGORIES,
+    DIVERGING,
     MARKERS,
     Chart,
     add_band,
+    add_colour_bar,
+    add_hover,
+    add_label,
     add_ordered_lines,
     add_series,
     add_zero_line,
     fix_range,
     new_figure,
+    of_direction,
+    ordered_colours,
+    palette,
     shared_range,
     span_words,
 )
-from fusion.report.wording import number
-from interferometry.figures import ACCENT, ARROWS, COLOURS, INK, MUTED, hours_since_start
+from fusion.report.wording import join, number, print_unit
+from interferometry.plots import ACCENT, ARROWS, COLOURS, INK, MUTED, hours_since_start
+
+# Charts of the joint estimate: drift of every position over time, drift-free profile.
+
+
+def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw the drift of every position over time, mean of both approaches; the ends of the axis are named and have their 95 % band."""
+    hours = hours_since_start(deviations).mean("direction").transpose("cycle", "target").values
+    lines = drift["drift"].mean("direction").transpose("cycle", "target").values
+    band = 2 * drift["drift_u"].mean("direction").transpose("cycle", "target").values
+    position = deviations["position"].values
+    order = np.argsort(position, kind="stable")
+    colours = ordered_colours(position.size)
+    # Room for names at the right.
+    first_h, last_h = float(np.nanmin(hours)), float(np.nanmax(hours))
+    times = (first_h - 0.02 * (last_h - first_h), last_h + 0.18 * (last_h - first_h))
+    drawn = new_figure(x="time since first reading / h", y="drift / µm", height=360, x_range=times)
+    add_zero_line(drawn)
+    ends = (0, position.size - 1)
+    for rank in ends:
+        line, half = lines[:, order[rank]], band[:, order[rank]]
+        add_band(drawn, hours[:, order[rank]], line - half, line + half, colours[rank])
+    add_ordered_lines(drawn, list(hours.T[order]), list(lines.T[order]), position[order], "position / mm")
+    for rank in ends:
+        x, y = hours[:, order[rank]], lines[:, order[rank]]
+        valid = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+        if valid.size:
+            last, name = valid[-1], f"{position[order[rank]]:g} mm"
+            add_label(drawn, float(x[last]), float(y[last]), name, offset=(4, -6), colour=colours[rank], size="11px")
+    courses = [line[np.isfinite(line)] for line in lines.T]
+    change = np.mean([course[-1] - course[0] for course in courses if course.size])
+    far = np.argmax([np.abs(course).max(initial=-1.0) for course in courses])
+    seen = (
+        f"Drift of {position.size} positions over {number(float(np.nanmax(hours)), 2)} h: {span_words(lines, 'µm')}; from the first to the "
+        f"last cycle it changes by {number(float(change), 2)} µm on average, and the largest drift is at {position[far]:g} mm."
+    )
+    columns = {
+        "cycle": np.repeat(drift["cycle"].values, position.size),
+        "position / mm": np.tile(position, len(lines)),
+        "time since first reading / h": hours.ravel(),
+        "drift / µm": lines.ravel(),
+        "95 % band ± / µm": band.ravel(),
+    }
+    return Chart(drawn, seen, columns)
+
+
+def plot_profile(drift: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the drift-free profile of both approaches with its 95 % band."""
+    drawn = new_figure(x="position / mm", y="deviation / µm")
+    add_zero_line(drawn)
+    order = np.argsort(position.values, kind="stable")
+    drift, x = drift.isel(target=order), position.values[order].astype(float)
+    columns: dict[str, np.ndarray] = {"position / mm": x}
+    for direction in drift["direction"].values:
+        row = drift.sel(direction=direction)
+        value, half = row["profile"].values, 2 * row["profile_u"].values
+        add_band(drawn, x, value - half, value + half, COLOURS[direction])
+        add_series(drawn, x, value, name=ARROWS[direction], half=half, **of_direction(direction))
+        columns[f"profile, {ARROWS[direction]} / µm"] = value
+        columns[f"95 % band ±, {ARROWS[direction]} / µm"] = half
+    rows = "; ".join(
+        f"{ARROWS[direction]} {span_words(drift['profile'].sel(direction=direction), 'µm')}"
+        for direction in drift["direction"].values
+    )
+    seen = f"Drift-free deviation over {span_words(x, 'mm')} of the axis: {rows}."
+    return Chart(drawn, seen, columns)
+
+
+def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the reversal (positive minus negative approach) of every position with its 95 % interval."""
+    drawn = new_figure(x="position / mm", y="positive − negative / µm")
+    add_zero_line(drawn)
+    x, value, half = position.values.astype(float), drift["reversal"].values, 2 * drift["reversal_u"].values
+    add_series(drawn, x, value, name="reversal", colour=INK, line=False, marker="circle", half=half, legend=False)
+    apart = int((np.abs(value) > half).sum())
+    seen = f"Reversal of {x.size} positions: {span_words(value, 'µm')}; {apart} of them differ from zero by more than their 95 % interval."
+    return Chart(drawn, seen, {"position / mm": x, "reversal / µm": value, "95 % interval ± / µm": half})
+
+
+def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Set[int]) -> Chart:
+    """Draw the random scatter of every position and approach with its 95 % interval; flagged positions are shaded."""
+    x = position.values.astype(float)
+    step = float(np.median(np.diff(np.sort(x)))) if x.size > 1 else 1.0
+    drawn = new_figure(x="position / mm", y="scatter s / µm")
+    for target in sorted(flagged):
+        place = float(position.sel(target=target))
+        sides = {"left": place - 0.4 * step, "right": place + 0.4 * step}
+        drawn.add_layout(BoxAnnotation(**sides, fill_color=ACCENT, fill_alpha=0.12, level="underlay"))
+    columns: dict[str, np.ndarray] = {"position / mm": x}
+    for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
+        value, half = (drift[name].sel(direction=direction).values for name in ("scatter", "scatter_u"))
+        looks = of_direction(direction)
+        add_series(drawn, x + shift * step, value, name=ARROWS[direction], line=False, half=2 * half, **looks)
+        columns[f"scatter, {ARROWS[direction]} / µm"] = value
+        columns[f"95 % interval ±, {ARROWS[direction]} / µm"] = 2 * half
+    highest = float((drift["scatter"] + 2 * drift["scatter_u"]).max())
+    fix_range(drawn, 0.0, 1.06 * highest if np.isfinite(highest) else 1.0)
+    places = join([f"{float(position.sel(target=target)):g} mm" for target in sorted(flagged)])
+    seen = f"Random scatter of {x.size} positions: {span_words(drift['scatter'], 'µm')}; " + (
+        f"marked as standing out: {places}." if flagged else "none is marked as standing out."
+    )
+    return Chart(drawn, seen, columns)
+
+
+def plot_drift_map(drift: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the drift as colours over cycle and position, mean of both approaches."""
+    return cycle_map(drift["drift"].mean("direction"), position, "drift / µm")
+
+
+def plot_deviation_map(deviations: xr.Dataset) -> Chart:
+    """Draw the readings as colours over cycle and position, mean of both approaches, each position about its mean over the cycles."""
+    read = deviations["deviation"].mean("direction")
+    return cycle_map(read - read.mean("cycle"), deviations["position"], "deviation from the mean of the position / µm")
+
+
+def cycle_map(values: xr.DataArray, position: xr.DataArray, label: str) -> Chart:
+    """Draw values as colours over cycle and position; a value that is missing is left blank."""
+    order = np.argsort(position.values, kind="stable")
+    field = values.transpose("cycle", "target").values[:, order]
+    cycle, place = values["cycle"].values.astype(float), position.values[order].astype(float)
+    quantity, _, unit = label.rpartition(" / ")
+    low, high = shared_range(field, symmetrical=True)
+    mapper = LinearColorMapper(palette(DIVERGING), low=low, high=high, nan_color="#ffffff")
+    (left, right), (bottom, top) = edges(cycle), edges(place)
+    drawn = new_figure(
+        x="cycle", y="position / mm", height=300, x_range=(left[0], right[-1]), y_range=(bottom[0], top[-1])
+    )
+    drawn.grid.grid_line_color = None
+    across, along = field.shape
+    cells = drawn.quad(
+        left="left", right="right", bottom="bottom", top="top", line_color=None,
+        fill_color={"field": "value", "transform": mapper},
+        source={
+            "left": np.repeat(left, along), "right": np.repeat(right, along), "bottom": np.tile(bottom, across),
+            "top": np.tile(top, across), "value": field.ravel(), "cycle": np.repeat(cycle, along), "place": np.tile(place, across),
+        },
+    )  # fmt: skip
+    tips = [("cycle", "@cycle{0}"), ("position", "@place{0.[000]} mm"), (quantity, f"@value{{0.00}} {unit}")]
+    add_hover(drawn, tips, [cells])
+    add_colour_bar(drawn, mapper, label)
+    largest = np.unravel_index(np.nanargmax(np.abs(field)), field.shape)
+    seen = (
+        f"{quantity.capitalize()} of {across} cycles at {along} positions: {span_words(field, unit)}; the largest size is in cycle "
+        f"{cycle[largest[0]]:.0f} at {place[largest[1]]:g} mm."
+    )
+    cycles = np.repeat(cycle, along).astype(int)
+    return Chart(drawn, seen, {"cycle": cycles, "position / mm": np.tile(place, across), label: field.ravel()})
+
+
+def edges(middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the cells about points along an axis: half-way to the neighbours."""
+    if middle.size < 2:
+        return middle - 0.5, middle + 0.5
+    between = (middle[1:] + middle[:-1]) / 2
+    first, last = 2 * middle[0] - between[0], 2 * middle[-1] - between[-1]
+    return np.concatenate([[first], between]), np.concatenate([between, [last]])
+
+
+# Chart of a test by ISO 230-2: means and ±2 s of both approaches over the targets, with A, E and B.
+
+
+def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the chart of the standard: mean deviation and ±2 s of each approach, with the spans of A and E and the place of B."""
+    order = np.argsort(position.values, kind="stable")
+    settled, x = settled.isel(target=order), position.values[order].astype(float)
+    room = 0.24 * (np.ptp(x) or 1.0)
+    left = x[0] - 0.04 * room
+    drawn = new_figure(x="position / mm", y="deviation / µm", height=420, x_range=(left, x[-1] + room))
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {"target": settled["target"].values, "position / mm": x}
+    for direction in settled["direction"].values:
+        row = settled.sel(direction=direction)
+        mean, s = row["mean_unidirectional"].values, row["standard_deviation"].values
+        if not np.isfinite(mean).any():
+            continue
+        name = ARROWS[direction]
+        add_band(drawn, x, mean - 2 * s, mean + 2 * s, COLOURS[direction])
+        source = ColumnDataSource({"x": x, "y": mean, "low": mean - 2 * s, "high": mean + 2 * s, "s": s})
+        drawn.line("x", "y", source=source, line_width=1.6, color=COLOURS[direction], legend_label=f"mean, {name}")
+        whisker = Whisker(base="x", upper="high", lower="low", source=source, line_color=COLOURS[direction])
+        for head in (whisker.upper_head, whisker.lower_head):
+            head.update(line_color=COLOURS[direction], size=8)
+        drawn.add_layout(whisker)
+        looks = {"marker": MARKERS[direction], "size": 7, "color": COLOURS[direction]}
+        points = drawn.scatter("x", "y", source=source, legend_label=f"mean, {name}", **looks)
+        tips = [("position", "@x{0.###} mm"), (f"mean {name}", "@y{0.00} µm"), ("s", "@s{0.00} µm")]
+        add_hover(drawn, tips, [points])
+        columns |= {f"mean, {name} / µm": mean, f"s, {name} / µm": s}
+    if np.isfinite(settled["mean_bidirectional"]).any():
+        drawn.line(x, settled["mean_bidirectional"].values, color=INK, line_dash="dotted", legend_label="mean of both")
+        _mark_reversal(drawn, settled, x)
+    _mark_spans(drawn, settled, x[-1], room)
+    return Chart(drawn, _seen(settled, x), columns)
+
+
+def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> None:
+    """Draw the spans of A and E to the right of the data, where both approaches were measured, else those of the one approach."""
+    mean, s = settled["mean_unidirectional"].values, settled["standard_deviation"].values
+    if not np.isfinite(mean).any():
+        return
+    # Labels are at two heights: at one height they would be written over each other.
+    spans = (("A", mean - 2 * s, mean + 2 * s, 0.15, 0.3), ("E", mean, mean, 0.62, 0.6))
+    for symbol, low, high, share, height in spans:
+        at, bottom, top = end + share * room, float(np.nanmin(low)), float(np.nanmax(high))
+        drawn.segment([at], [bottom], [at], [top], line_color=INK, line_width=1.4)
+        for level in (bottom, top):
+            drawn.segment([end], [level], [at], [level], line_color=MUTED, line_dash="dashed", line_width=0.8)
+        add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {top - bottom:.2f}", offset=(4, -8))
+
+
+def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:
+    """Draw the reversal error B at the target where it is largest."""
+    reversal = settled["reversal"].values
+    k = int(np.nanargmax(np.abs(reversal)))
+    ends, s = settled["mean_unidirectional"].values[:, k], settled["standard_deviation"].values[:, k]
+    drawn.segment([x[k]], [ends.min()], [x[k]], [ends.max()], line_color=INK, line_width=3)
+    add_label(drawn, float(x[k]), float((ends + 2 * s).max()), f"B {abs(reversal[k]):.2f}", offset=(-16, 6))
+
+
+def _seen(settled: xr.Dataset, x: np.ndarray) -> str:
+    """Return the text alternative."""
+    means = {
+        direction: settled["mean_unidirectional"].sel(direction=direction) for direction in settled["direction"].values
+    }
+    rows = [f"{ARROWS[side]} {span_words(mean, 'µm')}" for side, mean in means.items() if np.isfinite(mean).any()]
+    known = [symbol for symbol in "AEB" if np.isfinite(settled[symbol])]
+    values = ", ".join(f"{symbol} {number(float(settled[symbol]))} µm" for symbol in known)
+    told = f"Mean deviation over {span_words(x, 'mm')} of the axis with ±2 s: {'; '.join(rows)}."
+    return f"{told} {values}." if values else told
+
+
+def plot_single_runs(deviations: xr.Dataset) -> Chart:
+    """Draw the deviations of a test of one cycle, which has no standard deviation."""
+    drawn = new_figure(x="position / mm", y="deviation / µm", height=420)
+    add_zero_line(drawn)
+    ordered = deviations.sortby("position")
+    x = ordered["position"].values
+    columns: dict[str, np.ndarray] = {"target": ordered["target"].values, "position / mm": x}
+    seen = []
+    for direction in ordered["direction"].values:
+        for cycle in ordered["cycle"].values:
+            y = ordered["deviation"].sel(direction=direction, cycle=cycle).values
+            if not np.isfinite(y).any():
+                continue
+            name = ARROWS[direction]
+            drawn.line(x, y, color=COLOURS[direction], line_width=1.6, legend_label=name)
+            points = drawn.scatter(x, y, marker=MARKERS[direction], size=7, color=COLOURS[direction], legend_label=name)
+            add_hover(drawn, [("position", "$x{0.###} mm"), (name, "$y{0.00} µm")], [points])
+            columns[f"cycle {cycle}, {name} / µm"] = y
+            seen.append(f"{name} {span_words(y, 'µm')}")
+    return Chart(drawn, f"Single deviations over {span_words(x, 'mm')} of the axis: {'; '.join(seen)}.", columns)
+
+
+# Charts of the differences between neighbouring positions.
+
+
+def _links(links: xr.DataArray, position: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions (mm) of the further and of the nearer target of every pair."""
+    along = position["target"].values[np.argsort(position.values, kind="stable")].tolist()
+    nearer = [along[along.index(int(target)) - 1] for target in links.values]
+    return position.sel(target=links.values).values.astype(float), position.sel(target=nearer).values.astype(float)
+
+
+def plot_scatter_comparison(comparison: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the standard deviation of the differences of neighbours and the conventional one of each position."""
+    place, _ = _links(comparison["link"], position)
+    drawn = new_figure(x="position / mm", y="standard deviation / µm", y_type="log")
+    columns: dict[str, np.ndarray] = {"position / mm": place}
+    for name, text, dash in (("differenced", "differences", "solid"), ("conventional", "conventional", "dashed")):
+        for direction in comparison["direction"].values:
+            values = comparison[name].sel(direction=direction).values
+            add_series(drawn, place, values, name=f"{text}, {direction}", dash=dash, **of_direction(direction))
+            columns[f"s of the {text}, {ARROWS[direction]} / µm"] = values
+    seen = (
+        f"Standard deviation of {place.size} positions: of the differences {span_words(comparison['differenced'], 'µm')}, conventional "
+        f"{span_words(comparison['conventional'], 'µm')}."
+    )
+    return Chart(drawn, seen, columns)
+
+
+def plot_mean_differences(neighbours: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the mean difference of neighbouring positions, nearer minus further, with its 95 % interval."""
+    further, nearer = _links(neighbours["link"], position)
+    middle, step = (further + nearer) / 2, float(np.median(further - nearer))
+    drawn = new_figure(x="middle of the pair / mm", y="nearer − further position, mean / µm")
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {"nearer position / mm": nearer, "further position / mm": further}
+    for shift, direction in zip((-0.1, 0.1), neighbours["direction"].values, strict=False):
+        value = neighbours["mean_difference"].sel(direction=direction).values
+        half = 2 * neighbours["mean_difference_u"].sel(direction=direction).values
+        looks = of_direction(direction)
+        add_series(drawn, middle + shift * step, value, name=ARROWS[direction], line=False, half=half, **looks)
+        columns |= {f"nearer − further, {ARROWS[direction]} / µm": value, f"95 % ±, {ARROWS[direction]} / µm": half}
+    seen = (
+        f"Mean difference of {middle.size} pairs of neighbours, nearer minus further: {span_words(neighbours['mean_difference'], 'µm')}; "
+        "below zero the deviation grows along the axis."
+    )
+    return Chart(drawn, seen, columns)
+
+
+def plot_reference_chart(chart: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the deviation chart from the reference value at the first position, with borders of twice the scatter of the differences."""
+    order = np.argsort(position.sel(target=chart["target"]).values, kind="stable")
+    chart = chart.isel(target=order)
+    place = position.sel(target=chart["target"]).values.astype(float)
+    drawn = new_figure(x="position / mm", y="deviation / µm")
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {"position / mm": place}
+    for direction in chart["direction"].values:
+        value, border = (chart[name].sel(direction=direction).values for name in ("chart", "border_s"))
+        name, looks = ARROWS[direction], {"line_color": COLOURS[direction], "line_dash": "dashed"}
+        add_series(drawn, place, value, name=name, **of_direction(direction))
+        for sign in (-1, 1):
+            drawn.line(place, value + sign * border, legend_label=f"±2 s, {direction}", **looks)
+        columns |= {f"deviation, {name} / µm": value, f"border ±, {name} / µm": border}
+    seen = f"Deviation from the reference at {place[0]:g} mm: {span_words(chart['chart'], 'µm')} over {place.size} positions."
+    return Chart(drawn, seen, columns)
 
 
 def plot_cycles(deviations: xr.Dataset, direction: str, *, quantity: str = "deviation") -> Chart:
-    """Draw the readings of every cycle over position for one direction of approach; both directions have the same y range.
-
-    Parameters
-    ----------
-    deviations : Dataset
-        ``deviation`` (um; cycle, direction, target) and ``position`` (mm; target).
-    direction : {"positive", "negative"}
-        Direction of approach.
-    quantity : str
-        What the y axis shows.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the readings of every cycle over position for one direction of approach; both directions have the same y range."""
     order = np.argsort(deviations["position"].values, kind="stable")
     every = deviations["deviation"].transpose("cycle", "direction", "target")
     lines = every.sel(direction=direction).values[:, order]
@@ -51,30 +367,12 @@ def plot_cycles(deviations: xr.Dataset, direction: str, *, quantity: str = "devi
         f"{quantity.capitalize()} of {len(lines)} cycles, {ARROWS[direction]}: {span_words(lines, 'µm')}; the mean over the cycles goes "
         f"from {number(float(mean[0]), 2)} µm at {place[0]:g} mm to {number(float(mean[-1]), 2)} µm at {place[-1]:g} mm."
     )
-    columns = {
-        "cycle": np.repeat(cycles, place.size),
-        "position / mm": np.tile(place, len(lines)),
-        f"{quantity} / µm": lines.ravel(),
-    }
-    return Chart(drawn, seen, columns)
+    columns = {"cycle": np.repeat(cycles, place.size), "position / mm": np.tile(place, len(lines))}
+    return Chart(drawn, seen, {**columns, f"{quantity} / µm": lines.ravel()})
 
 
 def plot_history(deviations: xr.Dataset, drift: xr.Dataset, target: int) -> Chart:
-    """Draw the readings at one position over time with profile and drift as estimated and the 95 % band of the drift.
-
-    Parameters
-    ----------
-    deviations : Dataset
-        Content of deviations.nc.
-    drift : Dataset
-        Its group ``drift``.
-    target : int
-        Number of the position.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the readings at one position over time with profile and drift as estimated and the 95 % band of the drift."""
     hours, place = hours_since_start(deviations), float(deviations["position"].sel(target=target))
     drawn = new_figure(x="time since first reading / h", y="deviation / µm", title=f"position {target} ({place:g} mm)")
     columns: dict[str, np.ndarray] = {"cycle": deviations["cycle"].values}
@@ -84,9 +382,9 @@ def plot_history(deviations: xr.Dataset, drift: xr.Dataset, target: int) -> Char
         line = read - drift["noise"].sel(chosen).values
         half = 2 * drift["drift_u"].sel(chosen).values
         add_band(drawn, x, line - half, line + half, COLOURS[direction])
-        name, colour = ARROWS[direction], COLOURS[direction]
-        add_series(drawn, x, line, name=f"estimate, {direction}", colour=colour)
-        add_series(drawn, x, read, name=f"readings, {direction}", colour=colour, line=False, marker=MARKERS[direction])
+        name = ARROWS[direction]
+        add_series(drawn, x, line, name=f"estimate, {direction}", colour=COLOURS[direction])
+        add_series(drawn, x, read, name=f"readings, {direction}", line=False, **of_direction(direction))
         columns |= {
             f"time, {name} / h": x,
             f"deviation, {name} / µm": read,
@@ -99,28 +397,17 @@ def plot_history(deviations: xr.Dataset, drift: xr.Dataset, target: int) -> Char
 
 
 def plot_windows(windows: xr.Dataset) -> Chart:
-    """Draw accuracy A, repeatability R and reversal B of five-cycle windows along the test; dotted: all cycles as one window.
-
-    Parameters
-    ----------
-    windows : Dataset
-        Group ``iso`` of deviations.nc: one entry per window, the last one the whole test.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw accuracy A, repeatability R and reversal B of five-cycle windows along the test; dotted: all cycles as one window."""
     short, whole = windows.isel(window=slice(None, -1)), windows.isel(window=-1)
     drawn = new_figure(x="middle cycle of the window", y="A, R, B / µm")
     middle = short["middle_cycle"].values
     columns: dict[str, np.ndarray] = {"middle cycle": middle}
-    for shift, (name, colour, text, marker) in enumerate(
-        (
-            ("A", INK, "accuracy A", "circle"),
-            ("R", ACCENT, "repeatability R", "square"),
-            ("B", MUTED, "reversal B", "diamond"),
-        )
-    ):
+    shown = (
+        ("A", INK, "accuracy A", "circle"),
+        ("R", ACCENT, "repeatability R", "square"),
+        ("B", MUTED, "reversal B", "diamond"),
+    )
+    for shift, (name, colour, text, marker) in enumerate(shown):
         value, half = short[name].values, 2 * short[f"{name}_u"].values
         add_series(drawn, middle + 0.25 * (shift - 1), value, name=text, colour=colour, marker=marker, half=half)
         drawn.hspan(float(whole[name]), line_color=colour, line_dash="dotted", line_width=1.5)
@@ -133,3 +420,91 @@ def plot_windows(windows: xr.Dataset) -> Chart:
         f"R {number(float(whole['R']))} µm."
     )
     return Chart(drawn, seen, columns)
+
+
+# What was recorded when, and the environment and the drivers on the same time axis.
+
+_TIME = "time since first reading / h"
+#: A recording has a gap where nothing comes for this many of its usual intervals.
+_GAP = 1.8
+
+
+def plot_timeline(fused: xr.Dataset) -> Chart:
+    """Draw bars of what was recorded when, with gaps, and below them environment and drivers in their own units."""
+    times = fused["time"]
+    start = np.nanmin(times.values)
+    recorded = {"readings": np.asarray(((times - start) / np.timedelta64(1, "h")).mean(["direction", "target"]), float)}
+    for name, dim in (("frames", "frame_time"), ("environment log", "environment_time"), ("driver log", "driver_time")):
+        if dim in fused.dims:
+            recorded[name] = _hours(fused[dim].values, start)
+    spans = {name: recorded_spans(hours) for name, hours in recorded.items()}
+    bars = _plot_spans(spans)
+    series = [str(name) for name in fused.data_vars if fused[name].dims in (("environment_time",), ("driver_time",))]
+    below: list[figure] = []
+    for at, name in enumerate(series):
+        below.append(_plot_series(fused[name], _hours(fused[fused[name].dims[0]].values, start), at, bars))
+    for drawn in (bars, *below)[:-1]:
+        drawn.xaxis.axis_label = None
+    shown: LayoutDOM = column(bars, *below, sizing_mode="stretch_width") if below else bars
+    gaps = [f"{name} {len(parts) - 1}" for name, parts in spans.items() if len(parts) > 1]
+    units = {name: print_unit(str(fused[name].attrs.get("units", "1"))) for name in series}
+    said = [f"{_words(name)} {span_words(fused[name], unit)}" for name, unit in units.items()]
+    seen = (
+        f"Recorded over {number(float(max(np.nanmax(hours) for hours in recorded.values())), 2)} h: {join(list(recorded))}; "
+        f"{'gaps: ' + ', '.join(gaps) if gaps else 'no gaps'}." + (f" {'; '.join(said)}." if said else "")
+    )
+    rows = [(name, low, high) for name, parts in spans.items() for low, high in parts]
+    columns: dict[str, Sequence[str] | np.ndarray] = {
+        "recording": [name for name, *_ in rows],
+        f"first, {_TIME}": np.array([low for _, low, _ in rows]),
+        f"last, {_TIME}": np.array([high for *_, high in rows]),
+    }
+    return Chart(shown, seen, columns)
+
+
+def recorded_spans(hours: np.ndarray) -> list[tuple[float, float]]:
+    """Return the spans without a gap of a recording: first and last time of each."""
+    known = np.sort(hours[np.isfinite(hours)])
+    if known.size < 2:
+        return [(float(known[0]), float(known[0]))] if known.size else []
+    steps = np.diff(known)
+    breaks = np.flatnonzero(steps > _GAP * float(np.quantile(steps, 0.9)))
+    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [known.size - 1]])
+    return [(float(known[first]), float(known[last])) for first, last in zip(firsts, lasts, strict=True)]
+
+
+def _hours(times: np.ndarray, start: np.datetime64) -> np.ndarray:
+    hours = (times - start) / np.timedelta64(1, "h")
+    return np.asarray(hours[np.isfinite(hours)], float)
+
+
+def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> figure:
+    """Draw one bar for every span of every recording."""
+    names = list(spans)
+    every = [end for parts in spans.values() for part in parts for end in part]
+    low, high = shared_range(np.array(every))
+    drawn = new_figure(x=_TIME, y="", height=60 + 22 * len(names), y_range=names[::-1], x_range=(low, high))
+    for at, name in enumerate(names):
+        parts = spans[name]
+        source = {"y": [name] * len(parts), "left": [part[0] for part in parts], "right": [part[1] for part in parts]}
+        bar = drawn.hbar(y="y", left="left", right="right", height=0.55, color=CATEGORIES[at], source=source)
+        add_hover(drawn, [("", name), ("from", "@left{0.00} h"), ("to", "@right{0.00} h")], [bar])
+    return drawn
+
+
+def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure) -> figure:
+    """Draw one logged quantity below the bars, on the same time axis."""
+    unit = print_unit(str(values.attrs.get("units", "1")))
+    words = _words(str(values.name))
+    drawn = new_figure(x=_TIME, y=unit or "1", title=words, height=118)
+    drawn.x_range = above.x_range
+    drawn.yaxis.ticker.desired_num_ticks = 3
+    low, high = shared_range(values.values)
+    fix_range(drawn, low, high)
+    line = drawn.line(hours, values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)
+    add_hover(drawn, [("time", "@x{0.00} h"), (words, f"@y{{0.00}} {unit}")], [line])
+    return drawn
+
+
+def _words(name: str) -> str:
+    return name.removesuffix("_series").replace("_", " ")

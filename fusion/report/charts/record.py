@@ -11,7 +11,6 @@ from bokeh.plotting import figure
 from fusion.report.charts.style import (
     BEFORE,
     CATEGORIES,
-    DASHES,
     Chart,
     add_band,
     add_hold_out,
@@ -20,11 +19,12 @@ from fusion.report.charts.style import (
     add_zero_line,
     fix_range,
     new_figure,
+    of_rank,
     shared_range,
     span_words,
 )
 from fusion.report.wording import effect_words, join, number, print_unit
-from interferometry.figures import COLOURS, INK
+from interferometry.plots import COLOURS, INK
 
 _TIME, _AFTER, _PALE = "time since start / h", COLOURS["positive"], "#b3bdc2"
 #: Sensors that are named; a legend of dozens hides the chart.
@@ -32,33 +32,20 @@ _NAMED = 4
 
 
 def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
-    """Draw one channel as measured and as predicted by the declared and by the final model; the hold-out is shaded.
-
-    The 95 % band is that of the model's fit where the model was fitted, and that of its predictions where the record was held out.
-
-    Parameters
-    ----------
-    record : Dataset
-        fusion.nc of a record.
-    channel : str
-        Name of the channel.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw one channel as measured and as predicted by the declared and by the final model; the hold-out is shaded."""
     hours, chosen = hours_of(record), record.sel(channel=channel)
-    half = 2 * np.where(record["sealed"].values, float(chosen["predicted_u"]), _fit_error(chosen))
-    measured, declared, final = (
-        chosen[name].values for name in ("displacement", "predicted_declared", "predicted_final")
-    )
+    names = ("displacement", "predicted_declared", "predicted_final")
+    measured, declared, final = (chosen[name].values for name in names)
+    held = record["sealed"].values
+    # Root mean square by which the final model misses what it was fitted to, µm.
+    missed_fit = float(np.sqrt(np.nanmean((measured - final)[~held] ** 2)))
+    half = 2 * np.where(held, float(chosen["predicted_u"]), missed_fit)
     drawn = new_figure(x=_TIME, y="displacement / µm", title=channel, height=340)
     _shade_hold_out(record, drawn)
     add_band(drawn, hours, final - half, final + half, _AFTER, legend_label="95 % band")
     add_series(drawn, hours, declared, name="declared model", colour=BEFORE, dash="dashed")
     add_series(drawn, hours, final, name="final model", colour=_AFTER, width=2.2)
     add_series(drawn, hours, measured, name="measured", colour=INK, width=1.2)
-    held = record["sealed"].values
     missed = float(np.sqrt(np.nanmean((measured - final)[held] ** 2))) if held.any() else float("nan")
     seen = (
         f"{channel} measured from {span_words(measured, 'µm')}; where it was held out, the final model misses it by "
@@ -71,36 +58,16 @@ def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
     return Chart(drawn, seen, columns)
 
 
-def _fit_error(chosen: xr.Dataset) -> float:
-    """Return the root mean square by which the final model misses what it was fitted to, µm."""
-    fitted = ~chosen["sealed"].values
-    return float(np.sqrt(np.nanmean((chosen["displacement"] - chosen["predicted_final"]).values[fitted] ** 2)))
-
-
 def plot_residuals(record: xr.Dataset, channel: str) -> Chart:
-    """Draw the residuals of both models in one channel over time.
-
-    Parameters
-    ----------
-    record : Dataset
-        fusion.nc of a record.
-    channel : str
-        Name of the channel.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the residuals of both models in one channel over time."""
     hours, chosen = hours_of(record), record.sel(channel=channel)
     drawn = new_figure(x=_TIME, y="measured − predicted / µm", title=channel)
     _shade_hold_out(record, drawn)
     add_zero_line(drawn)
     columns: dict[str, np.ndarray] = {_TIME: hours}
     parts = []
-    for ending, name, colour, dash in (
-        ("declared", "declared model", BEFORE, "dashed"),
-        ("final", "final model", _AFTER, "solid"),
-    ):
+    stages = (("declared", "declared model", BEFORE, "dashed"), ("final", "final model", _AFTER, "solid"))
+    for ending, name, colour, dash in stages:
         missed = (chosen["displacement"] - chosen[f"predicted_{ending}"]).values
         add_series(drawn, hours, missed, name=name, colour=colour, dash=dash)
         columns[f"measured − {name} / µm"] = missed
@@ -109,17 +76,7 @@ def plot_residuals(record: xr.Dataset, channel: str) -> Chart:
 
 
 def plot_temperatures(record: xr.Dataset) -> Chart:
-    """Draw the rise of every sensor since the first block; the sensors that rise most have a colour and a name each.
-
-    Parameters
-    ----------
-    record : Dataset
-        fusion.nc of a record.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw the rise of every sensor since the first block; the sensors that rise most have a colour and a name each."""
     hours = hours_of(record)
     rise = (record["temperature"] - record["temperature"].isel(time=0)).transpose("time", "sensor").values
     names = [str(name) for name in record["sensor"].values]
@@ -134,25 +91,13 @@ def plot_temperatures(record: xr.Dataset) -> Chart:
         )  # fmt: skip
         add_hover(drawn, [("sensor", "@name"), ("time", "$x{0.00} h"), ("rise", "$y{0.00} K")], [lines])
     for rank, k in enumerate(order[:_NAMED]):
-        add_series(
-            drawn, hours, rise[:, k], name=names[k], colour=CATEGORIES[rank], dash=DASHES[rank % len(DASHES)], width=2.0
-        )
+        add_series(drawn, hours, rise[:, k], name=names[k], width=2.0, **of_rank(rank))
     seen = f"Rise of {len(names)} sensors: {span_words(rise, 'K')}; those that move most are {join([names[k] for k in order[:_NAMED]])}."
     return Chart(drawn, seen, {_TIME: hours, **{f"rise of {name} / K": rise[:, k] for k, name in enumerate(names)}})
 
 
 def plot_drivers(record: xr.Dataset) -> Chart:
-    """Draw every driver in its own unit, one below the other on one time axis.
-
-    Parameters
-    ----------
-    record : Dataset
-        fusion.nc of a record.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw every driver in its own unit, one below the other on one time axis."""
     hours = hours_of(record)
     columns: dict[str, np.ndarray] = {_TIME: hours}
     parts: list[figure] = []
@@ -174,19 +119,7 @@ def plot_drivers(record: xr.Dataset) -> Chart:
 
 
 def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
-    """Draw what each term of the final model contributes to one channel, about its mean.
-
-    Parameters
-    ----------
-    record : Dataset
-        fusion.nc of a record.
-    channel : str
-        Name of the channel.
-
-    Returns
-    -------
-    Chart
-    """
+    """Draw what each term of the final model contributes to one channel, about its mean."""
     hours = hours_of(record)
     drawn = new_figure(x=_TIME, y="contribution / µm", title=channel)
     _shade_hold_out(record, drawn)
@@ -195,31 +128,23 @@ def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
     said = []
     for k, effect in enumerate(str(name) for name in record["effect"].values):
         values, words = record["contribution"].sel(channel=channel).isel(effect=k).values, effect_words(effect).name
-        add_series(
-            drawn, hours, values, name=words, colour=CATEGORIES[k % len(CATEGORIES)], dash=DASHES[k % len(DASHES)]
-        )
+        add_series(drawn, hours, values, name=words, **of_rank(k))
         columns[f"{words} / µm"] = values
         said.append(f"{words} {span_words(values, 'µm')}")
     return Chart(drawn, f"Contributions to {channel} over time: {'; '.join(said) or 'the model has no term'}.", columns)
 
 
 def _shade_hold_out(record: xr.Dataset, drawn: figure) -> None:
-    """Shade the hold-out, every run that is held out by itself."""
-    hours, sealed = hours_of(record), record["sealed"].values
+    """Shade the hold-out, each run that is held out separately."""
+    hours, held_out = hours_of(record), record["sealed"].values
     run = record["run"].values if "run" in record else np.zeros(hours.size, int)
-    for one in np.unique(run[sealed]):
-        here = hours[sealed & (run == one)]
+    for one in np.unique(run[held_out]):
+        here = hours[held_out & (run == one)]
         add_hold_out(drawn, float(here[0]), float(here[-1]))
 
 
 def hours_of(record: xr.Dataset) -> np.ndarray:
-    """Return the time of every block since the start of the record in hours; of several runs, the time between them left out.
-
-    Parameters
-    ----------
-    record : Dataset
-        fusion.nc of a record.
-    """
+    """Return the time of every block since the start of the record in hours; of several runs, the time between them left out."""
     if "elapsed" in record:
         return np.asarray(record["elapsed"].values / 3600.0)
     time = record["time"].values

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeAlias
 
+import bokeh
 import numpy as np
 import xarray as xr
 from bokeh import palettes
+from bokeh.document import Document
 from bokeh.models import (
     BoxAnnotation,
     ColorBar,
@@ -17,18 +23,21 @@ from bokeh.models import (
     FixedTicker,
     GlyphRenderer,
     HoverTool,
+    Label,
     LayoutDOM,
     Legend,
     LinearColorMapper,
     PanTool,
+    Plot,
     Range1d,
     WheelZoomTool,
 )
 from bokeh.plotting import figure
+from markupsafe import Markup
 
-from interferometry.figures import ACCENT, COLOURS, GRID, INK, MUTED
+from interferometry.plots import ACCENT, COLOURS, GRID, INK, MUTED
 
-#: Colours of named lines, each readable on white and told apart by colour-blind readers together with the dashes of `DASHES`.
+#: Colours of named lines, each readable on white and distinguishable by colour-blind readers together with the dashes of `DASHES`.
 CATEGORIES = (COLOURS["positive"], COLOURS["negative"], "#6a3d9a", INK, "#4d7c0f", "#a0447f", "#1f66b0", "#7a5c00")
 DASHES = ("solid", "dashed", "dotdash", "dotted")
 #: Colour of what a model said before anything was added.
@@ -44,6 +53,10 @@ _DARK_SHARE = 0.58
 #: Labels of logarithmic axes: 1, 2 and 5 of every decade.
 _LOG_TICKS = [step * 10.0**decade for decade in range(-6, 7) for step in (1, 2, 5)]
 _FONT = "system-ui, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
+
+
+#: What is shown under the pointer: name and value, as Bokeh writes it.
+Tips: TypeAlias = Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -76,35 +89,9 @@ def new_figure(
     x_type: str = "auto",
     y_type: str = "auto",
     legend_columns: int = 2,
-    like: figure | None = None,
 ) -> figure:
-    """Return an empty figure in the common style: as wide as its place in the page, legend above the data.
-
-    Parameters
-    ----------
-    x, y : str
-        Labels of the axes, "quantity / unit".
-    title : str
-        Above the legend; empty: none.
-    height : int
-        CSS px.
-    x_range, y_range : tuple of float or sequence of str, optional
-        Ends of an axis, or its categories; None: from the data.
-    x_type, y_type : {"auto", "linear", "log", "datetime"}
-        Scale of an axis. A logarithmic one is announced in its label.
-    legend_columns : int
-        Entries of the legend beside each other; two fit on a phone.
-    like : figure, optional
-        Shares both ranges with this one, so that several figures zoom together.
-
-    Returns
-    -------
-    bokeh.plotting.figure
-        Pan and wheel zoom are there but not active: scrolling over a chart scrolls the page until the reader switches them on.
-    """
+    """Return an empty figure in the common style: as wide as its place in the page, legend above the data."""
     ranges: dict[str, Any] = {"x_range": x_range, "y_range": y_range}
-    if like is not None:
-        ranges = {"x_range": like.x_range, "y_range": like.y_range}
     drawn = figure(
         height=height, sizing_mode="stretch_width", tools="", toolbar_location=None, title=title or None,
         x_axis_label=_announced(x, x_type), y_axis_label=_announced(y, y_type), x_axis_type=x_type, y_axis_type=y_type,
@@ -139,23 +126,9 @@ def _announced(label: str, scale: str) -> str:
     return f"{label} (logarithmic)" if scale == "log" else label
 
 
-def add_hover(
-    drawn: figure, tips: Sequence[tuple[str, str]], renderers: Sequence[GlyphRenderer], *, mode: str = "mouse"
-) -> None:
-    """Show the values under the pointer.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    tips : sequence of (str, str)
-        Name and Bokeh format of each value, such as ``("drift", "@y{0.00} µm")``.
-    renderers : sequence of GlyphRenderer
-        What answers.
-    mode : {"mouse", "vline"}
-        Whether the pointer must be on a mark, or only at its place along x.
-    """
-    drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers), mode=mode))
+def add_hover(drawn: figure, tips: Tips, renderers: Sequence[GlyphRenderer]) -> None:
+    """Show the values under the pointer."""
+    drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers)))
 
 
 def add_series(
@@ -173,33 +146,7 @@ def add_series(
     size: float = 7.0,
     legend: bool = True,
 ) -> None:
-    """Draw a named series with its values under the pointer.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart; the tips take quantity and unit from the labels of its axes.
-    x, y : (n,) ndarray
-        Units of the axes.
-    name : str
-        For legend and tips.
-    colour : str
-        CSS colour.
-    dash : str
-        Dash of the line, see `DASHES`.
-    line : bool
-        Whether the points are joined.
-    marker : str, optional
-        Bokeh marker of every point; None: no marks.
-    half : (n,) ndarray, optional
-        Half length of the interval about each point, unit of y; None: no intervals.
-    width : float
-        Of the line, CSS px.
-    size : float
-        Of the marks, CSS px.
-    legend : bool
-        Whether the legend names it.
-    """
+    """Draw a named series with its values under the pointer."""
     source = ColumnDataSource({"x": np.asarray(x), "y": np.asarray(y)})
     named: dict[str, Any] = {"legend_label": name} if legend else {}
     parts = []
@@ -216,6 +163,24 @@ def add_series(
     add_hover(drawn, [("", name), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {y_unit}")], parts[-1:])
 
 
+def of_direction(direction: str) -> dict[str, Any]:
+    """Return colour and marker of a series of one direction of approach."""
+    return {"colour": COLOURS[direction], "marker": MARKERS[direction]}
+
+
+def of_rank(rank: int) -> dict[str, Any]:
+    """Return colour and dash of one of several named lines."""
+    return {"colour": CATEGORIES[rank % len(CATEGORIES)], "dash": DASHES[rank % len(DASHES)]}
+
+
+def add_label(
+    drawn: figure, x: float, y: float, text: str, *, offset: tuple[int, int], colour: str = INK, size: str = "12px"
+) -> None:
+    """Write a text at a point, moved by an offset in px."""
+    across, up = offset
+    drawn.add_layout(Label(x=x, y=y, text=text, text_color=colour, text_font_size=size, x_offset=across, y_offset=up))
+
+
 def _parts(label: str) -> tuple[str, str]:
     """Return quantity and unit of the label of an axis."""
     quantity, _, unit = label.partition(" / ")
@@ -225,19 +190,7 @@ def _parts(label: str) -> tuple[str, str]:
 def add_ordered_lines(
     drawn: figure, xs: Sequence[np.ndarray], ys: Sequence[np.ndarray], order: np.ndarray, label: str
 ) -> None:
-    """Draw one line for each value of an ordered quantity, such as a cycle, with colour bar and values under the pointer.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    xs, ys : sequence of (n,) ndarray
-        Units of the axes, one pair for each line, in rising `order`.
-    order : (lines,) ndarray
-        The quantity.
-    label : str
-        "quantity / unit" of the quantity.
-    """
+    """Draw one line for each value of an ordered quantity, such as a cycle, with colour bar and values under the pointer."""
     (along, x_unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     source = {"xs": list(xs), "ys": list(ys), "order": np.asarray(order, float), "colour": ordered_colours(len(order))}
     lines = drawn.multi_line(
@@ -251,75 +204,29 @@ def add_ordered_lines(
 
 
 def add_hold_out(drawn: figure, low: float, high: float) -> None:
-    """Shade the part of a test that took no part in any choice.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    low, high : float
-        Its ends along x.
-    """
+    """Shade the part of a test that took no part in any choice."""
     drawn.add_layout(BoxAnnotation(left=low, right=high, fill_color=ACCENT, fill_alpha=0.08, level="underlay"))
 
 
 def add_zero_line(drawn: figure) -> None:
-    """Draw the line of zero.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    """
+    """Draw the line of zero."""
     drawn.hspan(0.0, line_color=MUTED, line_width=1, level="underlay")
 
 
 def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, **options: Any) -> None:
-    """Shade what lies between two lines; a gap in either is a gap.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    x, low, high : (n,) ndarray
-        Units of the axes.
-    colour : str
-        CSS colour.
-    **options
-        Further properties of the shade, such as ``legend_label``.
-    """
+    """Shade what lies between two lines; a gap in either is a gap."""
     x, low, high = (np.asarray(values, float) for values in (x, low, high))
     valid = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
     for piece in np.split(np.arange(x.size), np.flatnonzero(np.diff(valid.astype(int))) + 1):
         if piece.size and valid[piece[0]]:
-            drawn.varea(
-                x=x[piece],
-                y1=low[piece],
-                y2=high[piece],
-                fill_color=colour,
-                fill_alpha=0.18,
-                level="underlay",
-                **options,
-            )
+            ends = {"x": x[piece], "y1": low[piece], "y2": high[piece]}
+            drawn.varea(**ends, fill_color=colour, fill_alpha=0.18, level="underlay", **options)
 
 
 def add_colour_bar(
     drawn: figure, mapper: ColorMapper, label: str, *, ticks: Sequence[float] | None = None, place: str = "below"
 ) -> None:
-    """Put the scale of the colours beside a map or ordered lines.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    mapper : ColorMapper
-        Its colours.
-    label : str
-        "quantity / unit".
-    ticks : sequence of float, optional
-        Where it is labelled; None: Bokeh chooses.
-    place : {"below", "right"}
-    """
+    """Put the scale of the colours at a map or ordered lines."""
     bar = ColorBar(
         color_mapper=mapper, title=label, width="auto" if place == "below" else 10, height=10 if place == "below" else "auto",
         title_text_font=_FONT, title_text_font_size="11px", title_text_font_style="normal", title_text_color=INK,
@@ -330,45 +237,19 @@ def add_colour_bar(
     drawn.add_layout(bar, place)
 
 
-def palette(name: str = SEQUENTIAL, steps: int = 256) -> list[str]:
-    """Return the colours of a scale from low to high.
-
-    Parameters
-    ----------
-    name : str
-        `SEQUENTIAL`, `DIVERGING` or "PuOr_r"; what matplotlib calls by the same name.
-    steps : int
-        Number of colours.
-    """
-    return list(palettes.interp_palette(_SCALES[name], steps))
+def palette(name: str = SEQUENTIAL) -> list[str]:
+    """Return the colours of a scale from low to high."""
+    return list(palettes.interp_palette(_SCALES[name], 256))
 
 
 def ordered_colours(count: int) -> list[str]:
-    """Return the colours of lines that have an order, such as cycles or positions, from dark to lighter.
-
-    Parameters
-    ----------
-    count : int
-        Number of lines.
-
-    Notes
-    -----
-    The first 58 % of viridis: the rest is too pale for a line on white (contrast below 3 : 1, WCAG 2.2, 1.4.11).
-    """
+    """Return the colours of lines that have an order, such as cycles or positions, from dark to lighter."""
     dark = palettes.Viridis256[: round(_DARK_SHARE * 256)]
     return list(palettes.interp_palette(dark, count))
 
 
 def shared_range(*values: np.ndarray, symmetrical: bool = False) -> tuple[float, float]:
-    """Return one range for charts that are compared: all values with a margin of 4 %.
-
-    Parameters
-    ----------
-    *values : ndarray
-        What the charts show; NaN are left out.
-    symmetrical : bool
-        Whether zero is in the middle.
-    """
+    """Return one range for charts that are compared: all values with a margin of 4 %."""
     every = np.concatenate([np.ravel(part) for part in values])
     every = every[np.isfinite(every)]
     low, high = (float(every.min()), float(every.max())) if every.size else (0.0, 1.0)
@@ -380,15 +261,7 @@ def shared_range(*values: np.ndarray, symmetrical: bool = False) -> tuple[float,
 
 
 def fix_range(drawn: figure, low: float, high: float) -> None:
-    """Set the y range of a chart.
-
-    Parameters
-    ----------
-    drawn : figure
-        The chart.
-    low, high : float
-        Ends, in the unit of the axis.
-    """
+    """Set the y range of a chart."""
     drawn.y_range = Range1d(low, high)
 
 
@@ -412,3 +285,93 @@ def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
         return "without values"
     low, high = float(np.nanmin(every)), float(np.nanmax(every))
     return f"{low:.2f} to {high:.2f} {unit}".replace("-", "−")
+
+
+# Charts in a page: the scripts once, each chart with its caption, its text alternative and its data.
+
+
+@dataclass(frozen=True)
+class EmbeddedChart:
+    """A chart as the macro ``draw`` of ``templates/charts.html.j2`` reads it.
+
+    Attributes
+    ----------
+    name : str
+        Unique in its page; a word of letters, digits and underscores.
+    seen : str
+        Text alternative.
+    height : int
+        CSS px that are kept free until it is drawn.
+    item : Markup
+        Bokeh's document as JSON that may stand in a ``<script>``.
+    """
+
+    name: str
+    seen: str
+    height: int
+    item: Markup
+
+
+def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
+    """Return charts ready for a template."""
+    for chart in charts.values():
+        _prepare(chart)
+    return {
+        name: EmbeddedChart(name, chart.seen, _height(chart), _in_script(json.dumps(item, separators=(",", ":")), "</"))
+        for (name, chart), item in zip(charts.items(), _items(charts), strict=True)
+    }
+
+
+def _prepare(chart: Chart) -> None:
+    """Take from a chart what no page needs, and add what it lets the reader download."""
+    for renderer in (renderer for plot in _plots(chart) for renderer in plot.renderers):
+        if isinstance(renderer, GlyphRenderer):
+            # Looks of what is not selected or muted, which Bokeh adds to every mark: a page has no tool that selects or mutes.
+            renderer.update(nonselection_glyph=None, muted_glyph=None)
+    columns = {heading: _compact(np.asarray(values)) for heading, values in chart.columns.items()}
+    chart.figure.tags = [ColumnDataSource(columns), *chart.figure.tags]
+
+
+def _items(charts: Mapping[str, Chart]) -> list[dict[str, object]]:
+    """Return what `bokeh.embed.json_item` returns of every chart; it also looks for mistakes in every drawing, for most of the time."""
+    document = Document(title="")
+    with document.models.freeze():
+        for chart in charts.values():
+            document.add_root(chart.figure)
+    content = document.to_json(deferred=False)
+    items: list[dict[str, object]] = []
+    for (name, chart), root in zip(charts.items(), content["roots"], strict=True):
+        names = {"target_id": f"drawing-{name}", "root_id": chart.figure.id}
+        items.append({**names, "doc": {**content, "roots": [root]}, "version": bokeh.__version__})
+    return items
+
+
+def _compact(values: np.ndarray) -> np.ndarray:
+    """Return a column as it travels: numbers in single precision (seven digits), everything else as text."""
+    if values.dtype.kind in "fiub":
+        return values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
+    return values.astype(str).astype(object)
+
+
+def _plots(chart: Chart) -> list[Plot]:
+    """Return the figure of a chart, or those of a layout."""
+    return [chart.figure] if isinstance(chart.figure, Plot) else list(chart.figure.select({"type": Plot}))
+
+
+def _height(chart: Chart) -> int:
+    """Return the height of a chart in CSS px: its own, or the sum of what a column of charts holds."""
+    own = chart.figure.height
+    return int(own) if own is not None else sum(int(plot.height or 0) for plot in _plots(chart))
+
+
+@cache
+def chart_scripts() -> tuple[Markup, ...]:
+    """Return BokehJS and what draws the charts, as texts for script elements; once per page, after the last chart."""
+    library = (Path(bokeh.__file__).parent / "server" / "static" / "js" / "bokeh.min.js").read_text(encoding="utf-8")
+    own = (resources.files("fusion.report") / "templates" / "charts.js").read_text(encoding="utf-8")
+    return tuple(_in_script(text, "</script") for text in (library, own))
+
+
+def _in_script(text: str, closing: str) -> Markup:
+    """Return a text that may stand in a script element: nothing in its strings closes the element."""
+    return Markup(text.replace(closing, closing.replace("</", "<\\/")))

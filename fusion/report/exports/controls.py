@@ -9,12 +9,206 @@ Functions, K3; HEIDENHAIN, Technical Manual MANUALplus 620, "Entering compensati
 
 from __future__ import annotations
 
+import json
+import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
-from fusion.report.exports.errors import ExportError
-from fusion.report.exports.profile import ErrorTable
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import special
+
+from fusion.common import FusionError
+from fusion.report.wording import environment
+from fusion.results.results import Results
+from fusion.results.store import DamagedProductError, file_sha256, group, read_product
+
+# The error of exports.
+
+
+class ExportError(FusionError):
+    """Results that cannot be exported as asked for; the message says why and what to do."""
+
+
+# The drift-free profile of an axis as a compensation needs it: relative to a reference, at the points of a table,
+# with its uncertainty.
+
+Array = NDArray[np.float64]
+
+#: Order of the approaches along the first axis of every array.
+APPROACHES = ("positive", "negative")
+_SPACING_TOLERANCE_MM = 1e-3
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Positioning deviations without drift at the targets, in the order of the positions.
+
+    Attributes
+    ----------
+    position_mm : (n,) ndarray
+        Targets, increasing.
+    deviation_um : (2, n) ndarray
+        Approach in positive and in negative direction.
+    covariance_um2 : (2, n, 2, n) ndarray
+        Of the deviations.
+    """
+
+    position_mm: Array
+    deviation_um: Array
+    covariance_um2: Array
+
+
+@dataclass(frozen=True)
+class ErrorTable:
+    """What a compensation table corrects: deviations at its points, relative to the reference position.
+
+    Attributes
+    ----------
+    position_mm : (m,) ndarray
+        Points of the table, increasing.
+    deviation_um : (2, m) ndarray
+        Approach in positive and in negative direction; zero at the reference position approached in positive direction.
+    u_um : (2, m) ndarray
+        Standard uncertainty, that of the interpolation included.
+    reference_mm : float
+        Position at which the correction is zero.
+    widest_gap_mm : float
+        Largest distance of two neighbouring targets.
+    resampled : bool
+        Whether the points are others than the targets.
+    """
+
+    position_mm: Array
+    deviation_um: Array
+    u_um: Array
+    reference_mm: float
+    widest_gap_mm: float
+    resampled: bool = False
+
+    def spacing_mm(self) -> float | None:
+        """Return the distance of the points; None where they are not equally spaced."""
+        steps = np.diff(self.position_mm)
+        return float(steps.mean()) if np.ptp(steps) <= _SPACING_TOLERANCE_MM else None
+
+    def mean_um(self) -> Array:
+        """Return the mean of both approaches (m,), relative to the reference, for a control that knows one table."""
+        mean = self.deviation_um.mean(axis=0)
+        return mean - np.interp(self.reference_mm, self.position_mm, mean)
+
+    def reversal_um(self) -> float:
+        """Return the mean reversal error (positive minus negative approach)."""
+        return float((self.deviation_um[0] - self.deviation_um[1]).mean())
+
+
+def read_profile(deviations: xr.Dataset) -> Profile:
+    """Return the profile of a run."""
+    drift = group(deviations, "drift")
+    order = np.argsort(deviations["position"].values)
+    position = deviations["position"].values[order].astype(float)
+    chosen = drift.sel(direction=list(APPROACHES)).isel(target=order, other_target=order)
+    deviation = chosen["profile"].transpose("direction", "target").values
+    gaps = ~np.isfinite(deviation).all(axis=0)
+    if gaps.any():
+        raise ExportError(
+            f"no profile at {position[gaps][0]:g} mm in one approach; a compensation table needs both: measure it in both directions"
+        )
+    if position.size < 2:
+        raise ExportError("one position only; a compensation table needs at least two")
+    swap = [list(deviations["direction"].values).index(name) for name in APPROACHES]
+    covariance = chosen["covariance"].isel(other_direction=swap)
+    return Profile(
+        position, deviation, covariance.transpose("direction", "target", "other_direction", "other_target").values
+    )
+
+
+def tabulate(profile: Profile, *, spacing_mm: float | None = None, reference_mm: float | None = None) -> ErrorTable:
+    """Return the deviations at the points of a table, relative to the reference."""
+    targets = profile.position_mm
+    reference = targets[0] if reference_mm is None else reference_mm
+    if not targets[0] <= reference <= targets[-1]:
+        raise ExportError(
+            f"the reference {reference:g} mm is outside the measured {targets[0]:g} to {targets[-1]:g} mm; "
+            "name a position between them with --reference"
+        )
+    points = targets if spacing_mm is None else _grid(targets, spacing_mm)
+    weights = _weights(targets, points)
+    # Of the table itself, not of the profile: where the axis is referenced, nothing may jump.
+    at_reference = (_weights(points, np.array([reference])) @ weights)[0]
+    deviation = profile.deviation_um @ weights.T - profile.deviation_um[0] @ at_reference
+    _, since, until = _segments(targets, points)
+    # The variance between the targets.
+    bridge = path_variance(profile) * np.abs(since * until) / (since + until)
+    return ErrorTable(
+        points,
+        deviation,
+        np.sqrt(_relative_variance(profile, weights, at_reference) + bridge),
+        float(reference),
+        float(np.diff(targets).max()),
+        resampled=spacing_mm is not None,
+    )
+
+
+def path_variance(profile: Profile) -> float:
+    """Return the variance per mm of the profile between its targets, from the errors of predicting each target by its two neighbours."""
+    targets = profile.position_mm
+    estimates = []
+    for i in range(1, targets.size - 1):
+        before, after = targets[i] - targets[i - 1], targets[i + 1] - targets[i]
+        contrast = np.zeros(targets.size)
+        contrast[i - 1 : i + 2] = -after / (before + after), 1.0, -before / (before + after)
+        for approach in range(len(APPROACHES)):
+            noise = contrast @ profile.covariance_um2[approach, :, approach] @ contrast
+            error = profile.deviation_um[approach] @ contrast
+            estimates.append((error**2 - noise) * (before + after) / (before * after))
+    return max(0.0, float(np.mean(estimates))) if estimates else 0.0
+
+
+def _grid(targets: Array, spacing_mm: float) -> Array:
+    """Return equally spaced points from the first target to the last or just behind it."""
+    length = float(targets[-1] - targets[0])
+    if not 0.0 < spacing_mm <= length:
+        raise ExportError(
+            f"--spacing {spacing_mm:g} mm does not suit targets from {targets[0]:g} to {targets[-1]:g} mm; "
+            f"write a spacing above 0 and up to {length:g} mm"
+        )
+    steps = math.ceil(length / spacing_mm - 1e-9)
+    return targets[0] + spacing_mm * np.arange(steps + 1)
+
+
+def _segments(targets: Array, points: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """Return the target before each point, the distance from it, and the distance to the target behind; the last segment has no end."""
+    before = np.clip(np.searchsorted(targets, points, side="right") - 1, 0, targets.size - 2)
+    return before, points - targets[before], targets[before + 1] - points
+
+
+def _weights(targets: Array, points: Array) -> Array:
+    """Return the weights (m, n) by which deviations at the targets are interpolated at the points."""
+    before, since, until = _segments(targets, points)
+    rows = np.arange(points.size)
+    weights = np.zeros((points.size, targets.size))
+    weights[rows, before] = until / (since + until)
+    weights[rows, before + 1] = since / (since + until)
+    return weights
+
+
+def _relative_variance(profile: Profile, weights: Array, at_reference: Array) -> Array:
+    """Return the variance (2, m) of the interpolated deviations less the one at the reference, um2."""
+    variances = []
+    for approach in range(len(APPROACHES)):
+        contrast = np.zeros((weights.shape[0], *profile.deviation_um.shape))
+        contrast[:, approach] += weights
+        contrast[:, 0] -= at_reference
+        flat = contrast.reshape(weights.shape[0], -1)
+        covariance = profile.covariance_um2.reshape(flat.shape[1], flat.shape[1])
+        variances.append(np.einsum("mi,ij,mj->m", flat, covariance, flat))
+    return np.maximum(np.array(variances), 0.0)
+
 
 #: Maximum number of points per joint that LinuxCNC reads.
 _LINUXCNC_POINTS = 256
@@ -31,7 +225,7 @@ class Control:
     write : callable
         Returns the table's text from the error table, the axis name and the lines of its header.
     file_name : str
-        Name of the file; ``{axis}`` stands for the axis.
+        Name of the file; ``{axis}`` is replaced by the axis.
     sign : str
         Sign convention, a sentence.
     comment : str
@@ -39,7 +233,7 @@ class Control:
     equal_spacing : bool
         Whether the points must be equally spaced.
     names_axis : bool
-        Whether the axis stands in the table.
+        Whether the axis is named in the table.
     one_table : bool
         Whether it knows one table for both approaches.
     """
@@ -55,22 +249,7 @@ class Control:
 
 
 def linuxcnc(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
-    """Return a COMP_FILE of type 0: triplets of nominal, and true position by the forward and by the reverse approach, in mm.
-
-    Parameters
-    ----------
-    table : ErrorTable
-        What is corrected.
-    axis : str
-        Not named in this file; ``[JOINT_n] COMP_FILE`` says which joint it belongs to.
-    header : sequence of str
-        Not written: the control stops reading at the first line that is no triplet.
-
-    Raises
-    ------
-    ExportError
-        If there are more points than LinuxCNC reads.
-    """
+    """Return a COMP_FILE of type 0: triplets of nominal, and true position by the forward and by the reverse approach, in mm."""
     if table.position_mm.size > _LINUXCNC_POINTS:
         raise ExportError(
             f"{table.position_mm.size} points; LinuxCNC reads at most {_LINUXCNC_POINTS} per joint, choose a wider --spacing"
@@ -80,20 +259,7 @@ def linuxcnc(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
 
 
 def siemens840d(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
-    """Return an $AA_ENC_COMP archive in mm: the mean of both approaches; the mean reversal belongs to the backlash.
-
-    The machine part lags behind the encoder where backlash is positive: it stays too low in positive and too high in negative direction,
-    so that the backlash is the reversal error with the opposite sign.
-
-    Parameters
-    ----------
-    table : ErrorTable
-        What is corrected, equally spaced.
-    axis : str
-        Machine axis of the control, for example X1 or AX1.
-    header : sequence of str
-        Comment lines.
-    """
+    """Return an $AA_ENC_COMP archive in mm: the mean of both approaches; the mean reversal belongs to the backlash."""
     mean_mm = (table.mean_um() * 1e-3).tolist()
     area = axis if re.fullmatch(r"AX\d+", axis) else "AX"
     lines = [
@@ -114,17 +280,7 @@ def siemens840d(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
 
 
 def heidenhain(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
-    """Return a table AXIS_<axis>.COM: position, and deviation (mm) by the negative (BACKLASH) and by the positive approach.
-
-    Parameters
-    ----------
-    table : ErrorTable
-        What is corrected; its points may be unequally spaced.
-    axis : str
-        Axis of the control's list of axes.
-    header : sequence of str
-        Not written: the layout has no comments.
-    """
+    """Return a table AXIS_<axis>.COM: position, and deviation (mm) by the negative (BACKLASH) and by the positive approach."""
     head = f"{'NR':<6}{'AXISPOS':<14}{'BACKLASH':<14}{axis}"
     rows = [
         f"{number:<6}{at:<+14.4f}{reverse:<+14.6f}{forward:+.6f}"
@@ -134,17 +290,7 @@ def heidenhain(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
 
 
 def renishaw(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
-    """Return a table of deviations (um) with spacing, start and end (mm), forward and reverse.
-
-    Parameters
-    ----------
-    table : ErrorTable
-        What is corrected, equally spaced.
-    axis : str
-        Not named in this file.
-    header : sequence of str
-        Not written: the layout has no comments.
-    """
+    """Return a table of deviations (um) with spacing, start and end (mm), forward and reverse."""
     lines = [
         f"Compensation start {table.position_mm[0]:.4f}",
         f"Compensation end {table.position_mm[-1]:.4f}",
@@ -206,3 +352,247 @@ def _spacing(table: ErrorTable) -> float:
     spacing = table.spacing_mm()
     assert spacing is not None
     return spacing
+
+
+# The thermal state that a profile belongs to: when it was measured, and how warm material and air were.
+
+
+@dataclass(frozen=True)
+class ThermalState:
+    """When and how warm.
+
+    Attributes
+    ----------
+    first, last : datetime64 or None
+        Time of the first and the last reading, UTC; None where the file has no times.
+    cycles : tuple of int
+        Number of the first and the last cycle.
+    temperatures_degC : dict of str to (mean, lowest, highest) or None
+        Of material and air at the readings, the mean over cycles of equal weight, as for the profile; None where it was not logged.
+    """
+
+    first: np.datetime64 | None
+    last: np.datetime64 | None
+    cycles: tuple[int, int]
+    temperatures_degC: dict[str, tuple[float, float, float] | None]
+
+
+def read_thermal_state(folder: Path, deviations: xr.Dataset) -> ThermalState:
+    """Return the thermal state of a run."""
+    times, cycles = deviations["time"].values, deviations["cycle"].values
+    timed = times[~np.isnat(times)]
+    there = (folder / "fusion.nc").is_file()
+    fused: Mapping[Any, xr.DataArray] = read_product(folder, "fusion") if there else {}
+    found: dict[str, tuple[float, float, float] | None] = {}
+    for name in ("material", "air"):
+        values = fused.get(f"{name}_temperature")
+        if values is None or not bool(values.notnull().any()):
+            found[name] = None
+            continue
+        mean = float(values.mean(["direction", "target"]).mean())
+        found[name] = (mean, float(values.min()), float(values.max()))
+    first, last = (timed.min(), timed.max()) if timed.size else (None, None)
+    return ThermalState(first, last, (int(cycles.min()), int(cycles.max())), found)
+
+
+# The header of a compensation table: where it comes from, in which thermal state it holds, what it is predicted to
+# do, how to try it.
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The run that a table was made from; texts that its campaign file does not state are empty.
+
+    Attributes
+    ----------
+    active : str
+        The compensation during the test.
+    verdict : str
+        Verdict of the closed loop.
+    """
+
+    campaign: str
+    machine: str
+    axis: str
+    active: str
+    verdict: str
+    state: ThermalState
+    results_sha256: str
+
+
+def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
+    """Return where a table comes from."""
+    stated = _parameters(folder / "provenance.json")
+    report = stated.get("report", {})
+    serial = report.get("machine_serial_number")
+    return Origin(
+        campaign=results.campaign,
+        machine=", serial number ".join(str(part) for part in (report.get("machine"), serial) if part),
+        active=str(report.get("machine_compensation") or ""),
+        axis=str(stated.get("campaign", {}).get("axis") or ""),
+        verdict=results.loop.verdict if results.loop is not None else "",
+        state=state,
+        results_sha256=file_sha256(folder / "results.json"),
+    )
+
+
+def header_lines(origin: Origin, **facts: Any) -> list[str]:
+    """Return the header of a table as lines of ASCII text, from the facts that ``templates/compensation_header.j2`` states."""
+    # A text from a file must not end its line: a control would run what follows.
+    made = environment(html=False).overlay(finalize=lambda value: _one_line(value) if isinstance(value, str) else value)
+    text = made.get_template("compensation_header.j2").render(origin=origin, **{"exported": datetime.now(UTC), **facts})
+    return [_one_line(line) for line in text.splitlines() if line]
+
+
+def _parameters(path: Path) -> Mapping[str, Any]:
+    """Return the campaign as the provenance of a run states it; empty where the file is absent."""
+    if not path.is_file():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")).get("parameters", {}))
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise DamagedProductError(
+            f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
+        ) from None
+
+
+def _one_line(text: str) -> str:
+    """Return a text without line breaks and control characters, in ASCII: it may come from a file, and controls read no UTF-8."""
+    plain = "".join(letter if letter.isprintable() else " " for letter in text)
+    for found, written in (("µ", "u"), ("μ", "u"), ("−", "-"), ("–", "-"), ("±", "+-"), ("°C", "degC")):
+        plain = plain.replace(found, written)
+    return plain.encode("ascii", "replace").decode("ascii")
+
+
+# Error line of an axis that moves with the material temperature: offset and gradient per kelvin, for controls that
+# follow a sensor.
+
+
+_BLOCKS = 5
+#: Error probability of a coefficient that is taken for more than chance.
+_LEVEL = 0.01
+#: Cycles that a block needs at least.
+_CYCLES_PER_BLOCK = 2
+
+
+@dataclass(frozen=True)
+class TemperatureLine:
+    """Drift per kelvin of the material temperature: ``(offset + gradient (P - P0)) (T - T0)``.
+
+    Attributes
+    ----------
+    offset_um_per_K, gradient_ppm_per_K : float
+        Shift and stretch per kelvin.
+    offset_u_um_per_K, gradient_u_ppm_per_K : float
+        Standard uncertainty by the jackknife over blocks of cycles.
+    reference_mm : float
+        P0.
+    mean_degC : float
+        T0, at which the profile holds.
+    range_degC : tuple of float
+        Lowest and highest temperature of the test.
+    before_um, after_um : float
+        Root mean square of the readings less the profile, and of the error of predicting each block of cycles from the others.
+    """
+
+    offset_um_per_K: float
+    gradient_ppm_per_K: float
+    offset_u_um_per_K: float
+    gradient_u_ppm_per_K: float
+    reference_mm: float
+    mean_degC: float
+    range_degC: tuple[float, float]
+    before_um: float
+    after_um: float
+
+    def objections(self) -> list[str]:
+        """Return why the line should not be used; empty where it predicts, by coefficients that are no chance."""
+        if self.after_um >= self.before_um:
+            return [
+                "the material temperature does not predict the drift: the error of predicting each block of cycles from the others is "
+                f"{self.after_um:.3g} um with the line and {self.before_um:.3g} um without it"
+            ]
+        limit = float(special.stdtrit(_BLOCKS - 1, 1.0 - _LEVEL / 2.0))
+        of_shift, of_stretch = limit * self.offset_u_um_per_K, limit * self.gradient_u_ppm_per_K
+        if abs(self.offset_um_per_K) > of_shift or abs(self.gradient_ppm_per_K) > of_stretch:
+            return []
+        return [f"neither shift nor stretch per kelvin exceeds {limit:.1f} standard uncertainties: they may be chance"]
+
+
+def fit_temperature_line(
+    deviations: xr.Dataset, material_degC: xr.DataArray, *, reference_mm: float
+) -> TemperatureLine:
+    """Fit shift and stretch of the axis per kelvin of the material temperature."""
+    cycles = deviations.sizes["cycle"]
+    if cycles < _BLOCKS * _CYCLES_PER_BLOCK:
+        raise ExportError(
+            f"{cycles} cycles; a temperature line needs at least {_BLOCKS * _CYCLES_PER_BLOCK}, to be judged on cycles left out of it"
+        )
+    drift = deviations["deviation"] - group(deviations, "drift")["profile"]
+    position = deviations["position"] - reference_mm
+    _, distance, temperature = xr.broadcast(drift, position, material_degC.reindex_like(drift))
+    dims = drift.dims
+    y, distance_mm, degC = (array.transpose(*dims).values for array in (drift, distance, temperature))
+    block = np.broadcast_to((np.arange(cycles) * _BLOCKS // cycles)[:, None, None], y.shape)
+    used = np.isfinite(y) & np.isfinite(degC)
+    mean = float(np.mean(degC[used])) if used.any() else np.nan
+    if not used.any() or np.ptp(degC[used]) <= 0.0:
+        raise ExportError(
+            "the material temperature did not change during the test; a temperature line cannot be fitted"
+        )
+    rise = degC[used] - mean
+    columns = np.stack([rise, rise * distance_mm[used] * 1e-3], axis=1)
+    readings, blocks = y[used], block[used]
+    fits, errors = _leave_blocks_out(columns, readings, blocks)
+    offset, gradient = np.linalg.lstsq(columns, readings, rcond=None)[0]
+    left_out = fits - fits.mean(axis=0)
+    offset_u, gradient_u = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum(left_out**2, axis=0))
+    return TemperatureLine(
+        offset_um_per_K=float(offset),
+        gradient_ppm_per_K=float(gradient),
+        offset_u_um_per_K=float(offset_u),
+        gradient_u_ppm_per_K=float(gradient_u),
+        reference_mm=reference_mm,
+        mean_degC=mean,
+        range_degC=(float(degC[used].min()), float(degC[used].max())),
+        before_um=float(np.sqrt(np.mean(readings**2))),
+        after_um=float(np.sqrt(np.mean(errors**2))),
+    )
+
+
+def _leave_blocks_out(columns: Array, readings: Array, blocks: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Return the coefficients without each block (blocks, 2), and the errors of predicting each block from the others (n,)."""
+    fits, errors = [], np.empty_like(readings)
+    for number in range(_BLOCKS):
+        inside = blocks == number
+        coefficients = np.linalg.lstsq(columns[~inside], readings[~inside], rcond=None)[0]
+        errors[inside] = readings[inside] - columns[inside] @ coefficients
+        fits.append(coefficients)
+    return np.array(fits), errors
+
+
+def siemens_temperature(line: TemperatureLine, axis: str, header: Sequence[str]) -> str:
+    """Return setting data of the 840D's temperature compensation: values at the mean temperature, and what to set at others."""
+    offset_mm, gradient = line.offset_um_per_K * 1e-3, line.gradient_ppm_per_K * 1e-6
+    low, high = line.range_degC
+    states = np.arange(np.floor(low), np.ceil(high) + 0.5)
+    rows = [
+        f"; {degC:10.1f} {offset_mm * (degC - line.mean_degC):+21.6f} {gradient * (degC - line.mean_degC):+17.9f}"
+        for degC in states.tolist()
+    ]
+    lines = [
+        *(f"; {text}" for text in header),
+        "; MD32750 $MA_TEMP_COMP_TYPE = 3 (bits 0 and 1) switches both parts on; the PLC or a synchronised action sets, at the",
+        "; temperature T of the sensor that was logged as material temperature:",
+        f"; $SA_TEMP_COMP_ABS_VALUE[{axis}] = {offset_mm:+.9f} mm/K * (T - {line.mean_degC:.2f} degC)",
+        f"; $SA_TEMP_COMP_SLOPE[{axis}] = {gradient:+.12f} 1/K * (T - {line.mean_degC:.2f} degC)",
+        ";   T / degC  TEMP_COMP_ABS_VALUE / mm  TEMP_COMP_SLOPE",
+        *rows,
+        f"; at the mean temperature {line.mean_degC:.2f} degC:",
+        "CHANDATA(1)",
+        f"$SA_TEMP_COMP_REF_POSITION[{axis}]={line.reference_mm:.4f}",
+        f"$SA_TEMP_COMP_ABS_VALUE[{axis}]=0.000000",
+        f"$SA_TEMP_COMP_SLOPE[{axis}]=0.000000000",
+        "M17",
+    ]
+    return "\n".join(lines) + "\n"

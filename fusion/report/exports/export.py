@@ -5,26 +5,143 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
-from fusion.campaign.messages import naming
-from fusion.products.contracts import read_product
-from fusion.products.grouped import has
-from fusion.products.results import Results, read_results
-from fusion.products.store import write_atomically
+from fusion.messages import naming
+from fusion.report.conclusions import headline
 from fusion.report.exports import tables
-from fusion.report.exports.controls import CONTROLS, Control
-from fusion.report.exports.errors import ExportError
-from fusion.report.exports.guard import objections, remarks
-from fusion.report.exports.header import Origin, header_lines, read_origin
-from fusion.report.exports.prediction import Prediction, predict
-from fusion.report.exports.profile import ErrorTable, path_variance, read_profile, tabulate
-from fusion.report.exports.temperature_line import TemperatureLine, fit_temperature_line, siemens_temperature
-from fusion.report.exports.thermal_state import read_thermal_state
+from fusion.report.exports.controls import (
+    CONTROLS,
+    Array,
+    Control,
+    ErrorTable,
+    ExportError,
+    Origin,
+    Profile,
+    fit_temperature_line,
+    header_lines,
+    path_variance,
+    read_origin,
+    read_profile,
+    read_thermal_state,
+    siemens_temperature,
+    tabulate,
+)
+from fusion.report.wording import anomaly_cause, anomaly_place, number
+from fusion.results.axis import AnomalyPart
+from fusion.results.results import Results, read_results
+from fusion.results.store import has, read_product, write_atomically
+
+# The guard of compensation tables: why a run's profile should not go into a control, and what to know where it may.
+
+#: Verdicts under which nothing is left in the drift that these data can show.
+_SOUND_VERDICTS = ("complete", "explained")
+
+
+def objections(results: Results) -> list[str]:
+    """Return why a compensation table should not be made from a run."""
+    found = []
+    if results.loop is None:
+        found.append("the drift was not modelled, so that nothing says whether the profile is free of it")
+    elif results.loop.verdict not in _SOUND_VERDICTS:
+        found.append(f"the verdict is {results.loop.verdict}: {headline(results).rstrip('.')}")
+    if results.inputs is None:
+        found.append("the inputs were not checked against each other")
+    else:
+        found += [
+            f"an input is doubted ({check.code}): {check.evidence.rstrip('.')}" for check in results.inputs.doubts
+        ]
+    found += [
+        f"{anomaly_place(anomaly)}, drifts or steps unlike the others ({anomaly.evidence.kind}, cause: {anomaly_cause(anomaly)}), "
+        "so that its mean is no property of the axis"
+        for anomaly in results.anomalies or ()
+        if _moves(anomaly)
+    ]
+    return found
+
+
+def remarks(results: Results) -> list[str]:
+    """Return what to know of single positions of a table that may be made."""
+    return [
+        f"{anomaly_place(anomaly)}, stands out ({anomaly_cause(anomaly)}, scatter {number(anomaly.scatter_um, 2)} um): "
+        "a table does not correct that"
+        for anomaly in results.anomalies or ()
+        if not _moves(anomaly)
+    ]
+
+
+def _moves(anomaly: AnomalyPart) -> bool:
+    """Whether the mean of a position depends on when it was measured, for no reason that the results name."""
+    return anomaly.evidence.kind != "scatter" and anomaly.cause != "local_temperature"
+
+
+# What a compensation table is predicted to do: the systematic error of the axis without and with it.
+
+_DRAWS, _SEED = 400, 20260309
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The axis without and with a compensation table, free of drift: E of ISO 230-2, the range of mean deviations of both approaches.
+
+    Attributes
+    ----------
+    before_um : float
+        Without the table.
+    after_um : float
+        With it, median over repetitions of the test, each with its own errors of measurement.
+    own_um : float
+        What the table leaves of the profile that it was made from: what its points and the control's model cannot follow.
+    resampling_um : float
+        Largest departure, at a target, of the table's straight lines from the profile.
+    value_u_um : float
+        Largest standard uncertainty of a value of the table within the targets.
+    """
+
+    before_um: float
+    after_um: float
+    own_um: float
+    resampling_um: float
+    value_u_um: float
+
+
+def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Prediction:
+    """Predict what a control leaves that interpolates linearly between the points of a table."""
+    inside = table.position_mm <= profile.position_mm[-1]
+    relative = profile.deviation_um - np.interp(table.reference_mm, profile.position_mm, profile.deviation_um[0])
+    left = remainder_um(profile, table, one_table=one_table)
+    size = left.size
+    draws = np.random.default_rng(_SEED).multivariate_normal(
+        left.ravel(), 2.0 * profile.covariance_um2.reshape(size, size), _DRAWS, method="eigh"
+    )
+    return Prediction(
+        before_um=float(np.ptp(profile.deviation_um)),
+        after_um=float(np.median(np.ptp(draws, axis=1))),
+        own_um=float(np.ptp(left)),
+        resampling_um=float(np.abs(relative - _at_targets(profile, table)).max()),
+        value_u_um=float(table.u_um[:, inside].max()),
+    )
+
+
+def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Array:
+    """Return what a table leaves of a profile at the targets (2, n), up to a constant."""
+    applied = _at_targets(profile, table)
+    if one_table:
+        half = table.reversal_um() / 2.0
+        applied = applied.mean(axis=0) + np.array([[half], [-half]])
+    return profile.deviation_um - applied
+
+
+def _at_targets(profile: Profile, table: ErrorTable) -> Array:
+    """Return what a table corrects at the targets (2, n), on straight lines between its points."""
+    return np.array([np.interp(profile.position_mm, table.position_mm, values) for values in table.deviation_um])
+
 
 #: Setting data that follow a temperature.
 TEMPERATURE_FORMAT = "siemens840d-temperature"
@@ -52,9 +169,9 @@ class Exported:
 
 
 def export_results(
-    results: Path,
+    results: str | Path,
     format: str,
-    out: Path,
+    out: str | Path,
     *,
     axis: str | None = None,
     spacing_mm: float | None = None,
@@ -67,11 +184,11 @@ def export_results(
 
     Parameters
     ----------
-    results : Path
+    results : str or Path
         Folder of a finished run.
     format : {"csv", "xlsx", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw"}
         Tables, a workbook, or a control; ``siemens840d-temperature`` is the part of the drift that follows the material temperature.
-    out : Path
+    out : str or Path
         Folder for the files; created where it is absent.
     axis : str, optional
         Name of the axis in the control. None: the axis of the campaign.
@@ -90,13 +207,13 @@ def export_results(
     -------
     Exported
         ``csv``: ``drift.csv``, ``profile.csv``, ``iso230.csv``, ``iso230_positions.csv``, and ``fields.csv`` where it was asked for;
-        ``xlsx``: ``results.xlsx``; a control: one table, with a README beside it where its dialect has no comments.
+        ``xlsx``: ``results.xlsx``; a control: one table, with a README where its dialect has no comments.
 
     Raises
     ------
     ExportError
         If the folder holds no results, a file exists, the positions do not suit the control, or something speaks against a compensation
-        table: a verdict other than complete or explained, a doubted input, a position that moves by itself.
+        table: a verdict other than complete or explained, a doubted input, a position that moves unlike the others.
 
     Notes
     -----
@@ -105,11 +222,12 @@ def export_results(
 
     Examples
     --------
-    >>> from pathlib import Path
-    >>> export_results(Path("results"), "csv", Path("results/export"))  # doctest: +SKIP
+    >>> from fusion import export_results
+    >>> export_results("results", "csv", "results/export")  # doctest: +SKIP
     """
     if format not in FORMATS:
         raise ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
+    results, out = Path(results), Path(out)
     if not (results / "deviations.nc").is_file():
         return _export_camera(results, format, out, overwrite=overwrite)
     found, deviations = read_results(results), read_product(results, "deviations")
@@ -120,9 +238,7 @@ def export_results(
         left = () if size is None else (f"fields.csv (about {size:.0f} MB) is written where --fields is given",)
         return Exported(_write(out, content, overwrite=overwrite), left)
     if format == "xlsx":
-        from fusion.report.exports.workbook import write_workbook
-
-        content = {"results.xlsx": lambda path: write_workbook(path, found, deviations)}
+        content = {"results.xlsx": lambda path: tables.write_workbook(path, found, deviations)}
         return Exported(_write(out, content, overwrite=overwrite))
     if not has(deviations, "drift"):
         raise ExportError(
@@ -136,7 +252,9 @@ def export_results(
             if format == TEMPERATURE_FORMAT
             else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, force=force)
         )
-    writers = {name: _text_writer(text) for name, text in texts.items()}
+    writers: dict[str, Writer] = {
+        name: partial(Path.write_text, data=text, encoding="ascii") for name, text in texts.items()
+    }
     return Exported(_write(out, writers, overwrite=overwrite), tuple(notes))
 
 
@@ -163,42 +281,16 @@ def _table_texts(
             f"{control.words}: needs equally spaced points; these are {distances[0]:g} to {distances[-1]:g} mm apart, as ISO 230-2 asks "
             f'for: resample them, for example with --spacing "{distances[len(distances) // 2]:.0f} mm"'
         )
-    prediction = predict(profile, table, one_table=control.one_table)
     name = _axis_name(run, axis, needed=control.names_axis)
-    header = header_lines(
-        run.origin,
-        words=control.words,
-        axis=name,
-        content=_content(table, prediction, path_variance(profile)),
-        sign=control.sign,
-        objections=against,
-        remarks=remarks(run.results),
-        exported=datetime.now(UTC),
-    )
-    file = _file_name(control.file_name, name)
+    facts: dict[str, Any] = {"words": control.words, "axis": name, "table": table, "sign": control.sign}
+    facts["prediction"] = predict(profile, table, one_table=control.one_table)
+    facts["between_um"] = (path_variance(profile) * table.widest_gap_mm / 4.0) ** 0.5
+    header = header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
+    file = control.file_name.format(axis=name) if name else control.file_name.replace("_{axis}", "")
     texts = {file: control.write(table, name, header if control.comment else ())}
     if not control.comment:
         texts[f"{file}.README.txt"] = "\n".join(header) + "\n"
     return texts, [*_forced(against), *remarks(run.results)]
-
-
-def _content(table: ErrorTable, prediction: Prediction, variance_um2_per_mm: float) -> list[str]:
-    """Return what a table holds and is predicted to do."""
-    points = f"{table.position_mm.size} points from {table.position_mm[0]:g} to {table.position_mm[-1]:g} mm"
-    made = f"table: {points}, at the measured targets"
-    if table.resampled:
-        made = f"table: {points}, resampled every {table.spacing_mm():g} mm by straight lines between the targets"
-    between = (variance_um2_per_mm * table.widest_gap_mm / 4.0) ** 0.5
-    return [
-        made,
-        f"at the targets the table departs from the profile by up to {prediction.resampling_um:.3f} um; midway between targets the "
-        f"profile itself is uncertain by up to {between:.2f} um (standard uncertainty)",
-        f"zero of the correction: {table.reference_mm:g} mm, approached in positive direction",
-        f"predicted systematic error E of the axis without drift: {prediction.before_um:.2f} um before, {prediction.after_um:.2f} um after "
-        f"(as a repeated test of as many cycles would show it; the table itself leaves {prediction.own_um:.2f} um)",
-        f"standard uncertainty of a value: up to {prediction.value_u_um:.2f} um",
-        "not in the table: the drift with temperature",
-    ]
 
 
 def _temperature_text(
@@ -215,29 +307,11 @@ def _temperature_text(
     line = fit_temperature_line(run.deviations, material, reference_mm=reference)
     against = _judge([*objections(run.results), *line.objections()], force=force)
     name = _axis_name(run, axis, needed=True)
-    header = header_lines(
-        run.origin,
-        words="Siemens SINUMERIK 840D, temperature compensation (SD43900, SD43910, SD43920)",
-        axis=name,
-        content=_line_content(line),
-        sign="the compensation value K0(T) + tan beta(T) (P - P0) is the measured error line: measured minus programmed",
-        objections=against,
-        remarks=(),
-        exported=datetime.now(UTC),
-    )
+    words = "Siemens SINUMERIK 840D, temperature compensation (SD43900, SD43910, SD43920)"
+    sign = "the compensation value K0(T) + tan beta(T) (P - P0) is the measured error line: measured minus programmed"
+    facts = {"words": words, "axis": name, "line": line, "sign": sign}
+    header = header_lines(run.origin, **facts, objections=against, remarks=())
     return {f"temperature_{name}.MPF": siemens_temperature(line, name, header)}, _forced(against)
-
-
-def _line_content(line: TemperatureLine) -> list[str]:
-    """Return what a temperature line says and is predicted to do."""
-    return [
-        f"shift {line.offset_um_per_K:+.3f} um/K (standard uncertainty {line.offset_u_um_per_K:.3f}), stretch "
-        f"{line.gradient_ppm_per_K:+.3f} um/m/K ({line.gradient_u_ppm_per_K:.3f}) about {line.reference_mm:g} mm",
-        f"predicted drift of a reading: {line.before_um:.2f} um rms before, {line.after_um:.2f} um after (each fifth of the cycles "
-        "predicted from the others)",
-        f"holds from {line.range_degC[0]:.1f} to {line.range_degC[1]:.1f} degC and at the rate of this test; not in it: the profile, which "
-        "is the table of the format siemens840d",
-    ]
 
 
 def _judge(against: list[str], *, force: bool) -> list[str]:
@@ -263,10 +337,6 @@ def _axis_name(run: _Run, given: str | None, *, needed: bool) -> str:
         return ""
     why = f'"{stated}" is no name of an axis' if stated else "the campaign does not state the axis"
     raise ExportError(f"{why}; write a letter and up to nine letters or digits, for example --axis X1")
-
-
-def _file_name(pattern: str, axis: str) -> str:
-    return pattern.format(axis=axis) if axis else pattern.replace("_{axis}", "")
 
 
 def _export_camera(results: Path, format: str, out: Path, *, overwrite: bool) -> Exported:
@@ -300,10 +370,6 @@ def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_f
 
 def _frame_writer(frame: pd.DataFrame) -> Writer:
     return lambda path: frame.to_csv(path, index=False, float_format="%.6g", date_format="%Y-%m-%dT%H:%M:%S.%fZ")
-
-
-def _text_writer(text: str) -> Writer:
-    return lambda path: path.write_text(text, encoding="ascii")
 
 
 def _write(out: Path, content: dict[str, Writer], *, overwrite: bool) -> tuple[Path, ...]:

@@ -1,20 +1,20 @@
 """The application as a user starts it, in a process of its own, and a browser in front of it."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+
+from fusion.app.results.data import Products
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -35,9 +35,7 @@ def started(folder: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def app(
-    campaign_folder: Path, results_folder: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[str, Path]]:
+def app(campaign_folder, results_folder, tmp_path_factory):
     """Address of an application, and its folder: a finished campaign, and a file outside to which a link leads."""
     above = tmp_path_factory.mktemp("app")
     folder = above / "folder"
@@ -51,6 +49,12 @@ def app(
         yield address, folder
 
 
+@pytest.fixture(scope="session")
+def products(results_folder):
+    """The products of the small campaign."""
+    return Products(results_folder)
+
+
 @dataclass(frozen=True)
 class Answer:
     """What a server answers, read whole."""
@@ -61,10 +65,10 @@ class Answer:
 
 
 @pytest.fixture(scope="session")
-def ask() -> Callable[..., Answer]:
+def ask():
     """Return a function that asks a server without a browser; headers are keyword arguments with _ in place of -."""
 
-    def request(address: str, path: str, *, method: str = "GET", body: bytes = b"", **headers: str) -> Answer:
+    def request(address, path, *, method="GET", body=b"", **headers):
         fields = {name.replace("_", "-"): value for name, value in headers.items()}
         with closing(http.client.HTTPConnection(urlsplit(address).netloc, timeout=10)) as connection:
             connection.request(method, path, body=body or None, headers=fields)
@@ -75,26 +79,26 @@ def ask() -> Callable[..., Answer]:
 
 
 @pytest.fixture(scope="session")
-def cookie(app: tuple[str, Path], ask: Callable[..., Answer]) -> str:
+def cookie(app, ask):
     """The cookie that the application gives for its token."""
     return ask(app[0], f"/?{urlsplit(app[0]).query}").headers["Set-Cookie"].split(";")[0]
 
 
 @pytest.fixture(scope="module")
-def new_page() -> Iterator[Callable[..., object]]:
+def new_page():
     """Return a function that opens an address in a new browser session; nothing may leave this machine or fail in a script."""
     if CHROMIUM is None:
         pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
-    from playwright.sync_api import Page, sync_playwright
+    from playwright.sync_api import sync_playwright
 
-    faults: list[str] = []
+    faults = []
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
 
-        def open_page(address: str, *, width: int = 1280, **options: object) -> Page:
+        def open_page(address, *, width=1280, **options):
             host = address.split("?")[0]
-            page = browser.new_context(viewport={"width": width, "height": 900}, **options).new_page()  # type: ignore[arg-type]
+            page = browser.new_context(viewport={"width": width, "height": 900}, **options).new_page()
             page.set_default_timeout(60_000)
             page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
             page.on(

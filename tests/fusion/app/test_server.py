@@ -1,19 +1,15 @@
 """The running server: what it refuses, what it sends with every answer, and what it says when it cannot start."""
 
-from __future__ import annotations
-
 import importlib.util
 import socket
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 from typer.testing import CliRunner
 
-from fusion.app.places import PlaceError
-from fusion.app.server import MissingExtraError, serve
+from fusion.app.parts import PathError
+from fusion.app.server import SCREENS, Credentials, MissingExtraError, serve
 from fusion.cli import app as command
 
 #: What opens the page, its connection, its scripts, and the data.
@@ -27,16 +23,14 @@ PATHS = (
 )
 
 
-def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(
-    app: tuple[str, Path], ask: Callable[..., Any]
-) -> None:
+def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(app, ask):
     answer = ask(app[0], f"/?{urlsplit(app[0]).query}")
     assert answer.status == 302 and answer.headers["Location"] == "/"
     assert "HttpOnly" in answer.headers["Set-Cookie"] and "SameSite=Strict" in answer.headers["Set-Cookie"]
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_a_stranger_gets_403_everywhere(app: tuple[str, Path], ask: Callable[..., Any], path: str) -> None:
+def test_a_stranger_gets_403_everywhere(app, ask, path):
     for query in ("", "?token=", "?token=x", "?token=%FF"):
         answer = ask(app[0], path + query)
         assert answer.status == 403 and b"open that one first" in answer.body
@@ -44,9 +38,7 @@ def test_a_stranger_gets_403_everywhere(app: tuple[str, Path], ask: Callable[...
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_another_site_and_another_name_get_nothing(
-    app: tuple[str, Path], cookie: str, ask: Callable[..., Any], path: str
-) -> None:
+def test_another_site_and_another_name_get_nothing(app, cookie, ask, path):
     for method in ("GET", "POST"):
         assert ask(app[0], path, method=method, Cookie=cookie, Origin="http://evil.example").status == 403
         assert ask(app[0], path, method=method, Cookie=cookie, Host="evil.example").status == 403
@@ -54,34 +46,29 @@ def test_another_site_and_another_name_get_nothing(
     assert "Set-Cookie" not in ask(app[0], f"{path}?{token}", Host="evil.example").headers
 
 
-def test_every_answer_says_what_a_browser_may_do_with_it(
-    app: tuple[str, Path], cookie: str, ask: Callable[..., Any]
-) -> None:
+def test_every_answer_says_what_a_browser_may_do_with_it(app, cookie, ask):
     for answer in (ask(app[0], "/"), ask(app[0], "/", Cookie=cookie), ask(app[0], "/none", Cookie=cookie)):
         policy = answer.headers["Content-Security-Policy"]
-        assert (
-            "default-src 'self'" in policy
-            and "script-src 'self' 'nonce-" in policy
-            and "script-src 'self' 'unsafe-inline'" not in policy
-        )
+        assert "default-src 'self'" in policy and "script-src 'self' 'nonce-" in policy
+        assert "script-src 'self' 'unsafe-inline'" not in policy
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
         assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
 
-def test_the_page_names_no_other_host(app: tuple[str, Path], cookie: str, ask: Callable[..., Any]) -> None:
+def test_the_page_names_no_other_host(app, cookie, ask):
     page = ask(app[0], "/", Cookie=cookie).body.decode()
     assert "https://" not in page and "http://" not in page
     assert cookie.split("=")[1] not in page, "a script of the page cannot learn the cookie"
 
 
-def test_it_listens_on_this_machine_only(app: tuple[str, Path]) -> None:
+def test_it_listens_on_this_machine_only(app):
     port = urlsplit(app[0]).port
     assert port is not None
     with pytest.raises(OSError, match=r"refused|unreachable"), socket.create_connection(("127.0.0.2", port), timeout=2):
         pass
 
 
-def test_without_the_extra_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_remedy_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr("fusion.app.server.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r'panel, which is not installed; run: pip install "thermofuse\[app\]"'):
         serve(tmp_path)
@@ -89,7 +76,95 @@ def test_without_the_extra_the_remedy_is_told(tmp_path: Path, monkeypatch: pytes
     assert answer.exit_code == 2 and "pip install" in answer.output
 
 
-def test_a_folder_must_exist(tmp_path: Path) -> None:
+def test_a_folder_must_exist(tmp_path):
     assert importlib.util.find_spec("panel")
-    with pytest.raises(PlaceError, match="no such folder"):
+    with pytest.raises(PathError, match="no such folder"):
         serve(tmp_path / "absent")
+
+
+OWN = Credentials(8765)
+
+
+class _Connection:
+    """What Tornado asks of the connection of a request."""
+
+    context = None
+
+    def set_close_callback(self, callback):
+        pass
+
+
+def asked(method="GET", **headers):
+    fields = {"Host": "127.0.0.1:8765"} | headers
+    line = RequestStartLine(method, "/", "HTTP/1.1")
+    return HTTPServerRequest(start_line=line, headers=HTTPHeaders(fields), connection=_Connection())
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example:8765", "127.0.0.1", "127.0.0.1:80", "localhost", "127.0.0.1:8765.evil.example", ""]
+)
+def test_another_host_name_is_refused(host):
+    assert "host name" in OWN.refusal(asked(Host=host))
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "https://127.0.0.1:8765", "http://127.0.0.1:80", "null", ""])
+def test_another_origin_is_refused(origin):
+    assert "another site" in OWN.refusal(asked(Origin=origin))
+
+
+def test_what_changes_something_says_where_it_comes_from():
+    assert "must say" in OWN.refusal(asked("POST"))
+    assert "must say" in OWN.refusal(asked(Upgrade="WebSocket"))
+    assert not OWN.refusal(asked("POST", Origin="http://127.0.0.1:8765"))
+    assert not OWN.refusal(asked())
+    assert not OWN.refusal(asked(Host="localhost:8765", Origin="http://localhost:8765"))
+
+
+def test_only_the_cookie_of_this_server_is_known():
+    assert OWN.is_authenticated(asked(Cookie=f"thermofuse-8765={OWN.secret}"))
+    for cookie in (
+        "",
+        "thermofuse-8765=",
+        f"thermofuse-1={OWN.secret}",
+        f"thermofuse-8765={OWN.token}",
+        "thermofuse-8765=é",
+    ):
+        assert not OWN.is_authenticated(asked(Cookie=cookie))
+
+
+def test_credentials_are_long_and_new_for_every_server():
+    other = Credentials(8765)
+    assert len({OWN.token, OWN.secret, other.token, other.secret}) == 4
+    assert min(map(len, (OWN.token, OWN.secret))) >= 43, "256 bits"
+    assert OWN.address == f"http://127.0.0.1:8765/?token={OWN.token}"
+
+
+def test_the_address_opens_the_first_screen_and_the_token_leaves_the_address(app, new_page):
+    page = new_page(app[0])
+    assert page.title() == "thermofuse" and "token" not in page.url
+    page.get_by_role("heading", name=next(iter(SCREENS)), exact=True).wait_for()
+    for name in SCREENS:
+        assert page.get_by_role("button", name=name, exact=True).count() == 1
+    other = page.context.new_page()
+    other.goto(page.url)
+    other.get_by_role("heading", name=next(iter(SCREENS)), exact=True).wait_for()
+
+
+def test_a_phone_shows_it_without_scrolling_sideways(app, new_page):
+    page = new_page(app[0], width=390)
+    page.get_by_role("heading", name=next(iter(SCREENS)), exact=True).wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_screen_breaks_a_serious_rule_of_accessibility(app, new_page, scheme):
+    from axe_playwright_python.sync_playwright import Axe
+
+    page = new_page(app[0], width=390, bypass_csp=True, color_scheme=scheme)
+    page.get_by_text("12 fiducials agree").wait_for()
+    page.get_by_role("slider", name="Camera clock minus laser clock (s)").wait_for()
+    for name in ("Set up", "Run"):
+        page.get_by_role("button", name=name, exact=True).first.press("Enter")
+        page.get_by_role("heading", name=name, exact=True).wait_for()
+        found = Axe().run(page).response["violations"]
+        assert not [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]

@@ -1,7 +1,5 @@
 """The texts of parts of a screen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from html import unescape
 

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from fusion.alignment.readings import Readings
-from fusion.campaign.config import Campaign, CampaignError, load_campaign
-from fusion.campaign.logged_tables import match_columns
-from fusion.effects.effect import Candidate, Effect
-from fusion.effects.library import library
+from fusion.analysis.alignment.readings import Readings
+from fusion.analysis.effects.effect import Candidate, Effect
+from fusion.analysis.effects.library import library
+from fusion.campaign.config import (
+    AcceptanceTable,
+    Campaign,
+    CampaignError,
+    ReportTable,
+    UncertaintyTable,
+    load_campaign,
+)
+from fusion.campaign.logs import match_columns
 
 TEXT = """\
 [campaign]
@@ -97,65 +106,35 @@ def test_paths_start_from_the_campaign_file_and_frames_are_sorted(folder: Path) 
     ]  # fmt: skip
 
 
-def test_a_record_stands_instead_of_the_instruments(folder: Path) -> None:
-    campaign = load(folder, RECORD)
-    assert campaign.record is not None and campaign.thermography is None
-    assert campaign.record.temperatures == ("t* [degC]",)
-
-
-# Each row: text to replace, its replacement, and the message after "FOLDER/campaign.toml" with {folder} filled in.
+# Each row: text to replace, its replacement, and how the message begins after "FOLDER/campaign.toml".
 BAD = [
-    ("emissivity", "emisivity",
-     ", line 7: unknown key thermography.emisivity; did you mean emissivity? known here: atmospheric_temperature, "
-     "atmospheric_temperature_u, camera_drift_u, camera_offset_u, camera_scale_u, clock_offset, emissivity, emissivity_u, frames, lens, "
-     "object_distance, object_distance_u, reference_patch, reflected_temperature, reflected_temperature_u, region, relative_humidity, "
-     "relative_humidity_u, stack, table, window, window_temperature, window_temperature_u, window_transmission, window_transmission_u"),
+    ("emissivity", "emisivity", ", line 7: unknown key thermography.emisivity; did you mean emissivity?"),
     ("emissivity = 0.97", 'emissivity = "0.97 +- much"',
      ', line 7: thermography.emissivity = "0.97 +- much": this is a number without quotes'),
     ("emissivity = 0.97", 'emissivity = "0.97 +- 2"',
-     ', line 7: thermography.emissivity = "0.97 +- 2": the standard uncertainty 2 of a share lies outside 0 to 1; '
-     'write a number such as 0.02, or "2 %"'),
+     ', line 7: thermography.emissivity = "0.97 +- 2": the standard uncertainty 2 of a share'),
     ("emissivity = 0.97", 'camera_scale_u = "1.2"',
-     ', line 7: thermography.camera_scale_u = "1.2": the standard uncertainty 1.2 of a share lies outside 0 to 1; '
-     'write a number such as 0.02, or "2 %"'),
+     ', line 7: thermography.camera_scale_u = "1.2": the standard uncertainty 1.2 of a share'),
     ("emissivity = 0.97", "reference_patch = [5, 5, 0, 20]",
-     ", line 7: thermography.reference_patch = [5, 5, 0, 20]: this patch holds no pixel of a frame; write first column and first row, "
-     "from 0 on, and the number of columns and of rows, at least 1 each, for example [8, 8, 24, 16]"),
-    ('"22 degC"', '"22 degC +- 1 mm"',
-     ', line 8: thermography.reflected_temperature = "22 degC +- 1 mm": '
-     '"mm" is not a unit of a temperature difference; use one of mK, K, degC, degF'),
-    ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value; write for example "5 mm"'),
-    ('"5 mm"', '"5"', ', line 15: plan.cell_size = "5": a length needs its unit in the value; write for example "5 mm"'),
-    ('"5 mm"', '"five mm"',
-     ', line 15: plan.cell_size = "five mm": this is not a length with a unit; write for example "5 mm"'),
-    ('"5 mm"', '"5 kg"', ', line 15: plan.cell_size = "5 kg": "kg" is not a unit of a length; use one of nm, um, mm, cm, m, in'),
+     ", line 7: thermography.reference_patch = [5, 5, 0, 20]: this patch holds no pixel"),
+    ('"22 degC"', '"22 degC +- 1 mm"', ', line 8: thermography.reflected_temperature = "22 degC +- 1 mm": "mm" is not a unit'),
+    ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value'),
     ('"5 mm"', '"-5 mm"', ', line 15: plan.cell_size = "-5 mm": this length in mm lies above 0 and up to 100000'),
-    ('"5 mm"', '"5 um"',
-     ", line 13: [plan]: cell_size 0.005 mm on a plan of 700 x 180 mm makes 5040000000 cells; "
-     "choose it for at least 2 cells per side and at most 4 million in all"),
-    ('"0 mm"', "0", ', line 25: interferometry.dead_path = 0: a length needs its unit in the value; write for example "5 mm"'),
-    ('"22 degC"', '"-300 degC"',
-     ', line 8: thermography.reflected_temperature = "-300 degC": a temperature in degC lies above -273.15 and up to 3000'),
+    ('"5 mm"', '"5 um"', ", line 13: [plan]: cell_size 0.005 mm on a plan of 700 x 180 mm makes 5040000000 cells"),
+    ('"22 degC"', '"-300 degC"', ', line 8: thermography.reflected_temperature = "-300 degC": a temperature'),
     ("0.97", "97", ", line 7: thermography.emissivity = 97: this fraction lies above 0 and up to 1"),
     ('"0.7 m", "180 mm"', '"0.7 m"', ", line 14: plan.size needs 2 values"),
-    ('"0.7 m", "180 mm"', '"0.7 m", 180',
-     ', line 14: plan.size = 180: a length needs its unit in the value; write for example "5 mm"'),
-    ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] points nowhere; write for example [-1, 0]"),
+    ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] points nowhere"),
     ("[-1, 0]", '["left", 0]', ', line 20: plan.axis.direction = "left": this is a number without quotes'),
-    ('["thermal/*.jpg"]', '"thermal/*.jpg"',
-     ', line 6: thermography.frames = "thermal/*.jpg": this is a list; write for example ["a", "b"]'),
-    ("*.jpg", "*.seq",
-     ', line 6: thermography.frames = "thermal/*.seq": matches no file in {folder}; paths are relative to the campaign file'),
-    ('"laser.csv"', '"lazer.csv"',
-     ', line 23: interferometry.deviations = "lazer.csv": no such file {folder}/lazer.csv; did you mean laser.csv? '
-     "paths are relative to the campaign file"),
-    ('fiducials = "fiducials.csv"\n', "", ", line 13: [plan] lacks fiducials; add it, see the campaign file in the README"),
-    ('"table_offset"', '"axis_expansion"', ', line 29: model.declared = ["axis_expansion", "axis_expansion"]: '
-     "axis_expansion named more than once; name each effect once"),
-    ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9); see the campaign file in the README"),
+    ('["thermal/*.jpg"]', '"thermal/*.jpg"', ', line 6: thermography.frames = "thermal/*.jpg": this is a list'),
+    ("*.jpg", "*.seq", ', line 6: thermography.frames = "thermal/*.seq": matches no file in {folder}'),
+    ('"laser.csv"', '"lazer.csv"', ', line 23: interferometry.deviations = "lazer.csv": no such file {folder}/lazer.csv'),
+    ('fiducials = "fiducials.csv"\n', "", ", line 13: [plan] lacks fiducials; add it"),
+    ('"table_offset"', '"axis_expansion"', ', line 29: model.declared = ["axis_expansion", "axis_expansion"]: axis_expansion named'),
+    ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9)"),
     ('title = "X axis"', 'title = ""', ', line 2: campaign.title = "": this text is empty; fill it in'),
     ('title = "X axis"', "title = 5", ", line 2: campaign.title = 5: this is text; write it in quotes"),
-    ('"-2 min"', '"1e12 s"', ', line 11: thermography.clock_offset = "1e12 s": this time in s lies above -3e+09 and up to 3e+09'),
+    ('"-2 min"', '"1e12 s"', ', line 11: thermography.clock_offset = "1e12 s": this time in s lies above -3e+09'),
 ]  # fmt: skip
 
 
@@ -164,21 +143,14 @@ def test_bad_input_is_named_with_place_value_and_remedy(folder: Path, old: str, 
     assert old in TEXT
     with pytest.raises(CampaignError) as error:
         load(folder, TEXT.replace(old, new))
-    assert str(error.value) == f"{folder}/campaign.toml" + message.format(folder=folder)
+    assert str(error.value).startswith(f"{folder}/campaign.toml" + message.format(folder=folder))
 
 
 def test_an_unknown_effect_is_answered_with_the_nearest(folder: Path) -> None:
     with pytest.raises(
-        CampaignError,
-        match=r'line 29: model.declared = "table_ofset": unknown effect; did you mean table_offset[?]',
+        CampaignError, match=r'line 29: model.declared = "table_ofset": unknown effect; did you mean table_offset[?]'
     ):
         load(folder, TEXT.replace("table_offset", "table_ofset"))
-
-
-@pytest.mark.parametrize("name", ["l" * 5000, f"{'l' * 5000}/laser.csv"])
-def test_a_name_longer_than_a_file_may_have_is_no_file(folder: Path, name: str) -> None:
-    with pytest.raises(CampaignError, match=r"no such file .*l; paths|no such file .*/laser\.csv; paths"):
-        load(folder, TEXT.replace('"laser.csv"', f'"{name}"'))
 
 
 def test_all_faults_come_in_one_message(folder: Path) -> None:
@@ -197,7 +169,7 @@ def test_files_and_effects_are_checked_together_with_the_values(folder: Path) ->
     assert "thermography.emissivity = 97" in first
     assert 'interferometry.deviations = "laser.csv": no such file' in second
     assert third == (
-        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect are not known beforehand; '
+        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect have to be estimated; '
         "remove it, the closed loop tries it anyway; can be declared here: axis_expansion, table_offset, dead_path, air_index, "
         "material_compensation"
     )
@@ -213,10 +185,10 @@ def test_a_record_is_declared_with_what_has_a_meaning_for_it(folder: Path) -> No
     assert load(folder, RECORD + '[model]\ndeclared = ["quasi_static"]\n').model.declared == ("quasi_static",)
     with pytest.raises(
         CampaignError,
-        match=r'line 10: model.declared = "dead_path": this effect has no meaning for a record; can be declared here: quasi_static',
+        match=r'line 10: model.declared = "dead_path": this effect does not apply to a record; can be declared here: quasi_static',
     ):
         load(folder, RECORD + '[model]\ndeclared = ["dead_path"]\n')
-    with pytest.raises(CampaignError, match='"quasi_static": this effect has no meaning for a campaign with positions'):
+    with pytest.raises(CampaignError, match='"quasi_static": this effect does not apply to a campaign with positions'):
         load(folder, TEXT.replace("table_offset", "quasi_static"))
 
 
@@ -231,17 +203,10 @@ def test_an_effect_of_a_users_own_is_declared_where_it_says_so(folder: Path) -> 
     (folder / "campaign.toml").write_text(text)
     loaded = load_campaign(folder / "campaign.toml", effects={**library(), own.name: own})
     assert loaded.model.declared == ("axis_expansion", "bed_bending")
-    with pytest.raises(CampaignError, match="the parameters of this effect are not known beforehand"):
-        load_campaign(folder / "campaign.toml", effects={**library(), own.name: replace(own, declarable=False)})
-
-
-def test_missing_tables_and_mixed_instruments_are_refused(folder: Path) -> None:
-    with pytest.raises(CampaignError, match=r"line 1: there is no instrument; a campaign needs \[interferometry\], or"):
-        load(folder, '[campaign]\ntitle = "empty"\n')
     with pytest.raises(
-        CampaignError, match=r"line 31: \[record\] stands instead of \[thermography\], \[plan\], \[interferometry\]"
+        CampaignError, match=r'model\.declared = "bed_bending": the parameters of this effect are not known beforehand'
     ):
-        load(folder, TEXT + "\n" + RECORD.split("\n\n")[1])
+        load_campaign(folder / "campaign.toml", effects={**library(), own.name: replace(own, declarable=False)})
 
 
 def test_no_campaign_file(folder: Path) -> None:
@@ -302,3 +267,114 @@ def test_a_fault_of_both_entries_of_a_list_is_told_once(folder: Path) -> None:
     with pytest.raises(CampaignError) as caught:
         load(folder, TEXT.replace('size = ["0.7 m", "180 mm"]', 'size = ["FILL IN", "FILL IN"]'))
     assert str(caught.value).count("FILL IN") == 1
+
+
+# Tests of the tables that a campaign needs: any subset of the instruments is taken, and what a table lacks is named.
+
+
+TITLE = 'campaign.title = "X"'
+LASER = 'interferometry.deviations = "laser.csv"'
+CAMERA = 'thermography.frames = ["*.jpg"]'
+SIZE = 'plan.size = ["20 mm", "10 mm"]'
+PLAN = f'{SIZE}\nplan.cell_size = "5 mm"\nplan.fiducials = "laser.csv"'
+AXIS = 'plan.axis = { origin = ["5 mm", "5 mm"], direction = [1, 0] }'
+PIXELS = 'plan.registration = "pixels"'
+SENSORS = 'sensors = { file = "laser.csv", places = "laser.csv" }'
+LOGGED = 'record = { file = "laser.csv", time = "t", temperatures = ["T"], displacements = ["X"] }'
+MOVING = 'thermography.table = "moving"'
+
+
+@pytest.fixture(scope="module")
+def bare_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bare_folder = tmp_path_factory.mktemp("campaign")
+    for name in ("laser.csv", "a.jpg"):
+        (bare_folder / name).touch()
+    return bare_folder
+
+
+def write(bare_folder: Path, *lines: str) -> Path:
+    path = bare_folder / "campaign.toml"
+    path.write_text("\n".join((TITLE, *lines)), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        (LASER,),
+        (LASER, SIZE),
+        (CAMERA, PLAN),
+        (CAMERA, PIXELS),
+        (CAMERA, PIXELS, 'plan.cell_px = "4 px"'),
+        (LASER, CAMERA, PLAN, AXIS),
+        (LASER, SENSORS, SIZE, AXIS),
+        (LOGGED,),
+    ],
+)
+def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: tuple[str, ...]) -> None:
+    assert load_campaign(write(bare_folder, *lines)).campaign.title == "X"
+
+
+@pytest.mark.parametrize(
+    ("lines", "number", "fault"),
+    [
+        ((), 1, "there is no instrument"),
+        ((SENSORS, SIZE, AXIS), 1, "there is no instrument"),
+        ((CAMERA,), 2, "[thermography] needs the table [plan]"),
+        ((LASER, SENSORS), 3, "[sensors] needs the table [plan]"),
+        ((CAMERA, PLAN.replace("plan.fid", "# ")), 3, "[plan] lacks fiducials; add it"),
+        ((LASER, CAMERA, PLAN), 4, "[plan] lacks axis; add it"),
+        ((CAMERA, MOVING, PLAN), 4, "[plan] lacks axis; add it"),
+        ((LASER, CAMERA, 'thermography.window = "5 min"', PLAN, AXIS), 4, "thermography.window divides the frames"),
+        ((CAMERA, PLAN.replace("plan.size", "# ")), 4, "[plan] lacks size; add it"),
+        ((CAMERA, PLAN, 'plan.cell_px = "4 px"'), 3, "[plan]: cell_px belongs to a plan of pixels"),
+        ((LASER, CAMERA, PIXELS), 2, 'plan.registration = "pixels", but [interferometry] needs the measured line'),
+        ((CAMERA, PIXELS, SENSORS), 4, 'plan.registration = "pixels", but [sensors] needs the places of the sensors'),
+        ((PIXELS, LASER), 2, 'registration = "pixels" makes the picture of a camera the plan'),
+        ((CAMERA, MOVING, PIXELS), 3, 'plan.registration = "pixels", but it holds for a table at rest'),
+        ((CAMERA, 'thermography.lens = "laser.csv"', PIXELS), 3, 'plan.registration = "pixels", but the calibration'),
+        ((CAMERA, PIXELS, PLAN, AXIS), 3, "[plan]: size, cell_size, fiducials, axis in millimetres cannot be combined"),
+        ((LASER, LOGGED), 3, "[record] cannot be combined with [interferometry]"),
+        (('path = "x"',), 2, "unknown key path; remove it"),
+    ],
+)
+def test_what_a_campaign_lacks_is_named_at_its_line(
+    bare_folder: Path, lines: tuple[str, ...], number: int, fault: str
+) -> None:
+    with pytest.raises(CampaignError) as caught:
+        load_campaign(write(bare_folder, *lines))
+    assert str(caught.value).startswith(f"{bare_folder}/campaign.toml, line {number}: {fault}")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+# Tables of a campaign file on the positioning test as a test by ISO 230-2.
+
+
+def test_uncertainties_carry_their_unit() -> None:
+    table = UncertaintyTable.model_validate(
+        {"device": "0.5 um/m", "alignment": "300 ppb", "material_temperature": "200 mK"}
+    )
+    assert (table.device_ppm, table.alignment_ppm, table.material_temperature_K) == (0.5, pytest.approx(0.3), 0.2)
+    with pytest.raises(ValidationError, match="needs its unit"):
+        UncertaintyTable.model_validate({"device": 0.5})
+    with pytest.raises(ValidationError, match="greater than or equal to 0"):
+        UncertaintyTable.model_validate({"environmental_variation": "-1 um"})
+
+
+def test_only_tolerances_that_are_stated_are_judged() -> None:
+    assert AcceptanceTable().limits() == {}
+    assert AcceptanceTable.model_validate({"A": "10 um", "R_unidirectional": "4000 nm"}).limits() == {
+        "A": 10.0,
+        "R_unidirectional": 4.0,
+    }
+
+
+def test_every_condition_may_be_left_out() -> None:
+    assert ReportTable().model_fields_set == set()
+    found = ReportTable.model_validate(
+        {"screw_lead": "1 cm", "feed": "2 m/min", "instrument": [{"name": "laser", "calibrated": date(2026, 1, 5)}]}
+    )
+    assert (found.screw_lead_mm, found.feed_mm_per_min) == (10.0, 2000.0)
+    assert found.instrument[0].calibrated == date(2026, 1, 5)
+    with pytest.raises(ValidationError, match="Extra inputs"):
+        ReportTable.model_validate({"machine_serial": "7"})

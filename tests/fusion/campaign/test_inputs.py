@@ -9,14 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.alignment.align import AlignmentError
+from fusion.analysis.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
-from fusion.campaign.inputs import SourceError, frames_notices, read_source
-from fusion.campaign.sources import LaserInputs
-from fusion.pipeline.interferometry import evaluate_interferometry
-from interferometry.io.readers import read_deviations
+from fusion.campaign.inputs import (
+    LaserInputs,
+    Source,
+    SourceError,
+    cycles_of_frames,
+    frames_notices,
+    read_source,
+    stack_options,
+    usual_window_s,
+)
+from fusion.pipeline.positioning import evaluate_interferometry
+from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import without
+from thermography.io.flir import index_frames
+from thermography.radiometry.planck import calibrate
 
 
 def shift_frames(folder: Path, hours: float) -> None:
@@ -66,7 +76,8 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
 def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: Path) -> None:
     shift_frames(copied, 1.0)
     with pytest.raises(
-        AlignmentError, match=r'look 1 h apart, as in two time zones .* write thermography.clock_offset = "-3600 s"'
+        AlignmentError,
+        match=r"the clocks look 1 h apart, as in two time zones \(frames 2026-03-09T06:",
     ):
         read_source(load_campaign(copied / "campaign.toml"))
     text = (copied / "campaign.toml").read_text()
@@ -76,13 +87,18 @@ def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: P
 
 def test_recordings_of_two_days_are_refused(copied: Path) -> None:
     shift_frames(copied, 100.0)
-    with pytest.raises(AlignmentError, match=r"frames and readings never meet .* readings of laser\.csv 20"):
+    with pytest.raises(
+        AlignmentError,
+        match=r"frames and readings never meet \(frames 2026-03-09T06:32:44Z to 2026-03-09T07:41:44Z, readings of laser\.csv 202",
+    ):
         read_source(load_campaign(copied / "campaign.toml"))
 
 
 def test_a_link_whose_frame_is_gone_is_named(copied: Path) -> None:
     (copied / "thermal" / "IR_gone.jpg").symlink_to(copied / "nowhere.jpg")
-    with pytest.raises(CampaignError, match=r"thermal/IR_gone.jpg is a link to a file that is gone; bring it back"):
+    with pytest.raises(
+        CampaignError, match=r"thermal/IR_gone.jpg is a link to a file that does not exist; restore the file"
+    ):
         load_campaign(copied / "campaign.toml")
 
 
@@ -156,7 +172,7 @@ def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:
     numbers = source.deviations["cycle"].values.tolist()
     assert numbers == [n for n in range(1, numbers[-1] + 1) if n not in (2, 5)]
     told = {notice.code: notice.message for notice in source.notices}["cycles_left_out"]
-    assert told == f"2 cycles of {numbers[-1]} in laser.rtl left out, without a reading that has a time: 2; 5."
+    assert told == f"2 cycles of {numbers[-1]} in laser.rtl left out, as none of their readings has a time: 2; 5."
     lost = read["deviation"].where(read["cycle"] == 1)
     write_rtl(copied / "laser.rtl", read.assign(deviation=lost))
     with pytest.raises(
@@ -172,3 +188,113 @@ def test_a_driver_of_the_name_of_a_logged_condition_is_refused(copied: Path) -> 
         SourceError, match=r"drivers\.csv: the driver 'air_temperature' is logged in environment\.csv too"
     ):
         read_source(load_campaign(copied / "campaign.toml"))
+
+
+# Temperatures of another camera in a campaign: the same fields as from the counts, and what must be stated.
+
+
+@pytest.fixture(scope="module")
+def stack_folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small campaign with the temperatures of its frames as one array and a table of times."""
+    folder = tmp_path_factory.mktemp("stack")
+    for name in ("campaign.toml", "fiducials.csv", "laser.csv", "environment.csv", "drivers.csv"):
+        (folder / name).write_bytes((campaign_folder / name).read_bytes())
+    frames, _ = index_frames(sorted((campaign_folder / "thermal").iterdir()))
+    campaign = load_campaign(campaign_folder / "campaign.toml").thermography
+    assert campaign is not None
+    np.save(folder / "stack.npy", np.stack([calibrate(frame.read_counts(), frame.parameters) for frame in frames]))
+    rows = [f"stack.npy,{i},{frame.time}+00:00" for i, frame in enumerate(frames)]
+    (folder / "times.csv").write_text("file,frame,time\n" + "\n".join(rows) + "\n")
+    return folder
+
+
+def stated(folder: Path, stack: str, *, camera: str = "") -> Path:
+    lines = (folder / "campaign.toml").read_text().splitlines()
+    dropped = ("frames", "emissivity", "reflected", "atmospheric", "relative_humidity", "object_distance")
+    start = lines.index("[thermography]")
+    end = next(i for i in range(start + 1, len(lines)) if lines[i].startswith("["))
+    kept = [line for line in lines[start:end] if not line.startswith(dropped)]
+    table = [*kept, 'frames = ["stack.npy"]', camera, "[thermography.stack]", stack, ""]
+    path = folder / "stack.toml"
+    path.write_text("\n".join([*lines[:start], *table, *lines[end:]]))
+    return path
+
+
+def test_the_frames_are_those_of_the_camera(campaign_folder: Path, stack_folder: Path) -> None:
+    path = stated(stack_folder, 'unit = "degC"\ntimes = "times.csv"')
+    source = read_source(load_campaign(path))
+    assert isinstance(source, Source)
+    frames, _ = index_frames(sorted((campaign_folder / "thermal").iterdir()))
+    assert [frame.time for frame in source.frames] == [frame.time for frame in frames]
+    for i in (0, len(frames) - 1):
+        ours = calibrate(source.frames[i].read_counts(), source.frames[i].parameters)
+        # Half a step of the scale at room temperature is 2.4 mK.
+        assert ours == pytest.approx(calibrate(frames[i].read_counts(), frames[i].parameters), abs=2.6e-3)
+    codes = {notice.code for notice in source.notices}
+    assert {"camera_accuracy_assumed", "stack_emissivity_unknown"} <= codes
+
+
+def test_a_stated_camera_needs_no_notice(stack_folder: Path) -> None:
+    stack = 'unit = "degC"\ntimes = "times.csv"\nemissivity = 0.95\nreflected_temperature = "22 degC"'
+    source = read_source(load_campaign(stated(stack_folder, stack, camera='camera_offset_u = "1 K"\nemissivity = 0.9')))
+    assert not {"camera_accuracy_assumed", "stack_emissivity_unknown"} & {notice.code for notice in source.notices}
+    assert source.frames[0].parameters.emissivity == 0.95  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("stack", "camera", "message"),
+    [
+        ('unit = "degC"\nstart = "now"', "", "the time 'now' of a frame is not an ISO 8601 time"),
+        ('unit = "degC"\nstart = "2026-03-09T06:30Z"\ntimes = "times.csv"', "", "times and start each say when"),
+        ('unit = "degF"', "", "degC"),
+        ('unit = "degC"', "emissivity = 0.9", "write that as emissivity under .thermography.stack."),
+        (
+            'unit = "degC"',
+            'object_distance = "1 m"',
+            r"\[thermography\]: object_distance is already corrected for in temperatures",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(stack_folder: Path, stack: str, camera: str, message: str) -> None:
+    with pytest.raises(CampaignError, match=message):
+        stack_options(load_campaign(stated(stack_folder, stack, camera=camera)))
+
+
+# Tests of the windows that stand for cycles where no laser gives them.
+
+
+START = np.datetime64("2026-03-09T08:00", "ns")
+
+
+def frames(*minutes: float) -> np.ndarray:
+    return START + np.round(np.array(minutes) * 60e9).astype("timedelta64[ns]")
+
+
+def test_windows_follow_each_other_and_hold_every_frame() -> None:
+    times = frames(*range(13))
+    cycles = cycles_of_frames(times, 300.0)
+    assert cycles.number.tolist() == [1, 2, 3]
+    assert (cycles.bounds[1:, 0] == cycles.bounds[:-1, 1]).all()
+    inside = (times[:, None] >= cycles.bounds[:, 0]) & (times[:, None] < cycles.bounds[:, 1])
+    assert inside.sum(axis=1).tolist() == [1] * 13
+
+
+def test_a_window_without_a_frame_is_left_out_and_the_number_says_so() -> None:
+    assert cycles_of_frames(frames(0, 1, 17), 300.0).number.tolist() == [1, 4]
+
+
+@pytest.mark.parametrize(
+    ("times", "window_s"),
+    [
+        (frames(*np.arange(0, 240)), 300.0),  # four hours: 48 windows of 5 min
+        (frames(*np.arange(0, 10, 1 / 60)), 10.0),  # ten minutes at 1 Hz: 60 windows of 10 s
+        (frames(0, 45, 90), 3600.0),  # a frame in 45 min: an hour is the first usual length that holds one
+        (frames(0, 1), 60.0),
+        (frames(*np.arange(0, 0.004, 0.0005)), 0.05),  # 0.2 s at 33 Hz: shorter than every usual length
+        (frames(0, 0.0661), 2.0),  # two frames 4 s apart: two windows
+        (frames(0, 1e-8), 6e-7),
+    ],
+)
+def test_the_usual_window_is_a_round_time_and_makes_at_most_sixty(times: np.ndarray, window_s: float) -> None:
+    assert usual_window_s(times) == window_s
+    assert cycles_of_frames(times, window_s).number.size <= 61

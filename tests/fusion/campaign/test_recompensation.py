@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 from pydantic import ValidationError
 
-from fusion.alignment.align import AxisGeometry
+from fusion.analysis.alignment.align import AxisGeometry
 from fusion.campaign.config import InterferometryTable, load_campaign
 from fusion.campaign.inputs import compensate_by_camera, read_source
-from fusion.campaign.iso_budget import StatedBudget
-from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
-from fusion.pipeline.interferometry import evaluate_interferometry
-from fusion.products.store import read_dataset
+from fusion.campaign.recompensation import (
+    RecompensationError,
+    StatedBudget,
+    compensate_readings,
+    material_by_cycle,
+    see_material,
+    state_budget,
+)
+from fusion.pipeline.positioning import evaluate_interferometry
+from fusion.results.store import read_dataset
 from interferometry.compensation import CompensationError, air_index, environment_factor
-from interferometry.io.readers import read_deviations
+from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from interferometry.iso230 import Iso230Budget
 from tests.interferometry.simulated_campaigns import START, simulate
@@ -93,7 +100,8 @@ def test_what_cannot_be_redone_is_refused(readings: xr.Dataset, log: xr.Dataset)
     with pytest.raises(RecompensationError, match=r'compensation = "redo" needs the air: log air temperature'):
         compensate_readings(readings, None, table(compensation="redo"))
     with pytest.raises(
-        ValidationError, match=r'material_temperature = "camera" without compensation = "redo", to which it belongs'
+        ValidationError,
+        match=r'material_temperature = "camera" without compensation = "redo"',
     ):
         table(material_temperature="camera")
     wrong = table(compensation="redo", environment_factor=["0.3 um", "0.3 um"])
@@ -150,3 +158,65 @@ def test_a_campaign_with_the_camera_as_thermometer(copied: Path, results_folder:
     assert seen["origin"] == "from the camera" and logged["origin"] == "assumed"
     assert seen["E_um"] / logged["E_um"] == pytest.approx(seen["u"] / logged["u"], rel=0.05)
     assert seen["B_um"] == logged["B_um"] == 0.0
+
+
+# The budget of a campaign: stated, measured, assumed.
+
+
+def stating(uncertainty: dict[str, str] | None = None, **keys: Any) -> InterferometryTable:
+    return InterferometryTable.model_validate({"deviations": "laser.csv", "uncertainty": uncertainty or {}, **keys})
+
+
+def test_what_is_stated_replaces_what_is_assumed() -> None:
+    found = state_budget(stating({"device": "0.1 um/m", "environmental_variation": "300 nm"}))
+    assert found.budget == Iso230Budget(device_ppm=0.1, environmental_variation_um=0.3)
+    assert found.origins == {
+        "device": "stated",
+        "alignment": "assumed",
+        "material_temperature": "assumed",
+        "expansion_coefficient": "assumed",
+        "environmental_variation": "stated",
+    }
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        stating({"expansion_coefficient": "0.8 ppm/K"}, expansion_coefficient="10.5 ppm/K"),
+        stating(expansion_coefficient="10.5 +- 0.8 ppm/K"),
+    ],
+)
+def test_the_uncertainty_of_the_coefficient_may_stand_beside_it_or_in_the_budget(asked: InterferometryTable) -> None:
+    budget = state_budget(asked)
+    assert budget.budget.expansion_coefficient_ppm_per_K == pytest.approx(0.8)
+    assert budget.budget.nominal_expansion_ppm_per_K == 10.5
+    assert budget.origins["expansion_coefficient"] == "stated"
+
+
+def test_two_uncertainties_of_one_coefficient_are_refused() -> None:
+    with pytest.raises(
+        ValidationError,
+        match=r"of the expansion coefficient is 0.8 ppm/K with",
+    ):
+        stating({"expansion_coefficient": "1 ppm/K"}, expansion_coefficient="10.5 +- 0.8 ppm/K")
+
+
+def test_the_camera_as_thermometer_has_its_own_uncertainty_unless_one_is_stated() -> None:
+    assert state_budget(stating(), camera_u_K=0.7).budget.material_temperature_K == 0.7
+    assert state_budget(stating(), camera_u_K=0.7).origins["material_temperature"] == "from the camera"
+    stated = state_budget(stating({"material_temperature": "0.4 K"}), camera_u_K=0.7)
+    assert (stated.budget.material_temperature_K, stated.origins["material_temperature"]) == (0.4, "stated")
+
+
+def test_the_material_of_a_cycle_is_that_of_its_middle() -> None:
+    deviations = simulate(np.random.default_rng(1), cycles=3)[0]
+    time = deviations["time"].values
+    log = xr.Dataset({"material_temperature": ("time", [20.0, 30.0])}, coords={"time": [time.min(), time.max()]})
+    found = material_by_cycle(deviations, log)
+    assert found is not None
+    share = (time - time.min()) / (time.max() - time.min())
+    np.testing.assert_allclose(found, 20.0 + 10.0 * share.mean(axis=(1, 2)))
+    assert material_by_cycle(deviations, None) is None
+    assert material_by_cycle(deviations, log.isel(time=slice(0, 0))) is None
+    sensors = deviations.assign(material_temperature=(("sensor", "end"), [[21.0, 23.0]]))
+    assert material_by_cycle(sensors, None).values.tolist() == [22.0, 22.0, 22.0]  # type: ignore[union-attr]

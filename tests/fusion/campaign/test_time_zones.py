@@ -9,10 +9,9 @@ import pytest
 import xarray as xr
 
 from fusion.campaign.config import CampaignError, load_campaign
-from fusion.campaign.inputs import read_source
-from fusion.campaign.record_runs import read_record
+from fusion.campaign.inputs import read_record, read_source
 from fusion.campaign.time_zones import bring_to_utc, lacks_zone, refuse_mixed_zones
-from interferometry.io.dates import NO_ZONE
+from interferometry.io.tables import NO_ZONE
 
 
 def table(*times: str, reference: str = NO_ZONE) -> xr.Dataset:

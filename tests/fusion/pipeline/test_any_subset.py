@@ -1,8 +1,5 @@
 """Runs of campaigns that have one instrument only, or few cycles: what the data carry is there, the rest is named and shown nowhere."""
 
-from __future__ import annotations
-
-import json
 import re
 import shutil
 from pathlib import Path
@@ -10,102 +7,78 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.alignment.align import AlignmentError
+from fusion.analysis.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
+from fusion.pipeline.check import check_campaign
 from fusion.pipeline.run import run_campaign
-from fusion.products.folder import claim, read_manifest
-from fusion.products.results import Results, read_results
-from fusion.products.store import read_dataset, read_tree
 from fusion.report.exports.export import ExportError, export_results
 from fusion.report.terminal import summary_rows
-from fusion.starting.check import check_campaign
+from fusion.results.folder import claim, read_manifest
+from fusion.results.results import read_results
+from fusion.results.store import read_dataset, read_tree
 from tests.fusion.campaign_parts import without
+
+pytestmark = pytest.mark.chain
 
 CAMERA_CHECKS = ("camera", "fiducial", "plan", "frames", "frozen", "scene", "material", "axis_line")
 
 
-def sections(folder: Path) -> list[str]:
-    return re.findall(r'<section id="([a-z0-9]+)"', (folder / "report.html").read_text(encoding="utf-8"))
+def sections(folder: Path) -> set[str]:
+    return set(re.findall(r'<section id="([a-z0-9]+)"', (folder / "report.html").read_text(encoding="utf-8")))
 
 
 @pytest.fixture(scope="module")
-def folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(campaign_folder, tmp_path_factory):
     """A copy of the small campaign for campaign files with some of its tables."""
     return shutil.copytree(campaign_folder, tmp_path_factory.mktemp("parts") / "campaign")
 
 
 @pytest.fixture(scope="module")
-def laser_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def laser_results(folder, tmp_path_factory):
     """The products of the small campaign without camera and plan."""
     out = tmp_path_factory.mktemp("laser") / "results"
     run_campaign(without(folder / "campaign.toml", "thermography", "plan", "model", name="laser.toml"), out)
     return out
 
 
-def test_the_laser_alone_gives_all_that_needs_no_field(laser_results: Path, results_folder: Path) -> None:
+def test_the_laser_alone_gives_all_that_needs_no_field(laser_results, results_folder):
     results, both = read_results(laser_results), read_results(results_folder)
-    assert results.iso230 == both.iso230
-    assert results.drift == both.drift
-    assert results.neighbours == both.neighbours
-    assert results.loop is not None and results.loop.declared == ()
+    assert (results.iso230, results.drift, results.neighbours) == (both.iso230, both.drift, both.neighbours)
+    assert results.loop.declared == () and results.anomalies is not None
     assert "reversal_drift" in [step.effect for step in results.loop.steps]
-    assert results.anomalies is not None
     for part in ("registration", "camera", "radiometry", "alignment", "hotspots", "correlation"):
         assert getattr(results, part) is None, part
-    assert sorted(path.name for path in laser_results.glob("[!.]*")) == [
-        "deviations.nc",
-        "fusion.nc",
-        "manifest.json",
-        "provenance.json",
-        "report.html",
-        "results.json",
-    ]
-
-
-def test_a_check_that_needs_the_camera_is_not_counted_as_passed(laser_results: Path) -> None:
-    results = read_results(laser_results)
-    assert results.inputs is not None
+    products = {"deviations.nc", "fusion.nc", "manifest.json", "provenance.json", "report.html", "results.json"}
+    assert {path.name for path in laser_results.glob("[!.]*")} == products
+    # A check that needs the camera is not counted as passed.
     codes = [check.code for check in results.inputs.checks]
     assert codes and not [code for code in codes if code.startswith(CAMERA_CHECKS)]
-
-
-def test_the_report_of_the_laser_has_no_section_of_the_camera(laser_results: Path) -> None:
-    found = sections(laser_results)
-    assert {"drift", "iso230", "anomalies", "loop"} <= set(found)
-    assert not {"registration", "fields", "correlation"} & set(found)
-    assert "the camera does not" not in (laser_results / "report.html").read_text(encoding="utf-8")
-    names = [name for name, _ in summary_rows(read_results(laser_results))]
-    assert "registration" not in names and "drift and field" not in names
-
-
-def test_effects_of_the_field_are_named_as_not_available_without_camera(laser_results: Path) -> None:
-    loop = json.loads((laser_results / "results.json").read_text(encoding="utf-8"))["loop"]
-    assert "the campaign holds no temperature of the table" in loop["not_tried"]["axis_expansion"]
+    assert "the campaign holds no temperature of the table" in results.loop.not_tried["axis_expansion"]
     for name in ("unseen_heat_source", "laser_warm_up", "angular_growth", "material_compensation"):
-        assert "its own expansion looks the same" in loop["not_tried"][name]
+        assert "its own expansion looks the same" in results.loop.not_tried[name]
+    found = sections(laser_results)
+    assert {"drift", "iso230", "anomalies", "loop"} <= found and not {"registration", "fields", "correlation"} & found
+    assert "the camera does not" not in (laser_results / "report.html").read_text(encoding="utf-8")
+    assert not {"registration", "drift and field"} & {name for name, _ in summary_rows(results)}
 
 
-def test_an_effect_of_the_field_cannot_be_declared_without_one(copied: Path) -> None:
-    with pytest.raises(
-        CampaignError, match="follows the temperature of the table, which this campaign does not measure"
-    ):
+def test_an_effect_of_the_field_cannot_be_declared_without_one(copied):
+    with pytest.raises(CampaignError, match="follows the temperature of the table, which this campaign does not"):
         load_campaign(without(copied / "campaign.toml", "thermography", "plan"))
 
 
-def test_the_products_of_the_laser_are_exported_and_resumed(laser_results: Path, folder: Path, tmp_path: Path) -> None:
+def test_the_products_of_the_laser_are_exported_and_resumed(laser_results, folder, tmp_path):
     names = [path.name for path in export_results(laser_results, "csv", tmp_path).files]
     assert "drift.csv" in names and "fields.csv" not in names
+    labels = []
     before = read_results(laser_results)
-    labels: list[str] = []
-    kept = run_campaign(
-        folder / "laser.toml", laser_results, resume=True, report=lambda label, *_: labels.append(label)
-    )
-    assert kept == before
+    campaign = folder / "laser.toml"
+    assert run_campaign(campaign, laser_results, resume=True, report=lambda label, *_: labels.append(label)) == before
     assert "run (kept)" in labels
 
 
 @pytest.fixture(scope="module")
-def camera_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def camera_results(folder, tmp_path_factory):
     """The products of the small campaign without the laser."""
     out = tmp_path_factory.mktemp("camera") / "results"
     path = without(folder / "campaign.toml", "interferometry", "plan.axis", "model", name="camera.toml")
@@ -114,49 +87,36 @@ def camera_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return out
 
 
-def test_the_camera_alone_gives_fields_by_windows_of_time(camera_results: Path, results_folder: Path) -> None:
+def test_the_camera_alone_gives_fields_by_windows_of_time(camera_results, results_folder, tmp_path):
     results = read_results(camera_results)
     fields, both = read_dataset(camera_results / "fields.nc"), read_dataset(results_folder / "fields.nc")
     # 24 cycles of 3 min, of which two make a window; the same frames in the same places.
-    assert fields.sizes["cycle"] == 12
+    assert fields.sizes["cycle"] == len(list((camera_results / "maps").glob("*.exr"))) == 12
     np.testing.assert_allclose(fields["frame_temperature"], both["frame_temperature"], atol=1e-4)
-    assert len(list((camera_results / "maps").glob("*.exr"))) == 12
     assert results.hotspots and all(spot.targets == () and spot.p_value is None for spot in results.hotspots)
     (notice,) = [warning for warning in results.warnings if warning.code == "cycles_from_windows"]
     assert "12 windows of 6 min, as thermography.window states" in notice.message
     for part in ("iso230", "drift", "neighbours", "anomalies", "loop", "correlation", "alignment"):
         assert getattr(results, part) is None, part
-
-
-def test_the_report_of_the_camera_has_no_section_of_the_laser(camera_results: Path) -> None:
-    found = sections(camera_results)
-    assert {"registration", "fields"} <= set(found)
-    assert not {"drift", "paper", "iso230", "anomalies", "correlation", "loop"} & set(found)
+    field, rows, found = results.field, dict(summary_rows(results)), sections(camera_results)
+    assert field.fields == 12
+    assert field.mean_rise_K.value == pytest.approx(float(fields["temperature_rise"].isel(cycle=-1).mean()), rel=1e-6)
+    assert field.largest_rise_K.value == pytest.approx(float(fields["temperature_rise"].max()), rel=1e-6)
+    assert "The largest rise of a cell" in rows["where"] and "hotspot 1 at x " in rows["where"]
+    assert "expanded uncertainties" in rows["how sure"]
+    assert {"registration", "fields"} <= found
+    assert not {"drift", "paper", "iso230", "anomalies", "correlation", "loop"} & found
     page = (camera_results / "report.html").read_text(encoding="utf-8")
-    assert "laser's clock" not in page and "Positions whose drift goes with it" not in page
-
-
-def test_the_fields_of_the_camera_are_exported_and_no_compensation(camera_results: Path, tmp_path: Path) -> None:
+    assert "the table changed by" in page.lower()
+    for absent in ("laser's clock", "Positions whose drift is associated with it", "without a model"):
+        assert absent not in page
     assert [path.name for path in export_results(camera_results, "csv", tmp_path).files] == ["fields.csv"]
     with pytest.raises(ExportError, match="this campaign has no laser"):
         export_results(camera_results, "linuxcnc", tmp_path)
 
 
-def test_the_summary_of_the_camera_says_the_rise_and_where_it_is(camera_results: Path) -> None:
-    results = read_results(camera_results)
-    field, rows = results.field, dict(summary_rows(results))
-    assert field is not None and field.fields == 12 and results.hotspots
-    fields = read_dataset(camera_results / "fields.nc")
-    assert field.mean_rise_K.value == pytest.approx(float(fields["temperature_rise"].isel(cycle=-1).mean()), rel=1e-6)
-    assert field.largest_rise_K.value == pytest.approx(float(fields["temperature_rise"].max()), rel=1e-6)
-    page = (camera_results / "report.html").read_text(encoding="utf-8")
-    assert "the table changed by" in page.lower() and "without a model" not in page
-    assert "The largest rise of a cell" in rows["where"] and "hotspot 1 at x " in rows["where"]
-    assert "expanded uncertainties" in rows["how sure"]
-
-
 @pytest.fixture(scope="module")
-def picture_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def picture_results(folder, tmp_path_factory):
     """The products of the frames of the small campaign, of whose places nothing is known."""
     out = tmp_path_factory.mktemp("picture") / "results"
     path = without(folder / "campaign.toml", "interferometry", "plan", "model", "drivers", name="picture.toml")
@@ -165,9 +125,7 @@ def picture_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return out
 
 
-def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(
-    picture_results: Path, tmp_path: Path
-) -> None:
+def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(picture_results, tmp_path):
     results = read_results(picture_results)
     fields = read_dataset(picture_results / "fields.nc")
     rows, columns = fields["reference_frame"].shape
@@ -175,41 +133,34 @@ def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(
     assert (fields.sizes["y"] * cell, fields.sizes["x"] * cell) == (rows, columns)
     assert fields["x"].attrs["units"] == "1" and fields["x"].attrs["comment"].startswith("px;")
     assert not [name for name, variable in fields.variables.items() if variable.attrs.get("units") == "mm"]
-    assert results.registration is not None and results.registration.is_picture
+    assert results.registration.is_picture
     assert results.hotspots and all(spot.x_mm is None and spot.area is None for spot in results.hotspots)
-    assert results.field is not None and results.field.largest_x_mm is None
+    assert results.field.largest_x_mm is None
     text = " ".join(text for _, text in summary_rows(results))
     assert " px" in text and " mm" not in text.replace("plan in mm", "")
     page = (picture_results / "report.html").read_text(encoding="utf-8")
     shown = re.sub(r"(?s)<style.*?</style>|<script>.*?</script>", "", page)
     shown = shown.replace("nothing is known in mm", "").replace("plan in mm", "").replace("lengths in mm", "")
     assert not re.search(r"\d mm\b|/ mm\b", shown)
-    assert {"fields", "registration"} <= set(sections(picture_results))
+    assert {"fields", "registration"} <= sections(picture_results)
     (table,) = export_results(picture_results, "csv", tmp_path).files
     assert table.read_text().splitlines()[0].split(",")[1:3] == ["y_px", "x_px"]
 
 
-@pytest.fixture(scope="module")
-def ordinary_test(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Results]:
-    """The first five cycles of the small campaign, with and without camera."""
+def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_path):
     lines = (folder / "laser.csv").read_text().splitlines()
     short = [line for line in lines if line.split(",")[0] in {"cycle", "1", "2", "3", "4", "5"}]
     (folder / "five.csv").write_text("\n".join(short) + "\n")
-    path = folder / "five.toml"
+    path, out = folder / "five.toml", tmp_path / "results"
     path.write_text((folder / "campaign.toml").read_text().replace('"laser.csv"', '"five.csv"'))
-    out = tmp_path_factory.mktemp("five") / "results"
-    return out, run_campaign(path, out)
-
-
-def test_five_cycles_give_all_but_causes_and_say_what_those_need(ordinary_test: tuple[Path, Results]) -> None:
-    out, results = ordinary_test
-    assert results.iso230 is not None and results.iso230.window == "cycles 1 to 5"
+    results = run_campaign(path, out)
+    assert results.iso230.window == "cycles 1 to 5"
     assert results.drift is not None and results.neighbours is not None and results.hotspots is not None
     assert results.loop is None and results.anomalies is None and results.correlation is None
     (notice,) = [warning for warning in results.warnings if warning.code == "too_small_for_model"]
     assert notice.message.startswith("5 cycles at 6 targets: ISO 230-2, profile, scatter and drift are evaluated")
-    assert {"fields", "drift", "iso230"} <= set(sections(out))
-    assert not {"anomalies", "correlation", "loop"} & set(sections(out))
+    assert {"fields", "drift", "iso230"} <= sections(out)
+    assert not {"anomalies", "correlation", "loop"} & sections(out)
     assert "mean_rise" in read_tree(out / "fusion.nc").to_dataset()
 
 
@@ -239,29 +190,26 @@ BOTH = ("positive", "negative")
 
 
 @pytest.mark.parametrize(
-    ("cycles", "targets", "directions"),
-    [(2, 2, BOTH), (5, 11, BOTH), (5, 11, ("negative",)), (12, 3, BOTH), (12, 3, ("positive",))],
+    ("cycles", "targets", "directions"), [(2, 2, BOTH), (5, 11, ("negative",)), (12, 3, BOTH), (12, 3, ("positive",))]
 )
-def test_a_test_of_any_size_ends_with_what_it_can_carry(
-    tmp_path: Path, cycles: int, targets: int, directions: tuple[str, ...]
-) -> None:
+def test_a_test_of_any_size_ends_with_what_it_can_carry(tmp_path, cycles, targets, directions):
     out = tmp_path / "results"
     results = run_campaign(write_laser(tmp_path / "campaign", cycles, targets, directions), out)
-    assert results.drift is not None and results.neighbours is not None and results.iso230 is not None
+    assert results.drift is not None and results.neighbours is not None
     assert (results.iso230.A_um.value is not None) == (directions == BOTH)
     assert (results.loop is not None) == (results.anomalies is not None) == (cycles >= 12)
     codes = [warning.code for warning in results.warnings]
     assert ("one_approach" in codes) == (directions != BOTH)
     assert ("too_small_for_model" in codes) == (cycles < 12)
     assert "readings_missing" not in codes
-    assert {"drift", "iso230"} <= set(sections(out)) and ("loop" in sections(out)) == (cycles >= 12)
+    assert {"drift", "iso230"} <= sections(out) and ("loop" in sections(out)) == (cycles >= 12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("cycles", "targets"), [(12, 400), (2000, 5)])
-def test_a_very_large_test_ends(tmp_path: Path, cycles: int, targets: int) -> None:
+def test_a_very_large_test_ends(tmp_path, cycles, targets):
     results = run_campaign(write_laser(tmp_path / "campaign", cycles, targets, BOTH), tmp_path / "results")
-    assert results.loop is not None and results.drift is not None
+    assert results.loop is not None
     assert len(results.drift.profile_um["positive"]) == targets
 
 
@@ -282,11 +230,11 @@ def write_sensors(campaign: Path, fields: Path, *, gain: float = 1.0) -> None:
 SENSORS = '\n[sensors]\nfile = "sensors.csv"\nplaces = "places.csv"\ntemperature_u = "0.05 K"\n'
 
 
-def test_contact_sensors_stand_for_the_camera(folder: Path, results_folder: Path, tmp_path: Path) -> None:
+def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
     write_sensors(folder, results_folder / "fields.nc")
     path = without(folder / "campaign.toml", "thermography", name="sensors.toml", added=SENSORS)
     results, both = run_campaign(path, tmp_path / "results"), read_results(results_folder)
-    assert results.loop is not None and both.loop is not None
+    assert both.loop is not None
     assert results.loop.declared == ("axis_expansion", "table_offset")
     (here,), (there,) = (
         [one for one in loop.declared_coefficients if one.effect == "axis_expansion"]
@@ -295,19 +243,16 @@ def test_contact_sensors_stand_for_the_camera(folder: Path, results_folder: Path
     # The same rise, from five places instead of all cells: the coefficients agree within their uncertainties.
     assert abs(here.value - there.value) < 2.0 * np.hypot(here.u, there.u)
     assert "the campaign has no camera" in results.loop.not_tried["camera_offset"]
-    assert results.sensors is not None and [sensor.used for sensor in results.sensors] == [True] * 5
+    assert [sensor.used for sensor in results.sensors] == [True] * 5
     assert results.sensors[0].camera_rise_K is None and results.sensors[0].rise_K is not None
     assert "sensors" in sections(tmp_path / "results")
     (notice,) = [warning for warning in results.warnings if warning.code == "sensors_for_the_camera"]
     assert "which enters the uncertainty of every coefficient per kelvin" in notice.message
-    assert results.inputs is not None
     codes = {check.code: check.passed for check in results.inputs.checks}
     assert codes["plan_sensors"] and codes["sensors_coverage"] and "sensors_rise" not in codes
 
 
-def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(
-    folder: Path, results_folder: Path, tmp_path: Path
-) -> None:
+def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(folder, results_folder, tmp_path):
     write_sensors(folder, results_folder / "fields.nc", gain=1.5)
     path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
     results = run_campaign(path, tmp_path / "results")
@@ -315,8 +260,8 @@ def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(
     for sensor in results.sensors:
         assert sensor.rise_K == pytest.approx(1.5 * sensor.camera_rise_K, rel=0.1), sensor.name
     assert read_dataset(tmp_path / "results" / "sensors.nc")["camera_rise"].notnull().any()
-    assert {"sensors", "fields"} <= set(sections(tmp_path / "results"))
-    assert results.inputs is not None and results.inputs.state == "doubted"
+    assert {"sensors", "fields"} <= sections(tmp_path / "results")
+    assert results.inputs.state == "doubted"
     (doubt,) = [check for check in results.inputs.doubts if check.code == "sensors_rise"]
     assert "the camera shows a rise of" in doubt.evidence
 
@@ -327,7 +272,7 @@ WIDE = (
 
 
 @pytest.fixture(scope="module")
-def untimed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def untimed(tmp_path_factory):
     """The products of a table of position by run, which holds no times."""
     folder = tmp_path_factory.mktemp("untimed")
     (folder / "laser.csv").write_text(WIDE, encoding="utf-8")
@@ -339,20 +284,20 @@ def untimed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "results"
 
 
-def test_readings_without_times_are_evaluated_by_the_standard(untimed: Path) -> None:
+def test_readings_without_times_are_evaluated_by_the_standard(untimed):
     results = read_results(untimed)
-    assert results.iso230 is not None and results.drift is None and results.loop is None and results.time is None
+    assert results.drift is None and results.loop is None and results.time is None
     # Means of the approaches: 1.0, 2.5 and 2.5, 4.0 µm.
     assert results.iso230.B_um.value == pytest.approx(1.5)
     assert results.iso230.E_um.value == pytest.approx(3.0)
     assert [warning.code for warning in results.warnings] == ["no_times"]
     assert "iso230" in sections(untimed)
     # What only times can tell is not counted as passed.
-    assert results.inputs is not None and "travel_order" not in [check.code for check in results.inputs.checks]
-    assert not {"drift", "anomalies", "loop"} & set(sections(untimed))
+    assert "travel_order" not in [check.code for check in results.inputs.checks]
+    assert not {"drift", "anomalies", "loop"} & sections(untimed)
 
 
-def test_products_of_an_instrument_that_is_gone_do_not_stay(untimed: Path, tmp_path: Path) -> None:
+def test_products_of_an_instrument_that_is_gone_do_not_stay(untimed, tmp_path):
     shutil.copytree(untimed.parent, tmp_path, dirs_exist_ok=True)
     folder, campaign = tmp_path / "results", tmp_path / "campaign.toml"
     (folder / "maps").mkdir()
@@ -366,7 +311,7 @@ def test_products_of_an_instrument_that_is_gone_do_not_stay(untimed: Path, tmp_p
     assert "fields.nc" not in read_manifest(folder)
 
 
-def test_readings_without_times_are_exported_without_drift(untimed: Path, tmp_path: Path) -> None:
+def test_readings_without_times_are_exported_without_drift(untimed, tmp_path):
     names = [path.name for path in export_results(untimed, "csv", tmp_path).files]
     assert names == ["readings.csv", "iso230.csv", "iso230_positions.csv"]
     assert export_results(untimed, "xlsx", tmp_path).files
@@ -374,7 +319,7 @@ def test_readings_without_times_are_exported_without_drift(untimed: Path, tmp_pa
         export_results(untimed, "linuxcnc", tmp_path, force=True)
 
 
-def test_readings_without_times_beside_a_camera_are_refused(folder: Path) -> None:
+def test_readings_without_times_beside_a_camera_are_refused(folder):
     text = (folder / "campaign.toml").read_text(encoding="utf-8")
     (folder / "wide.csv").write_text(WIDE, encoding="utf-8")
     path = folder / "untimed.toml"

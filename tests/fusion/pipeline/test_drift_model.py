@@ -1,7 +1,6 @@
-"""The stage that models the drift: notices, the library of a campaign, and readings laid out by cycle, direction and target."""
+"""The stage that models the drift: notices, the library, readings laid out by cycle, direction and target, and the scale of the rise."""
 
-from __future__ import annotations
-
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,15 +8,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.alignment.readings import Series
-from fusion.effects.effect import Prior
-from fusion.effects.library import library
-from fusion.loop.camera_correction import FieldFault
-from fusion.loop.result import rmse
-from fusion.model.fit import fit_model
+from fusion.analysis.alignment.align import AxisGeometry
+from fusion.analysis.alignment.readings import Readings, Series
+from fusion.analysis.consistency.model import check_coefficients
+from fusion.analysis.drift_model.axis import FieldFault, rmse
+from fusion.analysis.drift_model.fit import fit_model
+from fusion.analysis.effects.effect import Prior
+from fusion.analysis.effects.library import library
 from fusion.pipeline import drift_model
 from fusion.pipeline.drift_model import (
     CorrectedCamera,
+    axis_scale_u,
     both_models,
     correct_camera,
     correction_variables,
@@ -26,10 +27,27 @@ from fusion.pipeline.drift_model import (
     join_fusion,
     library_for,
     loop_variables,
+    place_scale_u,
+    plan_scale_u,
     prediction_variables,
+    scale_coefficients,
+    scale_evidence,
+    scaled,
     with_event_times,
 )
 from tests.fusion.small_campaign import campaign, logged, model_of, term
+
+DIMS = ("cycle", "direction", "target")
+
+
+def readings_with_noise(bare: Readings) -> Readings:
+    return replace(bare, response=np.random.default_rng(2).standard_normal(bare.seconds.size))
+
+
+def empty(cycles: int = 12) -> xr.Dataset:
+    """Readings of four targets in both directions, all zero."""
+    coords = {"cycle": np.arange(1, cycles + 1), "direction": ["positive", "negative"], "target": np.arange(1, 5)}
+    return xr.Dataset({"deviation": (DIMS, np.zeros((cycles, 2, 4)))}, coords=coords)
 
 
 def gapped(*starts: float) -> Series:
@@ -48,20 +66,18 @@ def test_gaps_of_a_log_are_one_notice_for_every_series():
     assert duty.message.startswith("duty has 2 gaps, 10 min together, the first 5 min after the first reading; ")
     assert duty.remedy == "Log duty without a break, at least once a minute."
     assert air.message.startswith("air_temperature has 1 gap, 5 min together, the first 10 min after ")
-    assert gap_notices(campaign(series={"duty": logged(np.ones(60), "1")}, drivers=("duty",))) == []
+    assert list(gap_notices(campaign(series={"duty": logged(np.ones(60), "1")}, drivers=("duty",)))) == []
     same = {"T1": gapped(300.0), "T2": gapped(300.0)}
     (both,) = gap_notices(campaign(series=same, drivers=("T1", "T2")))
     assert both.message.startswith("T1, T2 each have 1 gap, 5 min together, ")
 
 
 def test_camera_errors_that_were_taken_out_are_noted():
-    error = FieldFault(
-        "camera_offset", "the camera read too high from cycle 5 on", 0.5, 0.1, 5, np.zeros(1), np.ones((1, 1))
-    )
+    error = FieldFault.model_construct(effect="camera_offset", text="the camera read too high from cycle 5 on")
     (notice,) = field_notices([error])
     assert notice.code == "field_corrected_camera_offset"
-    assert notice.message.startswith("The camera read too high from cycle 5 on: taken out of the frames")
-    assert field_notices([]) == []
+    assert notice.message.startswith("The camera read too high from cycle 5 on: removed from the frames")
+    assert list(field_notices([])) == []
 
 
 def test_the_expected_expansion_is_that_of_the_campaign_file():
@@ -78,26 +94,10 @@ def test_the_expected_expansion_is_that_of_the_campaign_file():
     assert library_for(SimpleNamespace(campaign=SimpleNamespace(interferometry=None, thermography=True))) == library()
 
 
-def test_a_camera_that_did_not_err_is_not_corrected():
+def test_what_the_correction_of_the_camera_changes_is_kept_where_it_erred():
     times = np.datetime64("2026-01-05T06:00", "ns") + np.arange(3) * np.timedelta64(100, "s")
     fused = xr.Dataset(
-        {
-            "time": (("cycle", "direction", "target"), times[:, None, None]),
-            "deviation": (("cycle", "direction", "target"), np.zeros((3, 1, 1))),
-        },
-        coords={"cycle": [1, 2, 3]},
-    )
-    fields = xr.Dataset(coords={"time": times})
-    result = SimpleNamespace(steps=[SimpleNamespace(effect="dead_path")])
-    assert correct_camera(SimpleNamespace(), result, fields, fused, fused) is None
-    assert correction_variables(None, fields, fused) == {}
-
-
-def test_what_the_correction_changes_is_written_beside_the_fields():
-    times = np.datetime64("2026-01-05T06:00", "ns") + np.arange(3) * np.timedelta64(100, "s")
-    dims = ("cycle", "direction", "target")
-    fused = xr.Dataset(
-        {"time": (dims, times[:, None, None]), "deviation": (dims, np.zeros((3, 1, 1)))}, coords={"cycle": [1, 2, 3]}
+        {"time": (DIMS, times[:, None, None]), "deviation": (DIMS, np.zeros((3, 1, 1)))}, coords={"cycle": [1, 2, 3]}
     )
     fields = xr.Dataset(
         {
@@ -107,28 +107,23 @@ def test_what_the_correction_changes_is_written_beside_the_fields():
         },
         coords={"time": times, "cycle": [1, 2, 3]},
     )
-    error = FieldFault("camera_offset", "it erred", 0.5, 0.1, 2, np.array([0.0, -0.5, -0.5]), np.ones((1, 1)))
-    again = xr.Dataset(
-        {name: (dims, np.full((3, 1, 1), k)) for k, name in enumerate(("mean_rise", "axis_integral", "local_rise"))}
-    )
+    result = SimpleNamespace(steps=[SimpleNamespace(effect="dead_path")])
+    assert correct_camera(SimpleNamespace(), result, fields, fused, fused) is None
+    assert correction_variables(None, fields, fused) == {}
+    error = FieldFault.model_construct(text="it erred", course_K=np.array([0.0, -0.5, -0.5]), pattern=np.ones((1, 1)))
+    aligned = ("mean_rise", "axis_integral", "local_rise")
+    again = xr.Dataset({name: (DIMS, np.full((3, 1, 1), k)) for k, name in enumerate(aligned)})
     told = correction_variables(CorrectedCamera([error], again), fields, fused)
-    assert set(told) == {
-        "field_correction",
-        "temperature_corrected",
-        "temperature_rise_corrected",
-        "mean_rise_corrected",
-        "axis_integral_corrected",
-        "local_rise_corrected",
-    }
+    corrected = {f"{name}_corrected" for name in ("temperature", "temperature_rise", *aligned)}
+    assert set(told) == {"field_correction", *corrected}
     np.testing.assert_array_equal(told["axis_integral_corrected"], again["axis_integral"])
     np.testing.assert_allclose(told["temperature_corrected"].values.ravel(), [20.0, 19.5, 19.5])
 
 
 def test_both_models_are_fitted_to_all_readings():
-    bare = campaign(cycles=12)
-    readings = replace(bare, response=np.random.default_rng(2).standard_normal(bare.seconds.size))
-    terms = [term(np.sin(bare.seconds / 100.0))]
-    before, after = model_of(readings, terms, bare.cycle <= 10), model_of(readings, terms)
+    readings = readings_with_noise(campaign(cycles=12))
+    terms = [term(np.sin(readings.seconds / 100.0))]
+    before, after = model_of(readings, terms, readings.cycle <= 10), model_of(readings, terms)
     models = both_models(SimpleNamespace(before=before, after=after))
     assert models["final"] is after
     assert models["declared"].used.all() and models["declared"].terms == before.terms
@@ -136,12 +131,10 @@ def test_both_models_are_fitted_to_all_readings():
 
 
 @pytest.fixture
-def laid() -> tuple[xr.Dataset, SimpleNamespace]:
+def laid():
     """A campaign of which one reading is missing, laid out; two steps and a wave in the final model."""
     whole = campaign(cycles=12)
-    kept = ~((whole.cycle == 3) & (whole.target == 2) & (whole.sign < 0))
-    bare = whole.subset(kept)
-    readings = replace(bare, response=np.random.default_rng(2).standard_normal(bare.seconds.size))
+    readings = readings_with_noise(whole.subset(~((whole.cycle == 3) & (whole.target == 2) & (whole.sign < 0))))
     terms = [
         term((readings.seconds > 500.0).astype(float), "step_event"),
         term(np.sin(readings.seconds / 100.0), "periodic_disturbance"),
@@ -157,14 +150,10 @@ def laid() -> tuple[xr.Dataset, SimpleNamespace]:
         )
         for k, name in enumerate(models)
     }
-    fused = xr.Dataset(
-        {"deviation": (("cycle", "direction", "target"), np.zeros((12, 2, 4)))},
-        coords={"cycle": np.arange(1, 13), "direction": ["positive", "negative"], "target": np.arange(1, 5)},
-    )
-    return loop_variables(fused, models, tests), SimpleNamespace(models=models, readings=readings)
+    return loop_variables(empty(), models, tests), SimpleNamespace(models=models, readings=readings)
 
 
-def test_every_reading_lies_at_its_cycle_direction_and_target(laid):
+def test_readings_residuals_effects_and_spectra_lie_where_they_belong(laid):
     dataset, of = laid
     readings = of.readings
     innovation = dataset["innovation_declared"]
@@ -174,9 +163,6 @@ def test_every_reading_lies_at_its_cycle_direction_and_target(laid):
         place = (readings.cycle[k] - 1, 0 if readings.sign[k] > 0 else 1, readings.target[k] - 1)
         assert innovation.values[place] == readings.seconds[k]
     np.testing.assert_array_equal(dataset["innovation_final"], innovation + 1.0)
-
-
-def test_residuals_hold_the_drift_and_have_mean_zero(laid):
     dataset, of = laid
     for name, model in of.models.items():
         residual = dataset[f"residual_{name}"].values
@@ -184,17 +170,23 @@ def test_residuals_hold_the_drift_and_have_mean_zero(laid):
         expected = model.readings.response - model.fit.design @ model.fit.coefficients
         np.testing.assert_allclose(residual[0, 0], (expected - expected.mean())[:4])
         assert dataset[f"residual_{name}"].attrs == {"units": "um"}
+    dataset, of = laid
+    assert dataset["effect"].values.tolist() == ["step_event 1", "periodic_disturbance", "step_event 3"]
+    final = of.models["final"]
+    for k, one in enumerate(final.terms):
+        series, _ = final.series(one)
+        np.testing.assert_allclose(dataset["contribution"].values[k][0, 0], series[:4])
+        assert np.isnan(dataset["contribution"].values[k][2, 1, 1])
+    dataset, _ = laid
+    np.testing.assert_array_equal(dataset["period"], [9.0, 4.0])
+    np.testing.assert_array_equal(dataset["periodogram_final"], 11.0)
+    assert (dataset["periodogram_declared"].attrs["limit"], dataset["periodogram_final"].attrs["limit"]) == (5.0, 6.0)
 
 
 def test_an_event_has_the_time_of_day_of_its_instant():
     start = np.datetime64("2026-03-09T06:30:02", "ns")
     time = start + (np.arange(24).reshape(3, 2, 4) * 60).astype("timedelta64[s]")
-    fused = xr.Dataset(
-        {
-            "deviation": (("cycle", "direction", "target"), np.zeros((3, 2, 4))),
-            "time": (("cycle", "direction", "target"), time),
-        }
-    )
+    fused = empty(3).assign(time=(DIMS, time))
     # The first reading has no value: the loop counts from the second.
     fused["deviation"][0, 0, 0] = np.nan
     added = [SimpleNamespace(candidate=SimpleNamespace(event_s=at)) for at in (600.4, None)]
@@ -205,8 +197,7 @@ def test_an_event_has_the_time_of_day_of_its_instant():
 
 def test_the_errors_that_the_loop_reports_are_kept_reading_by_reading():
     """Each root mean square is that of the result, and every error lies at its reading."""
-    whole = campaign(cycles=12)
-    readings = replace(whole, response=np.random.default_rng(2).standard_normal(whole.seconds.size))
+    readings = readings_with_noise(campaign(cycles=12))
     late = readings.cycle > 9
     random = np.random.default_rng(3)
     errors = {name: random.standard_normal(late.sum()) for name in ("declared", "final", "last_value")}
@@ -217,10 +208,7 @@ def test_the_errors_that_the_loop_reports_are_kept_reading_by_reading():
         hold_out_errors=errors,
         steps=[SimpleNamespace(cross_errors_before_um=blocks[0], cross_errors_after_um=blocks[1])],
     )
-    fused = xr.Dataset(
-        {"deviation": (("cycle", "direction", "target"), np.zeros((12, 2, 4)))}, coords={"cycle": np.arange(1, 13)}
-    )
-    variables = prediction_variables(fused, result)
+    variables = prediction_variables(empty(), result)
     for name, values in errors.items():
         laid_out = variables[f"held_out_error_{name}"].values
         assert np.isnan(laid_out[:9]).all()
@@ -232,37 +220,17 @@ def test_the_errors_that_the_loop_reports_are_kept_reading_by_reading():
         laid_out = variables[f"block_error_{name}"].values
         assert laid_out.shape == (1, 12, 2, 4) and np.isnan(laid_out[0, :2]).all()
         assert np.sqrt(np.nanmean(laid_out**2)) == pytest.approx(rmse(values), rel=1e-14)
-    assert set(prediction_variables(fused, SimpleNamespace(**{**vars(result), "steps": []}))) == {
+    assert set(prediction_variables(empty(), SimpleNamespace(**{**vars(result), "steps": []}))) == {
         f"held_out_error_{name}" for name in errors
     }
 
 
-def test_effects_that_enter_twice_are_numbered(laid):
-    dataset, of = laid
-    assert dataset["effect"].values.tolist() == ["step_event 1", "periodic_disturbance", "step_event 3"]
-    final = of.models["final"]
-    for k, one in enumerate(final.terms):
-        series, _ = final.series(one)
-        np.testing.assert_allclose(dataset["contribution"].values[k][0, 0], series[:4])
-        assert np.isnan(dataset["contribution"].values[k][2, 1, 1])
-
-
-def test_spectra_are_kept_with_their_limit(laid):
-    dataset, _ = laid
-    np.testing.assert_array_equal(dataset["period"], [9.0, 4.0])
-    np.testing.assert_array_equal(dataset["periodogram_final"], 11.0)
-    assert (dataset["periodogram_declared"].attrs["limit"], dataset["periodogram_final"].attrs["limit"]) == (5.0, 6.0)
-
-
 def test_a_model_without_effects_has_no_contribution():
-    bare = campaign(cycles=12)
-    readings = replace(bare, response=np.random.default_rng(2).standard_normal(bare.seconds.size))
-    fused = xr.Dataset(
-        {"deviation": (("cycle", "direction", "target"), np.zeros((12, 2, 4)))}, coords={"cycle": np.arange(1, 13)}
+    model = model_of(readings_with_noise(campaign(cycles=12)))
+    test = SimpleNamespace(
+        innovations=model.readings.seconds, power=np.ones(1), power_limit=1.0, periods_min=np.ones(1)
     )
-    test = SimpleNamespace(innovations=readings.seconds, power=np.ones(1), power_limit=1.0, periods_min=np.ones(1))
-    model = model_of(readings)
-    dataset = loop_variables(fused, {"declared": model, "final": model}, {"declared": test, "final": test})
+    dataset = loop_variables(empty(), {"declared": model, "final": model}, {"declared": test, "final": test})
     assert dataset["contribution"].shape == (0, 12, 2, 4)
 
 
@@ -285,3 +253,86 @@ def test_an_error_of_reading_stays_out_where_the_fields_are_corrected(monkeypatc
     source = SimpleNamespace(axis=None, environment=None, drivers=None)
     corrected = drift_model.correct_camera(source, None, None, fused, deviations)
     np.testing.assert_array_equal(corrected.fused["deviation"], [1.0, np.nan, 3.0])
+
+
+X, Y = 5.0 + 10.0 * np.arange(30), 5.0 + 10.0 * np.arange(6)
+
+
+def fields() -> xr.Dataset:
+    """A plan whose left half warms by 3 K with a scale known to 1 %, its right half by 1 K with one known to 5 %."""
+    left = np.broadcast_to(X < 150, (6, 30))
+    rise = np.stack([np.zeros((6, 30)), np.where(left, 3.0, 1.0), np.full((6, 30), np.nan)])
+    return xr.Dataset(
+        {"temperature_rise": (("cycle", "y", "x"), rise), "rise_scale_u": (("y", "x"), np.where(left, 0.01, 0.05))},
+        coords={"cycle": [1, 2, 3], "y": Y, "x": X},
+    )
+
+
+def test_scales_are_weighted_by_the_rise_and_both_parts_are_combined():
+    assert plan_scale_u(fields()) == pytest.approx((3 * 0.01 + 1 * 0.05) / 4)
+    along = AxisGeometry((20.0, 30.0), (1.0, 0.0))
+    assert axis_scale_u(fields(), along, np.array([0.0, 100.0])) == pytest.approx(0.01)
+    assert place_scale_u(fields(), 250.0, 30.0) == pytest.approx(0.05)
+    assert place_scale_u(fields(), np.nan, np.nan) == pytest.approx(plan_scale_u(fields()))
+    cold = fields().assign(temperature_rise=fields()["temperature_rise"] * 0.0)
+    assert plan_scale_u(cold) == pytest.approx(0.03)
+    both = scaled({"value": -10.0, "u": 0.3}, 0.04)
+    assert (both["u_fit"], both["u_scale"], both["u"]) == pytest.approx((0.3, 0.4, 0.5))
+
+
+def test_what_was_expected_does_not_depend_on_the_rise():
+    """The weighted mean of readings and expectation is shifted by the readings' weight times their own shift."""
+    alone, alone_u, expected, expected_u = 10.0, 1.0, 12.0, 2.0
+
+    def mean(readings):
+        weights = np.array([alone_u, expected_u]) ** -2.0
+        return float(np.average([readings, expected], weights=weights))
+
+    u = (alone_u**-2 + expected_u**-2) ** -0.5
+    entry = {"value": mean(alone), "u": u, "prior": expected, "prior_u": expected_u}
+    assert scaled(entry, 0.01)["u_scale"] == pytest.approx(abs(mean(alone * 1.01) - mean(alone)))
+    declared = [{**scaled(entry, 0.1), "effect": "axis_expansion", "unit": "ppm/K"}]
+    check = check_coefficients({"declared_coefficients": declared}, travel_mm=500.0)[0]
+    # 10 against 12: with 1 of the readings, 10 % of 10 of the scale, and 2 of the expectation.
+    assert check.value == pytest.approx(-2.0 / np.sqrt(1.0 + 1.0 + 4.0))
+
+
+def test_only_coefficients_per_kelvin_of_the_rise_are_scaled():
+    one = {"value": 2.0, "u": 0.1}
+    loop = {
+        "declared_coefficients": [
+            {"effect": "axis_expansion", "unit": "ppm/K", **one},
+            {"effect": "table_offset", "unit": "um/K", **one},
+            {"effect": "material_compensation", "unit": "ppm/K", **one},
+        ],
+        "steps": [
+            {"effect": "angular_growth", "parameters": {"follows": "mean_rise"}, "coefficients": [{"unit": "um/(K)", **one}]},
+            {"effect": "step_event", "parameters": {"time_s": 3.0}, "coefficients": [{"unit": "um", **one}]},
+        ],
+    }  # fmt: skip
+    before = json.dumps(loop)
+    done = scale_coefficients(loop, library(), axis_u=0.02, plan_u=0.03)
+    assert [entry.get("u_scale") for entry in done["declared_coefficients"]] == [0.04, 0.06, None]
+    assert [step["coefficients"][0].get("u_scale") for step in done["steps"]] == [0.06, None]
+    assert json.dumps(loop) == before
+
+
+def test_the_local_temperature_of_an_anomaly_carries_the_scale_of_its_place():
+    position = xr.DataArray([0.0, 200.0], dims="target", coords={"target": [1, 2]})
+    axis = AxisGeometry((20.0, 30.0), (1.0, 0.0))
+    anomaly = {"target": 2, "evidence": {"temperature_um_per_K": 2.0, "temperature_u_um_per_K": 0.1}}
+    evidence = scale_evidence(anomaly, axis, fields(), position)["evidence"]
+    assert evidence["temperature_scale_u_um_per_K"] == pytest.approx(0.1)
+    assert evidence["temperature_u_um_per_K"] == pytest.approx(0.1 * np.sqrt(2.0))
+    without = {"target": 2, "evidence": {}}
+    assert scale_evidence(without, axis, fields(), position) is without
+
+
+def test_results_carry_both_parts_of_every_coefficient(results_folder):
+    results = json.loads((results_folder / "results.json").read_text())
+    expansion, offset = results["loop"]["declared_coefficients"]
+    for entry in (expansion, offset, results["correlation"]["source"]["sensitivity_um_per_K"]):
+        assert entry["u"] == pytest.approx(np.hypot(entry["u_fit"], entry["u_scale"]))
+    assert expansion["u_scale"] == pytest.approx(results["radiometry"]["rise_scale_u"] * expansion["value"], rel=0.1)
+    assert all(spot["peak_rise_u_K"] > 0.01 * spot["peak_rise_K"] for spot in results["hotspots"])
+    assert "the scale of the rise ±" in (results_folder / "report.html").read_text()

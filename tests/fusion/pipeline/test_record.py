@@ -1,19 +1,17 @@
 """The main job on a record: what is declared, what is noted, and the product on its blocks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from fusion.alignment.sensor_health import Kind, SensorFault
-from fusion.effects.effect import Candidate
-from fusion.model.fit import Term
+from fusion.analysis.alignment.sensor_health import Kind, SensorFault
+from fusion.analysis.drift_model.fit import Term
+from fusion.analysis.drift_model.record import SensorHealth
+from fusion.analysis.drift_model.record_data import Record
+from fusion.analysis.effects.effect import Candidate
 from fusion.pipeline.record import declared_effects, record_notices, record_variables, sensor_notices
-from fusion.record.blocks import Record
-from fusion.record.sensor_health import SensorHealth
 from tests.fusion.record_tables import record_of
 
 
@@ -21,14 +19,11 @@ def campaign_with(*declared: str) -> SimpleNamespace:
     return SimpleNamespace(model_fields_set={"model"}, model=SimpleNamespace(declared=declared))
 
 
-def test_a_record_is_declared_quasi_static_where_nothing_else_is_said():
+def test_a_record_is_declared_quasi_static_and_what_needs_positions_is_dropped():
     silent = SimpleNamespace(model_fields_set=set(), model=SimpleNamespace(declared=("axis_expansion",)))
     assert declared_effects(silent) == (["quasi_static"], [])
     assert declared_effects(campaign_with("quasi_static")) == (["quasi_static"], [])
     assert declared_effects(campaign_with()) == ([], [])
-
-
-def test_what_needs_positions_is_dropped_with_a_notice():
     declared, (notice,) = declared_effects(campaign_with("axis_expansion", "table_offset"))
     assert declared == ["quasi_static"]
     assert notice.code == "declared_without_axis"
@@ -47,17 +42,17 @@ def notices_of(record: Record) -> dict[str, str]:
     return {notice.code: notice.message for notice in record_notices(record)}
 
 
-def test_a_whole_record_is_noted_for_nothing():
+def test_gaps_missing_displacements_sensors_and_drivers_are_noted():
     assert notices_of(plain()) == {}
-
-
-def test_gaps_and_missing_displacements_are_counted():
     displacement = np.zeros((50, 2))
     displacement[3:6, 1] = np.nan
     told = notices_of(plain(gaps={"t1": 4, "speed": 1}, displacement=displacement))
     assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 blocks)."
     assert told["record_displacements_missing"].startswith("3 block means of 100 of the displacements missing")
     assert set(told) == {"record_gaps", "record_displacements_missing"}
+    told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
+    assert told["record_sensors_dependent"] == "Left out because they duplicate other sensors: t2; t3."
+    assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
 
 
 @pytest.mark.parametrize(("longer_s", "pauses"), [(150.0, 0), (151.0, 1)])
@@ -68,12 +63,6 @@ def test_a_pause_is_longer_than_one_and_a_half_blocks(longer_s, pauses):
     assert len(told) == pauses
     if pauses:
         assert told["record_pauses"].startswith("Nothing was logged in 1 pause, the longest ")
-
-
-def test_dependent_sensors_and_missing_drivers_are_noted():
-    told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
-    assert told["record_sensors_dependent"] == "Left out because the other sensors tell the same: t2; t3."
-    assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
 
 
 def test_a_faulty_sensor_is_noted_with_both_errors_and_a_suspected_one_with_its_reason():

@@ -1,7 +1,5 @@
 """The main job end to end on a small campaign of the twin: products, truth, resumption, and everything left out being told."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -14,56 +12,48 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.beside import Beside, second_process
 from fusion.pipeline.run import run_campaign
-from fusion.products.contracts import check
-from fusion.products.folder import MANIFEST, read_manifest
-from fusion.products.progress import Report
-from fusion.products.results import AxisLoop, read_results, results_schema
-from fusion.products.store import OutputError, file_sha256, read_dataset
-from thermography.contract import FIELDS
-from thermography.io.openexr import read_maps
+from fusion.pipeline.workers import Worker, second_process
+from fusion.results.folder import MANIFEST, read_manifest
+from fusion.results.loop import AxisLoop
+from fusion.results.progress import Report
+from fusion.results.results import read_results, results_schema
+from fusion.results.store import OutputError, check, file_sha256, read_dataset
+from fusion.twin.instruments import simulate_campaign
+from thermography.common import FIELDS
+from thermography.io.files import read_maps
+
+pytestmark = pytest.mark.chain
 
 
-def test_all_products_are_written_and_keep_their_contracts(results_folder: Path) -> None:
-    names = {path.name for path in results_folder.iterdir()}
-    assert {
-        "results.json",
-        "report.html",
-        "fields.nc",
-        "deviations.nc",
-        "fusion.nc",
-        "maps",
-        "provenance.json",
-    } <= names
+def test_all_products_are_written_and_keep_their_contracts(results_folder):
+    names = {"results.json", "report.html", "fields.nc", "deviations.nc", "fusion.nc", "maps", "provenance.json"}
+    assert names <= {path.name for path in results_folder.iterdir()}
     results = json.loads((results_folder / "results.json").read_text())
     jsonschema.Draft202012Validator(results_schema()).validate(results)
     check(read_dataset(results_folder / "fields.nc"), FIELDS, name="fields.nc")
     assert len(list((results_folder / "maps").glob("cycle_*.exr"))) == 24
     assert not list(results_folder.rglob("*.partial*"))
     written = set(read_manifest(results_folder))
-    assert written == {str(path.relative_to(results_folder)) for path in visible_files(results_folder)} - {MANIFEST}
+    visible = [path for path in results_folder.rglob("*") if path.is_file() and ".stages" not in path.parts]
+    assert written == {str(path.relative_to(results_folder)) for path in visible} - {MANIFEST}
 
 
-def visible_files(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file() and ".stages" not in path.parts]
-
-
-def test_maps_hold_the_fields_bit_by_bit(results_folder: Path) -> None:
+def test_maps_hold_the_fields_bit_by_bit(results_folder):
     fields = read_dataset(results_folder / "fields.nc")
     maps = read_maps(results_folder / "maps" / "cycle_0024.exr")
-    for name, variable in (
-        ("temperature", "temperature"),
-        ("rise", "temperature_rise"),
-        ("uncertainty", "temperature_u"),
-    ):
+    for name, variable in {
+        "temperature": "temperature",
+        "rise": "temperature_rise",
+        "uncertainty": "temperature_u",
+    }.items():
         expected = fields[variable].sel(cycle=24).values.astype("f4")
         seen = np.isfinite(expected)
         np.testing.assert_array_equal(maps[name][seen], expected[seen])
-        np.testing.assert_array_equal(maps["mask"] > 0, np.isfinite(fields["temperature"].sel(cycle=24).values))
+    np.testing.assert_array_equal(maps["mask"] > 0, np.isfinite(fields["temperature"].sel(cycle=24).values))
 
 
-def test_the_undeclared_effect_of_the_twin_is_found(results_folder: Path) -> None:
+def test_the_undeclared_effect_of_the_twin_is_found(results_folder):
     """The reversal drifts by 1.5 um at a noise of 0.3 um, which the signature (odd, in time) tells from everything else."""
     loop = json.loads((results_folder / "results.json").read_text())["loop"]
     assert [step["effect"] for step in loop["steps"]] == ["reversal_drift"]
@@ -71,7 +61,7 @@ def test_the_undeclared_effect_of_the_twin_is_found(results_folder: Path) -> Non
     assert loop["noise_floor_um"] == pytest.approx(0.3, rel=0.2)
 
 
-def test_readings_outside_the_frames_are_counted_and_not_extrapolated(results_folder: Path) -> None:
+def test_readings_outside_the_frames_are_counted_and_not_extrapolated(results_folder):
     fusion = read_dataset(results_folder / "fusion.nc")
     outside = fusion["deviation"].notnull() & (fusion["inside_frames"] == 0)
     warnings = {
@@ -81,7 +71,7 @@ def test_readings_outside_the_frames_are_counted_and_not_extrapolated(results_fo
     assert fusion["mean_rise"].where(outside).isnull().all()
 
 
-def test_provenance_names_inputs_versions_and_no_machine(results_folder: Path, campaign_folder: Path) -> None:
+def test_provenance_names_inputs_versions_and_no_machine(results_folder, campaign_folder):
     text = (results_folder / "provenance.json").read_text()
     provenance = json.loads(text)
     assert provenance["inputs"]["laser.csv"]["sha256"] == file_sha256(campaign_folder / "laser.csv")
@@ -91,29 +81,20 @@ def test_provenance_names_inputs_versions_and_no_machine(results_folder: Path, c
     assert set(provenance["stage_seconds"]) == {"fields", "deviations", "correlation", "model"}
 
 
-def test_a_resumed_run_redoes_only_what_changed(results_folder: Path, copied: Path, tmp_path: Path) -> None:
-    out = shutil.copytree(results_folder, tmp_path / "results")
-    done: list[str] = []
+def test_a_resumed_run_redoes_only_what_changed(results_folder, copied, tmp_path):
+    out, campaign, done = shutil.copytree(results_folder, tmp_path / "results"), copied / "campaign.toml", []
     (out / "report.html").unlink()
-    run_campaign(copied / "campaign.toml", out, resume=True, report=lambda label, part, total: done.append(label))
-    assert (out / "report.html").is_file()
-    assert "frames" not in done and "correlation" not in done and "closed loop" not in done
-    assert "thermal fields (kept)" in done
-
-    text = (copied / "campaign.toml").read_text()
-    (copied / "campaign.toml").write_text(text.replace('"axis_expansion", "table_offset"', '"axis_expansion"'))
-    done.clear()
-    results = run_campaign(
-        copied / "campaign.toml", out, resume=True, report=lambda label, part, total: done.append(label)
-    )
+    campaign.write_text(campaign.read_text().replace('"axis_expansion", "table_offset"', '"axis_expansion"'))
+    results = run_campaign(campaign, out, resume=True, report=lambda label, part, total: done.append(label))
+    assert (out / "report.html").is_file() and "thermal fields (kept)" in done
     assert "frames" not in done and "correlation" not in done and "closed loop" in done
-    assert results.loop is not None and results.loop.declared == ("axis_expansion",)
+    assert results.loop.declared == ("axis_expansion",)
 
 
-def test_a_whole_run_is_read_and_nothing_written(results_folder: Path, copied: Path, tmp_path: Path) -> None:
+def test_a_whole_run_is_read_and_nothing_written(results_folder, copied, tmp_path):
     out = shutil.copytree(results_folder, tmp_path / "results")
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    told: list[str] = []
+    told = []
     results = run_campaign(
         copied / "campaign.toml", out, resume=True, report=lambda label, part, total: told.append(label)
     )
@@ -122,32 +103,30 @@ def test_a_whole_run_is_read_and_nothing_written(results_folder: Path, copied: P
     assert results.as_json() == json.loads((out / "results.json").read_text())
 
 
-class Noting(Beside):
+class Noting(Worker):
     """A second process that notes what it is given, and does not take the last."""
 
-    def __init__(self, second: Beside) -> None:
+    def __init__(self, second: Worker) -> None:
         super().__init__(second.faults)
         self.second, self.names = second, []
 
-    def start(self, work: Callable[..., Any], report: Report | None = None) -> Callable[[], Any]:
-        # A stage is timed where it is computed.
-        self.names.append(work.args[0].func.__name__ if work.func.__name__.startswith("_timed") else work.func.__name__)
-        # What is no function of a module cannot be sent.
-        return self.second.start((lambda: work()) if self.names[-1] == "_draw_placed" else work, report)
+    def submit(self, work: Callable[..., Any], report: Report | None = None) -> Callable[[], Any]:
+        # A stage is timed where it is computed; what is no function of a module cannot be sent.
+        first = work.args[0]
+        self.names.append(first if isinstance(first, str) else getattr(first, "func", work.func).__name__)
+        return self.second.submit((lambda: work()) if first == "placed" else work, report)
 
     def end(self) -> None:
         self.second.end()
 
 
-def test_a_second_process_takes_its_part_and_changes_nothing(
-    results_folder: Path, campaign_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 2)
+def test_a_second_process_takes_its_part_and_changes_nothing(results_folder, campaign_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("fusion.pipeline.workers.usable_processors", lambda: 2)
     with second_process() as second:
-        beside = Noting(second)
-        run_campaign(campaign_folder / "campaign.toml", tmp_path / "results", beside=beside)
-    assert beside.names == [
-        "evaluate_interferometry", "correlate_field", "_draw_measured", "check_fields", "write_exr", "_draw_modelled", "_draw_placed",
+        worker = Noting(second)
+        run_campaign(campaign_folder / "campaign.toml", tmp_path / "results", worker=worker)
+    assert worker.names == [
+        "evaluate_interferometry", "correlate_field", "measured", "check_fields", "write_exr", "modelled", "placed",
     ]  # fmt: skip
     provenance = json.loads((tmp_path / "results" / "provenance.json").read_text())
     (fault,) = provenance["second_process_faults"]
@@ -165,19 +144,19 @@ def test_a_second_process_takes_its_part_and_changes_nothing(
     assert charts == same and len(charts) > 20
 
 
-def test_an_older_result_is_not_overwritten(results_folder: Path, campaign_folder: Path) -> None:
+def test_an_older_result_is_not_overwritten(results_folder, campaign_folder):
     before = (results_folder / "results.json").read_bytes()
     with pytest.raises(OutputError, match="is not empty; add --resume"):
         run_campaign(campaign_folder / "campaign.toml", results_folder)
     assert (results_folder / "results.json").read_bytes() == before
 
 
-def test_the_errors_of_the_results_are_those_of_the_stored_readings(results_folder: Path) -> None:
+def test_the_errors_of_the_results_are_those_of_the_stored_readings(results_folder):
     """Root mean squares over the hold-out cycles, and over the blocks that were left out for every step."""
     fusion, loop = read_dataset(results_folder / "fusion.nc"), read_results(results_folder).loop
     assert isinstance(loop, AxisLoop) and loop.steps
 
-    def rms(errors: xr.DataArray) -> float:
+    def rms(errors):
         return float(np.sqrt((errors**2).mean()))
 
     held_out = {name: fusion[f"loop_held_out_error_{name}"] for name in ("declared", "final", "last_value")}
@@ -195,7 +174,7 @@ def test_the_errors_of_the_results_are_those_of_the_stored_readings(results_fold
             assert figure == pytest.approx(rms(fusion[f"loop_block_error_{stage}"].isel(step=k)), rel=1e-12)
 
 
-def test_residuals_lie_at_their_own_reading(results_folder: Path) -> None:
+def test_residuals_lie_at_their_own_reading(results_folder):
     """The residual of the declared model plus its profile and effects gives back the reading, so cells were not mixed up."""
     fusion = read_dataset(results_folder / "fusion.nc")
     for name in ("loop_residual_declared", "loop_residual_final"):
@@ -204,3 +183,59 @@ def test_residuals_lie_at_their_own_reading(results_folder: Path) -> None:
         xr.testing.assert_equal(both, fusion["inside_frames"].astype(bool) & fusion["deviation"].notnull())
     odd = fusion["loop_contribution"].sel(effect="reversal_drift")
     assert float(abs(odd.sel(direction="positive") + odd.sel(direction="negative")).max()) < 0.2 * float(abs(odd).max())
+
+
+#: 30 cycles and 6 targets, small frames and cells of 20 mm: a run takes a few seconds.
+RECIPE = """\
+[campaign]
+seed = 12
+[test]
+cycles = 30
+targets = 6
+spacing_mm = 50
+period_s = 180
+[duty]
+kind = "random"
+mean_hold_min = 12
+[laser]
+noise_um = 0.3
+[camera]
+columns = 320
+rows = 240
+focal_px = 700.0
+"""
+
+
+def run(folder: Path, effect: str = "") -> tuple[dict[str, Any], Path]:
+    """Simulate a campaign, run the command's work on its files, and read results.json."""
+    (folder / "recipe.toml").write_text(RECIPE + effect)
+    campaign = simulate_campaign(folder / "recipe.toml", folder / "campaign")
+    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
+    run_campaign(campaign, folder / "results")
+    return json.loads((folder / "results" / "results.json").read_text()), folder / "results"
+
+
+def test_a_camera_step_is_taken_out_of_the_fields(tmp_path):
+    results, folder = run(tmp_path, '[[effect]]\nname = "camera_offset"\namplitude_K = 0.6\nat_cycle = 14\n')
+    # It shows beside the table, before any drift is looked at: the loop has nothing left to find.
+    (step,) = results["camera"]["steps"]
+    assert step["step_K"]["value"] == pytest.approx(0.6, abs=0.05)
+    assert results["loop"]["steps"] == []
+    fields = read_dataset(folder / "fields.nc")
+    np.testing.assert_allclose(fields["camera_correction"][:13], 0.0, atol=1e-9)
+    np.testing.assert_allclose(fields["camera_correction"][13:], -step["step_K"]["value"], atol=0.05)
+    # The field no longer jumps: its largest change between two cycles is that of a warming table.
+    assert float(np.abs(fields["temperature_rise"].mean(["y", "x"]).diff("cycle")).max()) < 0.3
+
+
+def test_nothing_is_added_where_nothing_is_missing(tmp_path):
+    results, folder = run(tmp_path)
+    loop = results["loop"]
+    assert loop["steps"] == [] and loop["verdict"] == "complete"
+    assert loop["field_corrections"] == []
+    expansion = loop["declared_coefficients"][0]
+    assert (expansion["prior"], expansion["prior_u"]) == (11.7, 2.0)
+    assert 0.0 < expansion["u"] < 2.0
+    found = {one["effect"]: one for one in loop["identifiability"]}
+    assert 0.0 < found["reversal_drift"]["detectable_um"] < found["thermal_lag"]["detectable_um"]
+    assert "What this campaign can detect" in (folder / "report.html").read_text()

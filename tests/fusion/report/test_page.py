@@ -1,34 +1,321 @@
-"""A page is one file: scripts only where it has charts, every variable escaped."""
+"""report.html in a headless chromium: offline, readable on a phone, the map answers; the page of two sessions; printing."""
 
-from __future__ import annotations
+import re
+import shutil
+import stat
+from dataclasses import replace
 
-from pathlib import Path
-
-import jinja2
 import pytest
-from markupsafe import Markup
+import xarray as xr
+from playwright.sync_api import sync_playwright
 
-from fusion.report.page import render_page
+from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
+from fusion.report import page as pdf
+from fusion.report.page import (
+    ProductsError,
+    channel_sentence,
+    conclude_sessions,
+    describe_sources,
+    render_joint,
+    report_of,
+    session_names,
+    sources_table,
+)
+from fusion.results.results import assemble
+from tests.fusion.results_sample import PARTS
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-def test_a_page_needs_the_variables_of_its_template() -> None:
-    with pytest.raises(jinja2.UndefinedError, match="results"):
-        render_page("report.html.j2", {})
+@pytest.fixture(scope="module")
+def report(results_folder):
+    return results_folder / "report.html"
 
 
-def test_names_do_not_turn_the_direction_of_what_stands_beside_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "templates").mkdir()
-    (tmp_path / "templates" / "page.js").write_text("")
-    (tmp_path / "templates" / "a.j2").write_text(
-        '{% macro cell(text) %}<td title="{{ text }}">{{ text }}</td>{% endmacro %}{{ cell(name) }}{{ own }}{{ count }}'
-    )
-    monkeypatch.setattr("fusion.report.page.resources.files", lambda package: tmp_path)
-    page = render_page("a.j2", {}, name="x\u202egpj.\n<b>\x1b[2J", own=Markup("<i>\u2192</i>"), count=3)
+@pytest.fixture(scope="module")
+def opened(report):
+    """The report in a desktop window, and everything that went wrong or left the file while it loaded."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    faults = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 900}, bypass_csp=True)
+        page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
+        page.on(
+            "console", lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None
+        )
+        page.on(
+            "request", lambda request: faults.append(f"request: {request.url}") if is_foreign(request.url) else None
+        )
+        page.goto(report.as_uri())
+        yield page, faults
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def made_anew(report):
+    """The report once more, from its products."""
+    return report_of(report.parent)
+
+
+def is_foreign(url: str) -> bool:
+    return not url.startswith(("file://", "data:"))
+
+
+def test_it_opens_offline_without_a_fault(opened, report):
+    page, faults = opened
+    assert faults == []
+    assert "Small campaign" in page.title()
+    assert report.stat().st_size < 8e6
+    links = "[...document.querySelectorAll('[src], [href]')].map(e => e.getAttribute('src') ?? e.getAttribute('href'))"
+    assert [link for link in page.evaluate(links) if not link.startswith(("#", "data:"))] == []
+
+
+def test_every_section_and_figure_is_there(opened):
+    page, _ = opened
+    sections = "summary data registration fields drift paper iso230 anomalies correlation loop glossary"
+    for section in sections.split():
+        assert page.locator(f"section#{section}").count() == 1, section
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    figures = page.locator("figure svg, figure .drawing")
+    assert figures.count() >= 18
+    for at in range(figures.count()):
+        box = figures.nth(at).bounding_box()
+        assert box["width"] > 300 and box["height"] > 80
+    ids = page.evaluate("[...document.querySelectorAll('[id]')].map(e => e.id)")
+    assert len(ids) == len(set(ids))
+    for target in page.evaluate("[...document.querySelectorAll('nav a')].map(a => a.getAttribute('href').slice(1))"):
+        assert target in ids
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = false)")
+
+
+def test_a_link_of_the_contents_opens_the_appendix(opened):
+    page, _ = opened
+    assert not page.locator("section#paper").is_visible()
+    page.locator("nav.contents a[href='#paper']").click()
+    assert page.locator("section#paper").is_visible()
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = false)")
+
+
+def test_what_a_reader_acts_on_comes_before_the_statistics(opened):
+    page, _ = opened
+    order = page.evaluate("[...document.querySelectorAll('section[id]')].map(s => s.id)")
+    wanted = [
+        "summary",
+        "iso230",
+        "drift",
+        "anomalies",
+        "fields",
+        "cause",
+        "place",
+        "data",
+        "appendix",
+        "paper",
+        "loop",
+        "glossary",
+    ]
+    assert [name for name in order if name in wanted] == wanted
+
+
+def test_the_summary_comes_first_and_fits_one_screen(opened):
+    page, _ = opened
+    box = page.locator("section#summary").bounding_box()
+    assert box["y"] + box["height"] < 900
+    assert "a reversal error that changes" in page.locator("section#summary .headline").inner_text()
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_scrolls_sideways(opened, width):
+    page, _ = opened
+    page.set_viewport_size({"width": width, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.set_viewport_size({"width": 1280, "height": 900})
+
+
+def test_the_map_follows_slider_menu_and_play(opened):
+    page, faults = opened
+    figure = page.locator("#figure-thermal_map")
+    figure.scroll_into_view_if_needed()
+    page.wait_for_function("document.documentElement.dataset.charts == 'drawn'")
+    slider, shown = figure.locator("input[type=range]"), figure.locator("output")
+    assert shown.inner_text() == "24"
+    slider.focus()
+    page.keyboard.press("Home")
+    assert shown.inner_text() == "1"
+    figure.locator("select").select_option("temperature")
+    said = figure.locator(".drawing").get_attribute("aria-label") or ""
+    found = re.fullmatch(r"Plan of the table in cycle 1: temperature ([\d.]+) to ([\d.]+) °C\.", said)
+    assert 15 < float(found[1]) < float(found[2]) < 40
+    play = figure.get_by_role("button", name="Play")
+    play.click()
+    page.wait_for_function("document.querySelector('#figure-thermal_map output').textContent == '3'")
+    figure.get_by_role("button", name="Stop").click()
+    assert faults == []
+
+
+def test_tables_have_captions_and_charts_say_what_is_seen(opened):
+    page, _ = opened
     assert (
-        page
-        == r"""<td title="x\u202egpj.
-&lt;b&gt;\x1b[2J">x\u202egpj.
-&lt;b&gt;\x1b[2J</td><i>→</i>3"""
+        page.evaluate("[...document.querySelectorAll('table')].filter(t => !t.caption && t.closest('.scroll')).length")
+        == 0
     )
+    said = page.evaluate("[...document.querySelectorAll('.drawing')].map(d => d.getAttribute('aria-label'))")
+    assert len(said) >= 25
+    assert all(len(text) > 30 and text.endswith(".") for text in said), said
+    assert page.locator("a.skip").get_attribute("href") == "#main"
+    page.evaluate("document.getElementById('loop').scrollIntoView()")
+    nav = page.locator("nav.contents").bounding_box()
+    assert nav["y"] == 0  # it stays at hand
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_rule_of_accessibility_is_broken(opened, scheme):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    page, _ = opened
+    page.wait_for_function("document.documentElement.dataset.charts == 'drawn'")
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": 390, "height": 844})
+    found = axe.Axe().run(page).response["violations"]
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.emulate_media(color_scheme="light")
+    assert [(fault["id"], [node["target"] for node in fault["nodes"]][:3]) for fault in found] == []
+
+
+def test_it_is_made_anew_from_its_products(made_anew, report, tmp_path):
+    assert len(made_anew) == pytest.approx(report.stat().st_size, rel=0.02)
+    shutil.copy(report.parent / "results.json", tmp_path / "results.json")
+    with pytest.raises(ProductsError, match=r"provenance\.json is missing; run the campaign again"):
+        report_of(tmp_path)
+    no_input = '{"inputs": {"laser.csv": -1}, "versions": {}, "parameters": {"campaign": {}}}'
+    for text in ("null", "[]", '{"inputs": {}, "versions": {}, "parameters": {"campaign": 5}}', no_input):
+        (tmp_path / "provenance.json").write_text(text)
+        with pytest.raises(ProductsError, match=r"provenance\.json: not the provenance of a run; run the campaign"):
+            report_of(tmp_path)
+
+
+def test_it_prints(opened):
+    page, _ = opened
+    assert page.pdf(format="A4").startswith(b"%PDF")
+
+
+def test_no_link_of_the_contents_hides_behind_the_button(opened):
+    page, _ = opened
+    for width in (700, 1400):
+        page.set_viewport_size({"width": width, "height": 900})
+        boxes = page.evaluate(
+            "[...document.querySelectorAll('nav.contents > *')].map(e => { const r = e.getBoundingClientRect(); "
+            "return [r.left, r.right, r.top, r.bottom]; })"
+        )
+        left, _, top, bottom = boxes[-1]
+        assert all(right <= left or low <= top or high >= bottom for _, right, high, low in boxes[:-1])
+        assert max(right for _, right, _, _ in boxes) <= width
+
+
+RESULTS = [assemble(title, PARTS, []) for title in ("Monday <1>", "Tuesday")]
+SESSIONS = session_names(RESULTS)
+ALONE = SourceAgreement(
+    "joint",
+    405.0,
+    95.0,
+    (0,),
+    (0.002, 0.006),
+    (3.76, 7.8),
+    (0.08, 0.85),
+    (0.0, 600.0),
+    False,
+    True,
+    0.97,
+    (330.0, 90.0, 75.2),
+)
+AGREED = SourceAgreement(
+    "joint", 330.0, 90.0, (0, 1), (0.004, 0.004), (4.04, 5.75), (0.5, 0.6), (0.0, 0.0), True, False
+)
+CHANNEL = ChannelAgreement(
+    "joint", "attributable", 330.0, 90.0, 0.004, (4.04, 5.75), (0.0, 0.0), "both sessions find this place"
+)
+
+
+def compared(*sources: SourceAgreement) -> SessionComparison:
+    return SessionComparison(xr.Dataset(), [CHANNEL], list(sources))
+
+
+def test_a_neighbouring_place_is_told_apart_and_reconciled():
+    both = compared(ALONE, AGREED)
+    first, second = describe_sources(both, SESSIONS)
+    assert (first.name, second.name) == ("place 1", "place 2")
+    assert first.verdict.startswith(
+        "shown by A (Monday <1>) alone; B (Tuesday) shows something there too, but not the same: 3.8 and 7.8"
+    )
+    assert "75 mm both agree (place 2)" in first.verdict
+    assert second.verdict.startswith("both sessions agree here, but it is not a separate source")
+    told = conclude_sessions(both, [first, second], SESSIONS)
+    assert told[0] == "The two sessions show no cause in common."
+    assert (
+        told[1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
+        and told[2] == "A (Monday <1>) alone shows place 1."
+    )
+
+
+def test_what_one_session_shows_alone_has_the_chance_of_the_other():
+    missed = replace(ALONE, p_value=(0.002, 0.6), agreed_near_mm=None, shown_by=(0,), power=0.31)
+    (one,) = describe_sources(compared(missed), SESSIONS)
+    assert (
+        one.verdict
+        == "shown by A (Monday <1>) only; B (Tuesday) would have shown the same size with a probability of 31 %"
+    )
+    assert one.shown[1] == "p 0.6, 7.8 ± 1.7 µm/K, lag 10 min"
+
+
+def test_a_cause_is_what_both_sessions_show():
+    cause = replace(AGREED, separate=True)
+    both = compared(cause)
+    words = describe_sources(both, SESSIONS)
+    assert words[0].verdict.startswith("a cause: both sessions agree")
+    assert conclude_sessions(both, words, SESSIONS)[0].startswith("Both sessions show the same cause: place 1")
+    assert channel_sentence(CHANNEL).endswith("larger p of both 0.004, 4.0 and 5.8 µm/K")
+    nothing = compared()
+    assert sources_table([], SESSIONS) is None
+    assert conclude_sessions(nothing, [], SESSIONS)[0].startswith("Neither session shows a source")
+
+
+def test_the_page_escapes_titles_and_links_both_reports():
+    page = render_joint(RESULTS, ["monday", "tuesday"], compared(ALONE, AGREED))
+    assert "Monday &lt;1&gt;" in page and "<1>" not in page
+    assert 'href="monday/report.html"' in page and 'href="tuesday/report.html"' in page
+    assert "The two sessions show no cause in common." in page
+
+
+def test_the_browser_that_is_named_must_exist():
+    with pytest.raises(pdf.PrintError, match='--browser "no-such-browser": there is no such program'):
+        pdf.find_browser("no-such-browser")
+
+
+def test_without_a_browser_the_remedy_is_told(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(pdf.PrintError, match=r"no browser that can print was found .* press its button Print"):
+        pdf.find_browser()
+
+
+def test_a_browser_that_fails_leaves_the_old_file(tmp_path):
+    broken = tmp_path / "browser"
+    broken.write_text("#!/bin/sh\necho cannot open display >&2\nexit 3\n")
+    broken.chmod(broken.stat().st_mode | stat.S_IXUSR)
+    out = tmp_path / "report.pdf"
+    out.write_bytes(b"old")
+    with pytest.raises(pdf.PrintError, match="ended with 3 and printed nothing: cannot open display"):
+        pdf.print_pdf("<p>page</p>", out, browser=str(broken))
+    assert out.read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["browser", "report.pdf"]
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed (Debian: apt-get install chromium)")
+def test_the_report_is_printed_on_a4_with_its_charts(made_anew, tmp_path):
+    written = pdf.print_pdf(made_anew, tmp_path / "report.pdf", browser=CHROMIUM)
+    content = written.read_bytes()
+    assert content.startswith(b"%PDF")
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", content)
+    assert {(round(float(width)), round(float(height))) for width, height in boxes} == {(595, 842)}
+    assert 6 <= len(re.findall(rb"/Type /Page\b", content)) <= 20
+    assert len(content) > 300_000  # charts are drawings in it, not blank places

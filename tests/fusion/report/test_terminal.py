@@ -1,14 +1,14 @@
 """What the command prints: findings of a run, windows of cycles."""
 
-from __future__ import annotations
+import pytest
 
-from fusion.consistency.checks import Check, inputs_part
-from fusion.products.results import Notice, assemble
+from fusion.analysis.consistency.checks import Check, inputs_part
 from fusion.report.terminal import summary_rows
+from fusion.results.results import Notice, assemble
 from tests.fusion.results_sample import PARTS
 
 
-def test_the_findings_of_a_run_in_a_few_rows() -> None:
+def test_the_findings_of_a_run_in_a_few_rows():
     rows = dict(summary_rows(assemble("A", PARTS, [Notice("clock", "The clocks disagree.", "Set clock_offset.")])))
     assert rows["registration"] == "0.10 mm rms"
     assert "A = 1.00 \u00b1 0.20 \u00b5m" in rows["how much"]
@@ -23,7 +23,7 @@ def test_the_findings_of_a_run_in_a_few_rows() -> None:
     assert rows["warning"] == "The clocks disagree."
 
 
-def test_a_doubt_stands_beside_every_finding_that_rests_on_it() -> None:
+def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
     checks = [Check("datum", 1.0, 0.5, False, "It is off.", "Check it.", "figures")]
     rows = dict(summary_rows(assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])))
     condition = "(only if the datum of the laser stayed the same)"
@@ -41,7 +41,27 @@ def test_a_doubt_stands_beside_every_finding_that_rests_on_it() -> None:
     }
 
 
-def test_an_exact_fit_is_not_printed_as_accuracy() -> None:
+def test_an_exact_fit_is_not_printed_as_accuracy():
     part = {**PARTS["registration"], "rms_mm": None, "position_u_mm": 0.87, "leave_one_out_mm": dict.fromkeys("ABCD")}
     rows = dict(summary_rows(assemble("four discs", {**PARTS, "registration": part}, [])))
     assert rows["registration"] == ("standard uncertainty 0.87 mm, not checked: 4 fiducials determine the plan exactly")
+
+
+@pytest.mark.parametrize(
+    ("positive", "negative", "stated"),
+    [
+        ((0.4, None), (0.2, 0.3), "0.20 to 0.40 µm, median 0.30 µm"),
+        ((0.4, 0.0), (0.2, 0.3), "up to 0.40 µm, median 0.25 µm"),
+        ((None,), (None,), "not known: no position has enough readings"),
+    ],
+)
+def test_scatter_leaves_out_what_is_not_determined(positive, negative, stated):
+    drift = {**PARTS["drift"], "scatter_um": {"positive": positive, "negative": negative}}
+    assert dict(summary_rows(assemble("A", {**PARTS, "drift": drift}, [])))["scatter per position"] == stated
+
+
+def test_plain_predictions_are_last_value_mean_and_the_best_regression():
+    results = assemble("A", PARTS, [])
+    best = results.loop.model_copy(update={"best_baseline": "mean", "steps": ()})
+    rows = dict(summary_rows(results.model_copy(update={"loop": best})))
+    assert rows["plain predictions"].count(", ") == 1 and "->" not in rows["held-out error"]

@@ -1,13 +1,22 @@
-"""Numbers and verdicts in words: digits follow the uncertainty, every verdict has its sentence, remedies come in order."""
+"""Numbers, places, tables and findings: digits follow the uncertainty, conditions stand where a doubt touches a figure."""
 
-from __future__ import annotations
+from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from fusion.consistency.checks import Check, inputs_part
-from fusion.products.results_inputs import InputsPart
+from fusion.analysis.consistency.checks import Check, inputs_part
+from fusion.report import conclusions as answers
 from fusion.report import wording
+from fusion.report import wording as findings
+from fusion.report.conclusions import action, next_steps, step_phrase
+from fusion.report.wording import Row, Words, effect_words, print_table, say, table
+from fusion.results.axis import DutyPart, Evidence, Iso230Direction, Iso230Window, SourcePart
+from fusion.results.loop import AxisStep, ChannelErrors, Coefficient, Loop, RecordStep, StepPart, Unexplained
+from fusion.results.parts import AreaPart, InputsPart, Quantity, TimePart
+from fusion.results.results import AnomalyPart, CorrelationPart, Iso230Part, Notice, RecordLoop, Results, assemble
+from tests.fusion.results_sample import PARTS
 
 
 @pytest.mark.parametrize(
@@ -22,46 +31,29 @@ from fusion.report import wording
         (None, None, "–"),
     ],
 )
-def test_a_value_has_the_digits_of_its_uncertainty(value: float | None, u: float | None, text: str) -> None:
+def test_a_value_has_the_digits_of_its_uncertainty(value, u, text):
     assert wording.measured(value, u, "µm") == text
 
 
-def test_small_things_read_well() -> None:
+def test_numbers_probabilities_and_times_are_printed_as_a_reader_expects_them():
     assert wording.p_cell(0.0004) == "< 0.001" and wording.p_cell(0.0123) == "0.012" and wording.p_cell(None) == "–"
     assert wording.duration(90) == "90 s" and wording.duration(1800) == "30 min" and wording.duration(25200) == "7.0 h"
     assert wording.join(["a", "b", "c"]) == "a, b and c" and wording.join(["a"]) == "a" and wording.join([]) == ""
     assert wording.moment(np.datetime64("2026-03-09T06:30:05")) == "2026-03-09 06:30 UTC"
-
-
-def test_the_limit_of_a_simulation_is_an_upper_limit() -> None:
     assert wording.p_cell(1 / 280, 1 / 280) == "≤ 0.004" and wording.p_cell(0.002, 0.002) == "≤ 0.002"
     assert wording.p_cell(0.025, 0.025) == "≤ 0.03" and wording.p_cell(0.004, 0.002) == "0.004"
-    assert wording.p_words(0.002, 0.002) == "p ≤ 0.002, limit of the simulation"
+    assert wording.p_words(0.002, 0.002) == "p ≤ 0.002, resolution of the Monte Carlo test"
     assert wording.p_words(0.004, 0.002) == "p = 0.004" and wording.p_words(1e-9, 0.0) == "p < 0.001"
-
-
-def test_numbers_that_are_compared_have_as_many_decimals() -> None:
     assert wording.alike([1.938, 0.4643, None]) == ["1.94", "0.46", "–"]
     assert wording.alike([0.7331, 0.7372]) == ["0.73", "0.74"]
     # Two that differ do not read alike; two that are equal do.
     assert wording.alike([0.7331, 0.7332]) == ["0.7331", "0.7332"]
     assert wording.alike([0.5, 0.5]) == ["0.50", "0.50"]
     assert wording.alike([-0.5, float("nan")]) == ["−0.50", "–"]
-
-
-def test_a_time_is_local_where_a_zone_is_stated() -> None:
     assert wording.moment("2026-03-09T06:30:05Z", "Europe/Vienna") == "2026-03-09 07:30 CET"
     assert wording.moment("2026-07-09T06:30:05Z", "Europe/Vienna") == "2026-07-09 08:30 CEST"
     assert wording.moment(np.datetime64("NaT")) == "–"
-
-
-def test_an_effect_of_a_users_own_has_a_name_and_no_remedy() -> None:
-    assert wording.effect_words("bed_bending") == ("bed bending", "")
-
-
-def test_places_and_units_are_printed() -> None:
-    assert wording.place(355.4, None) == "x 355 mm, y – mm"
-    assert wording.print_unit("um/K") == "µm/K"
+    assert wording.gain(-0.04) == "0.0" and wording.gain(-0.06) == "−0.1" and wording.gain(None) == "–"
 
 
 def doubted(*codes: str) -> InputsPart:
@@ -70,7 +62,7 @@ def doubted(*codes: str) -> InputsPart:
     return InputsPart.model_validate(inputs_part(checks, ()))
 
 
-def test_what_a_doubt_touches_is_conditional_and_nothing_else() -> None:
+def test_what_a_doubt_touches_is_conditional_and_several_are_named_or_counted():
     inputs = doubted("material_rise")
     said = "The drift goes with the table."
     assert (
@@ -79,15 +71,320 @@ def test_what_a_doubt_touches_is_conditional_and_nothing_else() -> None:
     assert wording.conditional(said, inputs, "positions") == said == wording.conditional(said, None, "causes")
     assert wording.condition(inputs, "field") == "(only if the emissivity is right)"
     assert wording.condition(inputs, "positions") == ""
-    assert wording.untouched(inputs).startswith(
-        "Not touched by that: what the laser shows alone (deviations, drift, ISO 230-2 values"
-    )
-
-
-def test_several_doubts_are_named_or_counted() -> None:
+    assert wording.untouched(inputs).startswith("Not affected: what the laser shows alone")
     two, three = doubted("material_rise", "datum"), doubted("material_rise", "datum", "camera_clock")
     both = "the emissivity is right and the datum of the laser stayed the same"
     assert wording.condition(two, "causes") == f"(only if {both})"
     assert wording.condition(two, "positions") == "(only if the datum of the laser stayed the same)"
     assert wording.condition(three, "causes") == "(only if 3 doubted inputs are right)"
     assert wording.untouched(two) == "" == wording.untouched(None)
+
+
+def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
+    assert (
+        wording.parameters({"follows": "warm_up", "time_constant_min": 30.0})
+        == "follows warm up, time constant 30.0 min"
+    )
+    assert (
+        wording.parameters({"time_constant_min": 39.6}, {"time_constant_min": (29.0, None)})
+        == "time constant 39.6 min (at least 29.0)"
+    )
+    assert wording.spaced("jump_um_per_K") == "jump / (µm/K)"
+    assert wording.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, – and warm up"
+
+
+ISO = Iso230Part(
+    window="cycles 1 to 5",
+    B_of_scatter_um=None,
+    **{f"{name}_um": Quantity(value=9.9017, u=1.378) for name in (*"BREMA", "mean_reversal")},
+)
+
+
+def test_axis_values_bear_the_terms_of_the_standard_of_one_approach_the_unidirectional_ones():
+    assert findings.iso230_values(ISO)["A"] == "9.9 \u00b1 2.8 \u00b5m"
+    assert findings.ISO230_TERMS["E"] == "Bidirectional systematic positioning error E"
+    assert findings.ISO230_TERMS["M"] == "Mean bidirectional positioning error M"
+    assert findings.ISO230_TERMS["B"] == "Reversal error B"
+    known, unknown = Quantity(value=9.9017, u=1.378), Quantity(value=None, u=None)
+    side = Iso230Direction(A_um=known, R_um=known, E_um=known)
+    other = Iso230Direction(A_um=unknown, R_um=unknown, E_um=unknown)
+    window = Iso230Window.model_construct(A_um=unknown, positive=other, negative=side)
+    assert findings.quoted_values(window) == {"A\u2193": "9.9 \u00b1 2.8 \u00b5m", "R\u2193": "9.9 \u00b1 2.8 \u00b5m"}
+    assert list(findings.quoted_values(ISO)) == ["A", "R", "B"]
+
+
+def test_a_step_has_both_pairs_of_errors():
+    step = StepPart.model_construct(
+        rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
+    )
+    assert findings.step_errors(step) == (
+        "held-out error 0.60 -> 0.70 \u00b5m, blocks predicted from the others 0.50 -> 0.40 \u00b5m"
+    )
+    late = step.model_copy(update={"rmse_after_um": None})
+    assert findings.step_errors(late).startswith(
+        "found after the hold-out was opened, blocks predicted from the others 0.50"
+    )
+
+
+SHOWN = table([Words("Effect"), "Error / \u00b5m"], [["step", "0.4"], Row(["dead path", "0.3"], marked=True)])
+
+
+def test_the_terminal_shows_every_cell():
+    console = Console(width=60)
+    with console.capture() as capture:
+        console.print(print_table(SHOWN, "steps"))
+    text = capture.get()
+    assert all(cell in text for cell in ("steps", "Effect", "dead path", "0.4", "0.3"))
+
+
+def step(effect: str, **changes: Any) -> StepPart:
+    told = {
+        "effect": effect, "parameters": {}, "parameter_ranges": {}, "confirmed": True, "doubt": "", "event_time": None, "p_value": 1e-6,
+        "rmse_before_um": 1.94, "rmse_after_um": 0.66, "cross_rmse_before_um": 0.57, "cross_rmse_after_um": 0.45,
+    }  # fmt: skip
+    return StepPart.model_construct(**{**told, **changes})
+
+
+def loop(verdict: str = "explained", *steps: StepPart, shape: str = "", **changes: Any) -> Loop:
+    """The part of a loop that sentences are made of."""
+    told = {
+        "verdict": verdict, "declared": ("axis_expansion",), "steps": steps, "unconfirmed_effects": {}, "rmse_persistence_um": 2.5,
+        "unexplained": Unexplained.model_construct(shape=shape, rms_um=0.2), "rmse_declared_um": 1.94, "rmse_final_um": 0.66,
+        "noise_floor_um": 0.42, "held_out": "cycles 49 to 60 held out; coefficients frozen",
+    }  # fmt: skip
+    return Loop.model_construct(**{**told, **changes})
+
+
+def results(found: Loop | None, **parts: Any) -> Results:
+    return Results.model_construct(**{"loop": found, "warnings": (), **parts})
+
+
+@pytest.mark.parametrize(
+    ("found", "stated"),
+    [
+        (loop("complete"), ["the expansion of the axis", "no missing effect"]),
+        (loop("complete", declared=()), ["No effect is declared"]),
+        (
+            loop("explained", step("dead_path"), step("air_index")),
+            ["lacks the laser's dead path and the refractive index of the air.", "no further cause"],
+        ),
+        (
+            loop("partial", step("dead_path"), step("air_index", confirmed=False)),
+            ["lacks the laser's dead path.", "remains unexplained"],
+        ),
+        (loop("unexplained", shape="a wave"), ["(0.20 µm rms)", "no effect of the library"]),
+        (loop("unexplained"), ["Part of the drift remains unexplained"]),
+        (loop("no_skill"), ["repeating the last cycle or the mean"]),
+        (None, ["without a model"]),
+    ],
+)
+def test_every_verdict_has_its_statement(found, stated):
+    told = answers.headline(results(found))
+    assert all(part in told for part in stated), told
+    assert found is not None or answers.conclude(results(None)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "stated"),
+    [
+        (
+            {},
+            ["cycles 49 to 60 falls from 1.94 to 0.66 µm", "gives 2.50 µm,", "is 0.42 µm", "others: 0.57 -> 0.45 µm."],
+        ),
+        (
+            {"rmse_declared_um": 0.733, "rmse_final_um": 0.737, "rmse_persistence_um": 0.41},
+            ["does not fall (0.73 µm before, 0.74 µm after)", "gives 0.41 µm (less than the model"],
+        ),
+        ({"rmse_persistence_um": 1.0}, ["gives 1.00 µm (less than the declared model alone)"]),
+        ({"steps": ()}, ["measured before: 1.94 µm; repeating the last cycle gives 2.50 µm,"]),
+    ],
+)
+def test_errors_are_compared_with_plain_repetition(changes, stated):
+    told = say("prediction", loop("explained", step("dead_path"), **{"steps": (step("dead_path"),), **changes}))
+    assert all(part in told for part in stated), told
+
+
+def test_a_record_repeats_values_and_predicts_blocks_of_time():
+    channels = {
+        name: ChannelErrors.model_construct(rmse_declared_um=3.01, rmse_final_um=after)
+        for name, after in (("ch1", 2.0), ("ch2", 3.21))
+    }
+    told = {
+        **vars(loop("explained", step("thermal_lag"))),
+        "held_out": "37.0 h to 46.3 h held out; x",
+        "channels": channels,
+    }
+    stated = dict(answers.conclude(results(RecordLoop.model_construct(**told))))["How sure"]
+    parts = [
+        "37.0 h to 46.3 h falls",
+        "the last value",
+        "noise of a block mean",
+        "blocks of time",
+        "fall in ch2 (3.0 -> 3.2 µm).",
+    ]
+    assert all(part in stated for part in parts), stated
+    # The error rate of a name in a record is larger than its p-value.
+    assert "Of 40 simulated records" in stated
+    assert "Of 40" not in dict(answers.conclude(results(loop("explained", step("step_event")))))["How sure"]
+
+
+def test_what_is_left_is_said_once():
+    shape = "a slow, smooth drift"
+    found = results(loop("unexplained", shape=shape, unconfirmed_effects={"dead_path": 9e-35}))
+    told = dict(answers.conclude(found))["What remains"]
+    assert told.startswith(f"A{shape[1:]}: 0.20 µm rms.") and "dead path of the laser (p < 0.001)" in told
+    assert told.count("rms") == 1
+    assert "0.42 µm" in dict(answers.conclude(results(loop("complete"))))["What remains"]
+
+
+def correlation(verdict: str) -> CorrelationPart:
+    source = SourcePart.model_construct(
+        x_mm=355.0,
+        y_mm=95.0,
+        p_value=0.002,
+        area=AreaPart(x_low_mm=280.0, x_high_mm=420.0, y_low_mm=40.0, y_high_mm=150.0),
+    )
+    return CorrelationPart.model_construct(verdict=verdict, source=source, p_resolution=0.002, randomised_duty=None)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "part"),
+    [
+        ("attributable", "the area x 280 to 420 mm, y 40 to 150 mm (strongest at x 355 mm, y 95 mm) more closely than"),
+        ("not attributable", "the closest is the area x 280 to 420 mm"),
+        ("not separable", "These data cannot tell which place"),
+    ],
+)
+def test_every_attribution_has_its_sentence(verdict, part):
+    told = dict(answers.conclude(results(None, correlation=correlation(verdict))))["Which place"]
+    assert part in told and "drives" not in told
+    assert ("p ≤ 0.002, resolution of the Monte Carlo test" in told) == (verdict != "not separable")
+
+
+@pytest.mark.parametrize(
+    ("found", "verdict", "stated"),
+    [
+        (loop("explained", step("unseen_heat_source")), "attributable", "(the expansion of the axis), so this place"),
+        (
+            loop("explained", step("unseen_heat_source"), declared=("dead_path",)),
+            "attributable",
+            "after what was declared",
+        ),
+        (loop("explained", step("dead_path")), "attributable", ""),
+        (loop("explained", step("unseen_heat_source")), "not attributable", ""),
+    ],
+)
+def test_an_unseen_source_and_a_seen_place_are_reconciled(found, verdict, stated):
+    told = say("reconcile", results(found, correlation=correlation(verdict)))
+    assert stated in told and bool(stated) == bool(told)
+
+
+def test_a_position_that_stands_out_is_compared_with_the_others():
+    (anomaly,) = assemble("A", PARTS, []).anomalies or ()
+    placed = anomaly.model_copy(update={"position_mm": 40.0, "p_resolution": 0.01})
+    told = answers.describe_anomaly(placed)
+    assert (
+        told.startswith("Position 3 (40 mm) repeats worse") and "0.60 µm, that of the others 0.30 µm (p ≤ 0.01," in told
+    )
+    # Of one approach its own scatter is stated, not that of both.
+    evidence = anomaly.evidence.model_copy(update={"scatter_negative_um": 0.9})
+    one = anomaly.model_copy(update={"direction": "negative", "evidence": evidence})
+    told = answers.describe_anomaly(one)
+    assert told.startswith("Position 3, negative approach,") and "0.90 µm" in told
+
+
+@pytest.mark.parametrize(
+    ("least", "scatter", "stated"),
+    [
+        (3.1, (0.4, 0.4), "and least by 3.10 ± 0.20 µm at position 1 (0 mm) (± from scatter and estimate alone"),
+        (0.0, (0.4, 0.4), "and not noticeably at position 1 (0 mm) (± from"),
+        # Too few readings for a scatter: the size is stated as it is.
+        (0.0, (None, None), "and least by 0.00 ± 0.20 µm at position 1 (0 mm)"),
+    ],
+)
+def test_how_much_names_the_position_with_the_largest_drift(least, scatter, stated):
+    drift = {
+        **PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [least, 11.127], "range_u_um": [0.1, 0.17],
+        "scatter_um": {"positive": scatter, "negative": scatter},
+    }  # fmt: skip
+    told = dict(answers.conclude(assemble("A", {**PARTS, "drift": drift}, [])))["How much"]
+    assert "11.13 ± 0.34 µm at position 2 (150 mm)" in told and stated in told and "see the ISO 230-2 budget" in told
+    told = dict(answers.conclude(assemble("A", {**PARTS, "drift": drift, "iso230": None}, [])))["How much"]
+    assert told.endswith("without laser, material temperature and expansion coefficient).")
+
+
+LOCAL = TimePart(first="2026-03-09T06:30:02Z", last="2026-03-09T10:41:02Z", zone="Europe/Vienna")
+
+
+def axis_step(effect: str, **changes: Any) -> AxisStep:
+    told = {"event_cycle": None, "coefficients": (Coefficient(value=2.1, u=0.1, unit="um"),), **changes}
+    return AxisStep.model_construct(**{**vars(step(effect)), **told})
+
+
+SOURCE = axis_step(
+    "unseen_heat_source",
+    parameters={"follows": "duty", "time_constant_min": 12.94},
+    parameter_ranges={"time_constant_min": (11.0, 15.2)},
+)
+JUMP = axis_step("step_event", event_cycle=38, event_time="2026-03-09T09:08:00Z")
+
+
+def test_what_an_effect_follows_is_told_with_its_time_constant():
+    assert step_phrase(SOURCE, None, record=False) == (
+        "a heat source that the camera does not see (follows the logged duty, time constant 13 min [11 to 15])"
+    )
+    assert "no sensor sees" in step_phrase(SOURCE, None, record=True)
+    lagging = axis_step("thermal_lag", parameters={"time_constant_min": 30.0})
+    assert step_phrase(lagging, None, record=False).endswith("(time constant 30 min)")
+    assert step_phrase(axis_step("bed_bending"), None, record=False) == "bed bending"
+
+
+def test_an_event_is_told_with_its_size_and_its_local_time():
+    assert say("when", JUMP, LOCAL) == "2026-03-09 10:08 CET, cycle 38" and say("when", JUMP, None).startswith(
+        "2026-03-09 09:08 UTC"
+    )
+    assert step_phrase(JUMP, LOCAL, record=False) == (
+        "a sudden step (2.10 ± 0.20 µm, at 2026-03-09 10:08 CET, cycle 38)"
+    )
+    late = RecordStep.model_construct(
+        effect="step_event", parameters={}, parameter_ranges={}, event_s=7200.0, event_time=None
+    )
+    assert say("when", late, None) == "2.0 h after the start"
+
+
+def test_an_action_names_the_time_or_the_load():
+    assert action(JUMP, LOCAL, record=False).startswith("Look up 2026-03-09 10:08 CET, cycle 38 in the logs")
+    assert 'the logged load "duty"' in action(SOURCE, None, record=False)
+    assert "where no sensor sits" in action(SOURCE, None, record=True)
+    assert action(axis_step("dead_path"), None, record=False) == effect_words("dead_path").remedy
+    doubtful = action(axis_step("dead_path", confirmed=False), None, record=False)
+    assert doubtful.startswith("Not confirmed") and ": shorten" in doubtful
+    assert action(axis_step("bed_bending", confirmed=False), None, record=False) == ""
+
+
+def test_the_model_comes_first_and_what_asks_for_nothing_is_left_out():
+    found = results(
+        loop("partial", step("dead_path"), shape="a wave of 37 min"),
+        anomalies=(
+            AnomalyPart.model_construct(
+                target=3, position_mm=40.0, evidence=Evidence.model_construct(check="Inspect the guide.")
+            ),
+        ),
+        warnings=(Notice("gaps", "Gaps are allowed for.", ""), Notice("camera", "Late.", "Start the camera earlier.")),
+    )
+    first, second, third, last = next_steps(found)
+    assert first == effect_words("dead_path").remedy
+    assert "(a wave of 37 min)" in second
+    assert third == "Position 3 (40 mm): Inspect the guide." and last == "Start the camera earlier."
+    assert next_steps(results(loop("complete"))) == [
+        "Nothing has to be done: use the profile and its uncertainty as they are."
+    ]
+
+
+def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
+    source = SourcePart.model_construct(x_mm=355.0, y_mm=95.0, area=None)
+    seen = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
+    (step,) = next_steps(results(loop("complete"), correlation=seen))
+    assert step.startswith("To find out whether the place around x 355 mm, y 95 mm is a cause: repeat the test")
+    shown = seen.model_copy(update={"randomised_duty": (DutyPart.model_construct(name="spindle", cause=True),)})
+    assert "Nothing has to be done" in next_steps(results(loop("complete"), correlation=shown))[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fusion.twin.camera import SC660, Renderer, air_transmission, counts_of, fiducial_points, make_view
-from fusion.twin.machine.recipe import Camera, EffectRecipe, Recipe
+from fusion.twin.recipe import Camera, EffectRecipe, Recipe
 from fusion.twin.simulate import Truth, simulate
 
 QUIET = {"netd_K": 0.0, "blur_px": 0.0}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import tomllib
 from pathlib import Path
@@ -11,11 +12,11 @@ import pytest
 import xarray as xr
 
 from fusion.twin import simulate
-from fusion.twin.folders import truth_folder
+from fusion.twin.folders import check_free, truth_folder, whole_folders
 from fusion.twin.instruments import simulate_campaign, write_campaign
-from fusion.twin.machine.recipe import Recipe, RecipeError
+from fusion.twin.recipe import Recipe, RecipeError
 from fusion.twin.recipe_file import read_recipe
-from interferometry.io.readers import read_deviations, read_environment
+from interferometry.io.readings import read_deviations, read_environment
 from thermography.io.flir import index_frames, read_frame
 
 RECIPE = """
@@ -127,18 +128,6 @@ def test_same_recipe_writes_the_same_bytes(campaign, tmp_path):
         assert (again.parent / name).read_bytes() == (campaign.parent / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("taken", ["out", "out-truth"])
-def test_folder_that_holds_something_is_refused(tmp_path, taken):
-    (tmp_path / "RECIPE.toml").write_text("", encoding="utf-8")
-    (tmp_path / taken).mkdir()
-    (tmp_path / taken / "precious.txt").write_text("mine", encoding="utf-8")
-    with pytest.raises(
-        RecipeError, match=rf"{taken} exists and is not an empty folder; name another output folder or empty it"
-    ):
-        simulate_campaign(tmp_path / "RECIPE.toml", tmp_path / "out")
-    assert [p.name for p in (tmp_path / taken).iterdir()] == ["precious.txt"]
-
-
 def test_empty_folder_is_used_and_progress_is_reported(tmp_path):
     (tmp_path / "out").mkdir()
     steps: list[tuple] = []
@@ -172,3 +161,98 @@ def test_truth_holds_the_cell_means_of_the_true_field(campaign, truth):
     # stored as float32
     np.testing.assert_allclose(truth["temperature"].values, expected, atol=5e-6)
     assert np.array_equal(truth["field_time"].values, again.clock(again.session.frame_s).astype("datetime64[ns]"))
+
+
+# A simulated campaign is there whole or not at all.
+
+
+def fill(campaign: Path, truth: Path) -> None:
+    (campaign / "thermal").mkdir()
+    for file in (campaign / "campaign.toml", campaign / "thermal" / "IR_0001.jpg", truth / "truth.json"):
+        file.write_text("whole")
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_both_folders_appear_when_both_are_whole(tmp_path: Path, exists: bool) -> None:
+    out = tmp_path / "campaign"
+    if exists:
+        out.mkdir()
+    with whole_folders(out) as (campaign, truth):
+        fill(campaign, truth)
+        assert not truth_folder(out).exists() and out.exists() == exists
+    assert {path.name for path in out.iterdir()} == {"campaign.toml", "thermal"}
+    assert {path.name for path in tmp_path.iterdir()} == {"campaign", "campaign-truth"}
+
+
+@pytest.mark.parametrize("exists", [False, True])
+@pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_what_fails_or_is_stopped_leaves_nothing(tmp_path: Path, exists: bool, fault: BaseException) -> None:
+    out = tmp_path / "campaign"
+    if exists:
+        out.mkdir()
+    with pytest.raises((RecipeError, KeyboardInterrupt)) as told, whole_folders(out) as (campaign, truth):
+        fill(campaign, truth)
+        raise fault
+    assert [path.name for path in tmp_path.rglob("*")] == (["campaign"] if exists else [])
+    if isinstance(fault, OSError):
+        assert str(told.value) == (
+            f"{out}: cannot be written (No space left on device), and nothing is left there; make room, allow writing there, "
+            "or name another folder with --out"
+        )
+
+
+@pytest.mark.parametrize("existing", ["campaign", "campaign-truth"])
+def test_what_cannot_be_put_in_place_is_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, existing: str
+) -> None:
+    """An empty folder that exists, and that nothing can be written to; the other one can."""
+    (tmp_path / existing).mkdir()
+    rename = Path.rename
+
+    def refused(self: Path, target: Path) -> Path:
+        if target.parent == tmp_path / existing and target.name in ("thermal", "truth.json"):
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(RecipeError, match="nothing is left there"), whole_folders(tmp_path / "campaign") as folders:
+        fill(*folders)
+    assert [path.name for path in tmp_path.rglob("*")] == [existing]
+    check_free(tmp_path / "campaign")
+
+
+def test_a_reader_of_the_progress_who_left_is_no_fault_of_the_disk(tmp_path: Path) -> None:
+    with pytest.raises(BrokenPipeError), whole_folders(tmp_path / "campaign"):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_simulations_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    with whole_folders(tmp_path / "campaign") as folders:
+        with (
+            pytest.raises(RecipeError, match=r"another simulation is writing there, or was killed; wait for it"),
+            whole_folders(tmp_path / "campaign"),
+        ):
+            pass
+        fill(*folders)
+    assert {path.name for path in tmp_path.iterdir()} == {"campaign", "campaign-truth"}
+
+
+def test_what_somebody_else_put_there_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="not an empty folder"), whole_folders(tmp_path / "campaign") as folders:
+        fill(*folders)
+        (tmp_path / "campaign").mkdir()
+        (tmp_path / "campaign" / "campaign.toml").write_text("mine")
+    assert [path.name for path in tmp_path.iterdir()] == ["campaign"]
+    assert (tmp_path / "campaign" / "campaign.toml").read_text() == "mine"
+
+
+def test_a_folder_that_holds_something_and_the_root_of_a_disk_are_refused(tmp_path: Path, monkeypatch) -> None:
+    check_free(tmp_path / "new")
+    with pytest.raises(RecipeError, match=r"root of a disk.*name a folder in it"):
+        monkeypatch.setattr(Path, "is_mount", lambda path: True)
+        check_free(tmp_path / "new")
+    (tmp_path / "new-truth").mkdir()
+    (tmp_path / "new-truth" / "truth.json").write_text("{}")
+    with pytest.raises(RecipeError, match="new-truth exists and is not an empty folder"):
+        check_free(tmp_path / "new")

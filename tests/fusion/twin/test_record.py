@@ -9,11 +9,11 @@ import pytest
 import xarray as xr
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.record_runs import read_record
+from fusion.campaign.inputs import read_record
 from fusion.twin import simulate
 from fusion.twin.folders import truth_folder
 from fusion.twin.instruments import simulate_campaign
-from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe, RecipeError
+from fusion.twin.recipe import AnomalyRecipe, EffectRecipe, Recipe, RecipeError
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from fusion.twin.record import IN_A_RECORD, MOTOR_W, PARTS, SPINDLE_W, simulate_record, solve_parts
 
@@ -83,8 +83,8 @@ def test_record_is_read_back(tmp_path):
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"record": {"hours": 0.0}}, r"record\.hours = 0\.0; write a number above 0"),
-        ({"record": {"channels": 7}}, r"record\.channels = 7; write a number up to 6"),
+        ({"record": {"hours": 0.0}}, r"record\.hours = 0\.0: input should be greater than 0"),
+        ({"record": {"channels": 7}}, r"record\.channels = 7: input should be less than or equal to 6"),
         ({"anomaly": (AnomalyRecipe(3),)}, r"anomaly: a record has no targets; remove the \[\[anomaly\]\] tables"),
         (
             {"effect": (EffectRecipe("dead_path"),)},

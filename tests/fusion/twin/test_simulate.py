@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
-from fusion.twin.machine.recipe import AnomalyRecipe, Drift, EffectRecipe, Laser, Profile, Recipe
+from fusion.twin.machine import INNER_PART, Drive, Session, first_order, random_levels, stream, switched_levels
+from fusion.twin.recipe import AnomalyRecipe, Drift, EffectRecipe, Laser, Profile, Recipe
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from fusion.twin.simulate import (
     Truth,
@@ -17,6 +20,9 @@ from fusion.twin.simulate import (
     simulate,
     static_profile,
 )
+from fusion.twin.truth import deviations_of, fields_of
+from interferometry.common import DEVIATIONS
+from thermography.common import FIELDS
 
 BASE = Recipe().vary(test={"cycles": 40, "jitter_mm": 3.0})
 
@@ -128,3 +134,153 @@ def test_logs_are_taken_once_a_minute_and_cover_the_test(plain):
     true = np.interp(60.0 * np.arange(minutes), plain.session.grid_s, plain.session.air_degC)
     # 4 mK of noise and a resolution of 10 mK, uniform: 4.9 mK together
     assert float((environment["air_temperature"] - true).std()) == pytest.approx(0.0049, rel=0.15)
+
+
+# The states behind the readings: bodies that respond as two lags in series must, and series at the right times.
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(Recipe().vary(test={"cycles": 20}, table={"preheat_min": 30.0})).session
+
+
+def test_warm_up_is_that_of_two_lags_in_series(session):
+    tau, inner = 1800.0, INNER_PART * 1800.0
+    state = session.state("constant", 30.0, "any")
+    t = session.grid_s[session.grid_s >= 0]
+    expected = 1.0 - (tau * np.exp(-t / tau) - inner * np.exp(-t / inner)) / (tau - inner)
+    # the grid's step of 10 s delays each of the two lags by up to one step: 20 s of at most 1 / 1800 s
+    np.testing.assert_allclose(state[session.grid_s >= 0], expected, atol=0.012)
+    assert np.all(state[session.grid_s < 0] == 0.0)
+
+
+@pytest.mark.parametrize("follows", get_args(Drive))
+def test_every_state_starts_from_zero_with_the_test(session, follows):
+    state = session.state(follows, 20.0, "any")
+    assert np.interp(0.0, session.grid_s, state) == pytest.approx(0.0, abs=1e-12)
+    assert np.ptp(state) > 0.0
+
+
+def test_own_drive_differs_between_effects_and_is_not_the_logged_load(session):
+    first, second = session.state("own", 10.0, "first"), session.state("own", 10.0, "second")
+    assert not np.array_equal(first, second)
+    assert not np.array_equal(first, session.state("duty", 10.0, "first"))
+    np.testing.assert_array_equal(first, session.state("own", 10.0, "first"))
+
+
+# Named random streams, loads with their stated holds, and a lag that is exact for a stepwise constant drive.
+
+
+TIME_S = np.arange(0.0, 400 * 3600.0, 10.0)
+
+
+def holds_min(level: np.ndarray) -> np.ndarray:
+    """Times for which a level was held, the first and the last left out, min."""
+    changes = np.flatnonzero(np.diff(level))
+    return np.diff(TIME_S[changes]) / 60.0
+
+
+def test_stream_depends_on_seed_and_name_only():
+    draw = stream(4, "noise").standard_normal(5)
+    np.testing.assert_array_equal(stream(4, "noise").standard_normal(5), draw)
+    assert not np.array_equal(stream(4, "profile").standard_normal(5), draw)
+    assert not np.array_equal(stream(5, "noise").standard_normal(5), draw)
+
+
+def test_random_levels_are_held_between_0_4_and_1_6_of_the_mean(rng):
+    level = random_levels(TIME_S, 0.2, 0.9, 30.0, rng)
+    hold = holds_min(level)
+    step = 10.0 / 60.0
+    assert hold.min() >= 12.0 - step
+    assert hold.max() <= 48.0 + step
+    # some 800 holds with a standard deviation of 10.4 min know their mean to 0.4 min
+    assert hold.mean() == pytest.approx(30.0, abs=1.5)
+    # uniform levels between 0.2 and 0.9
+    assert level.mean() == pytest.approx(0.55, abs=0.03)
+
+
+def test_alternate_levels_take_turns(rng):
+    level = random_levels(TIME_S, 0.2, 0.9, 30.0, rng, alternate=True)
+    assert set(level.tolist()) == {0.2, 0.9}
+    assert holds_min(level).min() >= 12.0 - 10.0 / 60.0
+
+
+def test_switched_levels_have_a_minimum_hold_and_an_exponential_rest(rng):
+    hold = holds_min(switched_levels(TIME_S, (0.0, 1.0), (600.0, 1200.0), rng))
+    assert hold.min() >= 10.0 - 10.0 / 60.0
+    # some 800 holds of 10 min + Exp(20 min): mean and standard deviation of the rest are equal, known to 4 % and 5 %
+    assert hold.mean() == pytest.approx(30.0, abs=3.0)
+    assert hold.std() == pytest.approx(20.0, rel=0.2)
+
+
+@pytest.mark.parametrize("step_s", [10.0, 60.0, 300.0])
+def test_first_order_is_exact_for_a_constant_drive_at_any_step(step_s):
+    t = np.arange(0.0, 3600.0, step_s)
+    np.testing.assert_allclose(
+        first_order(np.full(t.size, 2.0), step_s, 900.0), 2.0 * (1.0 - np.exp(-t / 900.0)), atol=1e-12
+    )
+
+
+def test_first_order_attenuates_and_delays_a_sine_as_a_low_pass_does():
+    period_s, tau_s = 3600.0, 900.0
+    t = np.arange(0.0, 20 * period_s, 1.0)
+    omega = 2 * np.pi / period_s
+    settled = first_order(np.sin(omega * t), 1.0, tau_s)[10 * int(period_s) :]
+    transfer = 1.0 / (1.0 + 1j * omega * tau_s)
+    expected = np.abs(transfer) * np.sin(omega * t + np.angle(transfer))[10 * int(period_s) :]
+    # a drive held over steps of 1 s lags half a second more: omega / 2
+    np.testing.assert_allclose(settled, expected, atol=1e-3)
+
+
+# The truth as Datasets without files keeps the instruments' contracts, with the camera's noise and errors.
+
+
+def test_datasets_without_files_keep_the_contracts():
+    truth = simulate(Recipe().vary(test={"cycles": 5, "missing_fraction": 0.1}))
+    for dataset, contract in ((deviations_of(truth), DEVIATIONS), (fields_of(truth), FIELDS)):
+        for name, (dims, units, kind) in contract.items():
+            assert dataset[name].dims == dims, name
+            assert dataset[name].dtype.kind == kind, name
+            assert dataset[name].attrs.get("units", "") == units, name
+    deviations = deviations_of(truth)
+    assert np.array_equal(np.isnat(deviations["time"].values), np.isnan(deviations["deviation"].values))
+
+
+def test_fields_without_files_are_cell_means_with_the_frames_noise():
+    truth = simulate(Recipe().vary(test={"cycles": 6}))
+    quiet, noisy = fields_of(truth, noise_K=0.0), fields_of(truth)
+    fine_x, fine_y = np.arange(0.25, 700, 0.5)[600:610], np.arange(0.25, 180, 0.5)[150:160]
+    cell = truth.temperature(truth.session.frame_s, fine_x, fine_y).mean(axis=(1, 2))
+    np.testing.assert_allclose(quiet["temperature"].sel(x=302.5, y=77.5), cell, atol=1e-4)
+    noise = (noisy["temperature"] - quiet["temperature"]).std()
+    # 50 mK over 18.9 pixels of 5 mm
+    assert float(noise) == pytest.approx(0.0115, abs=0.0005)
+
+
+def test_burst_lowers_the_noise_of_a_cycle_and_shows_its_spread():
+    single, burst = (simulate(Recipe().vary(test={"cycles": 4}, camera={"frames_per_cycle": n})) for n in (1, 16))
+    quiet = fields_of(burst, noise_K=0.0)["temperature"]
+    noise = [float((fields_of(truth)["temperature"] - quiet).std()) for truth in (single, burst)]
+    # 22,680 values of noise; within three seconds the table itself moves by well under 1 mK
+    assert noise[0] / noise[1] == pytest.approx(4.0, rel=0.05)
+    assert float(fields_of(burst)["temperature_spread"].mean()) == pytest.approx(0.0115 * np.sqrt(15 / 16), rel=0.05)
+
+
+def test_fields_without_files_show_what_the_camera_adds():
+    effects = (EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 3}),)
+    spot = (EffectRecipe("reflected_source", amplitude_K=40.0, parameters={"follows": "constant"}),)
+    plain = fields_of(simulate(Recipe().vary(test={"cycles": 6})), noise_K=0.0)["temperature"]
+    lifted = fields_of(simulate(Recipe().vary(test={"cycles": 6}, effect=effects)), noise_K=0.0)["temperature"] - plain
+    np.testing.assert_allclose(lifted.mean(["y", "x"]), [0, 0, 0.5, 0.5, 0.5, 0.5], atol=1e-12)
+    mirrored = fields_of(simulate(Recipe().vary(test={"cycles": 6}, effect=spot)), noise_K=0.0)["temperature"] - plain
+    peak = mirrored[-1].argmax(["y", "x"])
+    # the spot's centre lies on the border of two cells in x and of two in y
+    assert abs(float(mirrored["x"][peak["x"]]) - 480.0) == 2.5
+    assert abs(float(mirrored["y"][peak["y"]]) - 60.0) == 2.5
+    # 3 % of 40 K over 97 %, warmed up to 99 %
+    assert float(mirrored[-1].max()) == pytest.approx(1.23, abs=0.05)
+
+
+def test_fields_of_a_moving_table_need_frames():
+    with pytest.raises(ValueError, match=r"fields_of needs camera\.table = 'still'; write the campaign"):
+        fields_of(simulate(Recipe().vary(test={"cycles": 2}, camera={"table": "moving"})))

@@ -1,7 +1,5 @@
 """The O(n) filter against dense Gaussian algebra, and the estimates against simulated truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +11,10 @@ from interferometry.drift.gls import (
     estimate,
     fit_fixed_effects,
     settling_noise_scale,
+    typical_memory,
     von_neumann_p_value,
 )
-from interferometry.drift.state_space import DriftModelError, drift_system, start_columns
+from interferometry.drift.kalman import DriftModelError, drift_system, start_columns
 
 POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
 
@@ -177,8 +176,6 @@ def test_the_von_neumann_ratio_tells_a_trend_from_alternation_and_needs_eight_va
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s, x, y, d: (s[::-1], x, y, d), "must not decrease"),
-        (lambda s, x, y, d: (s, x[:-1], y, d), "loadings has shape"),
         (lambda s, x, y, d: (s, x, np.where(s == s[3], np.nan, y), d), "must be finite"),
         (lambda s, x, y, d: (s, x, y, np.column_stack([d, d[:, :1]])), "column 2 of the design depends"),
         (lambda s, x, y, d: (s, x, y, np.column_stack([d, 0 * s])), "vanish"),
@@ -339,3 +336,42 @@ def drift_and_columns(rng):
     system = drift_system(np.arange(40.0), loadings, order=1, ratios=np.array([0.05]))
     x = np.column_stack([loadings, rng.standard_normal((n, 2))])
     return system, x @ [1.0, 2.0, -3.0] + rng.standard_normal(n), x
+
+
+def series(rng: np.random.Generator, correlation: float, *, rows: int = 32, cycles: int = 100) -> np.ndarray:
+    values = rng.standard_normal((rows, cycles))
+    for k in range(1, cycles):
+        values[:, k] = correlation * values[:, k - 1] + np.sqrt(1 - correlation**2) * values[:, k]
+    return values - values.mean(axis=1, keepdims=True)
+
+
+def test_independent_noise_has_no_memory_and_stays_as_it_is(rng):
+    values = series(rng, 0.0)
+    memory = typical_memory(values)
+    assert memory.weights.size == 0
+    assert memory.long_run == 1.0
+    assert memory.innovations(values) is values
+
+
+def test_memory_is_recognised_and_taken_out(rng):
+    values = series(rng, 0.4)
+    memory = typical_memory(values)
+    # 3,200 values: the standard error of a correlation is 0.016, its bias after taking the means 0.02.
+    assert memory.weights[0] == pytest.approx(0.4, abs=0.06)
+    assert memory.long_run == pytest.approx(1.4 / 0.6, abs=0.4)
+    innovations = memory.innovations(values)
+    assert innovations.shape == values.shape
+    lag_one = (innovations[:, 1:] * innovations[:, :-1]).sum() / (innovations**2).sum()
+    assert abs(lag_one) < 0.06
+    assert innovations[:, 0].std() == pytest.approx(innovations.std(), rel=0.5)
+
+
+def test_a_position_that_moves_by_itself_is_no_memory_of_all(rng):
+    values = series(rng, 0.0)
+    values[4:6] += 3.0 * np.sin(np.linspace(0, 6, 100))
+    assert typical_memory(values).weights.size == 0
+
+
+def test_series_without_values_or_too_few_cycles_have_no_memory():
+    assert typical_memory(np.zeros((4, 50))).weights.size == 0
+    assert typical_memory(np.ones((4, 3))).weights.size == 0

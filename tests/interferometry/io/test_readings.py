@@ -1,62 +1,41 @@
-"""Single readings: the checks that hold for every table, and the Dataset of all."""
-
-from __future__ import annotations
+"""Readings from tables of one reading per line and of one run per column: dialects, checks, and the Dataset of all."""
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import openpyxl
 import pytest
+import xarray as xr
 
+from interferometry.deviations import DUPLICATE, MISSING, OUT_OF_ORDER, UNREADABLE, sort_readings
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.readings import Reading, Readings, check_and_assemble, number_targets, turn_by_travel
+from interferometry.io.readings import (
+    Reading,
+    Readings,
+    check_and_assemble,
+    find_wide_table,
+    is_environment_log,
+    read_deviations,
+    read_environment,
+    turn_by_travel,
+)
+from interferometry.io.tables import read_grids
+from tests.interferometry.io.test_workbook import write_ods
+from tests.interferometry.laser_mutations import fuzz
 
 NAT = np.datetime64("NaT", "ns")
 
 
-def given(*cells: tuple[int, str, int, float], kind: str = "length") -> Readings:
-    """Readings without times whose deviation is their place in the list."""
-    readings = [Reading(2 + i, *cell, NAT, float(i)) for i, cell in enumerate(cells)]
-    return Readings(Path("t.csv"), kind, readings)  # type: ignore[arg-type]
-
-
-def test_readings_are_laid_out_by_cycle_direction_and_target() -> None:
-    test = check_and_assemble(given((1, "positive", 1, 0.0), (1, "positive", 2, 20.0), (2, "negative", 2, 20.0)))
-    assert test["deviation"].sel(cycle=2, direction="negative", target=2) == 2.0
-    assert test.attrs["missing"] == 5
-    assert test["time"].attrs["origin"] == "none"
-
-
-def test_the_units_of_a_rotary_axis_stand_at_its_variables() -> None:
-    test = check_and_assemble(given((1, "positive", 1, 0.0), kind="angle"))
-    assert (test["deviation"].attrs["units"], test["position"].attrs["units"]) == ("arcsec", "deg")
-
-
-def test_a_repeated_reading_is_named_and_the_first_kept() -> None:
-    test = check_and_assemble(given((1, "positive", 1, 0.0), (1, "positive", 1, 0.0)))
-    assert test["deviation"].values[0, 0, 0] == 0.0
-    assert "already stands on line 2, which is kept" in test.attrs["left_out"]
-
-
-def test_targets_that_move_are_refused() -> None:
-    with pytest.raises(LaserFormatError, match=r"target 1 stands at 0.0 mm on line 2 but at 5.0 mm elsewhere \(4 of 4"):
-        check_and_assemble(given(*((cycle, "positive", 1, 10.0 * (cycle > 2)) for cycle in (1, 2, 3, 4))))
-
-
-def test_positions_number_the_targets_within_their_tolerance() -> None:
-    assert number_targets([20.0, 0.0, 20.00001, -5.0]) == [3, 2, 3, 1]
-
-
-def test_without_times_forward_is_positive_and_this_is_told() -> None:
-    readings = given((1, "positive", 1, 0.0), (1, "positive", 2, 20.0))
+def test_what_times_do_not_tell_is_noted():
+    cells = ((1, "positive", 1, 0.0), (1, "positive", 2, 20.0))
+    readings = Readings(Path("t.csv"), "length", [Reading(2 + i, *cell, NAT, 0.0) for i, cell in enumerate(cells)])
     turn_by_travel(readings)
     assert [reading.direction for reading in readings.readings] == ["positive", "positive"]
     assert json.loads(check_and_assemble(readings).attrs["notes"]) == [
         "forward was taken as the positive direction: the file gives no times that tell the travel"
     ]
-
-
-def test_times_without_seconds_are_told() -> None:
     cells = ((1, "positive", 1, 0.0), (1, "positive", 2, 20.0), (1, "negative", 2, 20.0))
     minutes = (0, 0, 1)
     readings = [
@@ -67,3 +46,547 @@ def test_times_without_seconds_are_told() -> None:
     assert json.loads(test.attrs["notes"]) == [
         "warning: the times have no seconds, and 1 readings share theirs with others: export them with seconds"
     ]
+
+
+HEADER = "cycle,direction,target,position_mm,time,deviation_um"
+
+
+def rows(cycles: int = 3, targets: int = 3) -> list[str]:
+    """Lines of a complete test; line 2 of the file is cycle 1, positive, target 1."""
+    lines, second = [], 0
+    for cycle in range(1, cycles + 1):
+        for direction, order in (("positive", range(1, targets + 1)), ("negative", range(targets, 0, -1))):
+            for target in order:
+                time = f"2026-03-09T06:{30 + second // 60:02d}:{second % 60:02d}+00:00"
+                lines.append(f"{cycle},{direction},{target},{20 * (target - 1)},{time},{cycle + 0.1 * target:.1f}")
+                second += 6
+    return lines
+
+
+def write(folder: Path, lines: list[str], header: str = HEADER) -> Path:
+    path = folder / "laser.csv"
+    path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+def left_out(dataset: object) -> list[dict[str, object]]:
+    return json.loads(dataset.attrs["left_out"])
+
+
+def test_a_complete_file_comes_back_cell_by_cell(tmp_path):
+    deviations = read_deviations(write(tmp_path, rows()))
+    assert deviations.sizes == {"cycle": 3, "direction": 2, "target": 3}
+    assert deviations["deviation"].sel(cycle=2, direction="negative", target=3) == pytest.approx(2.3)
+    assert deviations["time"].values[0, 1, 2] == np.datetime64("2026-03-09T06:30:18")
+    assert deviations["position"].values.tolist() == [0.0, 20.0, 40.0]
+    assert deviations["time"].attrs["origin"] == "recorded"
+    assert left_out(deviations) == []
+    assert not deviations["quality_flag"].any()
+
+
+@pytest.mark.parametrize(
+    ("line", "column", "value", "reason"),
+    [
+        (4, 1, "sideways", "is neither 'positive' nor 'negative'"),
+        (5, 5, "nan", "is not a finite number"),
+        (5, 5, "", "is not a number"),
+        (6, 5, "-1e20", "is not a finite number"),
+        (7, 4, "half past six", "is not an ISO 8601 time"),
+        (8, 0, "1.5", "is not a whole number from 1"),
+        (9, 2, "0", "is not a whole number from 1"),
+        (10, 3, "abc", "is not a number"),
+        (11, 4, "2026-03-10T06:30:54+00:00", "is not a time within cycle 2"),
+        (12, 3, "21", "target 2 is at 20.0 mm elsewhere"),
+    ],
+)
+def test_one_bad_reading_is_left_out_with_its_line(tmp_path, line, column, value, reason):
+    lines = rows()
+    fields = lines[line - 2].split(",")
+    fields[column] = value
+    lines[line - 2] = ",".join(fields)
+    deviations = read_deviations(write(tmp_path, lines))
+    listed = left_out(deviations)
+    assert len(listed) == 1
+    assert listed[0]["line"] == line
+    assert reason in str(listed[0]["reason"])
+    assert listed[0]["path"] == "laser.csv"
+    assert int(np.isnan(deviations["deviation"]).sum()) == deviations.attrs["missing"] == 1
+
+
+def test_unreadable_repeated_and_disordered_readings_are_flagged_in_their_cells(tmp_path):
+    lines = rows()
+    lines[0] = lines[0].rsplit(",", 1)[0] + ",---"
+    flagged = read_deviations(write(tmp_path, lines))["quality_flag"].values
+    assert flagged[0, 0, 0] == MISSING.mask | UNREADABLE.mask
+    assert flagged.astype(bool).sum() == 1
+    lines = rows()
+    lines.insert(1, lines[0].rsplit(",", 1)[0] + ",99.0")
+    deviations = read_deviations(write(tmp_path, lines))
+    assert deviations["deviation"].values[0, 0, 0] == pytest.approx(1.1)
+    assert left_out(deviations)[0]["reason"] == ("cycle 1 positive target 1 already occurs on line 2, which is kept")
+    assert deviations["quality_flag"].values[0, 0, 0] == DUPLICATE.mask
+    lines = rows(targets=5)
+    lines[1] = lines[1].replace("06:30:06", "06:30:19")
+    flagged = read_deviations(write(tmp_path, lines))["quality_flag"].values
+    assert flagged[0, 0, 1] == OUT_OF_ORDER.mask
+    assert np.count_nonzero(flagged) == 1
+    lines = rows()
+    del lines[7]
+    deviations = read_deviations(write(tmp_path, lines))
+    assert deviations.attrs["missing"] == 1
+    assert sort_readings(deviations).sizes["reading"] == 17
+
+
+def test_byte_order_mark_crlf_and_semicolons_with_decimal_commas(tmp_path):
+    lines = [line.replace(",", ";").replace(".", ",") for line in rows()]
+    path = tmp_path / "laser.csv"
+    text = "\r\n".join([HEADER.replace(",", ";"), "", *lines]) + "\r\n"
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert read_deviations(path).equals(read_deviations(write(tmp_path, rows())))
+
+
+def test_other_zones_become_utc_and_a_missing_zone_is_stated(tmp_path):
+    utc = read_deviations(write(tmp_path, rows()))
+    shifted = [line.replace("T06:", "T08:").replace("+00:00", "+02:00") for line in rows()]
+    converted = read_deviations(write(tmp_path, shifted))
+    assert (converted["time"].values == utc["time"].values).all()
+    assert converted["time"].attrs["reference"] == "converted to UTC from +0200"
+    bare = read_deviations(write(tmp_path, [line.replace("+00:00", "") for line in rows()]))
+    assert bare["time"].attrs["reference"] == "no zone in the file: taken as UTC"
+
+
+def test_lines_in_any_order_give_the_same_test(tmp_path, rng):
+    shuffled = list(rng.permutation(rows()))
+    assert read_deviations(write(tmp_path, shuffled)).equals(read_deviations(write(tmp_path, rows())))
+
+
+def test_overlapping_cycles_and_targets_that_move_or_coincide_are_refused(tmp_path):
+    lines = rows()
+    lines[5] = lines[5].replace("06:30:30", "06:30:36")
+    with pytest.raises(LaserFormatError, match=r"cycle 2 begins at .* \(line 8\) before cycle 1 ends at .* \(line 7\)"):
+        read_deviations(write(tmp_path, lines))
+    lines = [line.replace(",2,20,", ",2,25,") if line.startswith(("2", "3")) else line for line in rows()]
+    with pytest.raises(
+        LaserFormatError, match=r"target 2 is at 20\.0 mm on line 3 but at 25\.0 mm elsewhere \(2 of 6 read"
+    ):
+        read_deviations(write(tmp_path, lines))
+    lines = [line.replace(",3,40,", ",3,20,") for line in rows()]
+    with pytest.raises(LaserFormatError, match=r"targets 2 and 3 are both at 20.0 mm"):
+        read_deviations(write(tmp_path, lines))
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (HEADER.replace("time,", ""), "18 of 18 lines cannot be used, the first is line 2: '' does not have 5 fields"),
+        (HEADER + ",time", "column time occurs more than once"),
+    ],
+)
+def test_a_wrong_column_is_refused(tmp_path, header, message):
+    with pytest.raises(LaserFormatError, match=message):
+        read_deviations(write(tmp_path, rows(), header))
+
+
+def test_files_without_readings_or_without_text_are_refused(tmp_path):
+    with pytest.raises(LaserFormatError, match="no reading below the header"):
+        read_deviations(write(tmp_path, []))
+    empty = tmp_path / "empty.csv"
+    empty.write_bytes(b"")
+    with pytest.raises(LaserFormatError, match="the file is empty"):
+        read_deviations(empty)
+    empty.write_bytes(b"cycle\x00\xff\xfe")
+    with pytest.raises(LaserFormatError, match="character 6 is a zero byte, so the file is not text"):
+        read_deviations(empty)
+
+
+ENVIRONMENT = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC"
+
+
+def test_environment_is_sorted_and_its_faults_are_listed(tmp_path):
+    path = tmp_path / "environment.csv"
+    lines = [
+        "2026-03-09T06:32:00Z,23.7,1000.0,42,23.8",
+        "2026-03-09T06:30:00Z,23.5,1000.2,42,23.9",
+        "2026-03-09T06:31:00Z,23.6,101.3,42,23.9",
+        "2026-03-09T06:30:00Z,23.6,1000.2,42,23.9",
+        "2026-03-09T06:33:00Z,23.6,1000.2,42,-10",
+        "2026-03-09T06:34:00Z,23.6,1000.2,42,24.0",
+        "2026-03-09T06:35:00Z,23.6,1000.2,42,24.0",
+    ]
+    path.write_text("\n".join([ENVIRONMENT, *lines]), encoding="utf-8")
+    environment = read_environment(path)
+    assert environment["air_temperature"].values.tolist() == [23.5, 23.7, 23.6, 23.6]
+    reasons = {one["line"]: one["reason"] for one in left_out(environment)}
+    assert "is outside 500 .. 1200, the range of air_pressure_hPa in its unit" in str(reasons[4])
+    assert "occurs on an earlier line too" in str(reasons[5])
+    assert "lies outside -9 .. 80" in str(reasons[6])
+
+
+def test_environment_in_another_unit_or_as_a_fraction_is_refused(tmp_path):
+    path = tmp_path / "environment.csv"
+    path.write_text(ENVIRONMENT + "\n2026-03-09T06:32:00Z,23.7,101.3,42,23.8\n", encoding="utf-8")
+    with pytest.raises(
+        LaserFormatError,
+        match=r"1 of 1 lines cannot be used, the first is line 2: '101\.3' is outside 500 \.\. 1200, the range of air_pressure_hP",
+    ):
+        read_environment(path)
+    path = tmp_path / "environment.csv"
+    path.write_text(ENVIRONMENT + "\n2026-03-09T06:32:00Z,23.7,1000.1,0.45,23.8\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match=r"'0.45' is outside 1 .. 100, the range of relative_humidity_percent"):
+        read_environment(path)
+
+
+@pytest.mark.parametrize("read", [read_deviations, read_environment])
+def test_a_missing_file_is_named_by_the_error(read, tmp_path):
+    with pytest.raises(FileNotFoundError) as caught:
+        read(tmp_path / "laser.csv")
+    assert Path(caught.value.filename) == tmp_path / "laser.csv"
+
+
+def test_damaged_files_raise_no_foreign_error(tmp_path):
+    counts = fuzz(tmp_path, 250, seed=28)
+    assert sum(taken for taken, _ in counts.values()) > 25
+    assert sum(refused for _, refused in counts.values()) > 25
+
+
+HEADINGS = {
+    "english": "time,air temperature (°C),air pressure (hPa),humidity (%),material temperature (°C)",
+    "german": "Zeit,Lufttemperatur [°C],Luftdruck [hPa],Luftfeuchte [%],Materialtemperatur [°C]",
+    "french": "Heure,Température de l'air (°C),Pression (hPa),Humidité (%),Température matière (°C)",
+    "spanish": "Hora,Temperatura del aire (°C),Presión (hPa),Humedad (%),Temperatura del material (°C)",
+    "chinese": "时间,空气温度(°C),气压(hPa),湿度(%),材料温度(°C)",
+}
+
+
+@pytest.mark.parametrize("language", HEADINGS)
+def test_environment_headings_in_five_languages(tmp_path, language):
+    path = tmp_path / "environment.csv"
+    path.write_text(HEADINGS[language] + "\n2026-03-09T06:30:00Z,23.5,1000.2,42,23.9\n", encoding="utf-8")
+    assert is_environment_log(path)
+    assert read_environment(path)["air_pressure"].values.tolist() == [1000.2]
+
+
+def test_environment_in_other_units_is_converted(tmp_path):
+    path = tmp_path / "environment.csv"
+    head = "time,air_temperature_degF,pressure (kPa),humidity (%),sample temperature [K]"
+    path.write_text(head + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
+    environment = read_environment(path)
+    values = [float(environment[name][0]) for name in ("air_temperature", "air_pressure", "material_temperature")]
+    assert values == pytest.approx([20.0, 1013.0, 20.0], abs=1e-9)
+    path.write_text(head.replace("kPa", "mm") + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match=r"line 1: the unit of 'pressure .mm.' is none of a pressure"):
+        read_environment(path)
+    path.write_text("time,air_temperature_degC\n2026-03-09T06:32:00Z,20\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match="line 1 lacks air_pressure_hPa, relative_humidity_percent, material"):
+        read_environment(path)
+
+
+def test_a_report_of_averages_is_no_test(tmp_path):
+    path = tmp_path / "x.pos"
+    path.write_text("Position   \tBidirectional Avg Error\n0\t0.001\n10\t0.002\n")
+    with pytest.raises(LaserFormatError, match="a report of averages over runs holds no single reading; export the"):
+        read_deviations(path)
+
+
+#: Cycle, sign, target, position in mm, second and deviation in um of a small test.
+TEST = [
+    (
+        cycle,
+        sign,
+        target,
+        20.0 * (target - 1),
+        60 * cycle + (6 * target if sign > 0 else 40 - 6 * target),
+        cycle + 0.25 * target * sign,
+    )
+    for cycle in (1, 2)
+    for sign in (1, -1)
+    for target in (1, 2, 3)
+]
+EXPECTED = np.array([[[c + 0.25 * t * s for t in (1, 2, 3)] for s in (1, -1)] for c in (1, 2)])
+LINE = "{c},{d},{t},{p},2026-03-09T{clock},{e}"
+
+
+def table(header: str, line: str, *, minus: str = "-", plus: str = "+", decimal: str = ".") -> str:
+    rows = [header]
+    for cycle, sign, target, position, second, deviation in TEST:
+        clock = f"{6 + second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}"
+        rows.append(
+            line.format(
+                c=cycle,
+                d=plus if sign > 0 else minus,
+                t=target,
+                p=str(position).replace(".", decimal),
+                clock=clock,
+                e=str(deviation).replace(".", decimal),
+                nm=deviation * 1e3,
+                mm=f"{deviation / 1e3:.6f}",
+                measured=f"{position + deviation / 1e3:.6f}",
+                inch=f"{position / 25.4:.9f}",
+                zero=cycle - 1,
+                tz=target - 1,
+                run=2 * cycle - (1 if sign > 0 else 0),
+            )
+        )
+    return "\n".join(rows) + "\n"
+
+
+def read(folder: Path, text: str, encoding: str = "utf-8", **options: bool) -> xr.Dataset:
+    path = folder / "laser.csv"
+    path.write_bytes(text.encode(encoding))
+    return read_deviations(path, **options)
+
+
+SIGNS = table(HEADER, LINE)
+DIALECTS = {
+    "german": table(
+        "Zyklus;Richtung;Punkt;Sollposition [mm];Datum;Uhrzeit;Abweichung [µm]",
+        "{c};{d};{t};{p};9.3.2026;{clock};{e}",
+        decimal=",",
+        plus="vorwärts",
+        minus="rückwärts",
+    ),
+    "french": table(
+        "Cycle;Sens;Point de mesure;Position cible (mm);Date;Heure;Écart (µm)",
+        "{c};{d};{t};{p};09.03.2026;{clock};{e}",
+        decimal=",",
+        plus="aller",
+        minus="retour",
+    ),
+    "spanish": table(
+        "Ciclo;Sentido;Punto;Posición (mm);Fecha y hora;Desviación (µm)",
+        "{c};{d};{t};{p};9.3.2026 {clock};{e}",
+        decimal=",",
+        plus="ida",
+        minus="vuelta",
+    ),
+    "chinese": table(
+        "循环,方向,目标,位置(mm),时间,偏差(μm)", "{c},{d},{t},{p},2026年3月9日 {clock},{e}", plus="正向", minus="反向"
+    ),
+    "signs": SIGNS,
+    "typographic minus": table(HEADER, LINE, minus="−").replace(",-", ",−"),
+    "forward": table(
+        "Cycle\tApproach\tTarget No.\tTarget [mm]\tTime\tError [um]",
+        LINE.replace(",", "\t").replace("T{", " {"),
+        plus="Forward",
+        minus="Reverse",
+    ),
+    "nanometres": table(HEADER.replace("_um", "_nm"), LINE.replace("{e}", "{nm}")),
+    "millimetres": table(HEADER.replace("_um", "_mm"), LINE.replace("{e}", "{mm}")),
+    "inches": table(HEADER.replace("position_mm", "position (inch)"), LINE.replace("{p}", "{inch}")),
+    "measured": table(HEADER.replace("deviation_um", "measured (mm)"), LINE.replace("{e}", "{measured}")),
+    "no targets": table(HEADER.replace("target,", ""), LINE.replace("{t},", "")),
+    "from 0": table(HEADER, LINE.replace("{c}", "{zero}").replace("{t}", "{tz}")),
+    "runs": table(HEADER.replace("cycle", "run"), LINE.replace("{c}", "{run}")),
+    "named numbers": table(HEADER, LINE.replace("{c}", "Cycle {c}").replace("{t}", "P{t}")),
+    "units row": table("cycle,direction,target,position,time,deviation\n,,,mm,,um", LINE),
+    "title": "Machine;X axis\nOperator;N.N.\n\n" + SIGNS.replace(",", ";"),
+    "quoted": table(HEADER, '"{c}","{d}","{t}","{p}","2026-03-09T{clock}","{e}"', decimal=","),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_every_dialect_gives_the_same_test(tmp_path, dialect):
+    test = read(tmp_path, DIALECTS[dialect])
+    # Inches of nine decimals place a target within 1e-8 mm; all other numbers are exact.
+    assert test["position"].values == pytest.approx([0.0, 20.0, 40.0], abs=1e-7)
+    assert test["deviation"].values == pytest.approx(EXPECTED, abs=1e-9)
+    assert test["time"].values[0, 0, 0] == np.datetime64("2026-03-09T06:01:06")
+    assert (test["deviation"].attrs["units"], test["position"].attrs["units"]) == ("um", "mm")
+    assert json.loads(test.attrs["left_out"]) == []
+
+
+@pytest.mark.parametrize(("dialect", "encoding"), [("german", "cp1252"), ("german", "utf-16"), ("chinese", "gb18030")])
+def test_encodings_of_spreadsheet_programs(tmp_path, dialect, encoding):
+    assert read(tmp_path, DIALECTS[dialect], encoding).equals(read(tmp_path, DIALECTS[dialect]))
+
+
+def test_a_sheet_with_title_merged_cycles_and_dates_is_read_among_others(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.append(["Operator", "N.N."])
+    sheet = book.create_sheet("X axis")
+    sheet.append(["Positioning test of the X axis"])
+    sheet.merge_cells("A1:F1")
+    sheet.append(["Cycle", "Direction", "Position [mm]", "Date", "Time", "Deviation [µm]"])
+    for row, (cycle, sign, _, position, second, deviation) in enumerate(TEST):
+        day = np.datetime64("2026-03-09").item()
+        clock = (np.datetime64("2026-03-09T06:00") + np.timedelta64(second, "s")).item().time()
+        sheet.append([cycle if row % 6 == 0 else None, sign, position, day, clock, deviation])
+    sheet.merge_cells("A3:A8")
+    sheet.merge_cells("A9:A14")
+    path = tmp_path / "laser.xlsx"
+    book.save(path)
+    test = read_deviations(path)
+    assert test["deviation"].values.tolist() == EXPECTED.tolist()
+    assert test["time"].values[0, 0, 0] == np.datetime64("2026-03-09T06:01:06")
+    book.copy_worksheet(sheet).title = "Y axis"
+    book.save(path)
+    with pytest.raises(LaserFormatError, match="the sheets 'X axis', 'Y axis' each hold a table of deviations; name"):
+        read_deviations(path)
+    assert read_deviations(path, sheet="Y axis").equals(test)
+    with pytest.raises(LaserFormatError, match="there is no sheet 'Z'; the sheets are 'Sheet', 'X axis', 'Y axis'"):
+        read_deviations(path, sheet="Z")
+
+
+def test_turned_directions_and_numbering_from_0_are_told(tmp_path):
+    turned = DIALECTS["forward"].replace("Forward", "?").replace("Reverse", "Forward").replace("?", "Reverse")
+    test = read(tmp_path, turned)
+    assert test["deviation"].values.tolist() == EXPECTED.tolist()
+    assert json.loads(test.attrs["notes"]) == [
+        "the forward runs lead to smaller positions: they are the negative direction"
+    ]
+    assert json.loads(read(tmp_path, DIALECTS["from 0"]).attrs["notes"]) == [
+        "the file numbers its cycles from 0: 1 was added",
+        "the file numbers its targets from 0: 1 was added",
+    ]
+
+
+def test_a_rotary_axis_keeps_its_units_and_is_refused_elsewhere(tmp_path):
+    text = table("cycle,direction,position (°),deviation (arcsec)", "{c},{d},{p},{e}")
+    test = read(tmp_path, text, rotary=True)
+    assert (test["deviation"].attrs["units"], test["position"].attrs["units"]) == ("arcsec", "deg")
+    assert test["deviation"].values == pytest.approx(EXPECTED, abs=1e-6)
+    with pytest.raises(LaserFormatError, match=r"the positions are angles; .* only the evaluation by ISO 230-2 is"):
+        read(tmp_path, text)
+
+
+def test_a_table_without_times_says_so(tmp_path):
+    test = read(tmp_path, table("cycle,direction,position_mm,deviation_um", "{c},{d},{p},{e}"))
+    assert test["time"].attrs["origin"] == "none"
+    assert np.isnat(test["time"].values).all()
+    assert not test["quality_flag"].any()
+
+
+@pytest.mark.parametrize("mark", ["9999", "-99999.999", "1_2.5", "−−1"])
+def test_a_mark_for_no_reading_is_no_value(tmp_path, mark):
+    test = read(tmp_path, DIALECTS["signs"].replace("01:06,1.25", f"01:06,{mark}"))
+    assert np.isnan(test["deviation"].values[0, 0, 0])
+    (line,) = json.loads(test.attrs["left_out"])
+    assert (line["line"], line["value"]) == (2, mark)
+
+
+@pytest.mark.parametrize(
+    ("header", "line", "message"),
+    [
+        ("cycle,direction,position,deviation_um", "{c},{d},{p},{e}", r"'position' has no unit; .*\[mm\]"),
+        ("cycle,direction,position_mm,deviation_degC", "{c},{d},{p},{e}", "position in mm, deviation in degc; give"),
+        (f"{HEADER},error_um", f"{LINE},{{e}}", "'deviation_um' and 'error_um' both name the deviation"),
+        (HEADER, LINE.replace("2026-03-09T", "3/9/2026 "), "line 2: '3/9/2026 .* the day or the month first"),
+        ("cycle,position_mm,deviation_um", "{c},{p},{e}", "cycle, position, deviation, but no column of a direction"),
+        ("a,b,c,d", "{c},{d},{p},{e}", "no table of deviations; line 1 is 'a,b,c,d'; expected one reading per line"),
+    ],
+)
+def test_what_a_table_lacks_is_named(tmp_path, header, line, message):
+    with pytest.raises(LaserFormatError, match=message):
+        read(tmp_path, table(header, line))
+
+
+WIDE_EXPECTED = np.array([[[1.25, 1.5, 1.75], [0.75, 0.5, 0.25]], [[2.25, 2.5, 2.75], [1.75, 1.5, 1.25]]])
+ROWS = [(0, 1.25, 0.75, 2.25, 1.75), (20, 1.5, 0.5, 2.5, 1.5), (40, 1.75, 0.25, 2.75, 1.25)]
+DATA = "\n".join(",".join(map(str, row)) for row in ROWS)
+BY_DIRECTION = "\n".join(",".join(str(row[i]) for i in (0, 1, 3, 2, 4)) for row in ROWS)
+BESIDE = "{0},{1},1.25,1.5,1.75\n{0},{2},.75,.5,.25\n{3},{1},2.25,2.5,2.75\n{3},{2},1.75,1.5,1.25\n"
+
+
+def read_wide(folder: Path, text: str, **options: bool) -> xr.Dataset:
+    path = folder / "wide.csv"
+    path.write_text(text, encoding="utf-8")
+    return read_deviations(path, **options)
+
+
+WIDE_DIALECTS = {
+    "signs": f"Position [mm],1+ [um],1- [um],2+ [um],2- [um]\n{DATA}",
+    "signs first": f"Position [mm],+1 [um],-1 [um],+2 [um],-2 [um]\n{DATA}",
+    "words": f"Unit: µm\nPosition (mm),Run 1 forward,Run 1 reverse,Run 2 forward,Run 2 reverse\n{DATA}",
+    "alternating runs": f"Position (mm),Run 1 + (µm),Run 2 - (µm),Run 3 + (µm),Run 4 - (µm)\n{DATA}",
+    "two rows": f"Deviations in µm\nPosition (mm),Cycle 1,,Cycle 2,\n,+,-,+,-\n{DATA}",
+    "rows above": f"Abweichungen [µm]\n,Zyklus 1,,Zyklus 2,\nSollposition [mm],+,-,+,-\n{DATA}",
+    "by direction": f"Écarts (µm),,,,\n,Aller,,Retour,\nPosition cible (mm),1,2,1,2\n{BY_DIRECTION}",
+    "unnumbered": f"Unit,um\nPosition [mm],+,-,+,-\n{DATA}",
+    "units row": f"Position,1+,1-,2+,2-\nmm,um,um,um,um\n{DATA}",
+    "chinese": f"位置(mm),第1次正向(μm),第1次反向(μm),第2次正向(μm),第2次反向(μm)\n{DATA}",
+    "summary columns": "Position [mm],1+ [um],1- [um],2+ [um],2- [um],Mean + [um],s\n"
+    + "\n".join(f"{line},0.5,0.1" for line in DATA.split("\n")),
+    "runs down": "Deviation [um]\nRun \\ Position [mm],Direction,0,20,40\n" + BESIDE.format(1, "+", "-", 2),
+    "runs down, units in the headings": "Unit: um\nCycle,Direction,0 mm,20 mm,40 mm\n"
+    + BESIDE.format(1, "fwd", "rev", 2),
+    "runs down in one label": "Unit: um\nRun,0 mm,20 mm,40 mm\n" + BESIDE.replace(",{", "{").format(1, "+", "-", 2),
+}
+
+
+@pytest.mark.parametrize("dialect", WIDE_DIALECTS)
+def test_every_dialect_of_a_wide_table_gives_the_same_test(tmp_path, dialect):
+    test = read_wide(tmp_path, WIDE_DIALECTS[dialect])
+    assert test["position"].values.tolist() == [0.0, 20.0, 40.0]
+    assert test["deviation"].values.tolist() == WIDE_EXPECTED.tolist()
+    assert test["time"].attrs["origin"] == "none"
+    assert test.attrs["missing"] == 0
+
+
+def test_columns_that_are_no_runs_empty_cells_and_words_are_named(tmp_path):
+    assert json.loads(read_wide(tmp_path, WIDE_DIALECTS["summary columns"]).attrs["columns_ignored"]) == [
+        "Mean + [um]",
+        "s",
+    ]
+    text = WIDE_DIALECTS["signs"].replace("0,1.25,", "0,,").replace("20,1.5", "20,fail")
+    test = read_wide(tmp_path, text + "\nMean,1,1,1,1\n")
+    assert np.isnan(test["deviation"].values[0, 0, :2]).all()
+    assert test.attrs["missing"] == 2
+    (line,) = json.loads(test.attrs["left_out"])
+    assert (line["line"], line["value"], line["reason"]) == (3, "fail", "is not a number")
+
+
+@pytest.mark.parametrize("kind", ["xlsx", "ods"])
+def test_a_sheet_with_merged_headings(tmp_path, kind):
+    rows = [
+        ["Deviations [um]"],
+        ["Position [mm]", "Cycle 1", "", "Cycle 2", ""],
+        ["", "+", "-", "+", "-"],
+        *map(list, ROWS),
+    ]
+    path = tmp_path / f"wide.{kind}"
+    if kind == "ods":
+        write_ods(path, rows)
+    else:
+        book = openpyxl.Workbook()
+        for row in rows:
+            book.active.append([value if value != "" else None for value in row])
+        for cells in ("A1:E1", "A2:A3", "B2:C2", "D2:E2"):
+            book.active.merge_cells(cells)
+        book.save(path)
+    assert read_deviations(path)["deviation"].values.tolist() == WIDE_EXPECTED.tolist()
+
+
+def test_a_rotary_axis_in_degrees_and_arcseconds(tmp_path):
+    text = WIDE_DIALECTS["signs"].replace("[mm]", "[deg]").replace("[um]", "[arcsec]")
+    test = read_wide(tmp_path, text, rotary=True)
+    assert test["deviation"].attrs["units"] == "arcsec"
+    assert test["deviation"].values == pytest.approx(WIDE_EXPECTED, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"Position,1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", r"line 1: the positions have no unit; .* \"Position"),
+        (f"Position [mm],1+,1-,2+,2-\n{DATA}", "the deviations have no unit; write it in the headings"),
+        (f"Position [deg],1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", "positions in deg, deviations in um; give both as"),
+        (f"Position [mm],1+ [um],1- [um],2+ [um],- [um]\n{DATA}", "'- .um.' has no number, but other runs have"),
+        (f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}", "no table of deviations; line 1 has columns of"),
+        ("Position [mm],1+ [um],1- [um]\n0,1,2\n0,1,2\n20,1,2\n", r"cycle 1 positive target 1|targets .* both stand"),
+    ],
+)
+def test_what_a_wide_table_lacks_is_named(tmp_path, text, message):
+    if "0,1,2\n0,1,2" in text:
+        assert message.split("|")[0] in read_wide(tmp_path, text).attrs["left_out"]
+        return
+    with pytest.raises(LaserFormatError, match=message):
+        read_wide(tmp_path, text)
+
+
+def test_one_wide_line_above_many_short_ones_does_not_fill_the_memory(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("Position [mm]" + "," * 16_000 + "\n" + "1\n" * 100_000)
+    tracemalloc.start()
+    (grid,) = read_grids(path)
+    assert find_wide_table(grid) is None
+    assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size + 200e6
+    tracemalloc.stop()

@@ -1,11 +1,7 @@
-"""Renishaw files: the traps of the genuine one, broken promises of the header, and round trips."""
-
-from __future__ import annotations
+"""Renishaw files and logs of assignments: the traps of the genuine one, and broken promises of the header."""
 
 import json
 import re
-import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +9,14 @@ import pytest
 
 from interferometry.inspection import describe_test
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.readers import read_deviations
-from interferometry.io.renishaw import read_rtx
+from interferometry.io.readings import read_deviations
+from interferometry.io.renishaw import read_ecmc_log
 
 GENUINE = "friedcucumber__RenishawWork/data/22.rtl"
 
 
 @pytest.mark.real_data
-def test_genuine_file_with_all_its_traps(real_file: Callable[[str], Path]) -> None:
+def test_genuine_file_with_all_its_traps(real_file):
     test = read_deviations(real_file(GENUINE))
     assert test.sizes["cycle"] == 1
     assert test["position"].values.tolist() == list(np.arange(-280.0, 421.0, 50.0))
@@ -39,7 +35,7 @@ def test_genuine_file_with_all_its_traps(real_file: Callable[[str], Path]) -> No
 
 
 @pytest.mark.real_data
-def test_genuine_file_gets_times_with_their_uncertainty(real_file: Callable[[str], Path]) -> None:
+def test_genuine_file_gets_times_with_their_uncertainty(real_file):
     test = read_deviations(real_file(GENUINE))
     times = test["time"].sel(direction="positive").values[0]
     assert test["time"].attrs["origin"] == "reconstructed"
@@ -86,14 +82,14 @@ def rtl(folder: Path, old: str = "", new: str = "", *, line_end: str = "\n") -> 
     return path
 
 
-def test_runs_become_cycles_and_directions(tmp_path: Path) -> None:
+def test_runs_become_cycles_and_directions(tmp_path):
     test = read_deviations(rtl(tmp_path))
     assert test["deviation"].sel(direction="positive").values.tolist() == [[1.1, 1.2, 1.3], [3.1, 3.2, 3.3]]
     assert test["deviation"].sel(direction="negative").values.tolist() == [[-2.1, -2.2, -2.3], [-4.1, -4.2, -4.3]]
     assert read_deviations(rtl(tmp_path, line_end="\r\n")).equals(test)
 
 
-def test_a_test_measured_in_one_direction_has_one_direction(tmp_path: Path) -> None:
+def test_a_test_measured_in_one_direction_has_one_direction(tmp_path):
     text = rtl(tmp_path).read_text("latin-1")
     reverse = "\n".join(f"2 {target} {-2 - target / 10}" for target in (3, 2, 1))
     forward = "\n".join(f"2 {target} {-2 - target / 10}" for target in (1, 2, 3))
@@ -109,7 +105,7 @@ def test_a_test_measured_in_one_direction_has_one_direction(tmp_path: Path) -> N
     assert np.isnan(test["deviation"].sel(direction="negative")).all()
 
 
-def test_feed_and_dwell_place_readings_within_their_run(tmp_path: Path) -> None:
+def test_feed_and_dwell_place_readings_within_their_run(tmp_path):
     test = read_deviations(rtl(tmp_path), feed_mm_per_min=300.0, dwell_s=2.0)
     steps = np.diff(test["time"].sel(direction="positive").values[0]) / np.timedelta64(1, "s")
     assert steps == pytest.approx([4.0, 4.0])
@@ -123,15 +119,15 @@ def test_feed_and_dwell_place_readings_within_their_run(tmp_path: Path) -> None:
         ("10.000000 \nFlags", "ten\nFlags", r"line 9: 'ten' is not a row of target positions"),
         ("Run-count:4", "Run-count:2", r"Run-count is 2, but DEVIATIONS holds runs \[1, 2, 3, 4\]"),
         (": rtl", ": rta", "File type is rta, not rtl; only linear tests"),
-        ("Run-count:4", "Run-count:ten", "line 13: Run-count is 'ten' and no whole number; copy the file again"),
-        ("Run-count:4", "Run+count:ten", "line 13: Run-count is 'ten' and no whole number"),
-        ("Target-count: 3", "Target-count: five", "line 6: Target-count is 'five' and no whole number"),
+        ("Run-count:4", "Run-count:ten", "line 13: Run-count is 'ten' and not a whole number; copy the file again"),
+        ("Run-count:4", "Run+count:ten", "line 13: Run-count is 'ten' and not a whole number"),
+        ("Target-count: 3", "Target-count: five", "line 6: Target-count is 'five' and not a whole number"),
         ("10.000000 \nFlags", "1_0.0\nFlags", r"line 9: '1_0.0' is not a row of target positions"),
         ("EOF::", "", "no section EOF::; the file is cut short"),
         ("DEVIATIONS::", "DEVIATIONS", "no section DEVIATIONS::"),
     ],
 )
-def test_broken_promises_of_the_header_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_broken_promises_of_the_header_are_refused(tmp_path, old, new, message):
     with pytest.raises(LaserFormatError, match=message):
         read_deviations(rtl(tmp_path, old, new))
 
@@ -146,26 +142,20 @@ def test_broken_promises_of_the_header_are_refused(tmp_path: Path, old: str, new
         ("1 1 1.2", "repeats run 1 target 1, the first is kept"),
     ],
 )
-def test_bad_rows_are_left_out_with_their_line(tmp_path: Path, new: str, reason: str) -> None:
+def test_bad_rows_are_left_out_with_their_line(tmp_path, new, reason):
     test = read_deviations(rtl(tmp_path, "1 2 1.2", new))
     (listed,) = json.loads(test.attrs["left_out"])
     assert (listed["line"], listed["reason"]) == (18, reason)
     assert np.isnan(test["deviation"].values[0, 0, 1])
 
 
-def test_minus_1e20_is_a_missing_reading(tmp_path: Path) -> None:
+def test_missing_readings_and_times_are_said_and_the_second_spelling_has_no_seconds(tmp_path):
     test = read_deviations(rtl(tmp_path, "1 2 1.2", "1 2 -100000000000000000000.000"))
     assert np.isnan(test["deviation"].values[0, 0, 1])
     assert test.attrs["missing"] == 1
-
-
-def test_a_file_without_times_says_so(tmp_path: Path) -> None:
     test = read_deviations(rtl(tmp_path, "DateTime", "Nothing"))
     assert test["time"].attrs["origin"] == "none"
     assert np.isnat(test["time"].values).all()
-
-
-def test_the_second_spelling_of_times_has_no_seconds(tmp_path: Path) -> None:
     old = '"2014-10-08 10:00:00" "2014-10-08 10:02:00"'
     test = read_deviations(rtl(tmp_path, old, '"10:46 Dec 12 2016" "11:01 Dec 12 2016"'))
     assert test["time"].attrs["origin"] == "reconstructed"
@@ -177,7 +167,7 @@ def test_the_second_spelling_of_times_has_no_seconds(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "times", ['"2014-13-08 10:00:00" "2014-10-08 10:02:00"', '"10:46 Foo 12 2016" "11:01 Dec 12 2016"']
 )
-def test_times_that_do_not_exist_are_no_times(tmp_path: Path, times: str) -> None:
+def test_times_that_do_not_exist_are_no_times(tmp_path, times):
     test = read_deviations(rtl(tmp_path, '"2014-10-08 10:00:00" "2014-10-08 10:02:00"', times))
     assert test["time"].attrs["origin"] == "none"
 
@@ -190,22 +180,19 @@ def zero_filled(folder: Path, flags: str) -> Path:
     return path
 
 
-def test_zero_filled_reverse_runs_of_a_unidirectional_test_are_no_readings(tmp_path: Path) -> None:
+def test_zero_filled_runs_are_readings_of_a_bidirectional_test_only(tmp_path):
     test = read_deviations(zero_filled(tmp_path, "0 1 2 0"))
     assert np.isnan(test["deviation"].sel(direction="negative")).all()
     assert test["deviation"].sel(direction="positive").values.tolist() == [[1.1, 1.2, 1.3], [3.1, 3.2, 3.3]]
     assert json.loads(test.attrs["notes"]) == [
         "run 2, 4 holds nothing but zeros and the flags say that one direction was measured: taken as not measured"
     ]
-
-
-def test_a_run_of_zeros_in_a_bidirectional_test_is_kept_and_told(tmp_path: Path) -> None:
     test = read_deviations(zero_filled(tmp_path, "0 0 2 0"))
     assert (test["deviation"].sel(direction="negative") == 0.0).all()
     assert any("every reading of run 2, 4 is 0" in line for line in describe_test(test))
 
 
-def test_damaged_numbers_of_the_environment_are_missing(tmp_path: Path) -> None:
+def test_damaged_numbers_of_the_environment_are_missing(tmp_path):
     test = read_deviations(
         rtl(tmp_path, "DateTime", "Air temp : -- --\nAir press : 101.1\nMat temp 1 : 1_2 20.5\nDateTime")
     )
@@ -214,40 +201,38 @@ def test_damaged_numbers_of_the_environment_are_missing(tmp_path: Path) -> None:
     assert np.isnan(test["material_temperature"].values).tolist() == [[True, False]]
 
 
-def rtx(folder: Path, samples: int, stated: object, *, end: bytes = b"EOF::\r\n", rate: str = "100") -> Path:
-    header = f"HEADER::\r\nFile Type: rtx\r\nSample no: {stated}\r\nActual sample rate: {rate}\r\nData:\r\n"
-    path = folder / "t.rtx"
-    path.write_bytes(header.encode() + struct.pack(f"<{samples}d", *range(samples)) + end)
+def test_a_dynamic_capture_is_refused(tmp_path):
+    path = tmp_path / "t.rtx"
+    path.write_bytes(b"HEADER::\r\nFile Type: rtx\r\nSample no: 5\r\nData:\r\n" + bytes(40) + b"EOF::\r\n")
+    with pytest.raises(LaserFormatError, match=r"t\.rtx: a dynamic capture .* has no target positions"):
+        read_deviations(path)
+
+
+def log(folder: Path, old: str = "", new: str = "") -> Path:
+    lines = ["UNIT=mm", "CYCLES=2", "POSITIONS=2"]
+    lines += [f"TGT_DATA[{t}]={10 * t}" for t in (1, 2)]
+    lines += [f"REF_DATA_{d}[{t},{c}]={10 * t + c / 1000}" for d in ("FWD", "BWD") for t in (1, 2) for c in (1, 2)]
+    text = "\n".join(lines)
+    assert old in text
+    path = folder / "log.dat"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
     return path
 
 
-def test_rtx_gives_displacement_and_seconds(tmp_path: Path) -> None:
-    capture = read_rtx(rtx(tmp_path, 5, 5))
-    assert capture["displacement"].values.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert capture["seconds"].values[-1] == pytest.approx(0.04)
+def test_logs_of_assignments_are_read(tmp_path):
+    test = read_deviations(log(tmp_path))
+    assert test["deviation"].values[:, 0, :] == pytest.approx(np.array([[1.0, 1.0], [2.0, 2.0]]))
+    assert test["time"].attrs["origin"] == "none"
 
 
-def test_rtx_is_not_a_test_of_targets(tmp_path: Path) -> None:
-    with pytest.raises(LaserFormatError, match="a dynamic capture has no targets; read it with"):
-        read_deviations(rtx(tmp_path, 5, 5))
-
-
-def test_rtx_that_breaks_its_promises_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LaserFormatError, match="'Sample no' is 6, but 5 samples follow"):
-        read_rtx(rtx(tmp_path, 5, 6))
-    with pytest.raises(LaserFormatError, match="HEADER::, Data: or EOF:: is missing"):
-        read_rtx(rtx(tmp_path, 5, 5, end=b""))
-    with pytest.raises(LaserFormatError, match="no 'Actual sample rate'"):
-        read_rtx(rtx(tmp_path, 5, 5, rate="0"))
-    with pytest.raises(LaserFormatError, match="line 4: Actual sample rate is 'many', which is not a number"):
-        read_rtx(rtx(tmp_path, 5, 5, rate="many"))
-    with pytest.raises(LaserFormatError, match="line 3: Sample no is 'ten', which is not a number"):
-        read_rtx(rtx(tmp_path, 5, "ten"))
-    assert read_rtx(rtx(tmp_path, 5, 5, rate="50000,0"))["seconds"].values[1] == 2e-5
-
-
-def test_rtx_with_samples_that_are_no_numbers_is_refused(tmp_path: Path) -> None:
-    path = rtx(tmp_path, 5, 5)
-    path.write_bytes(path.read_bytes().replace(struct.pack("<d", 3.0), struct.pack("<d", float("nan"))))
-    with pytest.raises(LaserFormatError, match="1 of 5 samples are no numbers, the first is sample 4"):
-        read_rtx(path)
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("UNIT=mm", "UNIT=inch", "UNIT=inch is not known; use one of mm, um, m"),
+        ("CYCLES=2", "CYCLES=5", "CYCLES=5, but 2 were found"),
+        ("TGT_DATA[2]", "TGT_DATA[3]", r"TGT_DATA gives targets \[1, 3\]"),
+    ],
+)
+def test_logs_that_break_their_promises_are_refused(tmp_path, old, new, message):
+    with pytest.raises(LaserFormatError, match=message):
+        read_ecmc_log(log(tmp_path, old, new))

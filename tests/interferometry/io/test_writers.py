@@ -1,19 +1,16 @@
 """Written files are read back as they were."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from interferometry.io.readers import read_deviations, read_environment
+from interferometry.io.readings import read_deviations, read_environment
 from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
 from tests.interferometry.simulated_campaigns import simulate
 
 
-def test_rtl_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_rtl_round_trip(tmp_path, rng):
     deviations, _ = simulate(rng, cycles=3)
     deviations["deviation"].values[1, 0, 5] = np.nan
     environment = {"air_temperature_degC": (20.5, 21.0), "air_pressure_hPa": (1000.0, 1001.0)}
@@ -25,13 +22,13 @@ def test_rtl_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     assert json.loads(back.attrs["user_text"])["machine"] == "X3"
 
 
-def test_rtl_writer_refuses_what_has_no_place(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_rtl_writer_refuses_what_has_no_place(tmp_path, rng):
     deviations, _ = simulate(rng, cycles=2)
     with pytest.raises(ValueError, match=r"environment: wind has no place in a .rtl"):
         write_rtl(tmp_path / "t.rtl", deviations, environment={"wind": (1.0, 2.0)})
 
 
-def test_csv_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_csv_round_trip(tmp_path, rng):
     deviations, _ = simulate(rng, cycles=3)
     write_deviations_csv(tmp_path / "t.csv", deviations)
     back = read_deviations(tmp_path / "t.csv")
@@ -39,7 +36,7 @@ def test_csv_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
     assert (back["time"].values == deviations["time"].values).all()
 
 
-def test_environment_csv_round_trip(tmp_path: Path) -> None:
+def test_environment_csv_round_trip(tmp_path):
     source = tmp_path / "a.csv"
     source.write_text(
         "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC\n"

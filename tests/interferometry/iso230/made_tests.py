@@ -1,20 +1,17 @@
 """Positioning tests of known numbers, and the quantities of the standard by hand."""
 
-from __future__ import annotations
-
 import numpy as np
-import xarray as xr
 
 from interferometry.deviations import build_deviations
 
 
-def test_made(x: np.ndarray) -> xr.Dataset:
+def test_made(x):
     """A test from (cycle, direction, target) deviations in um."""
     time = np.full(x.shape, np.datetime64("NaT", "ns"))
     return build_deviations(range(1, len(x) + 1), range(1, x.shape[2] + 1), np.arange(x.shape[2]) * 10.0, x, time)
 
 
-test_made.__test__ = False  # type: ignore[attr-defined]
+test_made.__test__ = False
 
 
 def by_hand(x: np.ndarray) -> dict[str, float]:

@@ -1,6 +1,4 @@
-"""Conditions that the standard asks of a test."""
-
-from __future__ import annotations
+"""Conditions that the standard asks of a test, and decisions within the uncertainty."""
 
 import numpy as np
 import pytest
@@ -8,12 +6,12 @@ import xarray as xr
 
 from interferometry.deviations import build_deviations
 from interferometry.drift.planning import Settling
-from interferometry.iso230.conditions import ConditionCheck, check_conditions
+from interferometry.iso230.conditions import ConditionCheck, check_conditions, decide
 
 CYCLES = [1, 2, 3, 4, 5]
 
 
-def test_at(position: list[float], cycles: int = 5) -> xr.Dataset:
+def at_positions(position, cycles=5):
     """A test at these positions, one cycle in 10 min."""
     shape = (cycles, 2, len(position))
     seconds = 600.0 * np.arange(cycles)[:, None, None] + np.arange(2 * len(position)).reshape(1, 2, -1)
@@ -23,46 +21,37 @@ def test_at(position: list[float], cycles: int = 5) -> xr.Dataset:
     )
 
 
-test_at.__test__ = False  # type: ignore[attr-defined]
-
-
 def found(deviations: xr.Dataset, **options: object) -> dict[str, ConditionCheck]:
-    checks = check_conditions(deviations, cycles=CYCLES, **options)  # type: ignore[arg-type]
+    checks = check_conditions(deviations, cycles=CYCLES, **options)
     names = ("targets", "travel", "spacing", "cycles", "completeness", "settled")
     return dict(zip(names, checks, strict=True))
 
 
-def test_a_test_as_the_standard_asks_for_it() -> None:
-    checks = found(test_at([0.0, 107.0, 195.0, 310.0, 402.0]), lead_mm=10.0, settling=[])
+def test_a_test_as_the_standard_asks_for_it():
+    checks = found(at_positions([0.0, 107.0, 195.0, 310.0, 402.0]), lead_mm=10.0, settling=[])
     assert all(check.met for check in checks.values())
     assert checks["spacing"].evidence == "Spacings of 88 to 115 mm."
 
 
-def test_too_few_targets_for_the_travel() -> None:
-    checks = found(test_at(list(np.linspace(0.0, 2500.0, 7) + 3.0 * np.arange(7) ** 2)))
+def test_too_few_targets_and_equal_spacings_are_told():
+    checks = found(at_positions(list(np.linspace(0.0, 2500.0, 7) + 3.0 * np.arange(7) ** 2)))
     assert checks["targets"].met is False and "asked for: 14" in checks["targets"].evidence
     assert checks["travel"].met is False and "targets about 250 mm apart" in checks["travel"].evidence
     assert checks["settled"].met is None
-
-
-def test_equal_spacings_hide_periodic_errors_and_whole_leads_those_of_the_screw() -> None:
-    equal = test_at([0.0, 25.0, 50.0, 75.0, 100.0])
+    equal = at_positions([0.0, 25.0, 50.0, 75.0, 100.0])
     assert "All spacings are 25 mm" in found(equal)["spacing"].evidence
     assert "whole number of leads (5 mm)" in found(equal, lead_mm=5.0)["spacing"].evidence
     assert "All spacings" in found(equal, lead_mm=10.0)["spacing"].evidence
     assert found(equal)["spacing"].met is False
-
-
-def test_missing_readings_and_other_numbers_of_cycles_are_counted() -> None:
-    deviations = test_at([0.0, 20.0, 45.0, 70.0, 100.0])
+    deviations = at_positions([0.0, 20.0, 45.0, 70.0, 100.0])
     deviations["deviation"][2, 1, 3] = np.nan
     assert found(deviations)["completeness"].evidence == "1 of 50 readings of the window are missing."
     assert check_conditions(deviations, cycles=[1, 2, 3])[3].met is False
 
 
 @pytest.mark.parametrize(("t95_s", "met"), [(1000.0, True), (1400.0, False)])
-def test_the_window_must_begin_after_the_warm_up(t95_s: float, met: bool) -> None:
-    deviations = test_at([0.0, 20.0, 45.0, 70.0, 100.0], cycles=7)
+def test_the_window_must_begin_after_the_warm_up(t95_s, met):
+    deviations = at_positions([0.0, 20.0, 45.0, 70.0, 100.0], cycles=7)
     settling = Settling("stretch", 500.0, 400.0, 600.0, t95_s, 900.0, np.inf, 4.0)
     check = check_conditions(deviations, cycles=[3, 4, 5, 6, 7], settling=[settling])[-1]
     # Cycle 3 begins 1200 s after the first reading.
@@ -70,9 +59,9 @@ def test_the_window_must_begin_after_the_warm_up(t95_s: float, met: bool) -> Non
     assert "to longer than the test can show" in check.evidence and "begins after 0.3 h" in check.evidence
 
 
-def test_an_axis_that_drifts_without_an_end_is_not_called_warmed_up() -> None:
+def test_an_axis_that_drifts_without_an_end_is_not_called_warmed_up():
     rng = np.random.default_rng(5)
-    deviations = test_at([0.0, 107.0, 195.0, 310.0, 402.0])
+    deviations = at_positions([0.0, 107.0, 195.0, 310.0, 402.0])
     deviations["deviation"] = deviations["deviation"] + rng.normal(0.0, 0.3, deviations["deviation"].shape)
     assert found(deviations, settling=[])["settled"].met
     # 2 um at the far end over the five cycles, as a warm-up that has hardly begun; its end position shows it best.
@@ -83,9 +72,9 @@ def test_an_axis_that_drifts_without_an_end_is_not_called_warmed_up() -> None:
     assert 0.8 <= float(check.evidence.split("by up to ")[1].split()[0]) <= 3.2
 
 
-def test_scatter_alone_is_seldom_called_a_trend() -> None:
+def test_scatter_alone_is_seldom_called_a_trend():
     rng = np.random.default_rng(6)
-    deviations = test_at([0.0, 107.0, 195.0, 310.0, 402.0])
+    deviations = at_positions([0.0, 107.0, 195.0, 310.0, 402.0])
     shape = deviations["deviation"].shape
     called = [
         not found(deviations.assign(deviation=deviations["deviation"] + rng.normal(0.0, 0.3, shape)), settling=[])[
@@ -95,3 +84,17 @@ def test_scatter_alone_is_seldom_called_a_trend() -> None:
     ]
     # 1 % of 200 is 2; seven or more would have a probability of 0.5 %.
     assert sum(called) < 7
+
+
+@pytest.mark.parametrize(
+    ("value", "u", "decision"),
+    [
+        (8.0, 2.0, "pass"),
+        (8.01, 2.0, "not decided within the uncertainty"),
+        (12.0, 2.0, "not decided within the uncertainty"),
+        (12.01, 2.0, "fail"),
+        (10.0, 0.0, "pass"),
+    ],
+)
+def test_the_uncertainty_counts_against_whoever_claims_the_result(value, u, decision):
+    assert decide(value, u, 10.0) == decision

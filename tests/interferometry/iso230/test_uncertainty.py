@@ -1,32 +1,19 @@
 """Uncertainty of ISO 230-2 quantities against repeated tests and against the product rule."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from interferometry.iso230 import CONTRIBUTIONS, Iso230Budget, evaluate_iso230
-from interferometry.iso230.budget import SCATTER_ALONE
-from tests.interferometry.iso230.made_tests import by_hand, test_made
+from interferometry.iso230.uncertainty import SCATTER_ALONE, axis_quantities, target_quantities
+from tests.interferometry.iso230.made_tests import test_made
 
 
-def test_uncertainty_agrees_with_repeated_tests() -> None:
-    rng = np.random.default_rng(7)
-    profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
-    repeated = [by_hand(profile + rng.normal(0, 0.5, (20, 2, 4))) for _ in range(2000)]
-    zero = SCATTER_ALONE
-    stated = evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero)
-    for name in ("B", "E", "M", "A"):
-        spread = np.std([one[name] for one in repeated], ddof=1)
-        # One test knows its own s to 1/sqrt(2 * 19) = 16 %; the extremes over positions add a little.
-        assert float(stated[f"{name}_u"]) == pytest.approx(spread, rel=0.45)
-
-
-def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_tests_confirm() -> None:
+def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_tests_confirm():
     rng = np.random.default_rng(11)
     profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
-    zero = SCATTER_ALONE
-    tests = [evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero) for _ in range(60)]
+    tests = [
+        evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=SCATTER_ALONE) for _ in range(60)
+    ]
     values = [name for name in tests[0].data_vars if f"{name}_u" in tests[0]]
     assert len(values) == 15
     for name in values:
@@ -38,7 +25,7 @@ def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_test
         assert (stated < (1.9 if name[0] in "RA" else 1.35) * spread).all(), name
 
 
-def test_one_direction_has_its_own_uncertainties(rng: np.random.Generator) -> None:
+def test_one_direction_has_its_own_uncertainties(rng):
     x = rng.normal(0, 1, (5, 2, 4))
     x[:, 1] = np.nan
     result = evaluate_iso230(test_made(x))
@@ -48,15 +35,12 @@ def test_one_direction_has_its_own_uncertainties(rng: np.random.Generator) -> No
     assert np.isnan([float(result[f"{name}_u"]) for name in ("B", "mean_reversal", "R", "E", "M", "A")]).all()
 
 
-def test_errors_that_grow_with_position_act_over_the_distance_between_the_deciding_targets() -> None:
+def test_scale_errors_enter_over_the_distance_as_the_product_rule_says():
     x = np.array([[[0.0, 1.0, 5.0], [0.5, 1.5, 5.5]]]) + np.array([[[-0.01]], [[0.01]]])
     shares = evaluate_iso230(test_made(x), budget=Iso230Budget(device_ppm=10.0))["contribution"]
     # E is decided by targets 1 and 3, 20 mm apart: 10 ppm of 20 mm.
     assert float(shares.sel(quantity="E", contributor="device")) == pytest.approx(0.2)
     assert float(shares.sel(quantity="B", contributor="device")) == 0.0
-
-
-def test_temperature_and_expansion_enter_as_the_product_rule_says() -> None:
     x = np.array([[[0.0, 5.0], [0.5, 5.5]]]) + np.array([[[-0.01]], [[0.01]]])
     budget = Iso230Budget(
         device_ppm=0.0,
@@ -70,7 +54,7 @@ def test_temperature_and_expansion_enter_as_the_product_rule_says() -> None:
     assert float(shares.sel(contributor="expansion_coefficient")) == pytest.approx(2.0 * 4.0 * 0.01)
 
 
-def test_contributions_add_up_to_the_uncertainty() -> None:
+def test_contributions_add_up_to_the_uncertainty():
     rng = np.random.default_rng(3)
     result = evaluate_iso230(
         test_made(rng.normal(0, 1, (5, 2, 6))), budget=Iso230Budget(environmental_variation_um=0.4)
@@ -81,7 +65,7 @@ def test_contributions_add_up_to_the_uncertainty() -> None:
         assert float(total) == pytest.approx(float(result[f"{name}_u"]), rel=1e-12)
 
 
-def test_an_environmental_variation_explains_no_more_of_s_than_there_is() -> None:
+def test_an_environmental_variation_explains_no_more_of_s_than_there_is():
     rng = np.random.default_rng(4)
     test = test_made(rng.normal(0, 0.5, (5, 2, 6)))
     shares = evaluate_iso230(test, budget=Iso230Budget(environmental_variation_um=100.0))["contribution"]
@@ -91,7 +75,7 @@ def test_an_environmental_variation_explains_no_more_of_s_than_there_is() -> Non
     assert within <= np.hypot(2 * np.sqrt((s**2).sum(axis=0).max()) * 2, 100.0 * np.sqrt(2 / 5))
 
 
-def test_the_largest_of_noisy_values_is_covered() -> None:
+def test_the_largest_of_noisy_values_is_covered():
     """B of an axis whose reversal error is 2 um at every position: without its excess U would cover 0.67 of such tests."""
     rng = np.random.default_rng(8)
     profile = np.stack([np.linspace(0, 15, 11) + 1.0, np.linspace(0, 15, 11) - 1.0])
@@ -101,3 +85,36 @@ def test_the_largest_of_noisy_values_is_covered() -> None:
         covered += abs(float(result["B"]) - 2.0) <= 2 * float(result["B_u"])
     # 0.93 of 400 such tests; three standard deviations of a share of 100 are 0.08.
     assert covered >= 85
+
+
+def test_a_negative_uncertainty_is_refused_and_a_temperature_below_20_degC_is_none():
+    with pytest.raises(ValueError, match="device_ppm=-1 is negative"):
+        Iso230Budget(device_ppm=-1)
+    with pytest.raises(ValueError, match=r"environmental_variation_um=-0\.1 is negative"):
+        Iso230Budget(environmental_variation_um=-0.1)
+    assert Iso230Budget(difference_from_20_degC_K=-2.0).difference_from_20_degC_K == -2.0
+
+
+def test_a_test_worked_by_hand():
+    mean, s = np.array([[0.0, 4.0, 6.0], [1.0, 2.0, 3.0]]), np.array([[0.5, 0.25, 0.5], [0.25, 0.25, 1.0]])
+    both, reversal, repeatability = target_quantities(mean, s)
+    assert both.tolist() == [0.5, 3.0, 4.5]
+    assert reversal.tolist() == [-1.0, 2.0, 3.0]
+    # 2 (0.5 + 0.25) + 1, 2 (0.25 + 0.25) + 2, 2 (0.5 + 1) + 3; four times either s is less.
+    assert repeatability.tolist() == [2.5, 3.0, 6.0]
+    found = axis_quantities(mean, s)
+    axis = {name: float(found[name]) for name in "BREMA"}
+    assert axis == {"B": 3.0, "R": 6.0, "E": 6.0, "M": 4.0, "A": 8.0}
+    assert found["R_unidirectional"].tolist() == [2.0, 4.0]
+    assert found["E_unidirectional"].tolist() == [6.0, 2.0]
+    # (6 + 1) - (0 - 1), (3 + 2) - (1 - 0.5) against 3 - 2 = 1 at the last position.
+    assert found["A_unidirectional"].tolist() == [8.0, 4.5]
+
+
+def test_many_tests_at_once_are_each_by_itself():
+    rng = np.random.default_rng(2)
+    mean, s = rng.normal(0, 5, (7, 2, 6)), rng.uniform(0.1, 1, (7, 2, 6))
+    together = axis_quantities(mean, s)
+    for k in range(7):
+        for name, value in axis_quantities(mean[k], s[k]).items():
+            assert together[name][k] == pytest.approx(value)

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.errors import FusionError
-from interferometry.errors import InterferometryError
-from thermography.errors import ThermographyError
+from fusion.common import FusionError
+from interferometry.common import InterferometryError
+from thermography.common import ThermographyError
 
 #: What a reader may raise of a damaged file.
 REFUSALS = (FusionError, ThermographyError, InterferometryError)

@@ -15,29 +15,26 @@ import numpy as np
 import tifffile
 import xarray as xr
 
-from fusion.attribution.thermal_modes import read_regions
+from fusion.analysis.attribution.modes import read_regions
 from fusion.campaign.config import load_campaign
-from fusion.campaign.logged_tables import read_drivers
-from fusion.campaign.record_runs import read_record
+from fusion.campaign.inputs import read_record
+from fusion.campaign.logs import read_drivers
 from fusion.pipeline.run import run_campaign
-from fusion.products.results import read_results
 from fusion.report.exports.export import export_results
-from fusion.report.html import report_of
+from fusion.report.page import report_of
 from fusion.report.terminal import summary_rows
+from fusion.results.results import read_results
 from fusion.twin.recipe_file import read_recipe
-from interferometry.io.readers import is_environment_log, read_deviations, read_environment
-from interferometry.io.renishaw import read_rtx
-from interferometry.io.xls.compound_file import read_stream, write_stream
+from interferometry.io.readings import is_environment_log, read_deviations, read_environment
 from tests.interferometry import laser_mutations as laser
-from tests.interferometry.io.xls import old_workbooks as xls
+from tests.interferometry import old_workbooks as xls
 from tests.soak.fuzz.harness import Kind
 from tests.thermography import flir_mutations as flir
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 from thermography.inspection import inspect_file
-from thermography.io.frame_readers import index_recordings
-from thermography.io.temperature_frames import StackOptions
-from thermography.registration.lens import read_lens
+from thermography.io.other_cameras import StackOptions, index_recordings
 from thermography.registration.plan import read_fiducials
+from thermography.registration.projection import read_lens
 
 CAMPAIGN = """\
 [campaign]
@@ -79,7 +76,7 @@ LENS = (
     "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
     "   data: [ 1530., 0., 320., 0., 1530., 240., 0., 0., 1. ]\ndistortion_coefficients: [ 0.1, 0., 0., 0., 0. ]\n"
 )
-RECIPE = Path("data/demo.toml").read_text(encoding="utf-8")
+RECIPE = Path("fusion/twin/recipes/demo.toml").read_text(encoding="utf-8")
 STACK = StackOptions(
     unit="degC", scale=0.04, offset=-273.15, start=np.datetime64("2026-03-09T06:30", "ns"), interval_s=1.0
 )
@@ -125,7 +122,7 @@ def damaged_compound(data: bytes, rng: np.random.Generator) -> bytes:
     """Damage an old spreadsheet as a file, or the records of its workbook in a whole container."""
     if rng.random() < 0.5:
         return flir.mutate(data, rng)
-    return write_stream("Workbook", flir.mutate(read_stream(data, ["Workbook"]), rng))
+    return xls.compound_file("Workbook", flir.mutate(data[xls.SECTOR :], rng))
 
 
 def old_workbook() -> bytes:
@@ -310,7 +307,6 @@ def kinds_of_inputs(folder: Path) -> list[Kind]:
         Kind("wide.csv", [laser.WIDE.encode(), laser.WIDE.encode("utf-16")], text, read_laser),
         Kind("environment.csv", [laser.LOG.encode()], text, read_laser),
         Kind("test.rtl", [laser.RTL.encode()], text, read_laser, 2.0),
-        Kind("capture.rtx", [laser._rtx()], text, read_rtx),
         Kind("log.dat", [laser.ECMC.encode()], text, read_laser),
         Kind("long.xlsx", [laser._workbook(folder)], damaged_archive, read_laser),
         Kind("long.xls", [old_workbook()], damaged_compound, read_laser),

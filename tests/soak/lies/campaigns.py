@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
-from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe
+from fusion.twin.recipe import AnomalyRecipe, EffectRecipe, Recipe
 from fusion.twin.simulate import Truth
 from tests.soak.lies.folder import set_key
 
@@ -30,9 +30,7 @@ RECIPES = {
     "effect": _SMALL.vary(
         effect=(
             EffectRecipe(
-                "unseen_heat_source",
-                0.8,
-                parameters={"time_constant_min": 14.0, "follows": "duty", "shape": "flat"},
+                "unseen_heat_source", 0.8, parameters={"time_constant_min": 14.0, "follows": "duty", "shape": "flat"}
             ),
         )
     ),

@@ -17,7 +17,7 @@ from thermography.io.flir import read_frame
 from thermography.io.frame import CalibratedRange, CameraIdentity, Frame
 
 LEVEL = r"flat.?field|\bFFC|\bNUC|housing|level|camera.*(offset|drift|step)|offset of the camera"
-BODY = r"reflect|warm bod|covered|hidden|before the table|frames?.*(left out|differ|unlike)|discs?"
+BODY = r"reflect|warm bod|covered|hidden|(before|in front of) the table|frames?.*(left out|differ|unlike)|discs?"
 LOST = r"frame.*(missing|left out|gap|cover|damaged|rejected)|readings_outside_frames|cover"
 DAMAGED = r"damaged|CRC|checksum|cut short|left out|corrupt|rejected"
 FROZEN = r"frozen|alike|identical|same pixels|repeat|copies"

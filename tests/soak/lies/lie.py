@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fusion.twin.machine.recipe import Recipe
+from fusion.twin.recipe import Recipe
 from tests.soak.lies.folder import Plant
 
 

@@ -70,9 +70,5 @@ LIES = (
         DRIVERS,
         edit_column("drivers.csv", "duty [1]", in_percent_from_the_middle),
     ),
-    Lie(
-        "drivers log once an hour",
-        DRIVERS,
-        edit_table("drivers.csv", lambda table: table.iloc[::60]),
-    ),
+    Lie("drivers log once an hour", DRIVERS, edit_table("drivers.csv", lambda table: table.iloc[::60])),
 )

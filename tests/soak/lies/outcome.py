@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from fusion.products.results import AnomalyPart, AxisLoop, Results
+from fusion.results.axis import AnomalyPart
+from fusion.results.loop import AxisLoop
+from fusion.results.results import Results
 from fusion.twin.simulate import Truth
 from tests.soak.lies.campaigns import EXPANSION_PPM_PER_K
 from tests.soak.lies.lie import Lie

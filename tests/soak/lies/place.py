@@ -120,11 +120,7 @@ LIES = (
     Lie("plan size of another table", FIDUCIAL, key("plan", "size", '["1400 mm", "360 mm"]')),
     Lie("fiducial F3 wrong by 20 mm", FIDUCIAL, fiducials(moved("F3", 20.0))),
     Lie("fiducial F3 wrong by 20 mm, no hints", FIDUCIAL, fiducials(moved("F3", 20.0), without_hints)),
-    Lie(
-        "fiducial F3 wrong by 20 mm of only 4",
-        FIDUCIAL,
-        fiducials(moved("F3", 20.0), only("F1", "F3", "F6", "F10")),
-    ),
+    Lie("fiducial F3 wrong by 20 mm of only 4", FIDUCIAL, fiducials(moved("F3", 20.0), only("F1", "F3", "F6", "F10"))),
     Lie(
         "fiducial F1 wrong by 20 mm of only 5",
         FIDUCIAL,

@@ -14,7 +14,7 @@ from tests.soak.lies.lie import Lie
 SIGN = r"\bsign"
 APPROACH = r"approach|direction"
 NUMBERS = r"cycle.*(number|begins|order)"
-COPIED = r"cop(y|ies|ied)|digit for digit|twice|already stands|repeat|begins at"
+COPIED = r"cop(y|ies|ied)|digit for digit|twice|already occurs|repeat|begins at"
 MISSING = r"missing|left out|only|gap"
 DATUM = r"datum|zero|jump|step|beam|shift"
 OUTLIER = r"outlier|beyond|far off|magnitude|gross|reading.{0,60}(off|away|set aside|left out)"
@@ -116,12 +116,7 @@ def exchanged_targets(table: pd.DataFrame) -> pd.DataFrame:
 LIES = (
     Lie("sign of the deviations inverted", SIGN, inverted(lambda t: t["cycle"] > 0)),
     Lie("sign inverted in the second half", SIGN, inverted(lambda t: t["cycle"] >= HALF)),
-    Lie(
-        "sign of target 5 inverted",
-        SIGN + "|target 5",
-        inverted(lambda t: t["target"] == 5),
-        targets=frozenset({5}),
-    ),
+    Lie("sign of target 5 inverted", SIGN + "|target 5", inverted(lambda t: t["target"] == 5), targets=frozenset({5})),
     Lie("sign of one approach inverted", SIGN + "|approach", inverted(lambda t: t["direction"] == "negative")),
     Lie("approach labels swapped everywhere", APPROACH, swapped_approaches(0)),
     Lie("approach labels swapped in the second half", APPROACH, swapped_approaches(HALF)),

@@ -16,14 +16,14 @@ from multiprocessing import get_context
 from pathlib import Path
 from unittest import mock
 
-from fusion.errors import FusionError
+from fusion.common import FusionError
 from fusion.pipeline.run import run_campaign
-from fusion.products.results import Results
-from interferometry.errors import InterferometryError
+from fusion.results.results import Results
+from interferometry.common import InterferometryError
 from tests.soak.lies.campaigns import RECIPES, write
 from tests.soak.lies.catalogue import GROUPS, LIES
 from tests.soak.lies.outcome import Outcome, judge, refusal
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 
 #: Longest part of a message that a row keeps.
 _MESSAGE = 400
@@ -66,7 +66,7 @@ def run_one(campaign: str, group: str, name: str, figures: bool) -> Row:
         truth = write(lie.world(RECIPES[campaign]), folder)
         lie.plant(folder)
         if not figures:
-            stack.enter_context(mock.patch("fusion.report.html.render_report", return_value=""))
+            stack.enter_context(mock.patch("fusion.report.page.render_report", return_value=""))
         wrong: list[str] = []
         said: tuple[str, ...] = ()
         try:

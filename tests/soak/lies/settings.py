@@ -62,11 +62,7 @@ LIES = (
     Lie("region by one cycle twice", r"region.*chuck.*cycle", region(_SQUARE, _STATES.format(7, 7))),
     Lie("reflected temperature in K as °C", REFLECTED, thermography("reflected_temperature", '"295 degC"')),
     Lie("reflected temperature 72 °F as °C", REFLECTED, thermography("reflected_temperature", '"72 degC"')),
-    Lie(
-        "atmospheric temperature 75 °F as °C",
-        r"atmospher|air",
-        thermography("atmospheric_temperature", '"75 degC"'),
-    ),
+    Lie("atmospheric temperature 75 °F as °C", r"atmospher|air", thermography("atmospheric_temperature", '"75 degC"')),
     Lie("object distance in mm as m", r"distance|transmission", thermography("object_distance", '"1760 m"')),
     Lie("humidity 45 for 0.45", r"humidity", thermography("relative_humidity", "45")),
     Lie("table said to move although it stands still", r"table|moving|still", thermography("table", '"moving"')),
@@ -78,8 +74,7 @@ LIES = (
         "dead path 1000 mm for 0, pressure in mmHg",
         r"dead.?path|pressure",
         in_turn(
-            laser("dead_path", '"1000 mm"'),
-            edit_column("environment.csv", "air_pressure_hPa", lambda p: p / 1.33322),
+            laser("dead_path", '"1000 mm"'), edit_column("environment.csv", "air_pressure_hPa", lambda p: p / 1.33322)
         ),
         describes=frozenset({"dead_path"}),
     ),

@@ -1,25 +1,33 @@
-"""Where frames are cut into blocks, and one block against its frames calibrated one by one."""
+"""Where frames are cut into blocks, one block against its frames calibrated one by one, and frames on their way to workers."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, record
+from tests.thermography.plan_scene import GRID, SC660, START, Scene, record, registered
 from thermography.fields import blocks as blocks_module
-from thermography.fields.blocks import RegisteredSensor, cut_blocks, reduce_block
-from thermography.fields.inputs import make_frame_series
+from thermography.fields.blocks import (
+    NO_CYCLE,
+    FrameRun,
+    PlainFrame,
+    RegisteredSensor,
+    cut_blocks,
+    make_frame_series,
+    reduce_block,
+)
 from thermography.fields.resampling import plan_weights
+from thermography.io.sequence import WindowReader
 from thermography.radiometry.planck import calibrate, override
 from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
-from thermography.registration.register import register
 
 SECOND = np.timedelta64(1, "s")
 
 
 @pytest.fixture(scope="module")
 def registration():
-    return register(Scene(disc_K=-4.0).render(), DISCS, grid=GRID)
+    return registered()
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +76,7 @@ def test_a_block_is_the_mean_of_its_calibrated_frames(registration, rng, tmp_pat
     frames = record(tmp_path / "a.seq", images)
     weights = plan_weights(registration, GRID)
     sensor = RegisteredSensor(weights, monitor_fiducials(registration, GRID, weights.window))
-    result = reduce_block(frames, SC660, sensor, True)
+    result = reduce_block(frames, SC660, sensor)
     each = np.stack([calibrate(frame.read().counts, SC660)[weights.window] for frame in frames]).astype(float)
     used = weights.used
     np.testing.assert_allclose(result.temperature.mean[used], each.mean(axis=0)[used], atol=5e-4)
@@ -77,7 +85,64 @@ def test_a_block_is_the_mean_of_its_calibrated_frames(registration, rng, tmp_pat
     assert result.temperature.variance[hot] == pytest.approx(each.var(axis=0)[hot], rel=1e-6)
     np.testing.assert_allclose(result.cells, weights.resample(result.temperature.mean))
     np.testing.assert_allclose(result.displacement_px[:, :2], [(0.4, 0.0)] + [(0.0, 0.0)] * 9, atol=0.08)
-    assert result.statistics.frames == 10
     single = reduce_block(frames[:1], SC660, sensor)
     np.testing.assert_array_equal(single.temperature.mean, each[0])
-    assert single.statistics is None
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    images = (np.full((12, 16), 20.0 + i) for i in range(40))
+    return record(tmp_path_factory.mktemp("run") / "a.seq", images)
+
+
+def test_video_is_sent_as_places_of_its_pixels(frames):
+    sent = pickle.dumps(FrameRun(frames))
+    assert len(sent) < 20 * len(frames) + 500
+    received = pickle.loads(sent)
+    assert len(received) == len(frames)
+    assert received[3].index == frames[3].index
+    for own, other in zip(frames, received, strict=True):
+        assert (own.read_counts() == other.read_counts()).all()
+    window = (slice(2, 9), slice(1, 14))
+    with WindowReader(window) as reader:
+        read = [reader.read(each, np.empty((40, 7, 13), np.uint16)).copy() for each in (frames[5:9], received[5:9])]
+    assert (read[0] == read[1]).all()
+
+
+def test_other_frames_are_sent_as_they_are(frames, tmp_path):
+    other = record(tmp_path / "b.seq", [np.full((12, 16), 30.0)])
+    received = pickle.loads(pickle.dumps(FrameRun([*frames[:2], *other])))
+    assert [frame.path for frame in received] == [frame.path for frame in [*frames[:2], *other]]
+    assert not any(isinstance(frame, PlainFrame) for frame in received)
+    assert len(pickle.loads(pickle.dumps(FrameRun([])))) == 0
+
+
+def test_a_file_that_became_shorter_is_named(frames, tmp_path):
+    short = tmp_path / "short.seq"
+    short.write_bytes(frames[0].path.read_bytes()[:-10])
+    last = pickle.loads(pickle.dumps(FrameRun(frames)))[-1]
+    with pytest.raises(OSError, match=r"short\.seq: frame 39 ends early; the file has become shorter"):
+        PlainFrame(short, 39, last.shape, last.plain_samples).read_counts()
+
+
+@pytest.fixture(scope="module")
+def references(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("inputs") / "a.seq", [np.full((8, 8), 20.0 + i) for i in range(6)])
+
+
+def plain_series(references, bounds, **options):
+    return make_frame_series(references, bounds, shape=(8, 8), override=lambda frame: frame.parameters, **options)
+
+
+def test_cycles_names_times_and_temperatures_of_frames(references):
+    bounds = START + np.array([[0, 2], [3, 5]]) * SECOND
+    assert plain_series(references, bounds).cycles.tolist() == [0, 0, NO_CYCLE, 1, 1, NO_CYCLE]
+    assert plain_series(references, START + np.array([1, 3, 4]) * SECOND).cycles.tolist() == [-1, 0, 0, 1, -1, -1]
+    frames = plain_series(references, START + np.array([0, 6]) * SECOND)
+    assert len(frames) == 6
+    assert frames.names(np.array([False, True, False, False, False, True])) == ["a.seq#1", "a.seq#5"]
+    assert frames.mean_time(slice(1, 5)) == START + 2.5 * np.timedelta64(1000, "ms")
+    np.testing.assert_array_equal(
+        frames.temperature(3), calibrate(references[3].read().counts, references[3].parameters)
+    )
+    assert frames.correction_K.tolist() == [0.0] * 6

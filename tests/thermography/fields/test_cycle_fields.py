@@ -7,26 +7,30 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.thermography.plan_scene import DISCS, GRID, START, Scene, record
-from thermography.fields.cycle_fields import (
-    CyclePart,
-    FinishedParts,
-    assemble_fields,
-    noise_of_differences,
-    pixel_noise,
-)
+from tests.thermography.flir_mutations import PARAMETERS
+from tests.thermography.plan_scene import GRID, START, Scene, record, registered
+from thermography.common import ThermographyError
+from thermography.fields import large_arrays as pieces
+from thermography.fields import large_arrays as spool
+from thermography.fields.cycle_fields import SURFACE_EDGE, CyclePart, assemble_fields, noise_of_differences, pixel_noise
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
-from thermography.fields.tasks import pieces, spool
-from thermography.registration.plan import PlanGrid
-from thermography.registration.register import register
+from thermography.fields.total_uncertainty import (
+    EmissivityRegion,
+    calibrate_surfaces,
+    find_surfaces,
+    measure_emissivity,
+)
+from thermography.io.frame import CameraParameters
+from thermography.radiometry.planck import counts_from_temperature, override, temperature_from_counts
+from thermography.registration.plan import PlanGrid, Polygon
 
 
 @pytest.fixture(scope="module")
 def products(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cf")
     image = Scene(disc_K=-4.0).render()
-    registration = register(image, DISCS, grid=GRID)
+    registration = registered()
     frames = record(folder / "a.seq", [image, image + 0.5, image + 1.0])
     bounds = START + np.arange(4) * np.timedelta64(1, "s")
     paths = {}
@@ -41,13 +45,12 @@ def products(tmp_path_factory):
 
 # The checker opens its own tables and sockets and leaves them to the garbage collector.
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", ["still", "moving"])
-def test_official_checker_finds_nothing(products, tmp_path, name):
+def test_official_checker_finds_nothing(products, tmp_path):
     runner = pytest.importorskip("compliance_checker.runner")
     runner.CheckSuite.load_all_available_checkers()
     report = tmp_path / "report.json"
     _, errors = runner.ComplianceChecker.run_checker(
-        str(products[name]),
+        str(products["moving"]),
         ["cf:1.11"],
         verbose=0,
         criteria="strict",
@@ -106,7 +109,7 @@ def test_rise_rate_and_noise_of_three_cycles():
 def test_very_many_cycles_are_evaluated_some_at_a_time_with_the_same_bits(monkeypatch, rng, tmp_path):
     covariance = np.zeros((4, 6, 2, 2))
     covariance[..., 0, 0], covariance[..., 1, 1] = 0.2**2, 0.5**2
-    finished = FinishedParts(tmp_path)
+    finished = spool.Spool(tmp_path)
     cycles = [*range(5), 8, 9, 12]
     parts = [part(c, rng.normal(20, 1, (4, 6)), start_s=600 * c + 7 * (c % 3), noise_K=0.01 * (c + 1)) for c in cycles]
     # The last two parts are one cycle before and after a knock.
@@ -160,3 +163,92 @@ def test_noise_of_an_image_ignores_its_smooth_field(rng, shape):
     interior = np.zeros(shape, bool)
     interior[10:90, 10:110] = True
     assert noise_of_differences(image, interior) == pytest.approx(0.05, rel=0.05)
+
+
+CAMERA = override(PARAMETERS, emissivity=0.97, object_distance_m=1.2, reflected_temperature_K=295.15)
+TABLE = PlanGrid(100, 60, 5)
+TABLE_SURE, TABLE_WHOLE = np.zeros((*TABLE.shape, 2, 2)), np.ones(TABLE.shape)
+STEEL = Polygon("steel", np.array([(0, 0), (40, 0), (40, 60), (0, 60)]))
+BARE = EmissivityRegion(STEEL, 0.35, 0.05)
+TRUE = (25.0, 30.0, 35.0)
+
+
+def steel_beside_paint(coverage: np.ndarray = TABLE_WHOLE) -> xr.Dataset:
+    """Fields of a table of one temperature, its left part bare steel, all calibrated as paint."""
+    parts = []
+    for cycle, celsius in enumerate(TRUE):
+        counts = counts_from_temperature(celsius, CAMERA, emissivity=np.where(TABLE.x_mm < 40, 0.35, 0.97))
+        field = np.broadcast_to(temperature_from_counts(counts, CAMERA), TABLE.shape).copy()
+        one = part(cycle, 0.0, start_s=600.0 * cycle)
+        shaped = {name: np.full(TABLE.shape, value) for name, value in (("spread", 0.1), ("noise_variance", 1e-4))}
+        parts.append(replace(one, mean=field, fell_back=field < 0, count=np.full(TABLE.shape, 4), **shaped))
+    stack = np.stack([one.mean for one in parts]).astype(np.float32)
+    return assemble_fields(
+        parts, 3, TABLE, [TABLE_SURE], [coverage], frames={"frame_temperature": (("time", "y", "x"), stack)}
+    )  # fmt: skip
+
+
+def calibrated(fields: xr.Dataset, regions: list[EmissivityRegion]) -> xr.Dataset:
+    surfaces, edge = find_surfaces(fields, regions, emissivity=0.97, emissivity_u=0.01)
+    cameras: dict[str, list[CameraParameters]] = {"cycle": [CAMERA] * 3, "time": [CAMERA] * 3}
+    return calibrate_surfaces(fields, surfaces, edge, cameras)
+
+
+def test_bare_steel_beside_paint_has_the_temperature_of_the_table():
+    raw = steel_beside_paint()
+    assert float(raw["temperature"][2, 0, 0]) < 28.0
+    done = calibrated(raw, [BARE])
+    for name in ("temperature", "frame_temperature"):
+        for cycle, celsius in enumerate(TRUE):
+            np.testing.assert_allclose(
+                done[name][cycle].values[np.isfinite(done[name][cycle].values)], celsius, atol=1e-4
+            )
+    np.testing.assert_allclose(done["temperature_rise"][2, 0, [0, 15]], 10.0, atol=1e-4)
+    np.testing.assert_allclose(done["temperature_rate"][1, 0, [0, 15]], 30.0, rtol=1e-4)
+    # A camera sees steel through 0.35 of its radiation, so that its noise is 0.97 / 0.35 times that of paint, less the curvature.
+    assert float(done["temperature_noise_u"][0, 0, 0] / done["temperature_noise_u"][0, 0, 15]) == pytest.approx(
+        2.7, rel=0.05
+    )
+
+
+def test_cells_at_the_edge_of_a_surface_are_empty_and_a_later_region_covers():
+    done = calibrated(steel_beside_paint(), [BARE])
+    empty = np.isnan(done["temperature"][0].values)
+    assert np.flatnonzero(empty[0]).tolist() == [7, 8]
+    assert ((done["quality_flag"][0].values & SURFACE_EDGE > 0) == empty).all()
+    crossing = EmissivityRegion(Polygon("steel", np.array([(0, 0), (42, 0), (42, 60), (0, 60)])), 0.35, 0.05)
+    assert np.flatnonzero(np.isnan(calibrated(steel_beside_paint(), [crossing])["temperature"][0, 0])).tolist() == [
+        7,
+        8,
+    ]
+    coverage = TABLE_WHOLE.copy()
+    coverage[3, 9] = 0.8
+    assert np.isnan(calibrated(steel_beside_paint(coverage), [BARE])["temperature"][0, 3, 9])
+    tape = EmissivityRegion(Polygon("tape", np.array([(10, 10), (30, 10), (30, 50), (10, 50)])), 0.95, 0.01)
+    surfaces, _ = find_surfaces(steel_beside_paint(), [BARE, tape], emissivity=0.97, emissivity_u=0.01)
+    assert [surface.name for surface in surfaces] == ["", "steel", "tape"]
+    assert surfaces[2].cells[5, 4] and not surfaces[1].cells[5, 4]
+    assert not (surfaces[0].cells & surfaces[1].cells).any()
+    strip = EmissivityRegion(Polygon("strip", np.array([(20, 0), (28, 0), (28, 60), (20, 60)])), 0.35, 0.05)
+    with pytest.raises(ThermographyError, match="region strip: no cell lies inside and away from its edge"):
+        find_surfaces(steel_beside_paint(), [strip], emissivity=0.97, emissivity_u=0.01)
+
+
+def test_emissivity_from_two_cycles_of_known_temperature():
+    states = [(1, 25.0, 0.1), (3, 35.0, 0.1)]
+    found = measure_emissivity(steel_beside_paint(), STEEL, states, CAMERA, camera_scale=0.0)
+    assert found.emissivity == pytest.approx(0.35, abs=1e-4)
+    # Two temperatures of 0.1 K over 10 K are 1.4 %.
+    assert found.emissivity_u == pytest.approx(0.014 * 0.35, rel=0.1)
+    scaled = measure_emissivity(steel_beside_paint(), STEEL, states, CAMERA, camera_scale=0.02)
+    assert scaled.emissivity_u == pytest.approx(np.hypot(found.emissivity_u, 0.007), rel=1e-3)
+    raw = steel_beside_paint()
+    with pytest.raises(ThermographyError, match="there is no cycle 9; name a measured one"):
+        measure_emissivity(raw, STEEL, [(1, 25.0, 0.1), (9, 35.0, 0.1)], CAMERA, camera_scale=0.0)
+    with pytest.raises(
+        ThermographyError, match=r"region steel: the two states give an emissivity of 0\.35 with a standar"
+    ):
+        measure_emissivity(raw, STEEL, [(1, 25.0, 2.0), (2, 30.0, 2.0)], CAMERA, camera_scale=0.0)
+    empty = raw.assign(temperature=raw["temperature"].where(raw["x"] > 40))
+    with pytest.raises(ThermographyError, match="cycle 1 shows no cell of it"):
+        measure_emissivity(empty, STEEL, [(1, 25.0, 0.1), (3, 35.0, 0.1)], CAMERA, camera_scale=0.0)

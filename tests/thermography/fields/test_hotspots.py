@@ -1,12 +1,13 @@
-"""Hotspots against fields whose peaks are known."""
+"""Hotspots against fields whose peaks are known, and means over regions."""
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 from thermography.fields import hotspots as module
-from thermography.fields.hotspots import detect_hotspots
+from thermography.fields.hotspots import common_part, detect_hotspots, region_series
+from thermography.registration.plan import PolygonError
 
 X = np.arange(140) * 5.0 + 2.5
 Y = np.arange(36) * 5.0 + 2.5
@@ -42,12 +43,6 @@ def test_noise_and_flat_fields_hold_no_hotspot(rng):
     assert detect_hotspots(flat + np.nan) == []
 
 
-def test_maximum_of_a_slope_is_marked_as_lying_at_the_edge():
-    (spot,) = detect_hotspots(plane(slope=0.01))
-    assert spot.at_edge
-    assert spot.x_mm == pytest.approx(697.5)
-
-
 def test_masked_discs_neither_make_nor_break_hotspots(rng):
     field = plane((300.0, 90.0, 2.0, 40.0)) + rng.normal(0, 0.014, (36, 140))
     field[16:20, 60:64] = np.nan
@@ -56,15 +51,9 @@ def test_masked_discs_neither_make_nor_break_hotspots(rng):
     assert np.hypot(spot.x_mm - 300, spot.y_mm - 90) < 15
 
 
-def test_a_stack_is_refused():
-    with pytest.raises(ValueError, match=r"give one field \(y, x\) of at least 3 x 3 cells"):
+def test_what_is_no_field_is_refused():
+    with pytest.raises(ThermographyError, match="dims"):
         detect_hotspots(xr.concat([plane()], "cycle"))
-
-
-@pytest.mark.parametrize("rise", [None, np.zeros((4, 4)), "temperature_rise"])
-def test_what_is_no_data_array_is_refused(rise):
-    with pytest.raises(ThermographyError, match=rf"rise is of type {type(rise).__name__}; give a DataArray \(y, x\)"):
-        detect_hotspots(rise)
 
 
 def test_a_second_peak_within_six_standard_deviations_of_the_noise_is_none(rng):
@@ -83,7 +72,7 @@ def test_the_zone_of_a_peak_is_that_above_half_its_height_to_the_edges_of_its_ce
     assert spot.x_mm == pytest.approx(202.5) and spot.y_mm == pytest.approx(92.5)
 
 
-def test_the_vertex_of_an_oblique_paraboloid_is_exact():
+def test_vertex_and_saddle_are_exact():
     row, column = np.mgrid[:9, :11]
     u, v = column - 5.3, row - 3.6
     values = 4.0 - 0.2 * u**2 - 0.3 * v**2 + 0.15 * u * v
@@ -93,9 +82,6 @@ def test_the_vertex_of_an_oblique_paraboloid_is_exact():
     # A ridge has no vertex: the cell itself.
     ridge = -0.3 * v**2
     assert module._vertex(ridge, ridge, (4, 5))[:2] == (5.0, 4.0)
-
-
-def test_the_prominence_of_a_peak_counts_from_the_saddle_to_a_higher_one():
     field = np.zeros((3, 9))
     field[1] = [0.0, 2.0, 5.0, 3.0, 4.0, 9.0, 6.0, 8.0, 1.0]
     assert module._saddle(field, (1, 2), 0.0) == 3.0
@@ -106,19 +92,13 @@ def test_the_prominence_of_a_peak_counts_from_the_saddle_to_a_higher_one():
     assert module._saddle(corner, (2, 2), 0.0) == 4.0
 
 
-def test_a_ripple_below_the_least_prominence_is_no_hotspot_on_a_warm_table():
+def test_prominence_limits_ranks_and_edges():
     assert detect_hotspots(plane((202.5, 92.5, 0.09, 30.0)) + 20.0) == []
     (spot,) = detect_hotspots(plane((202.5, 92.5, 0.12, 30.0)) + 20.0)
     assert spot.prominence_K == pytest.approx(0.12, rel=0.05) and spot.peak_rise_K == pytest.approx(20.12, rel=1e-3)
-
-
-def test_the_maximum_in_a_corner_of_the_plan_is_found_there():
     slope = plane(slope=0.01)
     (spot,) = detect_hotspots(slope + 0.02 * slope["y"])
     assert (spot.x_mm, spot.y_mm, spot.at_edge) == (697.5, 177.5, True)
-
-
-def test_the_most_prominent_come_first_and_no_more_than_asked_for():
     field = plane((120.0, 90.0, 1.0, 20.0), (350.0, 90.0, 3.0, 20.0), (580.0, 90.0, 2.0, 20.0))
     assert [round(spot.x_mm) for spot in detect_hotspots(field)] == [350, 580, 120]
     assert [round(spot.x_mm) for spot in detect_hotspots(field, limit=2)] == [350, 580]
@@ -131,3 +111,66 @@ def test_the_most_prominent_come_first_and_no_more_than_asked_for():
 def test_a_zone_that_reaches_any_edge_is_marked(place, at_edge):
     (spot,) = detect_hotspots(plane((*place, 3.0, 20.0)))
     assert spot.at_edge is at_edge
+
+
+TIMES = np.datetime64("2026-03-09T06:00:00", "ns") + np.arange(4) * np.timedelta64(60, "s")
+
+
+def stack(function=lambda x, y: x + 10 * y, grow=1.0):
+    x, y = np.meshgrid(X, Y)
+    values = np.stack([function(x, y) + grow * i for i in range(4)])
+    attrs = {"units": "K", "units_metadata": "temperature: difference"}
+    return xr.DataArray(values, dims=("time", "y", "x"), coords={"time": TIMES, "y": Y, "x": X}, attrs=attrs)
+
+
+def test_rectangle_and_triangle_of_a_plane_have_the_mean_of_their_centroid():
+    square = [(101, 41), (199, 41), (199, 99), (101, 99)]
+    triangle = [(200, 30), (500, 30), (200, 150)]
+    series = region_series(stack(), {"square": square, "triangle": triangle})
+    # Shares are counted by 100 points per cell.
+    np.testing.assert_allclose(series["mean"].sel(region="square"), 150 + 10 * 70 + np.arange(4.0), atol=0.3)
+    np.testing.assert_allclose(series["mean"].sel(region="triangle"), 300 + 10 * 70 + np.arange(4.0), atol=1.0)
+    assert series["n"].sel(region="square").values[0] == pytest.approx(98 * 58 / 25, rel=0.01)
+    assert float(series["max"].sel(region="square")[0]) == 197.5 + 10 * 97.5
+    assert float(series["min"].sel(region="square")[0]) == 102.5 + 10 * 42.5
+    assert series["mean"].attrs["units_metadata"] == "temperature: difference"
+
+
+def test_stated_uncertainty_of_a_region_mean_is_its_scatter(rng):
+    fields = xr.concat([stack(grow=0.0)] * 50, "time")
+    noisy = fields + rng.normal(0, 0.014, fields.shape)
+    series = region_series(noisy, {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]})
+    scatter = (
+        series["mean"] - region_series(fields, {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]})["mean"]
+    ).std()
+    # 200 means give their standard deviation to 5 %.
+    assert float(scatter) == pytest.approx(0.014 / 10, rel=0.15)
+    assert float(series["mean_noise_u"].mean()) == pytest.approx(0.014 / 10, rel=0.05)
+
+
+def test_what_all_cells_share_does_not_average_out(rng):
+    rise = stack(grow=0.0) * 0.0 + 5.0 + rng.normal(0, 0.014, (4, 36, 140))
+    fields = xr.Dataset(
+        {
+            "temperature_rise": rise,
+            "temperature_rise_noise_u": rise * 0.0 + 0.014,
+            "temperature_rise_u": rise * 0.0 + np.hypot(0.014, 0.05),
+        }
+    )
+    square = {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]}
+    series = region_series(rise, square, common_u=common_part(fields, "temperature_rise"))
+    np.testing.assert_allclose(series["mean_u"], np.hypot(0.05, 0.0014), rtol=0.002)
+    assert "mean_u" not in region_series(rise, square)
+
+
+def test_masked_cells_take_no_part():
+    fields = stack(lambda x, y: np.where((x > 300) & (x < 320), np.nan, 1.0), grow=0.0)
+    series = region_series(fields, {"r": [(280, 50), (340, 50), (340, 100), (280, 100)]})
+    np.testing.assert_allclose(series["mean"], 1.0)
+    np.testing.assert_allclose(series["n"], (60 - 20) * 50 / 25, rtol=0.01)
+
+
+def test_a_region_of_masked_cells_is_refused():
+    fields = stack(lambda x, y: np.where((x > 300) & (x < 320), np.nan, 1.0))
+    with pytest.raises(PolygonError, match="r: all its cells are masked or out of view"):
+        region_series(fields, {"r": [(301, 50), (319, 50), (319, 80), (301, 80)]})

@@ -1,4 +1,4 @@
-"""A table that travels through the view: its place in every frame, and the field that stays attached to it."""
+"""A table that travels through the view: its place in every frame, the field attached to it, and how cells are sampled."""
 
 import json
 import pickle
@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
+from tests.thermography.plan_scene import GRID, START, Scene, cell_truth, overhead, record, registered
 from thermography.fields import moving
-from thermography.fields.checkpoint import CheckpointError
-from thermography.fields.inputs import ReductionError
-from thermography.fields.moving import reduce_moving_frames
-from thermography.registration.register import register
+from thermography.fields.blocks import ReductionError
+from thermography.fields.moving import CellSums, add_frame, on_plan, reduce_moving_frames, sample_points, weigh_pixels
+from thermography.fields.still import CheckpointError
+from thermography.registration.plan import Fiducial, PlanGrid
 
 DIRECTION = (-1, 0)
 PLACES_MM = np.array([0.0, 121.3, 200.5, 299.7, 160.2, 5.5])
@@ -29,7 +29,7 @@ def travel(tmp_path_factory):
     """Six frames of a table that moves 300 mm, seen by a lens of k1 = -1.2; registered where it stood first."""
     rng = np.random.default_rng(7)
     home = Scene(disc_K=-4.0, k1=-1.2, rays=3, corners_px=((80, 150), (480, 140), (495, 285), (75, 300)))
-    registration = register(home.render(rng), DISCS, grid=GRID)
+    registration = registered(home)
     # The plan point under the spindle moves along -x as the axis position grows, so the table moves along +x.
     images = (replace(home, shift_mm=(float(p), 0.0)).render(rng) for p in PLACES_MM)
     frames = record(tmp_path_factory.mktemp("travel") / "a.seq", images)
@@ -47,7 +47,7 @@ def test_place_of_the_table_is_known_in_every_frame(travel):
     assert (fields["table_discs"] >= 6).all()
 
 
-def test_fields_of_frames_at_different_places_overlay(travel):
+def test_fields_of_frames_at_different_places_overlay_within_their_uncertainty(travel):
     _, _, _, fields = travel
     error = fields["temperature"].values - cell_truth()
     # Three frames, 3 x 4 px of 50 mK per cell: 8 mK; a misplacement of 0.1 mm in the largest gradient is 2 mK.
@@ -59,9 +59,6 @@ def test_fields_of_frames_at_different_places_overlay(travel):
     assert fields["count"].values[0].max() == 3
     # At 300 mm the far end of the table has left the view.
     assert fields["count"].values[1][30:34, -3].min() < 3
-
-
-def test_stated_uncertainty_is_the_true_error(travel):
     _, _, _, fields = travel
     error = fields["temperature"].values - cell_truth()
     ratio = np.sqrt(np.nanmean((error / fields["temperature_noise_u"].values) ** 2))
@@ -73,7 +70,7 @@ def test_frames_of_a_standing_table_are_sampled_alike(tmp_path, monkeypatch):
     home = Scene(disc_K=-4.0, corners_px=((80, 150), (480, 140), (495, 285), (75, 300)))
     rng = np.random.default_rng(3)
     frames = record(tmp_path / "a.seq", (home.render(rng) for _ in range(6)))
-    registration = register(home.render(), DISCS, grid=GRID)
+    registration = registered(home)
     computed = []
     weigh = moving.weigh_pixels
     monkeypatch.setattr(moving, "weigh_pixels", lambda *given: computed.append(given) or weigh(*given))
@@ -100,7 +97,7 @@ def test_frames_without_the_table_are_named(travel, tmp_path):
     assert np.isnan(fields["table_position"].values[1])
     with pytest.raises(ReductionError, match="the table is found in no frame; check the fiducials"):
         reduce_moving_frames(frames[1:], registration, GRID, edges(0, 2), direction=DIRECTION)
-    with pytest.raises(ReductionError, match="no frame in which the table is found lies within a cycle"):
+    with pytest.raises(ReductionError, match="no frame in which the table is found is within a cycle"):
         reduce_moving_frames(frames[:1], registration, GRID, edges(5, 7), direction=DIRECTION)
 
 
@@ -158,9 +155,103 @@ def test_a_killed_run_goes_on_at_the_first_block_that_is_not_done(travel, tmp_pa
     for name in whole.variables:
         assert whole[name].values.tobytes() == again[name].values.tobytes(), name
     assert whole.attrs == again.attrs
-    with pytest.raises(
-        CheckpointError, match=r"holds cycles of another reduction \(other reach_mm\); remove the folder"
-    ):
+    with pytest.raises(CheckpointError, match=r"holds cycles of another reduction \(other reach_mm\); remove the"):
         reduce_moving_frames(
             frames, registration, GRID, edges(0, 3, 6), checkpoint=tmp_path / "cp", reach_mm=400.0, **how
         )
+
+
+PLAN = PlanGrid(60, 40, 5)
+SHAPE = (120, 200)
+DISC = Fiducial("D", 31.0, 21.0, 8.0)
+#: A linear calibration, 0.01 K per count.
+CALIBRATION = 0.01 * np.arange(65536.0)
+
+
+@pytest.fixture(scope="module")
+def registration():
+    return overhead(PLAN, [DISC], shape=SHAPE, px_per_mm=2.0, origin_px=(10.0, 10.0))
+
+
+@pytest.fixture(scope="module")
+def samples(registration):
+    return sample_points(registration, PLAN)
+
+
+def empty_sums(samples):
+    cells = len(samples.valid)
+    return CellSums(np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells))
+
+
+def add(counts, samples, registration, shift, sums, *, correction=0.0, calibration=CALIBRATION):
+    lens = registration.projection.as_array
+    weights = weigh_pixels(samples.points_mm, samples.valid, np.array(shift), lens, SHAPE)
+    add_frame(counts, calibration, weights, correction, sums)
+
+
+def test_points_lie_in_their_cells_and_off_disc_and_edge(samples):
+    assert samples.points_mm.shape == (8 * 12, 16, 2)
+    np.testing.assert_allclose(samples.points_mm.mean(axis=1), PLAN.centres_mm.reshape(-1, 2))
+    assert np.ptp(samples.points_mm[0], axis=0) == pytest.approx([3.75, 3.75])
+    # Margins are 2.5 px of 0.5 mm: of points 0.625, 1.875, ... mm from the edge the first is masked, on the disc all within 5.25 mm.
+    assert samples.coverage[0, 0] == pytest.approx(9 / 16)
+    assert samples.coverage[0, 5] == pytest.approx(12 / 16)
+    distance = np.hypot(*np.moveaxis(samples.points_mm - (31.0, 21.0), -1, 0))
+    assert not samples.valid[distance < 5.25].any()
+    assert samples.coverage[2, 2] == 1
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (7.3, 2.2)])
+def test_a_linear_field_is_exact_wherever_the_table_is(registration, samples, shift):
+    column, row = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
+    counts = (2000 + 4 * column + 6 * row).astype(np.uint16)
+    sums = empty_sums(samples)
+    add(counts, samples, registration, shift, sums, correction=0.5)
+    field = on_plan(sums.frames, sums.mean, samples, PLAN)
+    centres = PLAN.centres_mm + shift
+    expected = 0.01 * (2000 + 4 * (10 + 2 * centres[..., 0]) + 6 * (10 + 2 * centres[..., 1])) + 0.5
+    seen = np.isfinite(field)
+    assert (seen == (samples.coverage >= 0.5)).all()
+    np.testing.assert_allclose(field[seen], expected[seen], atol=1e-6)
+
+
+def test_cells_partly_out_of_view_are_left_out(registration, samples):
+    counts = np.full(SHAPE, 2000, np.uint16)
+    sums = empty_sums(samples)
+    # Column 199, the last one, shows plan x = 94.5 mm: displaced by 60 mm, the cells beyond 35 mm are out of view.
+    add(counts, samples, registration, (60.0, 0.0), sums)
+    frames = sums.frames.reshape(PLAN.shape)
+    assert frames[2].tolist() == [1] * 7 + [0] * 5
+    assert np.isnan(on_plan(sums.frames, sums.mean, samples, PLAN)[:, 7:]).all()
+
+
+def test_mean_and_deviation_over_frames_and_calibration_point_by_point(registration, samples, rng):
+    sums = empty_sums(samples)
+    levels = rng.integers(1000, 3000, 7)
+    for level in levels:
+        add(np.full(SHAPE, level, np.uint16), samples, registration, (0.0, 0.0), sums)
+    shown = samples.valid.any(axis=1)
+    np.testing.assert_allclose(sums.mean[shown], 0.01 * levels.mean())
+    np.testing.assert_allclose(sums.squares[shown], 7 * np.var(0.01 * levels))
+    # A curved calibration and counts more than 600 apart: the mean of the pixels' temperatures, not the temperature of the mean.
+    curved, steep = (1e-3 * np.arange(65536.0)) ** 2, np.zeros(SHAPE, np.uint16)
+    steep[:] = 200 * np.arange(SHAPE[1])
+    sums = empty_sums(samples)
+    add(steep, samples, registration, (0.0, 0.0), sums, calibration=curved)
+    cell = 2 * PLAN.shape[1] + 2
+    columns = 10 + 2 * samples.points_mm[cell, :, 0]
+    temperatures = (1e-3 * steep[0].astype(float)) ** 2
+    assert sums.mean[cell] == pytest.approx(np.interp(columns, np.arange(SHAPE[1]), temperatures).mean(), abs=1e-6)
+
+
+def test_a_pixel_without_temperature_counts_only_where_it_has_a_weight(registration, samples):
+    counts = np.full(SHAPE, 2000, np.uint16)
+    below = np.where(np.arange(65536) < 1000, np.nan, CALIBRATION)
+    # Cell (3, 5) has points at columns 61.25 to 68.75 and rows 41.25 to 48.75, but those of its lower right corner lie on the disc.
+    counts[49, 69] = 10
+    counts[36, 46] = 10
+    sums = empty_sums(samples)
+    add(counts, samples, registration, (0.0, 0.0), sums, calibration=below)
+    means = sums.mean.reshape(PLAN.shape)
+    assert means[3, 5] == pytest.approx(20.0)
+    assert np.isnan(means[2, 3])

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from tests.thermography.plan_scene import DISCS, GRID, Scene, overhead
-from thermography.errors import ThermographyError
+from tests.thermography.plan_scene import DISCS, GRID, overhead, registered
+from thermography.common import ThermographyError
 from thermography.fields.resampling import centring_matrix, plan_weights, plan_window
 from thermography.registration.plan import Fiducial, PlanGrid, mask_discs
-from thermography.registration.register import register
 
 #: Cells of 10 x 10 px. Pixel centres lie at multiples of 0.5 mm less a quarter: pixel borders are cell borders.
 PLAN = PlanGrid(60, 40, 5)
@@ -87,7 +86,7 @@ def test_noise_factor_is_that_of_independent_pixels(registration, rng):
 
 def test_pixels_on_borders_of_cells_are_divided():
     """A scene in perspective: cells far from discs and edge are seen as a whole."""
-    registration = register(Scene(disc_K=-4.0).render(), DISCS, grid=GRID)
+    registration = registered()
     weights = plan_weights(registration, GRID)
     constant = weights.resample(np.full(weights.used.shape, 23.0))
     np.testing.assert_allclose(constant[np.isfinite(constant)], 23.0, rtol=1e-12)
@@ -109,8 +108,8 @@ def test_centring_moves_a_cell_along_the_gradient_of_its_neighbours():
 
 def test_a_plan_out_of_view_is_refused():
     below = overhead(PLAN, [DISC], shape=SHAPE, px_per_mm=2.0, origin_px=(9.5, 104.5))
-    with pytest.raises(ThermographyError, match="no pixel of the frame lies on the plan; check the fiducials"):
+    with pytest.raises(ThermographyError, match="no pixel of the frame is on the plan; check the fiducials"):
         plan_window(below, PLAN)
     aside = overhead(PLAN, [DISC], shape=SHAPE, px_per_mm=2.0, origin_px=(209.5, 4.5))
-    with pytest.raises(ThermographyError, match="no pixel of the frame lies on the plan; check the fiducials"):
+    with pytest.raises(ThermographyError, match="no pixel of the frame is on the plan; check the fiducials"):
         plan_weights(aside, PLAN)

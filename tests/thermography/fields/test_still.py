@@ -1,21 +1,44 @@
-"""Fields against scenes whose temperature is known in every cell: what noise, masks, order of averaging and knocks do to them."""
+"""Fields of a still table: noise, masks and knocks against scenes known in every cell; resumed reductions; how a recording is divided."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, smooth_field
-from thermography.contract import FIELDS
-from thermography.fields.inputs import ReductionError
-from thermography.fields.still import reduce_frames
+from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, registered, smooth_field
+from thermography.common import FIELDS
+from thermography.fields import still
+from thermography.fields import still as stretches
+from thermography.fields.blocks import (
+    NO_CYCLE,
+    FrameSeries,
+    ReductionError,
+    RegisteredSensor,
+    cut_blocks,
+    make_frame_series,
+)
+from thermography.fields.resampling import plan_weights
+from thermography.fields.still import (
+    STRETCH_FRAMES,
+    CheckpointError,
+    choose_frames,
+    cut_stretches,
+    describe_reduction,
+    gather_frames,
+    pixels_off,
+    reduce_frames,
+    reduce_portion,
+    reduce_stretch,
+)
 from thermography.fields.total_uncertainty import evaluate_uncertainty
+from thermography.io.frame import PlainSamples
 from thermography.radiometry.averaging import Accumulator, mean_temperature
 from thermography.radiometry.planck import calibrate, override
-from thermography.registration.displacement import RegistrationSpan
+from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
 from thermography.registration.plan import mask_discs
-from thermography.registration.register import register
 
 SECOND = np.timedelta64(1, "s")
 
@@ -25,11 +48,11 @@ def scene():
     """A still table with 4 K colder discs, its frame without noise, and its registration."""
     still = Scene(disc_K=-4.0)
     image = still.render()
-    return image, register(image, DISCS, grid=GRID), still
+    return image, registered(), still
 
 
 def edges(*seconds):
-    return START + np.array(seconds) * SECOND
+    return START + np.array(seconds, int) * SECOND
 
 
 def test_field_of_one_frame_per_cycle_is_true_within_its_noise(scene, rng, tmp_path):
@@ -168,7 +191,7 @@ def test_knocked_camera_keeps_the_field_in_place(scene, tmp_path):
     knocked = replace(still, shift_px=(3.0, -2.0))
     after = knocked.render()
     frames = record(tmp_path / "a.seq", [image, image, after, after])
-    spans = [RegistrationSpan(0, registration), RegistrationSpan(2, register(after, DISCS, grid=GRID))]
+    spans = [RegistrationSpan(0, registration), RegistrationSpan(2, registered(knocked))]
     fields = reduce_frames(frames, spans, GRID, edges(0, 1, 3, 4))
     assert (fields["count"].max(("x", "y")) == [1, 2, 1]).all()
     assert (fields["quality_flag"].values[1] & 4 == 4).all()
@@ -193,14 +216,10 @@ def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(s
     [
         ({"cycle_bounds": edges(0, 5, 3)}, r"cycle 2 ends at .*, before it starts"),
         ({"cycle_bounds": np.stack([edges(0, 2), edges(1, 3)])}, r"cycle 2 starts at .*, before cycle 1 ends"),
-        (
-            {"cycle_bounds": edges(100, 200)},
-            r"no frame lies within a cycle: .* check the time zones and the clock offset",
-        ),
-        (
-            {"correction_K": np.zeros(3)},
-            r"correction_K has shape \(3,\); it needs one finite value for each of 2 frames",
-        ),
+        ({"cycle_bounds": edges(100, 200)}, r"no frame is within a cycle: frames 2026-03-09T06:30:00\.000000000 to 20"),
+        ({"correction_K": np.zeros(3)}, r"correction_K has shape \(3,\); it needs one finite value for each of 2"),
+        ({"cycle_bounds": edges()}, "cycle_bounds is empty; give the start and end of at least one cycle"),
+        ({"correction_K": np.full(2, np.nan)}, "it needs one finite value for each of 2 frames"),
         ({"references": []}, "there is no frame to reduce"),
         ({"references": "reversed"}, r"frame 0 has the time .*, not after .*; sort the frames"),
         ({"references": "small"}, r"has \(8, 8\) pixels, the registered frames \(480, 640\)"),
@@ -219,22 +238,6 @@ def test_faults_are_named(scene, tmp_path, change, message):
         arguments["registration"] = [RegistrationSpan(1, registration)]
     with pytest.raises(ReductionError, match=message):
         reduce_frames(arguments.pop("references"), arguments.pop("registration"), GRID, **arguments)
-
-
-def test_a_knock_of_3_px_at_frame_40_is_found_at_frame_40(scene, rng, tmp_path):
-    image, registration, still = scene
-    after = replace(still, shift_px=(2.5, -1.7)).render()
-    frames = record(
-        tmp_path / "a.seq", ((image if i < 40 else after) + rng.normal(0, 0.05, image.shape) for i in range(50))
-    )
-    fields = reduce_frames(frames, registration, GRID, edges(0, 25, 50))
-    (knock,) = json.loads(fields.attrs["knocks"])
-    assert (knock["frame"], knock["index"]) == ("a.seq#40", 40)
-    assert knock["shift_px"] == pytest.approx([2.5, -1.7], abs=0.05)
-    error = fields["temperature"].values - cell_truth()
-    assert np.sqrt(np.nanmean(error**2)) < 0.005
-    assert np.nanmax(fields["frame_shift"].values) < 0.2
-    assert json.loads(fields.attrs["frames_shaken"]) == json.loads(fields.attrs["frames_unchecked"]) == []
 
 
 def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(scene, rng, tmp_path):
@@ -259,3 +262,302 @@ def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(scene, rng, 
     fields = reduce_frames(frames, registration, GRID, edges(0, 2))
     # The first one is what the others' picture of the table is compared with.
     assert json.loads(fields.attrs["frames_unchecked"]) == ["a.seq#0"]
+
+
+BOUNDS = START + np.array([0, 4, 8, 11, 14]) * np.timedelta64(1, "s")
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """Fourteen frames in four cycles with a knock in the third; registered on the first."""
+    rng = np.random.default_rng(11)
+    table = Scene(disc_K=-4.0)
+    before, after = table.render(), replace(table, shift_px=(3.0, -2.0)).render()
+    images = ((before if i < 9 else after) + 0.05 * i + rng.normal(0, 0.05, before.shape) for i in range(14))
+    return record(tmp_path_factory.mktemp("film") / "a.seq", images), registered()
+
+
+class BrokenOffError(Exception):
+    pass
+
+
+def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
+    frames, registration = film
+    whole = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2)
+    done, seen = [], []
+
+    def break_off(count):
+        done.append(count)
+        if sum(done) >= 11:
+            raise BrokenOffError
+
+    with pytest.raises(BrokenOffError):
+        reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=break_off)
+    again = reduce_frames(
+        frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=seen.append
+    )
+    # Two cycles, and both parts of the third, before the knock and after it, were finished.
+    assert seen[0] == 11
+    assert sum(seen) == len(frames)
+    for name in whole.variables:
+        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
+    assert whole.attrs == again.attrs
+    # A third run finds everything done but the last cycle's end, and reads no block.
+    monkeypatch.setattr(still, "reduce_stretch", None)
+    third = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
+    assert whole["temperature"].values.tobytes() == third["temperature"].values.tobytes()
+
+
+def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
+    """One cycle over all frames: what was done of it is kept whenever it has grown by some frames."""
+    frames, registration = film
+    monkeypatch.setattr(still, "STORED_FRAMES", 4)
+    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 4)
+    whole = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], block_s=2)
+    done, seen = [], []
+
+    def break_off(count):
+        done.append(count)
+        if sum(done) >= 6:
+            raise BrokenOffError
+
+    options = {"block_s": 2, "checkpoint": tmp_path / "cp"}
+    with pytest.raises(BrokenOffError):
+        reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=break_off, **options)
+    again = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=seen.append, **options)
+    assert seen[0] == 8
+    for name in whole.variables:
+        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
+    assert whole.attrs == again.attrs
+
+
+def test_a_checkpoint_of_another_reduction_is_refused(film, tmp_path):
+    frames, registration = film
+    reduce_frames(frames[:4], registration, GRID, BOUNDS, checkpoint=tmp_path)
+    with pytest.raises(CheckpointError, match=r"holds cycles of another reduction \(other frames\); remove the folder"):
+        reduce_frames(
+            frames[:4],
+            registration,
+            GRID,
+            BOUNDS,
+            checkpoint=tmp_path,
+            override=lambda f: override(f.parameters, emissivity=0.9),
+        )
+    with pytest.raises(CheckpointError, match=r"other block_s"):
+        reduce_frames(frames[:4], registration, GRID, BOUNDS, checkpoint=tmp_path, block_s=1)
+
+
+SCENE = Scene(disc_K=-4.0)
+STILL = SCENE.render()
+ZOOM = 1.05
+
+
+def reduced(tmp_path, rng, images, *, interval_s=60.0, cycles=None):
+    noisy = [image + rng.normal(0.0, 0.05, image.shape) for image in images]
+    frames = record(tmp_path / "a.seq", noisy, interval_s=interval_s)
+    edges = np.linspace(0.0, interval_s * len(images), (cycles or len(images)) + 1)
+    return reduce_frames(frames, registered(), GRID, START + np.round(1e3 * edges).astype("m8[ms]"))
+
+
+def rms_K(fields) -> float:
+    return float(np.sqrt(np.nanmean((fields["temperature"].values - cell_truth()) ** 2)))
+
+
+@pytest.mark.parametrize("shift_px", [(40.0, -25.0), (0.7, 0.0)])
+def test_a_knock_of_any_size_is_followed(tmp_path, rng, shift_px):
+    fields = reduced(tmp_path, rng, [STILL] * 3 + [replace(SCENE, shift_px=shift_px).render()] * 3)
+    (knock,) = json.loads(fields.attrs["knocks"])
+    assert knock["index"] == 3
+    assert knock["shift_px"] == pytest.approx(shift_px, abs=0.05)
+    assert knock["zoom"] == pytest.approx(1.0, abs=3e-4)
+    # 50 mK of noise and 17 pixels per cell.
+    assert rms_K(fields) < 0.02
+    assert np.nanmax(fields["frame_shift"].values) < 0.2
+    for remark in ("unchecked_stretches", "frames_shaken", "frames_unchecked"):
+        assert json.loads(fields.attrs[remark]) == []
+
+
+def test_a_zoom_is_followed(tmp_path, rng):
+    # Zoomed about a corner, so that the table stays within the image.
+    warp = np.array([[ZOOM, 0.0, -20.0], [0.0, ZOOM, -10.0]])
+    zoomed = cv2.warpAffine(STILL, warp, (640, 480), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    fields = reduced(tmp_path, rng, [STILL] * 3 + [zoomed] * 3)
+    (knock,) = json.loads(fields.attrs["knocks"])
+    assert (knock["index"], knock["zoom"]) == (3, pytest.approx(ZOOM, abs=1e-3))
+    assert rms_K(fields) < 0.02
+
+
+def test_a_frame_displaced_alone_is_left_out(tmp_path, rng):
+    shaken = replace(SCENE, shift_px=(8.0, 3.0)).render()
+    fields = reduced(tmp_path, rng, [STILL, STILL, shaken, STILL, STILL])
+    assert json.loads(fields.attrs["frames_shaken"]) == ["a.seq#2"]
+    assert np.isnan(fields["temperature"].values[2]).all()
+    assert fields["frame_count"].values.tolist() == [1, 1, 1, 1]
+
+
+def test_low_contrast_is_no_open_stretch_if_a_later_frame_shows_the_registration(tmp_path, rng):
+    uniform = Scene(disc_K=-4.0, field=lambda x, y: 23.0 + 0.0 * x, outside=23.0)
+    # Discs as warm as the table, and the table as warm as what surrounds it.
+    shown, hidden = uniform.render(), replace(uniform, discs=()).render()
+    closed = reduced(tmp_path, rng, [shown, hidden, hidden, shown])
+    assert json.loads(closed.attrs["frames_unchecked"]) == ["a.seq#1", "a.seq#2"]
+    assert json.loads(closed.attrs["unchecked_stretches"]) == []
+    opened = reduced(tmp_path, rng, [shown, shown, hidden, hidden])
+    assert json.loads(opened.attrs["unchecked_stretches"]) == [{"first": "a.seq#2", "last": "a.seq#3", "frames": 2}]
+
+
+def covered(above_K: float) -> np.ndarray:
+    """An object of uniform temperature over a seventh of the table."""
+    image = STILL.copy()
+    image[130:300, 250:330] = 24.0 + above_K
+    return image
+
+
+@pytest.mark.parametrize("above_K", [7.0, -3.0])
+def test_frames_with_an_object_are_left_out_and_named(tmp_path, rng, above_K):
+    images = [covered(above_K) if i in (2, 5) else STILL for i in range(8)]
+    fields = reduced(tmp_path, rng, images)
+    assert json.loads(fields.attrs["frames_obstructed"]) == ["a.seq#2", "a.seq#5"]
+    assert np.isnan(fields["temperature"].values[[2, 5]]).all()
+    assert rms_K(fields) < 0.02
+
+
+def test_the_other_frames_of_a_block_are_kept(tmp_path, rng):
+    images = [covered(7.0) if i in (0, 6, 7) else STILL for i in range(10)]
+    fields = reduced(tmp_path, rng, images, interval_s=0.5, cycles=2)
+    assert json.loads(fields.attrs["frames_obstructed"]) == ["a.seq#0", "a.seq#6", "a.seq#7"]
+    assert fields["frame_count"].values.tolist() == [4, 3]
+    assert rms_K(fields) < 0.015
+
+
+def test_an_object_that_stays_is_no_passing_one(tmp_path, rng):
+    fields = reduced(tmp_path, rng, [STILL] * 3 + [covered(7.0)] * 7, interval_s=200.0)
+    assert json.loads(fields.attrs["frames_obstructed"]) == []
+
+
+def test_a_common_change_is_no_object_and_limits_grow_with_the_noise():
+    base = np.linspace(20.0, 24.0, 200)
+    part = np.where(np.arange(200) < 20, 1.0, 0.0)
+    values = np.stack([base + 2.0, base + part])
+    np.testing.assert_allclose(pixels_off(values, base, base, 0.05), [0.0, 0.1])
+    gap = values.copy()
+    gap[:, 150] = np.nan
+    np.testing.assert_allclose(pixels_off(gap, base, base, 0.05), [0.0, 0.1])
+    # Eight standard deviations of 0.2 K are more than 1 K.
+    np.testing.assert_allclose(pixels_off(values, base, base, 0.2), [0.0, 0.0])
+
+
+WHOLE = [RegistrationSpan(0, None)]
+
+
+@dataclass(frozen=True)
+class SimulatedFrame:
+    """What planning needs of a frame."""
+
+    path: Path
+    index: int
+    time: np.datetime64
+    parameters: object = SC660
+    shape: tuple[int, int] = (480, 640)
+
+    @property
+    def plain_samples(self) -> PlainSamples:
+        return PlainSamples(1000 + 620_000 * self.index, True)
+
+
+def simulated(frames, *, cycles, interval_ms=33, files=24):
+    """A recording of which nothing is on disk."""
+    times = START + np.arange(frames) * np.timedelta64(interval_ms, "ms")
+    paths = [Path(f"hour{n}.seq") for n in range(files)]
+    references = [SimulatedFrame(paths[i * files // frames], i, time) for i, time in enumerate(times)]
+    bounds = START + np.linspace(0, interval_ms * frames, cycles + 1).round().astype("m8[ms]")
+    return make_frame_series(references, bounds, shape=(480, 640), override=lambda frame: frame.parameters)
+
+
+def cut(series, spans=WHOLE, **options):
+    return cut_stretches(cut_blocks(series, spans, block_s=10), total=len(series), **options)
+
+
+def test_stretches_divide_short_and_long_recordings_and_end_at_registrations():
+    series = simulated(756_000, cycles=100)
+    stretches = cut(series)
+    frames = [sum(portion.frames for portion in stretch) for stretch in stretches]
+    assert sum(frames) == 756_000
+    assert max(frames) <= STRETCH_FRAMES
+    # Cycles of 7,560 frames are two tasks each; with 5,000 frames/s, none takes less than half a second or more than one.
+    assert len(stretches) == 200
+    assert min(frames) > 2500
+    stretches = cut(simulated(4000, cycles=100))
+    assert len(stretches) >= 14
+    assert all(portion.whole for stretch in stretches for portion in stretch)
+    assert all(len(stretch) <= 8 for stretch in stretches)
+    series = simulated(3000, cycles=2)
+    knocked = cut(series, [RegistrationSpan(0, None), RegistrationSpan(700, None)])
+    assert all(len({portion.first.span for portion in stretch}) == 1 for stretch in knocked)
+    tail = cut_stretches(cut_blocks(series, WHOLE, block_s=10, first=1400), total=3000, begun=(0, 0))
+    assert tail[0][0].first.first == 1400
+    assert not tail[0][0].whole
+    stretches = cut(simulated(20_000, cycles=2, interval_ms=60_000))
+    assert max(sum(len(portion.blocks) for portion in stretch) for stretch in stretches) == 256
+
+
+def test_what_a_resumed_run_has_to_find_is_described_the_same_for_equal_parameters():
+    series = simulated(50, cycles=2)
+    copies = FrameSeries(
+        series.references,
+        series.times,
+        series.bounds,
+        series.cycles,
+        series.correction_K,
+        lambda frame: replace(frame.parameters),
+    )
+    assert describe_reduction(series, GRID, [], block_s=10) == describe_reduction(copies, GRID, [], block_s=10)
+
+
+@pytest.fixture(scope="module")
+def short_film(tmp_path_factory):
+    rng = np.random.default_rng(3)
+    image = Scene(disc_K=-4.0).render()
+    registration = registered()
+    images = [image + 0.2 * i + rng.normal(0, 0.05, image.shape) for i in range(9)]
+    frames = record(tmp_path_factory.mktemp("stretches") / "a.seq", images)
+    weights = plan_weights(registration, GRID)
+    sensor = RegisteredSensor(weights, monitor_fiducials(registration, GRID, weights.window))
+    return frames, sensor
+
+
+def test_a_portion_is_the_mean_of_its_frames(short_film):
+    frames, sensor = short_film
+    series = make_frame_series(
+        frames,
+        START + np.array([0, 6]) * np.timedelta64(1, "s"),
+        shape=(480, 640),
+        override=lambda frame: frame.parameters,
+        correction_K=np.full(9, 0.25),
+    )
+    blocks = cut_blocks(series, WHOLE, block_s=2)
+    [stretch] = cut_stretches(blocks, total=len(series))[:1]
+    tasks = [(gather_frames(series, portion.blocks), portion.whole) for portion in stretch]
+    [result, *_] = reduce_stretch(tasks, sensor)
+    assert stretch[0].whole
+    truth = sensor.weights.resample(
+        np.mean([calibrate(f.read_counts(), SC660)[sensor.weights.window] for f in frames[:6]], 0)
+    )
+    np.testing.assert_allclose(result.part.mean, truth + 0.25, atol=1e-4)
+    assert result.part.frames == 6
+    assert result.part.seconds == pytest.approx(15.0)
+    assert [view.cells.dtype for view in result.blocks] == [np.dtype("f4")] * 3
+    # Of frames that belong to no cycle only the fields of their blocks are wanted.
+    outside = [block for block in blocks if block.cycle == NO_CYCLE]
+    assert reduce_portion(gather_frames(series, outside), sensor, whole=False).part is None
+
+
+def test_frames_left_out_take_no_part(short_film):
+    frames, sensor = short_film
+    series = make_frame_series(
+        frames, START + np.array([0, 9]) * np.timedelta64(1, "s"), shape=(480, 640), override=lambda f: f.parameters
+    )
+    [block] = cut_blocks(series, WHOLE, block_s=60)
+    some = reduce_portion([choose_frames(series, block, np.array([0, 2]))], sensor, whole=False)
+    assert some.part.frames == 2
+    assert some.part.seconds == pytest.approx(2.0)

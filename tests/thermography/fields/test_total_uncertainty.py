@@ -1,7 +1,5 @@
 """Total uncertainty of fields: parts add up, an emissivity error is a share of the rise, and simulated errors are covered."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +8,17 @@ import xarray as xr
 
 from tests.thermography.fields.test_cycle_fields import PLAN, SURE, WHOLE, part
 from tests.thermography.flir_mutations import PARAMETERS
+from tests.thermography.rise_budget import temperature_rise_uncertainty
 from thermography.fields.cycle_fields import assemble_fields
-from thermography.fields.surfaces import Surface
-from thermography.fields.total_uncertainty import ShownRange, compare_with_monte_carlo, evaluate_uncertainty, find_range
+from thermography.fields.total_uncertainty import (
+    ShownRange,
+    Surface,
+    compare_with_monte_carlo,
+    evaluate_uncertainty,
+    find_range,
+)
 from thermography.radiometry.planck import RadiometryError, counts_from_temperature, override, temperature_from_counts
-from thermography.radiometry.uncertainty import InputUncertainty, temperature_rise_uncertainty, temperature_uncertainty
+from thermography.radiometry.uncertainty import InputUncertainty, temperature_uncertainty
 
 CAMERA = override(PARAMETERS, emissivity=0.97, object_distance_m=1.2, reflected_temperature_K=295.15)
 NONE = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -26,7 +30,7 @@ def fields(noise_K: float = 0.01, top: float = 27.0) -> xr.Dataset:
     return assemble_fields(parts, 3, PLAN, [SURE], [WHOLE])
 
 
-def test_noise_and_common_part_add_up_to_the_propagated_budget() -> None:
+def test_noise_and_common_part_add_up_to_the_propagated_budget():
     reduced = fields()
     before = reduced.copy(deep=True)
     done = evaluate_uncertainty(reduced, [CAMERA] * 3)
@@ -38,9 +42,12 @@ def test_noise_and_common_part_add_up_to_the_propagated_budget() -> None:
     # The share of the rise is the derivative at its middle: exact to the third order of the rise.
     np.testing.assert_allclose(cell["temperature_rise_u"], np.hypot(rise, [0, 0.01414, 0.01414]), rtol=5e-3)
     assert done["temperature_u"].attrs["units_metadata"] == "temperature: difference"
+    done = evaluate_uncertainty(fields(), [CAMERA] * 3, NONE)
+    np.testing.assert_allclose(done["temperature_u"], done["temperature_noise_u"])
+    np.testing.assert_allclose(done["temperature_rise_u"], done["temperature_rise_noise_u"])
 
 
-def test_an_uncertain_emissivity_is_its_share_of_every_rise() -> None:
+def test_an_uncertain_emissivity_is_its_share_of_every_rise():
     inputs = InputUncertainty(0.0097, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3, inputs)
     share = done["temperature_rise_u"] / done["temperature_rise"]
@@ -49,7 +56,7 @@ def test_an_uncertain_emissivity_is_its_share_of_every_rise() -> None:
     assert float(done["temperature_rise_u"][0].max()) == 0.0
 
 
-def test_a_cell_that_the_first_cycle_does_not_show_leaves_the_others_their_uncertainty() -> None:
+def test_a_cell_that_the_first_cycle_does_not_show_leaves_the_others_their_uncertainty():
     whole = fields()
     hidden = whole.copy(deep=True)
     hidden["temperature"][0, 2, 2] = np.nan
@@ -65,13 +72,7 @@ def test_a_cell_that_the_first_cycle_does_not_show_leaves_the_others_their_uncer
     )
 
 
-def test_without_uncertain_inputs_the_noise_is_left() -> None:
-    done = evaluate_uncertainty(fields(), [CAMERA] * 3, NONE)
-    np.testing.assert_allclose(done["temperature_u"], done["temperature_noise_u"])
-    np.testing.assert_allclose(done["temperature_rise_u"], done["temperature_rise_noise_u"])
-
-
-def test_of_a_drift_that_is_stated_and_what_a_correction_leaves_the_larger_is_in_the_rise() -> None:
+def test_of_a_drift_that_is_stated_and_what_a_correction_leaves_the_larger_is_in_the_rise():
     drifting = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1)
     black = override(CAMERA, emissivity=1.0, object_distance_m=0.0)
     stated = evaluate_uncertainty(fields(noise_K=0.0), [black] * 3, drifting).isel(y=1, x=1)
@@ -88,7 +89,7 @@ def test_of_a_drift_that_is_stated_and_what_a_correction_leaves_the_larger_is_in
     np.testing.assert_allclose(left["temperature_rise_u"], [0.0, 0.1, 0.1], rtol=1e-3)
 
 
-def test_surfaces_have_the_uncertainty_of_their_own_emissivity() -> None:
+def test_surfaces_have_the_uncertainty_of_their_own_emissivity():
     left = np.zeros(PLAN.shape, bool)
     left[:, :3] = True
     surfaces = [Surface("", 0.97, 0.01, ~left), Surface("steel", 0.35, 0.035, left)]
@@ -98,7 +99,7 @@ def test_surfaces_have_the_uncertainty_of_their_own_emissivity() -> None:
     assert scale[0, 5] < 0.02
 
 
-def test_metal_is_corrected_to_the_propagated_distribution_or_refused() -> None:
+def test_metal_is_corrected_to_the_propagated_distribution_or_refused():
     metal = override(CAMERA, emissivity=0.15)
     first = temperature_rise_uncertainty(27.0, 22.0, metal, InputUncertainty(emissivity=0.04)).common_u
     done = evaluate_uncertainty(fields(), [metal] * 3, InputUncertainty(emissivity=0.04))
@@ -107,7 +108,7 @@ def test_metal_is_corrected_to_the_propagated_distribution_or_refused() -> None:
         evaluate_uncertainty(fields(), [metal] * 3, InputUncertainty(emissivity=0.1))
 
 
-def test_drawn_inputs_are_covered(rng: np.random.Generator) -> None:
+def test_drawn_inputs_are_covered(rng):
     """One wrong emissivity, one reflected temperature, one offset and scale of the camera per draw, in all cycles."""
     done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3).isel(y=1, x=1)
     true = np.array([22.0, 24.0, 27.0])
@@ -141,13 +142,10 @@ def shown(temperature: np.ndarray, rise: np.ndarray) -> ShownRange:
     return found
 
 
-def test_surfaces_that_do_not_warm_can_be_compared() -> None:
+def test_first_order_is_compared_with_drawn_values_of_all_cells():
     still = np.full(4, 22.0)
     compared = compare_with_monte_carlo(shown(still, still - 22.0), CAMERA, InputUncertainty())
     assert compared.rise_ratio == pytest.approx(1.0, abs=0.05)
-
-
-def test_a_cell_that_the_first_cycle_does_not_show_does_not_hide_how_far_first_order_is_right() -> None:
     temperature = np.array([22.0, 30.0, 40.0])
     hidden, whole = (
         compare_with_monte_carlo(shown(temperature, np.array([first, 8.0, 18.0])), CAMERA, InputUncertainty())

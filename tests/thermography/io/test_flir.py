@@ -1,13 +1,19 @@
-"""FLIR files as containers of frames: JPEG segments, sequences, padding and damage; everything rejected is reported."""
+"""FLIR files as containers of frames: JPEG segments, sequences, padding, damage and annotations; everything rejected is reported."""
 
-from __future__ import annotations
-
+import json
+import shutil
 import struct
+import subprocess
+from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
 
+import flyr
 import numpy as np
 import pytest
+from flirpy.io.seq import Seq
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.thermography.flir_mutations import (
     CAMERA,
@@ -16,15 +22,26 @@ from tests.thermography.flir_mutations import (
     PARAMETERS,
     SETTINGS,
     TIME,
+    fuzz,
     jpeg,
     sequence,
 )
 from tests.thermography.flir_mutations import frame as simulate
-from thermography.io.flir import index_frames, index_sequence, read_frame
-from thermography.io.flir_writer import write_jpeg
+from thermography.io import sequence as by_threads
+from thermography.io.flir import (
+    FlirFrameReference,
+    FrameReference,
+    MeasurementRegion,
+    index_frames,
+    index_sequence,
+    read_frame,
+    read_measurement_regions,
+    read_visible_picture,
+)
+from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
-from thermography.io.frame_index import by_threads
-from thermography.io.frame_readers import index_recordings
+from thermography.io.other_cameras import index_recordings
+from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate, override
 
 SC660_JPEG = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
 SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
@@ -48,10 +65,8 @@ def _segments(data: bytes) -> list[tuple[int, int]]:
 
 
 # What files hold -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.real_data
-def test_sequence_is_walked_by_record_ends_not_by_magic(real_file) -> None:
+def test_sequence_is_walked_by_record_ends_not_by_magic(real_file):
     path = real_file(SC660_SEQ)
     # The pixels of this file hold the bytes of the magic, at which splitters cut it.
     assert path.read_bytes().count(b"FFF\0") > 2
@@ -64,7 +79,7 @@ def test_sequence_is_walked_by_record_ends_not_by_magic(real_file) -> None:
 
 
 @pytest.mark.real_data
-def test_csq_whose_last_frame_lacks_padding_is_read_whole(real_file) -> None:
+def test_csq_whose_last_frame_lacks_padding_is_read_whole(real_file):
     frames, rejected = index_frames([real_file(T1030_CSQ)])
     assert len(frames) == 8 and rejected == []
     assert frames[-1].notes == ("the last 4 padding bytes of the samples are missing",)
@@ -87,7 +102,7 @@ def test_csq_whose_last_frame_lacks_padding_is_read_whole(real_file) -> None:
         (C3X_JPEG, (96, 128), 1),
     ],
 )
-def test_other_cameras_give_smooth_pictures(real_file, name: str, shape: tuple[int, int], frames: int) -> None:
+def test_other_cameras_give_smooth_pictures(real_file, name, shape, frames):
     references, rejected = index_frames([real_file(name)])
     assert len(references) == frames and rejected == []
     counts = references[0].read().counts.astype(float)
@@ -97,10 +112,8 @@ def test_other_cameras_give_smooth_pictures(real_file, name: str, shape: tuple[i
 
 
 # Containers ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("encoding", ["raw", "png", "jpegls"])
-def test_written_jpeg_and_sequence_come_back_equal(tmp_path: Path, encoding: str) -> None:
+def test_written_jpeg_and_sequence_come_back_equal(tmp_path, encoding):
     written = jpeg(tmp_path / "a.jpg", encoding)
     sequence(tmp_path / "a.seq", encoding)
     for frame in (read_frame(tmp_path / "a.jpg"), index_frames([tmp_path / "a.jpg"])[0][0].read()):
@@ -115,7 +128,7 @@ def test_written_jpeg_and_sequence_come_back_equal(tmp_path: Path, encoding: str
     assert {frame.settings for frame in frames} == {SETTINGS}
 
 
-def test_segments_may_come_in_any_order(tmp_path: Path) -> None:
+def test_segments_may_come_in_any_order(tmp_path):
     path = tmp_path / "a.jpg"
     written = jpeg(path, rows=200, columns=400)
     data = path.read_bytes()
@@ -129,7 +142,7 @@ def test_segments_may_come_in_any_order(tmp_path: Path) -> None:
     assert len(pieces) == 4
 
 
-def test_segments_must_be_complete_and_single(tmp_path: Path) -> None:
+def test_segments_must_be_complete_and_single(tmp_path):
     path = tmp_path / "a.jpg"
     jpeg(path, rows=200, columns=400)
     data = path.read_bytes()
@@ -144,7 +157,7 @@ def test_segments_must_be_complete_and_single(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("padding", [1, 37, 5000])
-def test_undeclared_padding_is_stepped_over_and_said(tmp_path: Path, padding: int) -> None:
+def test_undeclared_padding_is_stepped_over_and_said(tmp_path, padding):
     path = tmp_path / "a.seq"
     written = sequence(path, frames=3, padding=padding)
     data = bytearray(path.read_bytes())
@@ -160,7 +173,7 @@ def test_undeclared_padding_is_stepped_over_and_said(tmp_path: Path, padding: in
 
 
 @pytest.mark.parametrize("damaged", [0, 1, 2])
-def test_a_frame_whose_header_is_lost_is_no_padding(tmp_path: Path, damaged: int) -> None:
+def test_a_frame_whose_header_is_lost_is_no_padding(tmp_path, damaged):
     path = tmp_path / "a.seq"
     written = sequence(path, frames=3)
     data = bytearray(path.read_bytes())
@@ -179,7 +192,7 @@ def test_a_frame_whose_header_is_lost_is_no_padding(tmp_path: Path, damaged: int
     assert f"expected {expected}" in lost.reason
 
 
-def test_declared_padding_needs_no_search(tmp_path: Path) -> None:
+def test_declared_padding_needs_no_search(tmp_path):
     path = tmp_path / "a.seq"
     sequence(path, frames=2, padding=100)
     data = bytearray(path.read_bytes())
@@ -191,24 +204,13 @@ def test_declared_padding_needs_no_search(tmp_path: Path) -> None:
     assert len(frames) == 2 and frames[1].notes == () and rejected == []
 
 
-def test_a_file_without_time_is_read_without_one(tmp_path: Path) -> None:
+def test_a_file_without_time_is_read_without_one(tmp_path):
     write_jpeg(tmp_path / "a.jpg", np.full((4, 5), 18000, np.uint16), PARAMETERS, np.datetime64("NaT"))
     frames, rejected = index_frames([tmp_path / "a.jpg"])
     assert np.isnat(frames[0].time) and rejected == []
 
 
-# Many files ----------------------------------------------------------------------------------------------------------
-
-
-def test_frames_of_many_files_come_in_order_of_time(tmp_path: Path) -> None:
-    names = ["c.jpg", "a.jpg", "b.jpg"]
-    for second, name in enumerate(names):
-        jpeg(tmp_path / name, seconds=second)
-    frames, rejected = index_frames(sorted(tmp_path.iterdir()))
-    assert [frame.path.name for frame in frames] == names and rejected == []
-
-
-def test_nothing_is_left_out_in_silence(tmp_path: Path) -> None:
+def test_nothing_is_left_out_in_silence(tmp_path):
     jpeg(tmp_path / "good.jpg")
     (tmp_path / "text.jpg").write_bytes(b"not a picture")
     (tmp_path / "empty.seq").write_bytes(b"")
@@ -225,7 +227,7 @@ def test_nothing_is_left_out_in_silence(tmp_path: Path) -> None:
     assert "No such file" in reasons["absent.jpg"]
 
 
-def test_a_damaged_frame_inside_a_sequence_costs_only_itself(tmp_path: Path) -> None:
+def test_a_damaged_frame_inside_a_sequence_costs_only_itself(tmp_path):
     path = tmp_path / "a.seq"
     written = sequence(path, frames=3)
     data = bytearray(path.read_bytes())
@@ -240,7 +242,7 @@ def test_a_damaged_frame_inside_a_sequence_costs_only_itself(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("kept", [3, 63, 64, 500, 1000])
-def test_a_last_frame_cut_inside_its_headers_is_said(tmp_path: Path, kept: int) -> None:
+def test_a_last_frame_cut_inside_its_headers_is_said(tmp_path, kept):
     path = tmp_path / "a.seq"
     sequence(path, frames=3)
     data = path.read_bytes()
@@ -250,7 +252,7 @@ def test_a_last_frame_cut_inside_its_headers_is_said(tmp_path: Path, kept: int) 
     assert "before the end" in rejected[0].reason or f"found {kept} bytes that are neither" in rejected[0].reason
 
 
-def test_a_jpeg_that_ends_too_early_is_left_out_at_once(tmp_path: Path) -> None:
+def test_a_jpeg_that_ends_too_early_is_left_out_at_once(tmp_path):
     path = tmp_path / "a.jpg"
     jpeg(path, rows=200, columns=400)
     data = path.read_bytes()
@@ -260,15 +262,7 @@ def test_a_jpeg_that_ends_too_early_is_left_out_at_once(tmp_path: Path) -> None:
     assert frames == [] and "50 bytes fewer: the frame is truncated" in rejected[0].reason
 
 
-def test_a_frame_reference_reads_in_another_process(tmp_path: Path) -> None:
-    import pickle
-
-    written = jpeg(tmp_path / "a.jpg")
-    (reference,), _ = index_frames([tmp_path / "a.jpg"])
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reference)).read().counts, written.counts)
-
-
-def test_ten_thousand_frames_are_indexed_without_their_pixels(tmp_path: Path) -> None:
+def test_ten_thousand_frames_are_indexed_without_their_pixels(tmp_path):
     path = tmp_path / "a.seq"
     (template,) = sequence(path, frames=1, rows=100, columns=100)
     record = path.read_bytes()
@@ -288,20 +282,20 @@ def test_ten_thousand_frames_are_indexed_without_their_pixels(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("kind", [str, Path])
-def test_a_single_path_is_one_file(tmp_path: Path, kind: type) -> None:
+def test_a_single_path_is_one_file(tmp_path, kind):
     write_jpeg(tmp_path / "a.jpg", np.full((8, 8), 18000, np.uint16), PARAMETERS, TIME)
     frames, rejected = index_frames(kind(tmp_path / "a.jpg"))
     assert [frame.path for frame in frames] == [tmp_path / "a.jpg"]
     assert rejected == []
 
 
-def test_a_missing_file_is_named_by_the_error(tmp_path: Path) -> None:
+def test_a_missing_file_is_named_by_the_error(tmp_path):
     with pytest.raises(FileNotFoundError) as caught:
         read_frame(tmp_path / "a.jpg")
     assert Path(caught.value.filename) == tmp_path / "a.jpg"
 
 
-def test_a_sequence_is_read_on_from_where_it_was_read_before(tmp_path: Path) -> None:
+def test_a_sequence_is_read_on_from_where_it_was_read_before(tmp_path):
     path = tmp_path / "a.seq"
     sequence(path, frames=5)
     whole = path.read_bytes()
@@ -315,7 +309,7 @@ def test_a_sequence_is_read_on_from_where_it_was_read_before(tmp_path: Path) -> 
     assert [frame.time for frame in [*frames, *rest]] == [frame.time for frame in every]
 
 
-def test_a_sequence_that_is_over_tells_what_its_end_lacks(tmp_path: Path) -> None:
+def test_a_sequence_that_is_over_tells_what_its_end_lacks(tmp_path):
     path = tmp_path / "a.seq"
     sequence(path)
     whole = path.read_bytes()
@@ -326,7 +320,7 @@ def test_a_sequence_that_is_over_tells_what_its_end_lacks(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("index", [index_frames, index_recordings])
-def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path: Path, monkeypatch, index) -> None:
+def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path, monkeypatch, index):
     """Where a folder is not in memory, threads wait for the disk; frames, order and reasons must not show it."""
     paths = []
     for number in range(60):
@@ -341,3 +335,276 @@ def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path: Path,
     together = index(paths)
     assert list(together[0]) == list(alone[0]) and together[1] == alone[1]
     assert len(alone[0]) + len(alone[1]) == 61 and len(alone[1]) > 4
+
+
+def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path):
+    read, refused = fuzz(tmp_path, 2000, seed=11)
+    assert read > 700 and refused > 700
+
+
+FOLDER = {
+    "spots": "gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg",
+    "area": "gtatters__Thermimage/inst/extdata/IR_2412.jpg",
+    "picture": "frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg",
+}
+
+
+def reference(path: Path) -> FlirFrameReference:
+    (frame,), _ = index_frames([path])
+    assert isinstance(frame, FlirFrameReference)
+    return frame
+
+
+@pytest.mark.real_data
+def test_the_spots_of_a_real_file(real_file):
+    assert read_measurement_regions(reference(real_file(FOLDER["spots"]))) == [
+        MeasurementRegion("Sp1", "spot", {"column": 66, "row": 57}),
+        MeasurementRegion("Sp2", "spot", {"column": 83, "row": 112}),
+    ]
+
+
+@pytest.mark.real_data
+def test_the_area_of_a_real_file_lies_in_its_frame(real_file):
+    frame = reference(real_file(FOLDER["area"]))
+    (region,) = read_measurement_regions(frame)
+    assert (region.kind, region.place) == ("area", {"column": 210, "row": 157, "width": 219, "height": 166})
+    assert region.place["column"] + region.place["width"] <= frame.shape[1]
+
+
+@pytest.mark.real_data
+def test_the_picture_of_a_real_file(real_file):
+    picture = read_visible_picture(reference(real_file(FOLDER["picture"])))
+    assert picture.pixels.shape == (480, 640, 3)
+    assert picture.scale == pytest.approx(1.4437, abs=1e-4)
+    assert picture.offset_px == (10, -20)
+
+
+@pytest.mark.real_data
+def test_a_damaged_picture_is_refused_and_damaged_tools_are_none(real_file, tmp_path):
+    content = real_file(FOLDER["picture"]).read_bytes()
+    second = content.index(b"\xff\xd8\xff\xe0", content.index(b"FLIR\0"))
+    path = tmp_path / "a.jpg"
+    path.write_bytes(content[:second] + bytes(20_000) + content[second + 20_000 :])
+    with pytest.raises(FlirFormatError, match=r"a.jpg: the visible-light picture of frame 0 is damaged"):
+        read_visible_picture(reference(path))
+    content = real_file(FOLDER["spots"]).read_bytes()
+    label = content.index("Sp1".encode("utf-16-le"))
+    path.write_bytes(content[: label - 44] + b"\xff" * 40 + content[label - 4 :])
+    assert read_measurement_regions(reference(path)) == []
+
+
+def test_files_without_annotations_have_none(tmp_path):
+    jpeg(tmp_path / "a.jpg")
+    frame = reference(tmp_path / "a.jpg")
+    assert read_measurement_regions(frame) == []
+    assert read_visible_picture(frame) is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.integers(1, 40),
+    columns=st.integers(1, 40),
+    encoding=st.sampled_from(["raw", "png", "jpegls"]),
+    seed=st.integers(0, 2**32 - 1),
+    milliseconds=st.integers(1000, 4_000_000_000_000),
+    offset=st.integers(-720, 840),
+)
+def test_random_frames_survive_a_round_trip(tmp_path_factory, rows, columns, encoding, seed, milliseconds, offset):
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(0.1, 1, 18).astype(np.float32).astype(float)
+    parameters = type(PARAMETERS)(*values)
+    parameters = type(PARAMETERS)(**{**vars(parameters), "planck_o": float(rng.integers(-30000, 30000))})
+    counts = rng.integers(0, 65536, (rows, columns)).astype(np.uint16)
+    time = np.datetime64(milliseconds, "ms")
+    path = tmp_path_factory.mktemp("round") / "a.jpg"
+    write_jpeg(path, counts, parameters, time, utc_offset_minutes=offset, encoding=encoding)
+    frame = read_frame(path)
+    np.testing.assert_array_equal(frame.counts, counts)
+    assert (frame.parameters, frame.time, frame.utc_offset_minutes) == (parameters, time, offset)
+
+
+def test_writing_leaves_its_input_alone_and_streams(tmp_path):
+    frames = sequence(tmp_path / "a.seq")
+    copies = [frame.counts.copy() for frame in frames]
+    for encoding in ("raw", "png", "jpegls"):
+        assert write_sequence(tmp_path / "b.seq", iter(frames), encoding=encoding) == 3
+    for frame, copy in zip(frames, copies, strict=True):
+        np.testing.assert_array_equal(frame.counts, copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"counts": np.zeros((3, 3))}, r"counts: expected uint16 with dims \(row, column\), got float64 of shape"),
+        ({"counts": np.zeros(3, np.uint16)}, r"got uint16 of shape \(3,\)"),
+        ({"time": "1965-01-01"}, "a FLIR file stores times from 1970 to 2106 only"),
+        ({"housekeeping": {"TSLens": 20.0}}, r"housekeeping 'TSLens' = 20\.0: expected an ASCII name .* and 150 to"),
+        ({"housekeeping": {f"T{i}": 300.0 for i in range(60)}}, "a FLIR file stores 47 readings, not 60"),
+        ({"encoding": "tiff"}, "encoding 'tiff': expected 'raw', 'png' or 'jpegls'"),
+    ],
+)
+def test_what_the_format_cannot_hold_is_refused(tmp_path, change, message):
+    arguments = {"counts": np.ones((3, 3), np.uint16), "time": TIME} | change
+    with pytest.raises(ValueError, match=message):
+        write_jpeg(tmp_path / "a.jpg", parameters=PARAMETERS, **arguments)
+
+
+def test_a_frame_too_large_for_a_jpeg_is_sent_to_a_sequence(tmp_path):
+    with pytest.raises(ValueError, match="does not fit the 256 segments of a JPEG; use write_sequence, or"):
+        write_jpeg(tmp_path / "a.jpg", np.zeros((3000, 3000), np.uint16), PARAMETERS, TIME)
+
+
+#: File -> frames, and what flyr, flirpy and exiftool make of it: frames whose counts (exiftool: parameters) equal ours.
+FILES: dict[str, tuple[int, int, int, int]] = {
+    "gtatters__Thermimage/inst/extdata/IR_2412.jpg": (1, 1, 0, 1),
+    "gtatters__Thermimage/inst/extdata/SampleSEQ.seq": (2, 0, 2, 1),
+    "gtatters__Thermimage/inst/extdata/SampleCSQ.csq": (8, 0, 0, 1),
+    "gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg": (1, 1, 0, 1),
+    "gpereyrairujo__IRimage/Windows/IRimage/sample_images/07 - BillHotFlashThermography.jpg": (1, 0, 0, 1),
+    "gpereyrairujo__IRimage/Windows/IRimage/sample_images/16 - Man_in_water_-_IR_image.jpg": (1, 1, 0, 1),
+    "LJMUAstroecology__flirpy/test/test_data/frame_000000_le.fff": (1, 0, 1, 1),
+    "LJMUAstroecology__flirpy/test/test_data/test.seq": (7, 0, 7, 1),
+    "SanNianYiSi__thermal_parser/images/FLIR_E40.jpg": (1, 1, 0, 1),
+    "SanNianYiSi__thermal_parser/images/DJI_XT2.jpg": (1, 0, 0, 1),
+    "VladimirSinitsin__flir_extractor/bin/examples/frame.fff": (1, 0, 1, 1),
+    **{f"frkatona__ThermalImageFitter/Nov19/FLIR{number}.jpg": (1, 1, 0, 1) for number in range(2167, 2216, 2)},
+}
+
+
+def _by_flyr(frame: FrameReference) -> bool | None:
+    """Whether flyr's counts equal ours; None where it does not read the file."""
+    if frame.path.name == "DJI_XT2.jpg":
+        # It takes the little-endian directory for a big-endian one and walks 33 million slots before it gives up.
+        return None
+    try:
+        counts = flyr.unpack(str(frame.path))._FlyrThermogram__thermal
+    except Exception:
+        return None
+    return bool(np.array_equal(counts, frame.read_counts()))
+
+
+def _by_flirpy(frame: FrameReference) -> bool | None:
+    """Whether flirpy's counts equal ours; None where it offers no reader or gives no finite temperature."""
+    if frame.path.suffix.lower() == ".jpg":
+        return None
+    theirs = Seq(str(frame.path))[frame.index]
+    # It takes compressed samples for counts: of these it says nothing, so its own temperatures must judge.
+    with np.errstate(all="ignore"):
+        if frame.samples.encoding != "raw" or not np.isfinite(theirs.get_radiometric_image()).any():
+            return None
+    return bool(np.array_equal(theirs.get_image(), frame.read_counts()))
+
+
+def _exiftool(paths: Sequence[Path]) -> list[dict[str, object]]:
+    """Return what exiftool prints for the first frame of each file, as numbers."""
+    program = shutil.which("exiftool")
+    if program is None:
+        pytest.skip("exiftool is not installed (Debian: libimage-exiftool-perl)")
+    command = [program, "-n", "-j", "-FLIR:all", *map(str, paths)]
+    printed: list[dict[str, object]] = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert [each["SourceFile"] for each in printed] == [str(path) for path in paths]
+    return printed
+
+
+def _agrees_with_exiftool(frame: FrameReference, printed: dict[str, object]) -> bool | None:
+    """Whether parameters, time and size equal exiftool's; None where it finds no camera information."""
+    if "PlanckR1" not in printed:
+        return None
+    p = frame.parameters
+    rows, columns = frame.shape
+    expected = {
+        "Emissivity": p.emissivity,
+        "ObjectDistance": p.object_distance_m,
+        "ReflectedApparentTemperature": p.reflected_temperature_K - ZERO_CELSIUS_K,
+        "AtmosphericTemperature": p.atmospheric_temperature_K - ZERO_CELSIUS_K,
+        "IRWindowTemperature": p.window_temperature_K - ZERO_CELSIUS_K,
+        "IRWindowTransmission": p.window_transmission,
+        "PlanckR1": p.planck_r1,
+        "PlanckB": p.planck_b,
+        "PlanckF": p.planck_f,
+        "PlanckO": p.planck_o,
+        "PlanckR2": p.planck_r2,
+        "AtmosphericTransAlpha1": p.atmosphere_alpha1,
+        "AtmosphericTransAlpha2": p.atmosphere_alpha2,
+        "AtmosphericTransBeta1": p.atmosphere_beta1,
+        "AtmosphericTransBeta2": p.atmosphere_beta2,
+        "AtmosphericTransX": p.atmosphere_x,
+        "RawThermalImageWidth": columns,
+        "RawThermalImageHeight": rows,
+        "RawValueRangeMin": frame.limits.raw_minimum,
+        "RawValueRangeMax": frame.limits.raw_maximum,
+    }
+    # exiftool prints float32 with up to 15 digits after its own kelvin conversion.
+    assert {key: float(str(printed[key])) for key in expected} == pytest.approx(expected, rel=1e-6, abs=1e-4)
+    assert str(printed["CameraModel"]).strip() == frame.camera.model
+    assert str(printed["CameraSerialNumber"]).strip() == frame.camera.serial
+    local = frame.time + np.timedelta64(frame.utc_offset_minutes, "m")
+    date, clock = str(local).split("T")
+    assert str(printed["DateTimeOriginal"]).startswith(f"{date.replace('-', ':')} {clock}")
+    return True
+
+
+@pytest.mark.real_data
+def test_file_by_reader_table(real_file):
+    table = {}
+    printed = _exiftool([real_file(name) for name in FILES])
+    for (name, expected), by_exiftool in zip(FILES.items(), printed, strict=True):
+        frames, rejected = index_frames([real_file(name)])
+        assert rejected == []
+        flyr_says = [_by_flyr(frame) for frame in frames[:1]]
+        flirpy_says = [_by_flirpy(frame) for frame in frames]
+        exiftool_says = [_agrees_with_exiftool(frames[0], by_exiftool)]
+        assert False not in flyr_says + flirpy_says, f"{name}: another reader has other counts"
+        table[name] = (len(frames), flyr_says.count(True), flirpy_says.count(True), exiftool_says.count(True))
+        assert table[name] == expected, name
+    print(f"{'frames':>8}{'flyr':>6}{'flirpy':>8}{'exiftool':>10}")
+    for name, (ours, *others) in table.items():
+        print(f"{ours:8d}{others[0]:6d}{others[1]:8d}{others[2]:10d}  {name}")
+
+
+@pytest.mark.parametrize("encoding", ["raw", "png"])
+def test_flyr_and_exiftool_read_our_jpeg(tmp_path, encoding):
+    path = tmp_path / "a.jpg"
+    written = jpeg(path, encoding, rows=48, columns=64)
+    (frame,), _ = index_frames([path])
+    assert _by_flyr(frame) is True
+    assert _agrees_with_exiftool(frame, *_exiftool([path])) is True
+    metadata = flyr.unpack(str(path)).metadata
+    assert metadata["planck_r2"] == written.parameters.planck_r2
+    assert metadata["emissivity"] == written.parameters.emissivity
+
+
+def test_flirpy_and_exiftool_read_our_sequence(tmp_path):
+    path = tmp_path / "a.seq"
+    written = sequence(path, frames=4, rows=48, columns=64)
+    frames, _ = index_frames([path])
+    assert [_by_flirpy(frame) for frame in frames] == [True] * 4
+    assert _agrees_with_exiftool(frames[0], *_exiftool([path])) is True
+    seconds = [frame.time.astype("datetime64[s]").astype(int) for frame in written]
+    assert [theirs.meta["Timestamp"] for theirs in Seq(str(path))] == seconds
+
+
+def test_ordinary_viewers_open_our_jpeg(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "a.jpg"
+    written = jpeg(path, rows=48, columns=64)
+    with Image.open(path) as picture:
+        assert picture.size == (64, 48)
+        assert picture.getexif()[0x0110] == "FLIR SC660"
+        grey = np.asarray(picture.convert("L"), float)
+    # Only the look is stored twice: bright where the counts are high.
+    assert np.corrcoef(grey.ravel(), written.counts.ravel().astype(float))[0, 1] > 0.98
+
+
+@pytest.mark.real_data
+def test_all_readers_agree_where_there_is_no_air(real_file):
+    path = real_file("gtatters__Thermimage/inst/extdata/IR_2412.jpg")
+    frame = read_frame(path)
+    ours = calibrate(frame.counts, override(frame.parameters, object_distance_m=0.0))
+    theirs = flyr.unpack(str(path)).adjust_metadata(object_distance=0.0).celsius
+    # float32 against float64 near 300 K: 2e-5 K.
+    np.testing.assert_allclose(ours, theirs, atol=5e-5)
+    with_air = np.abs(calibrate(frame.counts, frame.parameters) - flyr.unpack(str(path)).celsius).max()
+    # The two-half-path form of the public readers is off by hundredths of a kelvin over 1 m.
+    assert 0.03 < with_air < 0.06

@@ -1,7 +1,5 @@
 """FLIR files opened with xarray: lazy, with parameters as variables, and with a list of what could not be used."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import tomllib
@@ -24,9 +22,9 @@ def _open(path, **options) -> xr.Dataset:
     return xr.open_dataset(path, engine=FlirBackendEntrypoint, **options)
 
 
-def test_no_pixel_is_read_at_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_pixel_is_read_at_open(tmp_path, monkeypatch):
     written = sequence(tmp_path / "a.seq", frames=6)
-    read: list[int] = []
+    read = []
     original = FlirFrameReference.read_counts
     monkeypatch.setattr(FlirFrameReference, "read_counts", lambda self: read.append(self.index) or original(self))
     dataset = _open(tmp_path / "a.seq")
@@ -46,14 +44,14 @@ def test_no_pixel_is_read_at_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         {"time": [], "row": 0},
     ],
 )
-def test_every_kind_of_selection_equals_the_array(tmp_path: Path, selection: dict) -> None:
+def test_every_kind_of_selection_equals_the_array(tmp_path, selection):
     written = sequence(tmp_path / "a.seq", "png", frames=5)
     everything = xr.DataArray(np.stack([each.counts for each in written]), dims=("time", "row", "column"))
     dataset = _open(tmp_path / "a.seq")
     np.testing.assert_array_equal(dataset["counts"].isel(selection), everything.isel(selection))
 
 
-def test_contents_of_a_dataset(tmp_path: Path) -> None:
+def test_contents_of_a_dataset(tmp_path):
     sequence(tmp_path / "a.seq", frames=3)
     dataset = _open(tmp_path / "a.seq")
     assert dataset["counts"].dims == ("time", "row", "column") and dataset["counts"].dtype == np.uint16
@@ -67,7 +65,7 @@ def test_contents_of_a_dataset(tmp_path: Path) -> None:
     assert json.loads(dataset.attrs["rejected"]) == [] and json.loads(dataset.attrs["notes"]) == []
 
 
-def test_parameters_that_vary_lie_along_time(tmp_path: Path) -> None:
+def test_parameters_that_vary_lie_along_time(tmp_path):
     for second, emissivity in enumerate((0.5, 0.75)):
         each = frame(seconds=second)
         write_jpeg(tmp_path / f"{second}.jpg", each.counts, override(PARAMETERS, emissivity=emissivity), each.time)
@@ -76,7 +74,7 @@ def test_parameters_that_vary_lie_along_time(tmp_path: Path) -> None:
     assert dataset["camera_temperature"].shape == (2, 0)
 
 
-def test_dask_chunks_read_in_parallel_and_pickle(tmp_path: Path) -> None:
+def test_dask_chunks_read_in_parallel_and_pickle(tmp_path):
     import pickle
 
     written = sequence(tmp_path / "a.seq", frames=7)
@@ -86,7 +84,7 @@ def test_dask_chunks_read_in_parallel_and_pickle(tmp_path: Path) -> None:
     np.testing.assert_allclose(mean, np.mean([each.counts for each in written], axis=0))
 
 
-def test_a_dataset_survives_netcdf(tmp_path: Path) -> None:
+def test_a_dataset_survives_netcdf(tmp_path):
     sequence(tmp_path / "a.seq", frames=2)
     dataset = _open(tmp_path / "a.seq")
     dataset.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
@@ -94,7 +92,7 @@ def test_a_dataset_survives_netcdf(tmp_path: Path) -> None:
         xr.testing.assert_identical(stored.load(), dataset.load())
 
 
-def test_what_is_left_out_is_warned_of_and_listed(tmp_path: Path) -> None:
+def test_what_is_left_out_is_warned_of_and_listed(tmp_path):
     jpeg(tmp_path / "a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"nothing")
     with pytest.warns(
@@ -105,28 +103,25 @@ def test_what_is_left_out_is_warned_of_and_listed(tmp_path: Path) -> None:
     assert rejected["path"].endswith("b.jpg") and "expected a JPEG" in rejected["reason"]
 
 
-def test_no_frame_at_all_and_frames_of_other_sizes_are_refused(tmp_path: Path) -> None:
+def test_no_frame_at_all_and_frames_of_other_sizes_are_refused(tmp_path):
     (tmp_path / "b.seq").write_bytes(b"nothing")
     with pytest.raises(FlirFormatError, match=r"no FLIR frame can be read: .*b\.seq"):
         _open(tmp_path / "b.seq")
     with pytest.raises(FlirFormatError, match="no FLIR frame can be read: no files were given"):
         FlirBackendEntrypoint().open_dataset([])
     write_sequence(tmp_path / "b.seq", [frame(8, 9), frame(9, 8, seconds=1)])
-    with pytest.raises(
-        FlirFormatError,
-        match=r"frame 1 has \(rows, columns\) \(9, 8\), .* has \(8, 9\); open the files of each camera separately",
-    ):
+    with pytest.raises(FlirFormatError, match=r"frame 1 has \(rows, columns\) \(9, 8\), .* has \(8, 9\); open the"):
         _open(tmp_path / "b.seq")
 
 
-def test_the_engine_is_declared_under_the_name_flir() -> None:
+def test_the_engine_is_declared_under_the_name_flir():
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     ((name, target),) = project["entry-points"]["xarray.backends"].items()
     module, attribute = target.split(":")
     assert name == "flir" and getattr(importlib.import_module(module), attribute) is FlirBackendEntrypoint
 
 
-def test_files_are_recognised_by_their_start(tmp_path: Path) -> None:
+def test_files_are_recognised_by_their_start(tmp_path):
     sequence(tmp_path / "a.bin")
     (tmp_path / "b.bin").write_bytes(b"CDF\1")
     guess = FlirBackendEntrypoint().guess_can_open
@@ -138,7 +133,7 @@ def test_files_are_recognised_by_their_start(tmp_path: Path) -> None:
     assert guess(tmp_path / "c.jpg") and not guess(tmp_path / "photo.jpg")
 
 
-def test_temperature_is_calibrated_on_access_with_the_given_parameters(tmp_path: Path) -> None:
+def test_temperature_is_calibrated_on_access_with_the_given_parameters(tmp_path):
     written = sequence(tmp_path / "a.seq", frames=3)
     for options, parameters in (
         ({}, PARAMETERS),
@@ -156,7 +151,7 @@ def test_temperature_is_calibrated_on_access_with_the_given_parameters(tmp_path:
 
 
 @pytest.mark.parametrize("chunks", [None, {}, {"time": 2}])
-def test_the_accessor_calibrates_anew(tmp_path: Path, chunks: dict | None) -> None:
+def test_the_accessor_calibrates_anew(tmp_path, chunks):
     for second, emissivity in enumerate((0.5, 0.75, 0.9)):
         each = frame(seconds=second)
         write_jpeg(tmp_path / f"{second}.jpg", each.counts, override(PARAMETERS, emissivity=emissivity), each.time)
@@ -174,7 +169,7 @@ def test_the_accessor_calibrates_anew(tmp_path: Path, chunks: dict | None) -> No
 
 
 @pytest.mark.real_data
-def test_regions_and_picture_of_real_files(real_file) -> None:
+def test_regions_and_picture_of_real_files(real_file):
     spots = _open(real_file("gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg"))
     assert [each["label"] for each in json.loads(spots.attrs["measurement_regions"])] == ["Sp1", "Sp2"]
     picture = _open(real_file("frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg")).flir.visible_light()
@@ -182,14 +177,14 @@ def test_regions_and_picture_of_real_files(real_file) -> None:
     assert picture.attrs["offset_px"] == [10, -20]
 
 
-def test_variables_can_be_dropped(tmp_path: Path) -> None:
+def test_variables_can_be_dropped(tmp_path):
     sequence(tmp_path / "a.seq")
     assert "emissivity" not in _open(tmp_path / "a.seq", drop_variables="emissivity")
     assert "emissivity" not in _open(tmp_path / "a.seq", drop_variables=["emissivity", "planck_b"])
 
 
 @pytest.mark.real_data
-def test_a_real_series_of_jpegs_is_one_dataset(real_file) -> None:
+def test_a_real_series_of_jpegs_is_one_dataset(real_file):
     paths = [real_file(f"frkatona__ThermalImageFitter/Nov19/FLIR{number}.jpg") for number in range(2167, 2216, 2)]
     dataset = _open(paths[::-1])
     assert dict(dataset.sizes) == {"time": 25, "row": 96, "column": 128, "sensor": 4}
@@ -197,9 +192,7 @@ def test_a_real_series_of_jpegs_is_one_dataset(real_file) -> None:
     np.testing.assert_array_equal(dataset["counts"][24], read_frame(paths[24]).counts)
 
 
-def test_a_folder_read_by_threads_has_the_values_of_one_thread_and_tells_the_first_damaged_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_read_by_threads_has_the_values_of_one_thread_and_tells_the_first_damaged_frame(tmp_path, monkeypatch):
     paths = []
     for number in range(30):
         paths.append(str(tmp_path / f"{number:02}.jpg"))

@@ -1,12 +1,9 @@
 """Sums and averages of counts: exact in whole numbers, and temperatures within their bound of those calibrated frame by frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import PARAMETERS
-from thermography.errors import ThermographyError
 from thermography.radiometry.averaging import Accumulator, CountStatistics, MeanTemperature, mean_temperature
 from thermography.radiometry.planck import calibrate, counts_from_temperature, temperature_from_counts
 
@@ -18,7 +15,7 @@ def _accumulate(counts: np.ndarray) -> CountStatistics:
 
 
 @pytest.mark.parametrize("reach", [3, 900, 2047, 2048, 30_000])
-def test_sums_are_exact_however_far_the_counts_move(rng: np.random.Generator, reach: int) -> None:
+def test_sums_are_exact_however_far_the_counts_move(rng, reach):
     """Deviations of a few counts, at the limit of the 32-bit sums, and beyond it in one tile only; any number of frames."""
     counts = rng.integers(31_000, 31_000 + 3, (11, 3, 4000)).astype(np.uint16)
     counts[:, 1] = rng.integers(31_000 - reach, 31_000 + reach, (11, 4000))
@@ -35,20 +32,18 @@ def test_sums_are_exact_however_far_the_counts_move(rng: np.random.Generator, re
         assert (statistics.highest == wide.max(axis=0)).all()
 
 
-def test_sums_hold_1000_frames() -> None:
+def test_sums_hold_1000_frames():
     """The largest near deviation in 999 of 1000 frames: the sum of the squares nearly fills 32 bits."""
     counts = np.full((1000, 2, 2), 2047, np.uint16)
     counts[0] = 0
     statistics = _accumulate(counts)
     assert (statistics.squares == 999 * 2047**2).all()
-    with pytest.raises(
-        ValueError, match="counts: 1001 frames, but the sums hold 1000; merge the statistics of several"
-    ):
+    with pytest.raises(ValueError, match="counts: 1001 frames, but the sums hold 1000; merge the statistics of"):
         _accumulate(np.zeros((1001, 2, 2), np.uint16))
 
 
 @pytest.mark.parametrize(("first", "others"), [(0, 65535), (65535, 0)])
-def test_sums_hold_1000_frames_of_the_largest_deviation(first: int, others: int) -> None:
+def test_sums_hold_1000_frames_of_the_largest_deviation(first, others):
     counts = np.full((1000, 2), others, np.uint16)
     counts[0] = first
     statistics = _accumulate(counts)
@@ -56,16 +51,7 @@ def test_sums_hold_1000_frames_of_the_largest_deviation(first: int, others: int)
     assert statistics.squares.tolist() == [first**2 + 999 * others**2] * 2
 
 
-def test_merging_sums_is_exact_in_any_order(rng: np.random.Generator) -> None:
-    counts = rng.integers(8000, 20000, (30, 7, 9)).astype(np.uint16)
-    whole = _accumulate(counts)
-    pieces = _accumulate(counts[20:]).merge(_accumulate(counts[:5])).merge(_accumulate(counts[5:20]))
-    for name in ("total", "squares", "lowest", "highest"):
-        assert (getattr(whole, name) == getattr(pieces, name)).all()
-    np.testing.assert_allclose(whole.variance, counts.astype(float).var(axis=0), rtol=1e-12)
-
-
-def test_second_order_average_is_the_average_of_temperatures() -> None:
+def test_second_order_average_is_the_average_of_temperatures():
     """Scenes within 5 K: both ways agree below 1 mK, and the bound holds."""
     rng = np.random.default_rng(5)
     temperature = 22 + 5 * rng.random((200, 40, 50)) ** 3
@@ -79,7 +65,7 @@ def test_second_order_average_is_the_average_of_temperatures() -> None:
     np.testing.assert_allclose(reduced.variance, calibrate(counts, PARAMETERS).var(axis=0, dtype=float), rtol=0.03)
 
 
-def test_mean_of_two_counts_is_that_of_the_expansion() -> None:
+def test_mean_of_two_counts_is_that_of_the_expansion():
     """Two frames 2 d apart: mean and variance of the counts are n and d^2, so the expansion is T(n) + T''(n) d^2 / 2."""
     n, d = 19_000, 200
     counts = np.array([n - d, n + d], np.uint16).reshape(2, 1)
@@ -92,7 +78,7 @@ def test_mean_of_two_counts_is_that_of_the_expansion() -> None:
     assert 0 < abs(reduced.mean[0] - exact) <= reduced.bound_K[0]
 
 
-def test_merged_temperatures_are_those_of_all_frames(rng: np.random.Generator) -> None:
+def test_merged_temperatures_are_those_of_all_frames(rng):
     values = rng.normal(25, 2, (12, 5))
     parts = [
         MeanTemperature(len(part), part.mean(0), part.var(0), np.full(5, 1e-4)) for part in np.split(values, [3, 4])
@@ -103,16 +89,7 @@ def test_merged_temperatures_are_those_of_all_frames(rng: np.random.Generator) -
     np.testing.assert_allclose(merged.variance, values.var(axis=0), rtol=1e-12)
 
 
-def test_unused_pixels_are_zero_and_counts_below_any_temperature_are_nan() -> None:
+def test_unused_pixels_are_zero_and_counts_below_any_temperature_are_nan():
     counts = np.array([[18_000, 18_000, 100], [18_010, 18_010, 200]], np.uint16)
     reduced = mean_temperature(_accumulate(counts), PARAMETERS, used=np.array([True, False, True]))
     assert reduced.mean[0] > 20 and reduced.mean[1] == 0 and np.isnan(reduced.mean[2])
-
-
-def test_frames_of_another_shape_or_type_and_no_frames_are_refused() -> None:
-    with pytest.raises(ThermographyError, match=r"counts: expected frames of \(2, 3\) uint16, got \(1, 3, 2\) uint16"):
-        Accumulator((2, 3)).add(np.zeros((1, 3, 2), np.uint16))
-    with pytest.raises(ThermographyError, match=r"got \(1, 2, 3\) float64"):
-        Accumulator((2, 3)).add(np.zeros((1, 2, 3)))
-    with pytest.raises(ThermographyError, match="no frame has been added"):
-        Accumulator((2, 3)).statistics()

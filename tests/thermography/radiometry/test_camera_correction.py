@@ -1,15 +1,18 @@
-"""Correction of the camera's zero: planted steps and drifts are taken out within the stated uncertainty; a sound camera is left alone."""
-
-from __future__ import annotations
+"""Artefacts of the camera, and the correction of its zero within the stated uncertainty."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from thermography.radiometry.camera_correction import (
+from thermography.radiometry.camera import (
+    DEAD,
+    NOISY,
+    OFFSET,
     LevelSeries,
     estimate_correction,
+    find_bad_pixels,
+    find_repeats,
     hold_constant,
     room_temperatures,
 )
@@ -51,7 +54,7 @@ def _drift(series: LevelSeries, per_K: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("sigma_K", "per_K"), [(0.1, 0.0), (0.3, 0.1), (0.5, 0.3), (0.0, 0.1)])
-def test_steps_and_drift_are_taken_out_within_their_uncertainty(sigma_K: float, per_K: float) -> None:
+def test_steps_and_drift_are_taken_out_within_their_uncertainty(sigma_K, per_K):
     ratios = []
     for seed in range(6):
         series = _sound(seed)
@@ -65,22 +68,19 @@ def test_steps_and_drift_are_taken_out_within_their_uncertainty(sigma_K: float, 
     assert np.sqrt(np.mean(ratios)) < 1.5
 
 
-def test_a_sound_camera_is_left_alone() -> None:
+def test_a_sound_camera_is_left_alone():
     corrected = sum(estimate_correction(_sound(seed, logged=seed % 2 == 0)).corrects for seed in range(60))
     # At two tests of one per mille each, more than one of 60 has a probability of 0.6 %.
     assert corrected <= 1
 
 
-def test_a_step_has_its_place_size_and_uncertainty() -> None:
+def test_a_step_has_its_place_size_and_uncertainty_and_one_beside_the_table_is_the_rooms():
     offset = np.where(np.arange(FRAMES) >= 20, 0.25, 0.0)
     (step,) = estimate_correction(_with_camera(_sound(1), offset)).steps
     assert step.index == 20
     assert step.value_K == pytest.approx(0.25, abs=3 * step.u_K)
     assert 0.001 < step.u_K < 0.03
-
-
-def test_a_step_beside_the_table_alone_is_the_rooms() -> None:
-    """A door opens: what lies beside the table changes, the table does not."""
+    # A door opens: what lies beside the table changes, the table does not.
     series = _sound(2)
     found = estimate_correction(
         replace(series, background=series.background + np.where(np.arange(FRAMES) >= 30, 0.4, 0.0))
@@ -88,24 +88,21 @@ def test_a_step_beside_the_table_alone_is_the_rooms() -> None:
     assert found.steps == () and not found.corrects
 
 
-def test_without_a_log_of_the_room_a_drift_is_uncertainty_and_no_correction() -> None:
+def test_without_a_log_of_the_room_or_with_another_nothing_is_corrected():
     series = _sound(3, logged=False)
     offset = _drift(series, 0.1)
     found = estimate_correction(_with_camera(series, offset))
     assert not found.corrects
     assert found.u_K[-1] > 0.5 * abs(offset[-1])
     assert np.abs(found.unexplained_K).max() > 0.5
-
-
-def test_a_log_of_another_room_separates_nothing() -> None:
-    """The camera is warm and follows the room, as the background does; the log does not: the room must not pass for a drift."""
+    # The camera is warm and follows the room, as the background does; the log does not: the room must not pass for a drift.
     series = replace(_sound(4), room=_sound(5).room)
     noise = np.random.default_rng(4).normal(0, 0.01, (FRAMES, 1))
     follows = replace(series, housing=series.background[:, None] + 280.0 + noise)
     assert not estimate_correction(follows).drift_K.any()
 
 
-def test_steps_in_a_film_are_placed_to_the_frame() -> None:
+def test_steps_in_a_film_are_placed_to_the_frame():
     """3000 frames at 5 s: more than the fit takes."""
     series = _sound(6, frames=3000, interval_s=5.0)
     offset = np.where(np.arange(3000) >= 1234, -0.3, 0.0)
@@ -114,25 +111,22 @@ def test_steps_in_a_film_are_placed_to_the_frame() -> None:
 
 
 @pytest.mark.parametrize("frames", [2, 7])
-def test_few_frames_correct_nothing(frames: int) -> None:
+def test_few_frames_correct_nothing(frames):
     series = _sound(7, frames=frames)
     found = estimate_correction(series)
     assert not found.corrects and found.steps == ()
     np.testing.assert_allclose(found.u_K, np.abs(series.background - series.background[0]) / np.sqrt(3))
 
 
-def test_a_frozen_camera_and_missing_sensors_are_no_faults() -> None:
+def test_a_frozen_camera_and_missing_sensors_are_no_faults():
     series = _sound(8)
     frozen = replace(
-        series,
-        background=np.full(FRAMES, 23.0),
-        table=np.full(FRAMES, 24.0),
-        housing=np.full((FRAMES, 1), np.nan),
+        series, background=np.full(FRAMES, 23.0), table=np.full(FRAMES, 24.0), housing=np.full((FRAMES, 1), np.nan)
     )
     assert not estimate_correction(frozen).corrects
 
 
-def test_walls_follow_the_air_by_their_lags() -> None:
+def test_walls_follow_the_air_by_their_lags():
     logged = np.arange(0.0, 7200.0, 60.0)
     air = np.where(logged < 1800, 20.0, 21.0)
     room = room_temperatures(np.array([0.0, 1800.0 + 600.0]), logged, air)
@@ -141,7 +135,7 @@ def test_walls_follow_the_air_by_their_lags() -> None:
     assert room_temperatures(np.zeros(3), logged[:1], air[:1]).shape == (3, 0)
 
 
-def test_a_surface_of_constant_temperature_is_held_constant() -> None:
+def test_a_surface_of_constant_temperature_is_held_constant():
     rng = np.random.default_rng(9)
     offset = _steps(9, 0.3) + 0.002 * np.arange(FRAMES)
     found = hold_constant(24.0 + offset + rng.normal(0, 0.004, FRAMES))
@@ -152,8 +146,48 @@ def test_a_surface_of_constant_temperature_is_held_constant() -> None:
     assert found.u_K[0] == 0.0 and np.ptp(found.drift_K) == pytest.approx(np.ptp(offset), abs=0.03)
 
 
-def test_the_scatter_of_a_constant_surface_is_not_corrected() -> None:
+def test_the_scatter_of_a_constant_surface_is_not_corrected():
     rng = np.random.default_rng(10)
     # At one per mille, 4 or more of 300 have a probability of 0.03 %.
     assert sum(hold_constant(rng.normal(24.0, 0.004, FRAMES)).corrects for _ in range(300)) < 4
     assert not hold_constant(np.full(FRAMES, 24.0)).corrects and not hold_constant(np.arange(3.0)).corrects
+
+
+# Repeated frames -----------------------------------------------------------------------------------------------------
+
+
+def test_repeated_and_frozen_frames_are_told_apart():
+    time = np.datetime64("2026-03-09", "ms") + np.arange(11) * np.timedelta64(1, "s")
+    flags = find_repeats(np.isin(np.arange(11), (2, 6, 7, 8, 9)), time)
+    assert [(flag.cause, flag.index, flag.time) for flag in flags] == [
+        ("repeated_frame", 2, time[2]),
+        ("frozen_frames", 6, time[6]),
+    ]
+    assert flags[0].message == "1 frame repeats the counts of frame 1"
+    assert flags[1].message == "4 frames repeat the counts of frame 5: the camera output was frozen"
+    assert find_repeats(np.zeros(11, bool), time) == []
+
+
+# Bad pixels ----------------------------------------------------------------------------------------------------------
+
+
+def test_planted_bad_pixels_are_found_and_edges_are_not(rng):
+    row, column = np.mgrid[:60, :80]
+    # A hot block with sharp edges and a disc: what a table with fiducials looks like.
+    scene = (
+        18000 + 3000.0 * ((row > 20) & (row < 40) & (column > 30)) - 800.0 * ((row - 30) ** 2 + (column - 15) ** 2 < 36)
+    )
+    stack = scene + rng.normal(0, 8, (32, 60, 80))
+    stack[:, 5, 5] = 16000
+    stack[:, 50, 70] += 400
+    stack[:, 10, 40] += rng.normal(0, 200, 32)
+    flags = find_bad_pixels(np.rint(stack).astype(np.uint16))
+    assert flags[5, 5] == DEAD | OFFSET
+    assert flags[50, 70] == OFFSET
+    assert flags[10, 40] & NOISY
+    assert np.count_nonzero(flags) == 3
+
+
+def test_a_good_detector_has_no_bad_pixels(rng):
+    stack = (18000 + rng.normal(0, 8, (32, 120, 160))).astype(np.uint16)
+    assert not find_bad_pixels(stack).any()

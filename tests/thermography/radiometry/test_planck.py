@@ -1,6 +1,4 @@
-"""Counts to temperature: the vendor's export, the inverse, and parameters outside their range."""
-
-from __future__ import annotations
+"""Counts to temperature: the vendor's export, the inverse, overrides, emissivity of known states, parameters outside their range."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.thermography.flir_mutations import PARAMETERS
+from tests.thermography.flir_mutations import PARAMETERS, TIME, frame
 from thermography.io.flir import read_frame
+from thermography.radiometry.emissivity import KnownState, estimate_emissivity
 from thermography.radiometry.planck import (
+    Overrides,
+    ParameterLog,
     RadiometryError,
     black_body_signal,
     calibrate,
@@ -28,7 +29,7 @@ from thermography.radiometry.planck import (
 
 
 @pytest.mark.real_data
-def test_e40bx_equals_the_vendors_export_to_half_a_printed_digit(real_file) -> None:
+def test_e40bx_equals_the_vendors_export_to_half_a_printed_digit(real_file):
     folder = "gpereyrairujo__IRimage/Windows/IRimage/test/"
     frame = read_frame(real_file(folder + "test_image.jpg"))
     vendor = np.genfromtxt(real_file(folder + "csv/test_image.csv"), delimiter=",", encoding="utf-8-sig")
@@ -43,7 +44,7 @@ def test_e40bx_equals_the_vendors_export_to_half_a_printed_digit(real_file) -> N
 
 
 @pytest.mark.real_data
-def test_sc660_sequence_stores_the_transmission_that_the_formula_gives(real_file) -> None:
+def test_sc660_sequence_stores_the_transmission_that_the_formula_gives(real_file):
     frame = read_frame(real_file("gtatters__Thermimage/inst/extdata/SampleSEQ.seq"))
     stored = frame.parameters.stored_transmission
     assert stored == pytest.approx(0.993943155, abs=1e-9)
@@ -52,7 +53,7 @@ def test_sc660_sequence_stores_the_transmission_that_the_formula_gives(real_file
 
 
 @pytest.mark.real_data
-def test_half_the_path_taken_twice_is_not_what_the_vendor_calculates(real_file) -> None:
+def test_half_the_path_taken_twice_is_not_what_the_vendor_calculates(real_file):
     folder = "gpereyrairujo__IRimage/Windows/IRimage/test/"
     frame = read_frame(real_file(folder + "test_image.jpg"))
     vendor = np.genfromtxt(real_file(folder + "csv/test_image.csv"), delimiter=",", encoding="utf-8-sig")
@@ -66,7 +67,7 @@ def test_half_the_path_taken_twice_is_not_what_the_vendor_calculates(real_file) 
     assert (difference[vendor > air_degC + 1] > 0).all() and (difference[vendor < air_degC - 1] < 0).all()
 
 
-def test_formula_at_hand_calculated_points() -> None:
+def test_formula_at_hand_calculated_points():
     """By hand, with rounded constants: S(300 K) = 21106.77 / (0.012545258 (exp(1501/300) - 1)) + 7340 = 18714.9 counts."""
     black = replace(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
     expected = 21106.76953125 / (0.012545257806777954 * (np.exp(1501 / 300) - 1)) + 7340
@@ -79,14 +80,14 @@ def test_formula_at_hand_calculated_points() -> None:
     assert float(temperature_from_counts(expected, replace(grey, **warm))) == pytest.approx(26.85, abs=1e-9)
 
 
-def test_slope_is_the_derivative_of_the_signal() -> None:
+def test_slope_is_the_derivative_of_the_signal():
     kelvin = np.array([250.0, 293.15, 400.0])
     difference = black_body_signal(kelvin + 0.01, PARAMETERS) - black_body_signal(kelvin - 0.01, PARAMETERS)
     # The second difference of a 0.02 K step leaves 1e-8 of the slope, cancellation of 18000 counts 1e-9.
     np.testing.assert_allclose(signal_slope(kelvin, PARAMETERS), difference / 0.02, rtol=1e-7)
 
 
-def test_calibrate_is_the_float64_formula_within_float32() -> None:
+def test_calibrate_is_the_float64_formula_within_float32():
     counts = np.arange(9000, 60000, dtype=np.uint16).reshape(-1, 100)
     before = counts.copy()
     temperature = calibrate(counts, PARAMETERS)
@@ -97,12 +98,12 @@ def test_calibrate_is_the_float64_formula_within_float32() -> None:
 
 
 @pytest.mark.parametrize("view", [np.s_[::2, ::3], np.s_[:, 5], np.s_[3, 4]])
-def test_any_shape_and_stride_is_calibrated(view: tuple) -> None:
+def test_any_shape_and_stride_is_calibrated(view):
     counts = np.arange(18000, 18200, dtype=np.uint16).reshape(10, 20)
     np.testing.assert_array_equal(calibrate(counts[view], PARAMETERS), calibrate(counts, PARAMETERS)[view])
 
 
-def test_frames_that_share_their_parameters_give_the_same_bits_in_any_order_and_by_threads() -> None:
+def test_frames_that_share_their_parameters_give_the_same_bits_in_any_order_and_by_threads():
     """A table of temperatures is shared and grows with the counts that occur; what it held before must not show."""
     rng = np.random.default_rng(5)
     edges = np.sort(rng.integers(0, 1 << 16, (60, 2)), axis=1)
@@ -116,11 +117,7 @@ def test_frames_that_share_their_parameters_give_the_same_bits_in_any_order_and_
         assert shared.tobytes() == single.tobytes()
 
 
-def test_empty_counts_give_empty_temperature() -> None:
-    assert calibrate(np.empty((0, 4), np.uint16), PARAMETERS).shape == (0, 4)
-
-
-def test_counts_below_any_temperature_give_nan() -> None:
+def test_counts_below_any_temperature_give_nan():
     # S = counts - O is negative below 7340 counts minus the offset: no temperature of any surface.
     assert np.isnan(calibrate(np.array([0, 100], np.uint16), PARAMETERS)).all()
 
@@ -141,15 +138,8 @@ kelvins = st.floats(250.0, 350.0)
     humidity=st.floats(0, 1),
 )
 def test_temperature_to_counts_and_back(
-    temperature: float,
-    emissivity: float,
-    distance: float,
-    reflected: float,
-    air: float,
-    window: float,
-    window_transmission: float,
-    humidity: float,
-) -> None:
+    temperature, emissivity, distance, reflected, air, window, window_transmission, humidity
+):
     parameters = override(
         PARAMETERS,
         emissivity=emissivity,
@@ -165,13 +155,13 @@ def test_temperature_to_counts_and_back(
 
 
 @given(counts=st.integers(9000, 60000))
-def test_counts_to_temperature_and_back(counts: int) -> None:
+def test_counts_to_temperature_and_back(counts):
     temperature = calibrate(np.array([counts], np.uint16), PARAMETERS)
     # float32 of a temperature near 100 degC resolves 1e-3 counts.
     assert np.rint(counts_from_temperature(temperature, PARAMETERS))[0] == counts
 
 
-def test_an_emissivity_map_equals_one_calibration_per_region() -> None:
+def test_an_emissivity_map_equals_one_calibration_per_region():
     counts = np.full((2, 3), 19000, np.uint16)
     emissivity = np.array([[0.95, 0.9, 0.5], [0.2, 1.0, 0.95]])
     temperature = temperature_from_counts(counts, PARAMETERS, emissivity=emissivity)
@@ -180,15 +170,7 @@ def test_an_emissivity_map_equals_one_calibration_per_region() -> None:
         assert temperature[place] == pytest.approx(float(alone), abs=1e-12)
 
 
-def test_stored_transmission_is_used_until_its_causes_change() -> None:
-    stored = replace(PARAMETERS, stored_transmission=0.9)
-    assert transmission(stored) == 0.9
-    assert transmission(override(stored, emissivity=0.5)) == 0.9
-    assert transmission(override(stored, object_distance_m=1.0)) == pytest.approx(0.9939431, abs=1e-7)
-    assert transmission(override(stored, object_distance_m=1.0, stored_transmission=0.8)) == 0.8
-
-
-def test_transmission_falls_with_distance_and_humidity() -> None:
+def test_transmission_falls_with_distance_and_humidity():
     distances = [path_transmission(override(PARAMETERS, object_distance_m=d)) for d in (0, 1, 5, 20, 100)]
     assert distances[0] == 1.0 and all(a > b for a, b in pairwise(distances))
     humidities = [path_transmission(override(PARAMETERS, relative_humidity=h)) for h in (0.1, 0.5, 0.9)]
@@ -208,14 +190,14 @@ def test_transmission_falls_with_distance_and_humidity() -> None:
         ({"atmosphere_x": float("inf")}, "atmosphere_x = inf: expected a finite number"),
     ],
 )
-def test_parameters_without_meaning_are_refused_by_name(change: dict[str, float], message: str) -> None:
+def test_parameters_without_meaning_are_refused_by_name(change, message):
     broken = replace(PARAMETERS, **change)
     with pytest.raises(RadiometryError, match=message + ".*; override the wrong values of the file"):
         calibrate(np.full(3, 18000, np.uint16), broken)
 
 
 @pytest.mark.parametrize("name", ["reflected_temperature_K", "atmospheric_temperature_K", "window_temperature_K"])
-def test_temperatures_from_100_to_3000_kelvin_and_fractions_from_none_to_all_are_taken(name: str) -> None:
+def test_temperatures_from_100_to_3000_kelvin_and_fractions_from_none_to_all_are_taken(name):
     behind_glass = replace(PARAMETERS, window_transmission=0.9, stored_transmission=0.9)
     for value in (100.0, 3000.0):
         check_parameters(replace(behind_glass, **{name: value}))
@@ -230,25 +212,9 @@ def test_temperatures_from_100_to_3000_kelvin_and_fractions_from_none_to_all_are
                 check_parameters(replace(behind_glass, **{fraction: value}))
 
 
-def test_all_faults_come_in_one_message() -> None:
+def test_all_faults_come_in_one_message_and_a_window_that_is_not_there_has_none():
     with pytest.raises(RadiometryError, match=r"emissivity = 2.*relative_humidity = 3"):
         check_parameters(replace(PARAMETERS, emissivity=2.0, relative_humidity=3.0))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"atmosphere_alpha1": -1e5}, {"atmosphere_x": -3.0, "object_distance_m": 400.0}, {"atmosphere_beta2": -1e30}],
-)
-def test_constants_of_the_air_that_give_no_transmission_are_refused_unless_one_is_stored(
-    change: dict[str, float],
-) -> None:
-    broken = replace(PARAMETERS, stored_transmission=0.0, **change)
-    with pytest.raises(RadiometryError, match=r"transmission of the air = .*atmosphere_alpha1 = .*expected a fraction"):
-        calibrate(np.full(3, 18000, np.uint16), broken)
-    calibrate(np.full(3, 18000, np.uint16), replace(broken, stored_transmission=0.97))
-
-
-def test_a_window_that_is_not_there_needs_no_temperature() -> None:
     without = replace(PARAMETERS, window_temperature_K=0.0)
     check_parameters(without)
     assert temperature_from_counts(18000, without) == temperature_from_counts(18000, PARAMETERS)
@@ -256,16 +222,129 @@ def test_a_window_that_is_not_there_needs_no_temperature() -> None:
         check_parameters(replace(PARAMETERS, window_temperature_K=0.0, window_transmission=0.9))
 
 
-def test_unknown_names_averages_and_wild_emissivities_are_refused() -> None:
-    with pytest.raises(
-        RadiometryError, match="parameter 'distance' is unknown; use one of emissivity, object_distance_m"
-    ):
+@pytest.mark.parametrize(
+    "change",
+    [{"atmosphere_alpha1": -1e5}, {"atmosphere_x": -3.0, "object_distance_m": 400.0}, {"atmosphere_beta2": -1e30}],
+)
+def test_constants_of_the_air_that_give_no_transmission_are_refused_unless_one_is_stored(change):
+    broken = replace(PARAMETERS, stored_transmission=0.0, **change)
+    with pytest.raises(RadiometryError, match=r"transmission of the air = .*atmosphere_alpha1 = .*expected a fraction"):
+        calibrate(np.full(3, 18000, np.uint16), broken)
+    calibrate(np.full(3, 18000, np.uint16), replace(broken, stored_transmission=0.97))
+
+
+def test_unknown_names_averages_and_wild_emissivities_are_refused():
+    with pytest.raises(RadiometryError, match="parameter 'distance' is unknown; use one of emissivity"):
         override(PARAMETERS, distance=2.0)
     with pytest.raises(RadiometryError, match="counts: expected uint16, got float64; use temperature_from_counts"):
-        calibrate(np.array([18000.5]), PARAMETERS)  # type: ignore[arg-type]
+        calibrate(np.array([18000.5]), PARAMETERS)
     with pytest.raises(RadiometryError, match=r"emissivity from 0 to 0\.5: expected fractions above 0 and up to 1"):
         temperature_from_counts(18000, PARAMETERS, emissivity=[0.0, 0.5])
     with pytest.raises(RadiometryError, match=r"emissivity from 0\.5 to 1\.01: expected fractions above 0 and up to 1"):
         temperature_from_counts(18000, PARAMETERS, emissivity=[0.5, 1.01])
     with pytest.raises(RadiometryError, match="counts: expected uint16, got uint8"):
-        calibrate(np.array([180], np.uint8), PARAMETERS)  # type: ignore[arg-type]
+        calibrate(np.array([180], np.uint8), PARAMETERS)
+
+
+TIMES = TIME + np.array([0, 100, 300]).astype("timedelta64[s]")
+
+
+def test_constants_and_logs_replace_what_the_file_says():
+    changed = Overrides({"emissivity": 0.97, "object_distance_m": 1.2})(frame())
+    assert (changed.emissivity, changed.object_distance_m) == (0.97, 1.2)
+    assert changed.planck_r1 == PARAMETERS.planck_r1
+    assert Overrides()(frame()) is PARAMETERS
+    air = ParameterLog(TIMES, np.array([293.0, 295.0, 294.0]))
+    overrides = Overrides({"atmospheric_temperature_K": 300.0, "emissivity": 0.9}, {"atmospheric_temperature_K": air})
+    assert overrides(frame(seconds=0)).atmospheric_temperature_K == 293.0
+    assert overrides(frame(seconds=25)).atmospheric_temperature_K == pytest.approx(293.5)
+    assert overrides(frame(seconds=200)).atmospheric_temperature_K == pytest.approx(294.5)
+    assert overrides(frame(seconds=300)).emissivity == 0.9
+    air = ParameterLog(TIMES.astype("datetime64[ns]"), np.array([293.0, 295.0, 294.0]))
+    with pytest.raises(RadiometryError, match=r"frame at 2026-03-09T06:38:48\.125: the log reaches from"):
+        Overrides(logs={"atmospheric_temperature_K": air})(frame(seconds=301))
+    air = ParameterLog(TIMES[:1], np.array([293.0]))
+    assert air.interpolate(TIMES[0]) == 293.0
+    with pytest.raises(RadiometryError, match="only; extend it"):
+        air.interpolate(TIMES[1])
+
+
+@pytest.mark.parametrize(
+    ("times", "values", "message"),
+    [
+        (TIMES, [1.0, 2.0], r"expected as many times as values, got \(3,\) and \(2,\)"),
+        (TIMES[::-1], [1.0, 2.0, 3.0], "expected increasing times and finite values; sort the log and remove gaps"),
+        (TIMES, [1.0, np.nan, 3.0], "expected increasing times and finite values"),
+        (TIMES[[0, 1, 1]], [1.0, 2.0, 3.0], "expected increasing times and finite values"),
+        (TIMES[:2], [1.0, 2.0, 3.0], r"expected as many times as values, got \(2,\) and \(3,\)"),
+        (TIMES[None], [[1.0, 2.0, 3.0]], r"expected as many times as values, got \(1, 3\) and \(1, 3\)"),
+        (TIMES[:0], [], r"expected as many times as values, got \(0,\) and \(0,\)"),
+    ],
+)
+def test_a_broken_log_is_refused(times, values, message):
+    with pytest.raises(RadiometryError, match=message):
+        ParameterLog(times, np.array(values))
+
+
+@pytest.mark.parametrize(
+    ("changes", "stored"),
+    [
+        ({"relative_humidity": 0.9}, 0.0),
+        ({"object_distance_m": 5.0}, 0.0),
+        ({"atmospheric_temperature_K": 310.0}, 0.0),
+        ({"emissivity": 0.9}, 0.98),
+        ({"relative_humidity": 0.9, "stored_transmission": 0.95}, 0.95),
+    ],
+)
+def test_a_stored_transmission_goes_with_the_air_that_it_was_stored_for(changes, stored):
+    kept = replace(PARAMETERS, stored_transmission=0.98)
+    changed = override(kept, **changes)
+    assert changed.stored_transmission == stored
+    # Without a stored one, the transmission follows from the changed air.
+    recomputed = transmission(override(replace(kept, stored_transmission=0.0), **changes))
+    assert transmission(changed) == (recomputed if stored == 0.0 else stored)
+
+
+def _states(emissivity: float, *, reflected_K: float = 297.0, window: float = 1.0, u: float = 0.2) -> list[KnownState]:
+    parameters = override(
+        PARAMETERS, emissivity=emissivity, reflected_temperature_K=reflected_K, window_transmission=window
+    )
+    return [KnownState(float(counts_from_temperature(t, parameters)), 2.0, t, u) for t in (22.0, 45.0)]
+
+
+@pytest.mark.parametrize("emissivity", [0.3, 0.6, 0.85, 0.97])
+@pytest.mark.parametrize("window", [1.0, 0.85])
+def test_the_truth_comes_back_whatever_is_reflected(emissivity, window):
+    parameters = override(PARAMETERS, window_transmission=window, emissivity=0.99)
+    for reflected in (280.0, 297.0, 330.0):
+        estimate = estimate_emissivity(*_states(emissivity, reflected_K=reflected, window=window), parameters)
+        assert estimate.emissivity == pytest.approx(emissivity, abs=1e-12)
+        assert estimate.reflected_temperature_degC == pytest.approx(reflected - 273.15, abs=1e-6)
+
+
+def test_its_uncertainty_covers_repeated_experiments(rng):
+    exact = _states(0.85)
+    u = estimate_emissivity(*exact, PARAMETERS).emissivity_u
+    estimates = []
+    for _ in range(4000):
+        drawn = [
+            KnownState(s.counts + rng.normal(0, s.counts_u), s.counts_u, s.temperature_degC + rng.normal(0, 0.2), 0.2)
+            for s in exact
+        ]
+        estimates.append(estimate_emissivity(*drawn, PARAMETERS).emissivity)
+    # A standard deviation of 4000 draws scatters by 1.1 %.
+    assert np.std(estimates, ddof=1) == pytest.approx(u, rel=0.05)
+    assert np.mean(estimates) == pytest.approx(0.85, abs=4 * u / np.sqrt(4000) + 1e-3)
+
+
+def test_estimates_are_classed_and_what_determines_nothing_is_refused():
+    assert estimate_emissivity(*_states(0.95), PARAMETERS).quality == "usable"
+    assert estimate_emissivity(*_states(0.2), PARAMETERS).quality == "too_reflective"
+    assert estimate_emissivity(*_states(0.9, u=3.0), PARAMETERS).quality == "undetermined"
+    cold, hot = _states(0.95)
+    impossible = KnownState(2 * hot.counts, 2.0, hot.temperature_degC, 0.2)
+    assert estimate_emissivity(cold, impossible, PARAMETERS).quality == "undetermined"
+    state = _states(0.9)[0]
+    with pytest.raises(RadiometryError, match="both states have 22 degC: heat the surface between them"):
+        estimate_emissivity(state, state, PARAMETERS)
+    assert np.isnan(estimate_emissivity(*_states(0.995), PARAMETERS).reflected_temperature_degC)

@@ -1,14 +1,13 @@
 """Uncertainty of temperatures and rises, compared with Monte Carlo simulations of the measurement."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import PARAMETERS
-from thermography.errors import ThermographyError
+from tests.thermography.rise_budget import temperature_rise_uncertainty
+from thermography.common import ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import RadiometryError, counts_from_temperature, override, temperature_from_counts
 from thermography.radiometry.uncertainty import (
@@ -16,7 +15,6 @@ from thermography.radiometry.uncertainty import (
     common_contributions,
     monte_carlo_ratio,
     rise_scale_contributions,
-    temperature_rise_uncertainty,
     temperature_uncertainty,
 )
 
@@ -70,11 +68,9 @@ def _simulate(
 
 
 @pytest.mark.parametrize("window", [False, True])
-@pytest.mark.parametrize("emissivity", [0.5, 0.8, 0.95, 0.99])
+@pytest.mark.parametrize("emissivity", [0.5, 0.95])
 @pytest.mark.parametrize("camera_offset_K", [2 / 3**0.5, 0.0])
-def test_standard_uncertainty_equals_monte_carlo(
-    rng: np.random.Generator, emissivity: float, window: bool, camera_offset_K: float
-) -> None:
+def test_standard_uncertainty_equals_monte_carlo(rng, emissivity, window, camera_offset_K):
     """Also without the accuracy of the camera, which dominates the total and would hide a wrong sensitivity."""
     parameters = _scene(emissivity, window)
     inputs = replace(_inputs(window), camera_offset_K=camera_offset_K)
@@ -85,7 +81,7 @@ def test_standard_uncertainty_equals_monte_carlo(
     )
 
 
-def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng: np.random.Generator) -> None:
+def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng):
     parameters, inputs = _scene(0.95, window=False), InputUncertainty(camera_scale=0.0)
     before, after = 22.0, 27.0
     counts = [counts_from_temperature(t, parameters) for t in (before, after)]
@@ -103,14 +99,11 @@ def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng: np.ran
     assert float(budget.per_frame_u) == pytest.approx(np.sqrt(2) * single, rel=0.05)
 
 
-def test_averaging_reduces_the_per_frame_part_only() -> None:
+def test_the_budget_names_its_parts_and_adds_them_up():
     single = temperature_uncertainty(25.0, PARAMETERS)
     hundred = temperature_uncertainty(25.0, PARAMETERS, frames=100)
     assert float(hundred.common_u) == float(single.common_u)
     assert float(hundred.per_frame_u) == pytest.approx(float(single.per_frame_u) / 10)
-
-
-def test_budget_names_its_parts_and_adds_them_up() -> None:
     temperature = np.array([[10.0, 20.0], [30.0, 40.0]])
     before = temperature.copy()
     budget = temperature_uncertainty(temperature, PARAMETERS, InputUncertainty(camera_scale=0.02))
@@ -125,69 +118,48 @@ def test_budget_names_its_parts_and_adds_them_up() -> None:
     # A surface as warm as its surroundings radiates the same whatever its emissivity.
     at_ambient = temperature_uncertainty(20.0, override(PARAMETERS, reflected_temperature_K=293.15))
     assert abs(float(at_ambient.common["emissivity"])) < 1e-3
-
-
-def test_netd_is_met_on_the_black_body_on_which_it_is_stated() -> None:
     black = override(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
     budget = temperature_uncertainty(30.0, black, InputUncertainty(netd_K=0.04, netd_temperature_degC=30.0))
     assert float(budget.per_frame["noise"]) == pytest.approx(0.04, rel=1e-9)
     # One count of an SC660 is about 6 mK near 20 degC; rounding to it has a standard uncertainty of a twelfth's root.
     budget = temperature_uncertainty(20.0, PARAMETERS)
     assert float(budget.per_frame["quantisation"]) == pytest.approx(0.006 / 12**0.5, rel=0.1)
-
-
-def test_no_distance_has_a_finite_sensitivity() -> None:
     budget = temperature_uncertainty(50.0, override(PARAMETERS, object_distance_m=0.0))
     assert 0 < abs(float(budget.common["object_distance_m"])) < 0.1
 
 
-def test_the_uncertainty_of_metal_is_large() -> None:
-    metal, paint = (temperature_uncertainty(25.0, override(PARAMETERS, emissivity=e)) for e in (0.1, 0.95))
-    assert float(metal.total_u) > 5 * float(paint.total_u)
-
-
-def test_negative_uncertainty_is_refused_by_name() -> None:
+def test_what_has_no_meaning_is_refused_and_empty_cells_need_no_frames():
     with pytest.raises(ValueError, match=r"uncertainty of emissivity = -0\.1: expected 0 or more"):
         InputUncertainty(emissivity=-0.1)
+    budget = temperature_uncertainty(np.array([25.0, np.nan]), PARAMETERS, frames=np.array([4, 0]))
+    assert np.isfinite(budget.total_u).tolist() == [True, False]
+    with pytest.raises(RadiometryError, match=r"emissivity 0\.15 with a standard uncertainty of 0\.08: .*paint the"):
+        monte_carlo_ratio([30.0], (25.0, 30.0), _scene(0.15, window=False), InputUncertainty(emissivity=0.08))
 
 
 @pytest.mark.parametrize("frames", [0, -1, np.nan, np.array([4, 0])])
-def test_a_temperature_averaged_over_no_frame_is_refused(frames: object) -> None:
+def test_a_temperature_averaged_over_no_frame_is_refused(frames):
     with pytest.raises(ThermographyError, match=r"frames=.* for a temperature; give the number of frames"):
-        temperature_uncertainty(np.array([25.0, 26.0]), PARAMETERS, frames=frames)  # type: ignore[arg-type]
+        temperature_uncertainty(np.array([25.0, 26.0]), PARAMETERS, frames=frames)
 
 
-def test_cells_without_a_temperature_may_have_no_frames() -> None:
-    budget = temperature_uncertainty(np.array([25.0, np.nan]), PARAMETERS, frames=np.array([4, 0]))
-    assert np.isfinite(budget.total_u).tolist() == [True, False]
-
-
-def test_two_percent_of_reading_are_two_percent_of_the_reading_in_degrees_celsius() -> None:
+def test_errors_of_camera_and_emissivity_have_the_size_of_their_definition():
     black = override(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
     inputs = InputUncertainty(camera_offset_K=0.0, camera_scale=0.02)
     parts = common_contributions([25.0, 300.0, 400.0], black, inputs)
     np.testing.assert_allclose(parts["camera_scale"], [0.5, 6.0, 8.0], rtol=1e-6)
-
-
-def test_an_error_of_the_camera_is_larger_on_a_surface_that_emits_less() -> None:
     inputs = InputUncertainty(camera_offset_K=1.0, camera_scale=0.0)
     for emissivity in (0.97, 0.35):
         parameters = override(PARAMETERS, emissivity=emissivity, object_distance_m=0.0, reflected_temperature_K=298.15)
         # At the temperature of its surroundings the surface looks like a black body.
         part = common_contributions(25.0, parameters, inputs)["camera_offset_K"]
         assert float(part) == pytest.approx(1 / emissivity, rel=1e-6)
-
-
-def test_one_percent_of_emissivity_is_one_percent_of_the_rise() -> None:
     parameters = override(PARAMETERS, emissivity=0.97, object_distance_m=0.0)
     share = rise_scale_contributions(25.0, parameters, InputUncertainty(emissivity=0.0097))["emissivity"]
     counts = counts_from_temperature([24.5, 25.5], parameters)
     wrong = temperature_from_counts(counts, override(parameters, emissivity=0.9797))
     assert float(share) == pytest.approx(np.diff(wrong)[0] - 1.0, rel=0.02)
     assert float(share) == pytest.approx(-0.01, rel=0.1)
-
-
-def test_drift_of_the_zero_does_not_cancel_in_a_rise() -> None:
     inputs = InputUncertainty(camera_drift_K=0.2)
     budget = temperature_rise_uncertainty(
         27.0, 22.0, override(PARAMETERS, emissivity=1.0, object_distance_m=0.0), inputs
@@ -196,15 +168,8 @@ def test_drift_of_the_zero_does_not_cancel_in_a_rise() -> None:
 
 
 @pytest.mark.parametrize(("emissivity", "u", "low", "high"), [(0.97, 0.01, 0.95, 1.05), (0.15, 0.04, 1.15, 1.7)])
-def test_first_order_is_compared_with_drawn_distributions(emissivity: float, u: float, low: float, high: float) -> None:
+def test_first_order_is_compared_with_drawn_distributions(emissivity, u, low, high):
     inputs = InputUncertainty(emissivity=u)
     of_temperature, of_rise = monte_carlo_ratio([25.0, 30.0], (25.0, 30.0), _scene(emissivity, window=False), inputs)
     assert of_temperature.shape == (2,)
     assert low < of_rise < high
-
-
-def test_an_emissivity_within_two_uncertainties_of_zero_is_refused() -> None:
-    with pytest.raises(
-        RadiometryError, match=r"emissivity 0\.15 with a standard uncertainty of 0\.08: .*paint the surface"
-    ):
-        monte_carlo_ratio([30.0], (25.0, 30.0), _scene(0.15, window=False), InputUncertainty(emissivity=0.08))

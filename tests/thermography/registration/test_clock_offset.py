@@ -88,17 +88,13 @@ def test_of_the_offsets_of_a_periodic_test_the_smallest_is_taken_and_the_others_
 
 def test_offsets_of_a_periodic_test_that_are_all_far_from_the_expected_one_are_refused():
     arguments, period_s = filmed_from_long_before_to_long_after()
-    with pytest.raises(
-        ClockError, match=r"fits clock offsets of .* s about equally well \(a periodic test\), none of them within half"
-    ):
+    with pytest.raises(ClockError, match=r"fits clock offsets of .* s about equally well \(a periodic test\), none"):
         estimate_clock_offset(*arguments, expected_s=-800.0 - period_s, search_s=820.0 + period_s)
 
 
 def test_another_time_zone_is_refused(rng):
     frames, seen, u, readings, targets = campaign(rng, offset_s=7200.0)
-    with pytest.raises(
-        ClockError, match=r"do not meet within 900 s of an offset of 0 s; check the time zones \(all times are UTC\)"
-    ):
+    with pytest.raises(ClockError, match=r"do not overlap within 900 s of an offset of 0 s; check the time zones"):
         estimate_clock_offset(frames, seen, u, readings, targets)
     found = estimate_clock_offset(frames, seen, u, readings, targets, expected_s=7200.0)
     assert found.offset_s == pytest.approx(7200.0, abs=0.2)

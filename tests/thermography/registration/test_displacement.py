@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record
+from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, registered
 from thermography.fields.resampling import plan_window
 from thermography.fields.still import reduce_frames
 from thermography.radiometry.planck import counts_from_temperature
@@ -20,14 +20,14 @@ from thermography.registration.displacement import (
     shift_registration,
     zoom_and_turn,
 )
-from thermography.registration.register import RegistrationError, register
+from thermography.registration.register import RegistrationError
 
 BARE = Scene(discs=())
 
 
 @pytest.fixture(scope="module")
 def registration():
-    return register(Scene(disc_K=-4.0).render(), DISCS, grid=GRID)
+    return registered()
 
 
 @pytest.mark.parametrize("shift", [(3.0, -2.0), (0.4, 0.3), (0.0, 0.0), (-6.0, 5.0)])
@@ -85,9 +85,7 @@ def test_registration_after_a_knock_is_that_of_the_moved_table_or_names_the_fram
     shift = np.array([3.0, -2.0, 0.0, 0.0])
     again = register_after_knock(moved.render(rng), registration, shift, GRID, frame_name="a.seq#7")
     assert moved.registration_rms_mm(again) < 0.05
-    with pytest.raises(
-        RegistrationError, match=r"a\.seq#7: the fiducials moved by \(3\.0, -2\.0\) px and the plan is not"
-    ):
+    with pytest.raises(RegistrationError, match=r"a\.seq#7: the fiducials moved by \(3\.0, -2\.0\) px and the plan"):
         register_after_knock(BARE.render(rng), registration, shift, GRID, frame_name="a.seq#7")
 
 

@@ -1,14 +1,16 @@
-"""The projection against OpenCV and against conics; its fit against refits."""
+"""Projection of the plan through a lens, its fit to discs, and lens files as OpenCV writes them."""
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, FOCAL_PX, Scene
-from thermography.errors import ThermographyError
+from thermography.common import ThermographyError
 from thermography.registration.projection import (
     LENS_SPREAD,
     DiscObservations,
+    Lens,
+    LensError,
     Projection,
     fit_homography,
     fit_projection,
@@ -17,6 +19,7 @@ from thermography.registration.projection import (
     parameter_covariance,
     parameter_jacobian,
     project_point,
+    read_lens,
     select_lens_model,
     variance_factor,
 )
@@ -114,7 +117,7 @@ def test_where_discs_are_few_the_spread_among_lenses_is_the_uncertainty():
 def test_discs_on_a_line_determine_no_homography():
     line = np.column_stack([np.arange(5) * 100.0, np.full(5, 90.0)])
     observations = DiscObservations(line, line, np.full(5, 8.0), np.full(5, 0.01))
-    with pytest.raises(ThermographyError, match="lie on a line or on one spot; spread at least four"):
+    with pytest.raises(ThermographyError, match="are collinear or coincide; spread at least four"):
         fit_homography(observations, Projection(np.eye(3), np.zeros(4), 640.0, (319.5, 239.5)))
 
 
@@ -130,8 +133,72 @@ def test_leave_one_out_equals_leaving_one_out(rng, coefficients):
         observations, fit_projection(observations, fit_homography(observations, ideal), coefficients), coefficients
     )
     refitted = [
-        np.linalg.norm(observations.residuals_mm(fit_projection(observations.without(i), projection, coefficients))[i])
+        np.linalg.norm(
+            observations.residuals_mm(
+                fit_projection(observations.select(np.arange(12) != i), projection, coefficients)
+            )[i]
+        )
         for i in range(len(DISCS))
     ]
     # The homography alone leaves 3 px of distortion, over which the projection is not quite linear.
     np.testing.assert_allclose(leave_one_out_mm(observations, projection, coefficients), refitted, rtol=0.05, atol=0.01)
+
+
+MATRIX = np.array([[900.0, 0, 319.5], [0, 900.0, 239.5], [0, 0, 1]])
+
+
+def write(path, *, matrix=MATRIX, coefficients=(-0.2, 0.1, 1e-3, 2e-3, 0.0), size=(640, 480)):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", size[0])
+    storage.write("image_height", size[1])
+    storage.write("camera_matrix", np.asarray(matrix, float))
+    storage.write("distortion_coefficients", np.array([coefficients], float))
+    storage.release()
+    return path
+
+
+@pytest.mark.parametrize("ending", ["yaml", "yml", "xml", "json"])
+def test_files_of_opencv_are_read(tmp_path, ending):
+    lens = read_lens(write(tmp_path / f"lens.{ending}"))
+    assert lens == Lens(900.0, (319.5, 239.5), (-0.2, 0.1, 1e-3, 2e-3), (640, 480))
+
+
+def test_plain_lists_are_read(tmp_path):
+    path = tmp_path / "lens.json"
+    path.write_text('{"K": [[900, 0, 319.5], [0, 900, 239.5], [0, 0, 1]], "dist_coeffs": [-0.2, 0, 0, 0]}')
+    assert read_lens(path) == Lens(900.0, (319.5, 239.5), (-0.2, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"matrix": np.eye(2)}, "camera_matrix holds 4 numbers instead of 9"),
+        ({"matrix": np.diag([900.0, 1000.0, 1.0])}, "focal lengths 900 and 1000 px; the pixels of a sensor are square"),
+        ({"coefficients": (-0.2, 0.1, 0, 0, 0.3)}, "calibrate without more"),
+        ({"coefficients": (-0.2, 0.1)}, "give k1, k2, p1, p2"),
+    ],
+)
+def test_faults_are_named(tmp_path, changed, message):
+    with pytest.raises(LensError, match=message):
+        read_lens(write(tmp_path / "lens.yaml", **changed))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("hello", "holds no named entries"),
+        ("%YAML:1.0\n---\nK: [1,\n", "cannot be parsed"),
+        ("<opencv_storage><K>1 2", "cannot be parsed"),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><x/>', "not a calibration: plain text"),
+        ("K: &a [1, *a]\n", "recursive|is damaged|holds"),
+        ('{"a": 1}', "no entry camera_matrix"),
+        ("", r"not a calibration: plain text of at most 200000 bytes is expected"),
+        ('{"K": "' + "A" * 600_000 + '"}', r"not a calibration: plain text of at most 200000 bytes is expected"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   data: [ 1. ]\n", "camera_matrix is damaged"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, text, message):
+    path = tmp_path / "lens.json"
+    path.write_text(text)
+    with pytest.raises(LensError, match=message):
+        read_lens(path)

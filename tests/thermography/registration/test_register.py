@@ -1,13 +1,37 @@
-"""Registration against scenes whose plan is known exactly: OpenCV's lens model, rendered with 16 rays per pixel."""
+"""Registration against scenes whose plan is known exactly: matching, wrong places, the evidence for a plan, and refusals."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, FOCAL_PX, GRID, Scene
+from tests.thermography.plan_scene import DISCS, FOCAL_PX, GRID, Scene, registered
+from thermography.common import ThermographyError
+from thermography.registration.discs import SPOT_U_PX, LocatedDisc
 from thermography.registration.plan import Fiducial
-from thermography.registration.register import Lens, RegistrationError, register, register_points
+from thermography.registration.projection import DiscObservations, Projection
+from thermography.registration.register import (
+    Lens,
+    MatchError,
+    RegistrationError,
+    area_ratio,
+    chance_of_arrangement,
+    chance_of_hints,
+    contradicted_hints,
+    exact_homographies,
+    fit_agreeing,
+    match_by_arrangement,
+    match_by_hints,
+    refuse_chance,
+    refuse_picks,
+    refuse_scatter,
+    refuse_sizes,
+    register,
+    register_points,
+    size_contradiction,
+    spread_quadruples,
+)
 
 
 def hinted(scene, rng, error_px):
@@ -39,8 +63,10 @@ def test_wrong_hints_do_not_matter(rng):
 
 
 def test_ladder_stays_on_the_lowest_rung_that_is_enough(rng):
-    straight = register(Scene(disc_K=-4.0).render(rng), DISCS, grid=GRID)
-    bent = register(Scene(disc_K=-4.0, k1=-1.2).render(rng), DISCS, grid=GRID)
+    straight, bent = (
+        register(scene.render(rng), hinted(scene, rng, 2), grid=GRID)
+        for scene in (Scene(disc_K=-4.0), Scene(disc_K=-4.0, k1=-1.2))
+    )
     assert straight.model == "homography"
     # The rendered discs are made of 16 rays per pixel, whose 0.01 px the richest rung may take for tangential distortion.
     assert bent.model.startswith("homography+k1")
@@ -49,7 +75,7 @@ def test_ladder_stays_on_the_lowest_rung_that_is_enough(rng):
 def test_calibrated_lens_is_taken_as_given(rng):
     scene = Scene(disc_K=-4.0, k1=-1.2)
     lens = Lens(FOCAL_PX, (319.5, 239.5), (-1.2, 0.0, 0.0, 0.0))
-    registration = register(scene.render(rng), DISCS, grid=GRID, lens=lens)
+    registration = register(scene.render(rng), hinted(scene, rng, 2), grid=GRID, lens=lens)
     assert registration.distortion.tolist() == [-1.2, 0, 0, 0]
     assert scene.registration_rms_mm(registration) < 0.05
 
@@ -72,7 +98,7 @@ def test_low_contrast_in_one_frame_is_lifted_by_averaging(rng):
     flat = Scene(disc_K=-0.12, field=lambda x, y: np.full_like(x, 23.0 + 0.004 * 450 + 0.24))
     image = flat.render()
     stack = image + rng.normal(0, 0.05, (25, *image.shape))
-    registration = register(stack, DISCS, grid=GRID)
+    registration = register(stack, hinted(flat, rng, 2), grid=GRID)
     assert len(registration.located) == 12
     assert flat.registration_rms_mm(registration) < 0.1
 
@@ -89,14 +115,6 @@ def test_missing_duplicate_and_misplaced_fiducials_are_reported(rng):
     assert "F3" in registration.left_out
     assert "check its x_mm, y_mm" in registration.left_out["F8"]
     assert scene.registration_rms_mm(registration) < 0.05
-
-
-def test_symmetric_arrangement_is_refused_without_hints(rng):
-    places = [(40, 20), (350, 20), (660, 20), (40, 160), (350, 160), (660, 160)]
-    discs = [Fiducial(f"S{i}", x, y, 16.0) for i, (x, y) in enumerate(places)]
-    image = Scene(disc_K=-4.0, discs=tuple(discs)).render(rng)
-    with pytest.raises(RegistrationError, match="symmetric and fits in two ways; give column_px,row_px"):
-        register(image, discs, grid=GRID)
 
 
 def test_too_few_fiducials_are_refused(rng):
@@ -177,7 +195,7 @@ def test_a_mirrored_plan_is_recognised(rng):
     scene = Scene(disc_K=-4.0)
     listed = [replace(d, y_mm=180 - d.y_mm) for d in DISCS]
     assert register(scene.render(rng), listed, grid=GRID).mirrored
-    assert not register(scene.render(rng), DISCS, grid=GRID).mirrored
+    assert not registered(scene).mirrored
 
 
 def test_a_lens_of_other_frames_is_refused(rng):
@@ -188,7 +206,7 @@ def test_a_lens_of_other_frames_is_refused(rng):
 
 def test_points_on_a_line_are_refused():
     line = [Fiducial(f"L{i}", 50.0 + 100 * i, 90.0, 16.0) for i in range(5)]
-    with pytest.raises(RegistrationError, match="lie on a line or on one spot; spread at least four"):
+    with pytest.raises(RegistrationError, match="are collinear or coincide; spread at least four"):
         register_points({d.name: (d.x_mm, 200.0) for d in line}, line, (480, 640))
 
 
@@ -205,3 +223,232 @@ def test_a_list_of_fewer_than_four_discs_is_refused(fiducials):
         RegistrationError, match=f"fiducials lists {count} different discs; a plan is located by at least 4"
     ):
         register(np.zeros((48, 64)), fiducials, grid=GRID)
+
+
+SCENE = Scene()
+
+
+def spots_of(discs):
+    """Spots where the scene shows the discs, as large as it shows them."""
+    spots = {}
+    for disc in discs:
+        angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+        rim = np.column_stack([disc.x_mm + 8 * np.cos(angle), disc.y_mm + 8 * np.sin(angle)])
+        (column, row), outline = SCENE.to_pixels([(disc.x_mm, disc.y_mm)])[0], SCENE.to_pixels(rim)
+        a, b = outline, np.roll(outline, -1, axis=0)
+        area = 0.5 * abs((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+        spots[disc.name] = LocatedDisc(float(column), float(row), SPOT_U_PX, float(area), -3.0)
+    return spots
+
+
+def shuffled(spots, rng):
+    spots = list(spots)
+    rng.shuffle(spots)
+    return spots
+
+
+def test_arrangement_alone_names_every_spot(rng):
+    spots = spots_of(DISCS)
+    strays = [LocatedDisc(50.0, 400.0, SPOT_U_PX, 120.0, 2.0), LocatedDisc(400.0, 200.0, SPOT_U_PX, 900.0, -2.0)]
+    matched, hypotheses = match_by_arrangement(shuffled([*spots.values(), *strays], rng), DISCS, shape=SCENE.shape)
+    assert matched == spots
+    assert hypotheses > 0
+
+
+def test_a_mirrored_view_is_recognised(rng):
+    spots = {name: replace(spot, column_px=639 - spot.column_px) for name, spot in spots_of(DISCS).items()}
+    assert match_by_arrangement(shuffled(spots.values(), rng), DISCS, shape=SCENE.shape)[0] == spots
+
+
+def test_hints_name_the_spots_though_one_is_far_off(rng):
+    spots = spots_of(DISCS)
+    hinted = [
+        replace(disc, column_px=spots[disc.name].column_px + 8, row_px=spots[disc.name].row_px - 6) for disc in DISCS
+    ]
+    hinted[4] = replace(hinted[4], column_px=600.0, row_px=20.0)
+    assert match_by_hints(shuffled(spots.values(), rng), hinted) == spots
+
+
+def test_too_few_hints_and_symmetric_or_small_arrangements_are_refused():
+    assert match_by_hints(list(spots_of(DISCS).values()), DISCS) == {}
+    places = [(40, 20), (350, 20), (660, 20), (40, 160), (350, 160), (660, 160)]
+    symmetric = [Fiducial(f"S{i}", x, y, 16.0) for i, (x, y) in enumerate(places)]
+    with pytest.raises(MatchError, match="symmetric and fits in two ways; give column_px,row_px for at least 4"):
+        match_by_arrangement(list(spots_of(symmetric).values()), symmetric, shape=SCENE.shape)
+    with pytest.raises(MatchError, match=r"5 fiducials cannot be distinguished by their arrangement, which needs 6"):
+        match_by_arrangement(list(spots_of(DISCS[:5]).values()), DISCS[:5], shape=SCENE.shape)
+
+
+SQUARE = np.array([(0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0)])
+
+
+def test_the_widest_quadruple_comes_first_and_points_on_a_line_make_none():
+    points = np.concatenate([[(50.0, 50.0), (55.0, 52.0)], SQUARE])
+    assert set(spread_quadruples(points)[0].tolist()) == {2, 3, 4, 5}
+    assert len(spread_quadruples(points, limit=3)) == 3
+    line = np.column_stack([np.arange(6.0), np.zeros(6)])
+    assert spread_quadruples(line).shape == (0, 4)
+
+
+def test_of_many_points_a_part_is_compared_always_the_same(rng):
+    points = rng.uniform(0, 500, (60, 2))
+    first = spread_quadruples(points)
+    assert first.shape == (500, 4)
+    assert all(len(set(quad)) == 4 for quad in first.tolist())
+    np.testing.assert_array_equal(first, spread_quadruples(points))
+
+
+def test_four_points_are_mapped_exactly_as_by_opencv(rng):
+    plan = rng.uniform(0, 500, (20, 4, 2))
+    image = plan[:, ::-1] * 0.8 + rng.uniform(-20, 20, (20, 4, 2))
+    for matrix, one, other in zip(exact_homographies(plan, image), plan, image, strict=True):
+        np.testing.assert_allclose(cv2.perspectiveTransform(one[None], matrix)[0], other, atol=1e-6)
+    shared = exact_homographies(plan[:1], image)
+    np.testing.assert_allclose(cv2.perspectiveTransform(plan[:1], shared[7])[0], image[7], atol=1e-6)
+
+
+IDEAL = Projection(np.eye(3), np.zeros(4), 640.0, (319.5, 239.5))
+PLAN = np.array([(disc.x_mm, disc.y_mm) for disc in DISCS], float)
+
+
+def observed(rng, *, k1=-1.2, places_u_mm=0.0, plan=PLAN):
+    """Centroids of the listed discs with 0.02 px of noise; their true places differ from the list by `places_u_mm`."""
+    true = plan + rng.normal(0, 1, plan.shape) * places_u_mm
+    pixels = Scene(k1=k1).to_pixels(true) + rng.normal(0, 0.02, plan.shape)
+    return DiscObservations(pixels, plan, np.full(len(plan), 8.0), np.full(len(plan), 0.02))
+
+
+@pytest.mark.parametrize(("count", "error_mm"), [(1, 0.9), (2, 3.0), (3, 5.0), (3, 60.0)])
+def test_wrong_places_are_told_from_right_ones(rng, count, error_mm):
+    for _ in range(4):
+        observations = observed(rng)
+        wrong = rng.permutation(12)[:count]
+        angle = rng.uniform(0, 2 * np.pi, count)
+        observations.centres_mm[:] = PLAN
+        observations.centres_mm[wrong] += error_mm * np.column_stack([np.cos(angle), np.sin(angle)])
+        projection, _, agreeing = fit_agreeing(observations, IDEAL, calibrated=False)
+        assert set(np.flatnonzero(~agreeing)) == set(wrong)
+        np.testing.assert_allclose(projection.to_sensor(PLAN[agreeing]), observations.points_px[agreeing], atol=0.3)
+
+
+@pytest.mark.parametrize("places_u_mm", [0.0, 0.2])
+def test_right_places_are_not_called_wrong(rng, places_u_mm):
+    # The test is meant to lose a disc in one list of a thousand; of 30 more than one would be a wrong scale.
+    lost = sum(
+        not fit_agreeing(observed(rng, places_u_mm=places_u_mm), IDEAL, calibrated=False)[2].all() for _ in range(30)
+    )
+    assert lost <= 1
+
+
+def test_six_right_places_are_all_kept(rng):
+    # As six discs of a coarse camera lie, three of them nearly on a line: every five of them leave hardly a degree of freedom.
+    plan = np.array([(60, 30), (350, 32), (640, 35), (60, 145), (350, 150), (640, 148)], float)
+    lost = sum(not fit_agreeing(observed(rng, plan=plan), IDEAL, calibrated=False)[2].all() for _ in range(50))
+    assert lost <= 1
+
+
+def test_five_discs_cannot_be_told_apart(rng):
+    observations = observed(rng, plan=PLAN[[0, 4, 5, 9, 10]])
+    observations.centres_mm[0] += (20.0, 0.0)
+    assert fit_agreeing(observations, IDEAL, calibrated=False)[2].all()
+
+
+def test_a_given_lens_is_kept(rng):
+    lens = Projection(np.eye(3), np.array([-1.2, 0, 0, 0]), 1530.0, (319.5, 239.5))
+    projection, coefficients, agreeing = fit_agreeing(observed(rng), lens, calibrated=True)
+    assert (projection.distortion[0], coefficients, agreeing.all()) == (-1.2, 0, True)
+
+
+def test_discs_on_a_line_are_refused(rng):
+    line = np.column_stack([np.arange(7) * 90.0, np.full(7, 90.0)])
+    with pytest.raises(ThermographyError, match=r"the fiducials are collinear or coincide"):
+        fit_agreeing(observed(rng, k1=0.0, plan=line), IDEAL, calibrated=False)
+
+
+PROJECTION = Projection(Scene().plan_to_pixel, np.zeros(4), 640.0, (319.5, 239.5))
+AREA_PX = 480.0 * 640
+
+
+def located(discs=DISCS, ratio=1.0):
+    """The discs where they are, with `ratio` times their area."""
+    places = PROJECTION.to_sensor(np.array([(disc.x_mm, disc.y_mm) for disc in discs], float))
+    areas = np.abs(np.linalg.det(PROJECTION.jacobian(PLAN[: len(discs)]))) * np.pi * 64 * ratio
+    return {
+        disc.name: LocatedDisc(float(c), float(r), 0.02, float(a), -3.0)
+        for disc, (c, r), a in zip(discs, places, areas, strict=True)
+    }
+
+
+def as_spots(discs, shift=0.0):
+    return [LocatedDisc(d.column_px + shift, d.row_px, SPOT_U_PX, d.area_px, -3.0) for d in discs.values()]
+
+
+def test_chance_of_hints_is_the_rate_at_which_scattered_spots_do_as_well(rng):
+    hints, spots, reach, runs = rng.uniform(100, 380, (8, 2)), 12, 40.0, 4000
+    hits = 0
+    for _ in range(runs):
+        scattered = rng.uniform(0, (640, 480), (spots, 2))
+        nearest = np.linalg.norm(hints[:, None] - scattered, axis=-1).min(axis=1)
+        hits += int((nearest < reach).sum() >= 4)
+    expected = chance_of_hints(np.full(4, reach), 8, spots, area_px=AREA_PX)
+    # An expectation over choices bounds the rate, and by no more than the choices overlap.
+    assert hits / runs <= 1.1 * expected
+    assert expected < 20 * hits / runs
+
+
+def test_chance_of_an_arrangement_falls_with_discs_and_rises_with_misses_and_trials():
+    chance = lambda missed, hypotheses=1000, k=0: chance_of_arrangement(  # noqa: E731
+        12, 15, np.array(missed), hypotheses=hypotheses, coefficients=k, area_px=AREA_PX
+    )
+    assert chance([0.05] * 12) < 1e-30
+    assert chance([0.05] * 6) < chance([2.0] * 6) < chance([2.0] * 6, 10_000)
+    assert chance([0.05] * 5, k=1) == chance([0.05] * 4) == np.inf
+    assert chance([0.5] * 7, k=1) > chance([0.5] * 7)
+
+
+def test_what_chance_explains_is_refused_and_near_hints_prove():
+    few = located(DISCS[:6])
+    with pytest.raises(RegistrationError, match=r"6 of 12 fiducials fit the spots in view, and chance alone would"):
+        refuse_chance(few, DISCS, as_spots(few), np.full(6, 6.0), hypotheses=5000, coefficients=1, shape=(480, 640))
+    every = located()
+    refuse_chance(every, DISCS, as_spots(every), np.full(12, 0.05), hypotheses=5000, coefficients=1, shape=(480, 640))
+    four = located(DISCS[:4])
+
+    def hinted(error):
+        return [
+            Fiducial(d.name, d.x_mm, d.y_mm, 16.0, p.column_px + error, p.row_px)
+            for d, p in zip(DISCS, four.values(), strict=False)
+        ]
+
+    arguments = {"hypotheses": 1, "coefficients": 1, "shape": (480, 640)}
+    refuse_chance(four, hinted(8.0), as_spots(four), np.full(4, np.nan), **arguments)
+    with pytest.raises(RegistrationError, match=r"4 of 4 fiducials fit .*; 4 of their 4 hints contradict them"):
+        refuse_chance(four, hinted(90.0), as_spots(four) * 6, np.full(4, np.nan), **arguments)
+
+
+def test_places_diameters_and_hints_that_contradict_are_named():
+    missed = {disc.name: 0.1 for disc in DISCS} | {"F7": 9.0}
+    refuse_scatter(1.5, missed, DISCS)
+    with pytest.raises(RegistrationError, match=r"by 1\.7 mm \(standard deviation; up to 1\.6 mm.*F7 is missed by the"):
+        refuse_scatter(1.7, missed, DISCS)
+    refuse_picks(2.0, missed)
+    with pytest.raises(RegistrationError, match=r"picked points contradict one another by 4\.0 px.*F7"):
+        refuse_picks(4.0, missed)
+    assert area_ratio(located(ratio=1.2), DISCS, PROJECTION) == pytest.approx(1.2, rel=0.01)
+    assert np.isnan(area_ratio({}, [Fiducial("P1", 1.0, 2.0, 0.0, 3.0, 4.0)], PROJECTION))
+    refuse_sizes(1.2, DISCS)
+    with pytest.raises(RegistrationError, match=r"the discs in view measure 11\.3 mm, diameter_mm says 16 mm"):
+        refuse_sizes(0.5, DISCS)
+    places = located(ratio=0.25)
+    hinted = [Fiducial(d.name, d.x_mm, d.y_mm, 16.0, places[d.name].column_px, places[d.name].row_px) for d in DISCS]
+    assert "measure 8.0 mm, diameter_mm says 16 mm" in size_contradiction(as_spots(places), hinted)
+    assert size_contradiction(as_spots(located()), hinted) == ""
+    assert size_contradiction(as_spots(places), DISCS) == ""
+    places = located(DISCS[:2])
+    near, far = (
+        Fiducial(d.name, d.x_mm, d.y_mm, 16.0, places[d.name].column_px + error, places[d.name].row_px)
+        for d, error in zip(DISCS[:2], (10.0, 70.0), strict=True)
+    )
+    wrong = contradicted_hints(places, [near, far])
+    assert list(wrong) == ["F2 (hint)"]
+    assert "is 70 px from the disc; it was not used" in wrong["F2 (hint)"]

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, SC660, Scene
+from tests.thermography.plan_scene import GRID, SC660, Scene, registered
 from thermography.radiometry.planck import counts_from_temperature
-from thermography.registration.register import register
 from thermography.registration.tracking import locate_table, make_tracker
 
 HOME = Scene(disc_K=-4.0, k1=-1.2, rays=3, corners_px=((80, 150), (480, 140), (495, 285), (75, 300)))
@@ -15,7 +14,7 @@ HOME = Scene(disc_K=-4.0, k1=-1.2, rays=3, corners_px=((80, 150), (480, 140), (4
 
 @pytest.fixture(scope="module")
 def tracker():
-    registration = register(HOME.render(), DISCS, grid=GRID)
+    registration = registered(HOME)
     return make_tracker(registration, GRID, np.array([2.0, 0.0]), reach_mm=350.0)
 
 

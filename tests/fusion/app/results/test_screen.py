@@ -1,23 +1,17 @@
 """The screen *Results* in a browser: linked selection, keyboard, results that lack an instrument, texts of a file."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from fusion.products.store import file_sha256
-
-pytestmark = pytest.mark.browser
+from fusion.results.store import file_sha256
 
 
 @pytest.fixture(scope="module")
-def page(app: tuple[str, Path], new_page: Callable[..., Any]) -> Any:
+def page(app, new_page):
     """The application, with results of a laser alone whose title is markup beside the whole ones."""
     laser = shutil.copytree(app[1] / "results", app[1] / "laser_alone")
     (laser / "fields.nc").unlink()
@@ -30,18 +24,18 @@ def page(app: tuple[str, Path], new_page: Callable[..., Any]) -> Any:
     return new_page(app[0], width=390)
 
 
-def opened(page: Any, part: str) -> None:
+def opened(page, part):
     """Open a screen or a part of it."""
     page.get_by_role("button", name=part, exact=True).first.click()
 
 
-def name_folder(page: Any, folder: Path) -> None:
+def name_folder(page, folder):
     page.get_by_label("Results folder").fill(str(folder))
     page.get_by_label("Results folder").press("Enter")
     opened(page, "Open")
 
 
-def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page: Any) -> None:
+def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page):
     opened(page, "Results")
     page.get_by_text("Cycle 24 (").wait_for()
     page.get_by_role("slider").focus()
@@ -58,7 +52,7 @@ def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page: Any) -> N
     page.wait_for_function("document.documentElement.scrollWidth <= 390")
 
 
-def test_places_are_added_by_keyboard_and_by_click(page: Any) -> None:
+def test_places_are_added_by_keyboard_and_by_click(page):
     page.get_by_role("textbox", name="x / mm").fill("300")
     page.get_by_role("textbox", name="x / mm").press("Enter")
     page.get_by_role("button", name="Add place").press("Enter")
@@ -67,7 +61,7 @@ def test_places_are_added_by_keyboard_and_by_click(page: Any) -> None:
     page.get_by_text("over time. x 300 mm").filter(has_text=";").wait_for()
 
 
-def test_the_loop_and_the_positions_say_what_was_found(page: Any) -> None:
+def test_the_loop_and_the_positions_say_what_was_found(page):
     opened(page, "Loop")
     page.get_by_role("heading", name="Round 1").wait_for()
     page.get_by_text("What the final model leaves").first.wait_for()
@@ -76,7 +70,7 @@ def test_the_loop_and_the_positions_say_what_was_found(page: Any) -> None:
     page.wait_for_function("document.documentElement.scrollWidth <= 390")
 
 
-def test_a_changed_run_goes_to_a_folder_of_its_own_and_is_shown(page: Any, app: tuple[str, Path]) -> None:
+def test_a_changed_run_goes_to_a_folder_of_its_own_and_is_shown(page, app):
     opened(page, "Run again")
     page.get_by_text("Nothing was changed.").wait_for()
     start = page.get_by_role("button", name="Run again", exact=True).last
@@ -91,7 +85,7 @@ def test_a_changed_run_goes_to_a_folder_of_its_own_and_is_shown(page: Any, app: 
     assert declared == ["axis_expansion"]
 
 
-def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page: Any, app: tuple[str, Path]) -> None:
+def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app):
     name_folder(page, app[1] / "laser_alone")
     page.get_by_text("<img src=x onerror=alert(1)>").wait_for()
     page.get_by_text("Deviation along the axis").wait_for()
@@ -99,7 +93,7 @@ def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page: Any
     page.get_by_text("This run has no camera").wait_for()
 
 
-def test_a_folder_without_results_says_so(page: Any, app: tuple[str, Path]) -> None:
+def test_a_folder_without_results_says_so(page, app):
     name_folder(page, app[1] / "thermal")
     page.get_by_role("alert").filter(has_text="there is no results.json in it").wait_for()
     name_folder(page, Path("/"))

@@ -1,32 +1,27 @@
 """The screen *Set up*: what it reads from a folder, and the way to a campaign file in a browser, by keyboard and by mouse."""
 
-from __future__ import annotations
-
 import asyncio
 import shutil
 import tomllib
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from fusion.app.setup.campaign_text import open_campaign
+from fusion.app.parts import State
+from fusion.app.setup.campaign import open_campaign
 from fusion.app.setup.screen import SetUpScreen, grid_of, listed_fiducials, open_folder, told_of_check
-from fusion.app.state import State
-from fusion.starting.check import check_campaign
+from fusion.pipeline.check import check_campaign
 from tests.fusion.app.texts import texts
 
 
-def test_a_folder_is_opened_with_its_frame_fiducials_and_times(campaign_folder: Path) -> None:
+def test_a_folder_is_opened_with_its_frame_fiducials_and_times(campaign_folder):
     opened = open_folder(campaign_folder, campaign_folder)
-    assert opened.frame is not None and opened.frame.shape == (480, 640)
+    assert opened.frame.shape == (480, 640)
     assert opened.placed.registration is not None and len(opened.placed.residual_mm) == 12
     assert len(opened.recordings) == 4 and opened.positions_mm == (0.0, 50.0, 100.0, 150.0, 200.0, 250.0)
     assert not opened.remarks
 
 
-def test_what_is_damaged_or_outside_becomes_a_remark(copied: Path) -> None:
+def test_what_is_damaged_or_outside_becomes_a_remark(copied):
     text = (copied / "campaign.toml").read_text()
     (copied / "campaign.toml").write_text(text.replace('"fiducials.csv"', '"../fiducials.csv"'))
     assert "lies outside" in open_folder(copied, copied).remarks[0]
@@ -39,21 +34,19 @@ def test_what_is_damaged_or_outside_becomes_a_remark(copied: Path) -> None:
     assert listed_fiducials(copied, open_campaign(copied)) == []
 
 
-def test_a_check_is_told_with_its_faults_or_as_ready(copied: Path) -> None:
+def test_a_check_is_told_with_its_faults_or_as_ready(copied):
     assert "ready to run" in told_of_check(check_campaign(copied / "campaign.toml"))[0].object
     (copied / "environment.csv").unlink()
     shown = "".join(part.object for part in told_of_check(check_campaign(copied / "campaign.toml")))
     assert "not ready to run" in shown and "environment.csv" in shown
 
 
-def test_saving_is_off_while_it_works_and_comes_back_whatever_fails(
-    copied: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_saving_is_off_while_it_works_and_comes_back_whatever_fails(copied, monkeypatch):
     screen, seen = SetUpScreen(State(root=copied)), []
     asyncio.run(screen.look())
 
-    def failing(error: Exception) -> None:
-        def check(path: Path) -> None:
+    def failing(error):
+        def check(path):
             seen.append(screen._save.disabled)
             raise error
 
@@ -71,7 +64,7 @@ def test_saving_is_off_while_it_works_and_comes_back_whatever_fails(
 
 
 @pytest.fixture
-def new_folder(app: tuple[str, Path], campaign_folder: Path) -> Iterator[Path]:
+def new_folder(app, campaign_folder):
     """A folder inside that of the application, without a campaign file, which the folder above does not show."""
     folder = app[1] / ".new"
     shutil.copytree(campaign_folder, folder, ignore=shutil.ignore_patterns("campaign.toml"))
@@ -79,7 +72,7 @@ def new_folder(app: tuple[str, Path], campaign_folder: Path) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-def look_into(page: Any, written: str) -> None:
+def look_into(page, written):
     button = page.get_by_role("button", name="Look into it")
     page.get_by_text("24 frames of 640 x 480").first.wait_for()
     field = page.get_by_label("Folder of the measurement")
@@ -90,10 +83,7 @@ def look_into(page: Any, written: str) -> None:
     page.locator("caption", has_text=f"/{written}").wait_for()
 
 
-@pytest.mark.browser
-def test_a_campaign_file_is_made_by_keyboard_and_opened_again(
-    app: tuple[str, Path], new_folder: Path, new_page: Callable[..., Any]
-) -> None:
+def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, new_page):
     page = new_page(app[0])
     look_into(page, ".new")
     page.get_by_text("12 fiducials agree").wait_for()
@@ -127,10 +117,7 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(
     assert again.get_by_label("Spindle at axis position 0, x").input_value() == "500 mm"
 
 
-@pytest.mark.browser
-def test_files_are_dropped_into_the_folder_and_a_wrong_or_large_one_is_refused(
-    app: tuple[str, Path], new_folder: Path, new_page: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_files_are_dropped_into_the_folder_and_a_wrong_or_large_one_is_refused(app, new_folder, new_page, tmp_path):
     page = new_page(app[0])
     page.get_by_text("24 frames of 640 x 480").first.wait_for()
     field = page.get_by_label("Folder of the measurement")

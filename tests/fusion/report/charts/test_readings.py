@@ -1,16 +1,113 @@
-"""Charts of the readings show the numbers of the products, both approaches on one scale."""
-
-from __future__ import annotations
+"""Charts of the axis: their numbers are those of the products, intervals are k = 2, missing values are gaps."""
 
 import numpy as np
 import pytest
 import xarray as xr
+from bokeh.models import BoxAnnotation, Label
 
-from fusion.products.grouped import group
-from fusion.report.charts.readings import plot_cycles, plot_history, plot_windows
+from fusion.report.charts import readings as neighbours
+from fusion.report.charts.readings import (
+    plot_cycles,
+    plot_deviation_map,
+    plot_drift,
+    plot_drift_map,
+    plot_history,
+    plot_position_scatter,
+    plot_profile,
+    plot_reversal,
+    plot_single_runs,
+    plot_test,
+    plot_windows,
+)
+from fusion.report.wording import number
+from fusion.results.store import group
+from interferometry.iso230 import evaluate_iso230
+from tests.interferometry.iso230.made_tests import by_hand, test_made
 
 
-def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations: xr.Dataset) -> None:
+@pytest.fixture
+def still_readings():
+    """Group drift and deviations of 3 cycles and 2 targets (at 100 and 0 mm): the drift is the cycle at 100 mm and half of it at 0."""
+    cycle, target, direction = [1, 2, 3], [1, 2], ["positive", "negative"]
+    value = np.broadcast_to(np.array([0.0, 1.0, 2.0])[:, None, None] * np.array([1.0, 0.5]), (3, 2, 2))
+    dims = ("cycle", "direction", "target")
+    start = np.datetime64("2026-03-09T06:00", "ns")
+    time = start + (np.arange(3)[:, None, None] * np.timedelta64(60, "m")) + np.zeros((3, 2, 2), "timedelta64[ns]")
+    coords = {"cycle": cycle, "direction": direction, "target": target}
+    drift = xr.Dataset(
+        {
+            "drift": (dims, value),
+            "drift_u": (dims, np.full((3, 2, 2), 0.1)),
+            "profile": (("direction", "target"), [[4.0, 0.0], [3.0, -1.0]]),
+            "profile_u": (("direction", "target"), np.full((2, 2), 0.25)),
+        },
+        coords,
+    )
+    deviations = xr.Dataset({"time": (dims, time), "position": (("target",), [100.0, 0.0])}, coords)
+    return drift, deviations
+
+
+def test_drift_of_every_position(still_readings):
+    chart = plot_drift(*still_readings)
+    (lines,) = [r for r in chart.figure.renderers if "order" in r.data_source.data]
+    assert lines.data_source.data["order"].tolist() == [0.0, 100.0]
+    assert [line.tolist() for line in lines.data_source.data["ys"]] == [[0.0, 0.5, 1.0], [0.0, 1.0, 2.0]]
+    assert lines.data_source.data["xs"][0].tolist() == [0.0, 1.0, 2.0]
+    assert chart.figure.yaxis.axis_label == "drift / µm"
+    assert all(part in chart.seen for part in ("2 positions", "2.0 h: 0.00 to 2.00 µm", "by 1.5 µm", "at 100 mm")), (
+        chart.seen
+    )
+    assert chart.columns["cycle"].tolist() == [1, 1, 2, 2, 3, 3]
+    np.testing.assert_allclose(chart.columns["95 % band ± / µm"], 0.2)
+
+
+def test_a_first_cycle_and_a_position_without_drift_are_left_out_of_the_sentence(still_readings):
+    drift, deviations = (one.copy(deep=True) for one in still_readings)
+    drift["drift"][{"cycle": 0}] = np.nan
+    drift["drift"][{"target": 1}] = np.nan
+    mean = drift["drift"].mean("direction")
+    change = float((mean.isel(cycle=-1) - mean.isel(cycle=1)).mean())
+    assert f"it changes by {number(change, 2)} µm on average" in plot_drift(drift, deviations).seen
+
+
+def test_profile_with_its_band(still_readings):
+    drift, deviations = still_readings
+    chart = plot_profile(drift, deviations["position"])
+    points = [r for r in chart.figure.renderers if "half" in r.data_source.data]
+    points = points[::2]  # each interval shares the source of its marks
+    assert points[0].data_source.data["y"].tolist() == [0.0, 4.0]
+    assert points[0].data_source.data["half"].tolist() == [0.5, 0.5]
+    assert list(chart.columns)[1] == "profile, positive approach / µm"
+    assert "positive approach 0.00 to 4.00 µm; negative approach −1.00 to 3.00 µm." in chart.seen
+
+
+def test_reversal_and_scatter_of_a_campaign(deviations):
+    drift, position = group(deviations, "drift"), deviations["position"]
+    chart = plot_reversal(drift, position)
+    np.testing.assert_array_equal(chart.columns["reversal / µm"], drift["reversal"])
+    assert chart.figure.yaxis.axis_label == "positive − negative / µm"
+    chart = plot_position_scatter(drift, position, {2, 5})
+    shades = sorted(shade.left for shade in chart.figure.select(BoxAnnotation))
+    assert shades == [30.0, 180.0]
+    assert chart.seen.endswith("marked as standing out: 50 mm and 200 mm.")
+    assert plot_position_scatter(drift, position, set()).seen.endswith("none is marked as standing out.")
+
+
+def test_a_map_over_cycle_and_position(still_readings, deviations):
+    drift, at = still_readings
+    chart = plot_drift_map(drift, at["position"])
+    cells = chart.figure.renderers[0].data_source.data
+    assert cells["value"].tolist() == [0.0, 0.0, 0.5, 1.0, 1.0, 2.0]
+    assert (cells["bottom"][0], cells["top"][0]) == (-50.0, 50.0)
+    assert (cells["left"][0], cells["right"][0]) == (0.5, 1.5)
+    assert "0.00 to 2.00 µm" in chart.seen and "in cycle 3 at 100 mm" in chart.seen
+    mapper = chart.figure.renderers[0].glyph.fill_color.transform
+    assert mapper.low == -mapper.high
+    about = plot_deviation_map(deviations).columns["deviation from the mean of the position / µm"]
+    np.testing.assert_allclose(np.reshape(about, (24, 6)).mean(axis=0), 0.0, atol=1e-12)
+
+
+def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations):
     charts = [plot_cycles(deviations, side) for side in ("positive", "negative")]
     ends = {(chart.figure.y_range.start, chart.figure.y_range.end) for chart in charts}
     assert len(ends) == 1
@@ -22,7 +119,7 @@ def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations: xr.Da
     assert len(charts[0].columns["deviation / µm"]) == 24 * 6
 
 
-def test_the_history_holds_readings_and_the_line_through_them(deviations: xr.Dataset) -> None:
+def test_the_history_holds_readings_and_the_line_through_them(deviations):
     drift = group(deviations, "drift")
     chart = plot_history(deviations, drift, 2)
     read = deviations["deviation"].sel(target=2, direction="positive")
@@ -32,7 +129,7 @@ def test_the_history_holds_readings_and_the_line_through_them(deviations: xr.Dat
     assert chart.figure.title.text == f"position 2 ({float(deviations['position'].sel(target=2)):g} mm)"
 
 
-def test_windows_beside_the_whole_test(deviations: xr.Dataset) -> None:
+def test_windows_beside_the_whole_test(deviations):
     windows = group(deviations, "iso")
     chart = plot_windows(windows)
     np.testing.assert_array_equal(chart.columns["A / µm"], windows["A"][:-1])
@@ -40,3 +137,66 @@ def test_windows_beside_the_whole_test(deviations: xr.Dataset) -> None:
     whole = [r.glyph.y for r in chart.figure.renderers if type(r.glyph).__name__ == "HSpan"]
     assert whole == pytest.approx([float(windows[name][-1]) for name in "ARB"])
     assert chart.figure.y_range.start == 0.0
+
+
+def test_neighbours_side_by_side_with_sign_and_borders(deviations):
+    comparison = group(deviations, "comparison")
+    chart = neighbours.plot_scatter_comparison(comparison, deviations["position"])
+    assert chart.figure.yaxis.axis_label == "standard deviation / µm (logarithmic)"
+    assert chart.columns["position / mm"].tolist() == [50.0, 100.0, 150.0, 200.0, 250.0]
+    expected = comparison["differenced"].sel(direction="negative")
+    np.testing.assert_array_equal(chart.columns["s of the differences, negative approach / µm"], expected)
+    links = group(deviations, "neighbours")
+    chart = neighbours.plot_mean_differences(links, deviations["position"])
+    assert chart.figure.yaxis.axis_label == "nearer − further position, mean / µm"
+    read = deviations["deviation"].sel(direction="positive")
+    by_hand = (read.sel(target=1) - read.sel(target=2)).mean("cycle")
+    np.testing.assert_allclose(chart.columns["nearer − further, positive approach / µm"][0], by_hand)
+    assert (chart.columns["nearer position / mm"][0], chart.columns["further position / mm"][0]) == (0.0, 50.0)
+    found = group(deviations, "chart")
+    chart = neighbours.plot_reference_chart(found, deviations["position"])
+    np.testing.assert_array_equal(
+        chart.columns["deviation, positive approach / µm"], found["chart"].sel(direction="positive")
+    )
+    np.testing.assert_array_equal(
+        chart.columns["border ±, positive approach / µm"], found["border_s"].sel(direction="positive")
+    )
+    assert "Deviation from the reference at 0 mm" in chart.seen
+
+
+def test_means_and_spans_are_those_of_the_readings():
+    x = np.random.default_rng(5).normal(0, 1, (5, 2, 6)) + 3.0 * np.arange(6)
+    test = test_made(x)
+    chart = plot_test(evaluate_iso230(test), test["position"])
+    np.testing.assert_allclose(chart.columns["mean, positive approach / \u00b5m"], x[:, 0].mean(axis=0))
+    np.testing.assert_allclose(chart.columns["s, negative approach / \u00b5m"], x[:, 1].std(axis=0, ddof=1))
+    true = by_hand(x)
+    texts = {label.text for label in chart.figure.select({"type": Label})}
+    assert texts == {f"A {true['A']:.2f}", f"E {true['E']:.2f}", f"B {true['B']:.2f}"}
+    assert chart.seen.startswith("Mean deviation over 0.00 to 50.00 mm of the axis with \u00b12 s: positive approach ")
+
+
+def test_one_approach_has_a_chart_without_b():
+    x = np.random.default_rng(5).normal(0, 1, (5, 2, 6))
+    x[:, 1] = np.nan
+    test = test_made(x)
+    chart = plot_test(evaluate_iso230(test), test["position"])
+    assert "mean, negative approach / \u00b5m" not in chart.columns
+    assert not any(label.text.startswith("B") for label in chart.figure.select({"type": Label}))
+
+
+def test_a_single_run_shows_its_readings():
+    x = np.arange(12.0).reshape(1, 2, 6)
+    chart = plot_single_runs(test_made(x))
+    assert chart.columns["cycle 1, negative approach / \u00b5m"] == pytest.approx(np.arange(6.0, 12.0))
+
+
+def test_the_labels_of_both_spans_stand_apart():
+    test = test_made(np.random.default_rng(5).normal(0, 0.1, (5, 2, 6)) + 3.0 * np.arange(6))
+    labels = {
+        label.text[0]: label
+        for label in plot_test(evaluate_iso230(test), test["position"]).figure.select({"type": Label})
+    }
+    # Text of 12 px is a fifteenth of the chart's height.
+    assert labels["E"].y - labels["A"].y > 15.0 / 15
+    assert labels["A"].x < labels["E"].x

@@ -1,7 +1,5 @@
 """A results folder without thermograms: an axis of known profile that stretches with the material temperature."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -9,14 +7,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.products.grouped import joined
-from fusion.products.results import Notice, assemble
-from fusion.products.store import write_dataset, write_json
+from fusion.results.results import Notice, assemble
+from fusion.results.store import joined, write_dataset, write_json
 from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.iso230 import evaluate_windows
 from tests.fusion.results_sample import PARTS
-from thermography.contract import FIELDS
+from thermography.common import FIELDS
 
 #: Unequal distances, as ISO 230-2 asks for.
 UNEVEN_MM = np.array([0.0, 26.0, 48.0, 77.0, 101.0, 124.0, 153.0, 175.0])

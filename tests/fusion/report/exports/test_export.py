@@ -1,25 +1,30 @@
 """Exports of a folder: guarded, never overwriting in silence, with a header that the dialect can hold."""
 
-from __future__ import annotations
-
+import hashlib
 import shutil
-from pathlib import Path
+from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
+import openpyxl
 import pytest
 
 from fusion import cli
-from fusion.report.exports.errors import ExportError
-from fusion.report.exports.export import FORMATS, export_results
+from fusion.report.exports import tables
+from fusion.report.exports.controls import ExportError, header_lines, read_origin, read_thermal_state
+from fusion.report.exports.export import FORMATS, export_results, objections, remarks
+from fusion.report.exports.tables import write_workbook
+from fusion.results.results import Results, assemble, read_results
+from fusion.results.store import read_dataset
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
 from tests.fusion.results_sample import PARTS
 
 
-def test_the_command_offers_every_format() -> None:
+def test_the_command_offers_every_format():
     assert {item.value for item in cli.ExportFormat} == set(FORMATS)
 
 
-def test_csv_writes_tables_and_leaves_the_large_one_out(small_run, tmp_path) -> None:
+def test_csv_writes_tables_and_leaves_the_large_one_out(small_run, tmp_path):
     written = export_results(small_run, "csv", tmp_path / "a")
     assert [path.name for path in written.files] == ["drift.csv", "profile.csv", "iso230.csv", "iso230_positions.csv"]
     with pytest.raises(ExportError, match=r"there is no fields.nc in it, so that no fields.csv can be written"):
@@ -43,7 +48,7 @@ def test_csv_writes_tables_and_leaves_the_large_one_out(small_run, tmp_path) -> 
         ("renishaw", ["compensation_X.ren", "compensation_X.ren.README.txt"]),
     ],
 )
-def test_nothing_is_overwritten_in_silence(small_run, tmp_path, format: str, names: list[str]) -> None:
+def test_nothing_is_overwritten_in_silence(small_run, tmp_path, format, names):
     options = {"spacing_mm": 20.0} if format in ("siemens840d", "renishaw") else {}
     written = export_results(small_run, format, tmp_path, **options)
     assert [path.name for path in written.files] == names
@@ -57,11 +62,8 @@ def test_nothing_is_overwritten_in_silence(small_run, tmp_path, format: str, nam
     export_results(small_run, format, tmp_path, overwrite=True, **options)
 
 
-def test_unequal_targets_need_a_spacing(small_run, tmp_path) -> None:
-    with pytest.raises(
-        ExportError,
-        match=r"needs equally spaced points; these are 22 to 29 mm apart, as ISO 230-2 asks for: .* --spacing",
-    ):
+def test_unequal_targets_need_a_spacing(small_run, tmp_path):
+    with pytest.raises(ExportError, match=r"needs equally spaced points; these are 22 to 29 mm apart, as ISO 230-2"):
         export_results(small_run, "siemens840d", tmp_path)
     assert not list(tmp_path.iterdir())
     table = export_results(small_run, "siemens840d", tmp_path, spacing_mm=20.0, axis="X1").files[0]
@@ -70,17 +72,15 @@ def test_unequal_targets_need_a_spacing(small_run, tmp_path) -> None:
 
 
 @pytest.fixture(scope="module")
-def unexplained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unexplained(tmp_path_factory):
     loop = {**PARTS["loop"], "verdict": "unexplained"}
     even = measured(np.linspace(0.0, 140.0, 8))
     return write_run(tmp_path_factory.mktemp("unexplained"), even, axis="X axis; M30", loop=loop)
 
 
 @pytest.mark.parametrize("format", ["linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw"])
-def test_the_guard_refuses_and_a_forced_table_says_why(unexplained, tmp_path, format: str) -> None:
-    with pytest.raises(
-        ExportError, match=r"no compensation table is written: the verdict is unexplained: .* add --force"
-    ):
+def test_the_guard_refuses_and_a_forced_table_says_why(unexplained, tmp_path, format):
+    with pytest.raises(ExportError, match=r"no compensation table is written: the verdict is unexplained: .* add"):
         export_results(unexplained, format, tmp_path, axis="X")
     assert not list(tmp_path.iterdir())
     forced = export_results(unexplained, format, tmp_path, axis="X", force=True)
@@ -88,7 +88,7 @@ def test_the_guard_refuses_and_a_forced_table_says_why(unexplained, tmp_path, fo
     assert "FORCED, although the verdict is unexplained" in forced.files[-1].read_text(encoding="ascii")
 
 
-def test_the_axis_is_a_name(unexplained, tmp_path) -> None:
+def test_the_axis_is_a_name(unexplained, tmp_path):
     """The campaign's axis comes from a file: what is no name is never written into a table."""
     with pytest.raises(ExportError, match=r'"X axis; M30" is no name of an axis; write a letter'):
         export_results(unexplained, "heidenhain", tmp_path, force=True)
@@ -98,19 +98,183 @@ def test_the_axis_is_a_name(unexplained, tmp_path) -> None:
     assert files[0].name == "compensation.comp" and "axis: not stated" in files[1].read_text()
 
 
-def test_a_run_of_the_camera_alone_has_its_fields(tmp_path) -> None:
+def test_a_run_of_the_camera_alone_has_its_fields(tmp_path):
     write_fields(tmp_path)
     assert [path.name for path in export_results(tmp_path, "csv", tmp_path / "out").files] == ["fields.csv"]
-    with pytest.raises(
-        ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to write"
-    ):
+    with pytest.raises(ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to"):
         export_results(tmp_path, "linuxcnc", tmp_path / "out")
 
 
-def test_a_folder_without_results_is_refused(tmp_path) -> None:
-    with pytest.raises(
-        ExportError, match=r"there is no deviations.nc in it; name the results folder of a finished run"
-    ):
+def test_a_folder_without_results_is_refused(tmp_path):
+    with pytest.raises(ExportError, match=r"there is no deviations.nc in it; name the results folder of a finished"):
         export_results(tmp_path, "csv", tmp_path)
     with pytest.raises(ExportError, match=r'there is no format "mazak"; write one of csv, xlsx, linuxcnc'):
         export_results(tmp_path, "mazak", tmp_path)
+
+
+SOUND = {"state": "sound", "accepted": [], "checks": []}
+CHECK = {
+    "code": "copied_cycles", "value": 3.0, "limit": 0.0, "passed": False, "evidence": "3 cycles are copies.", "remedy": "Look.",
+    "endangers": "all", "assumption": "no cycle is a copy", "conditional": ["positions"],
+}  # fmt: skip
+
+
+def results(**changes: Any) -> Results:
+    return assemble("A", {**PARTS, "inputs": SOUND, **changes}, [])
+
+
+def loop(**changes: Any) -> dict[str, Any]:
+    return {**PARTS["loop"], **changes}
+
+
+def anomaly(kind: str, cause: str) -> dict[str, Any]:
+    (sample,) = PARTS["anomalies"]
+    return {**sample, "cause": cause, "evidence": {**sample["evidence"], "kind": kind}}
+
+
+@pytest.mark.parametrize("verdict", ["complete", "explained"])
+def test_a_sound_run_has_no_objection(verdict):
+    found = results(loop=loop(verdict=verdict))
+    assert objections(found) == []
+    assert remarks(found) == [
+        "position 3, both approaches, stands out (scatter of the structure, scatter 0.70 um): a table does not correct that"
+    ]
+
+
+@pytest.mark.parametrize("verdict", ["partial", "unexplained", "no_skill"])
+def test_other_verdicts_are_objections(verdict):
+    (reason,) = objections(results(loop=loop(verdict=verdict)))
+    assert reason.startswith(f"the verdict is {verdict}: ")
+
+
+def test_doubts_a_missing_model_and_unlike_positions_are_objections():
+    doubted = {"state": "doubted", "accepted": [], "checks": [CHECK]}
+    assert objections(results(inputs=doubted)) == ["an input is doubted (copied_cycles): 3 cycles are copies"]
+    assert objections(results(inputs={**doubted, "accepted": ["copied_cycles"]})) == []
+    unchecked = assemble("A", {name: part for name, part in PARTS.items() if name != "inputs"}, [])
+    assert objections(unchecked) == ["the inputs were not checked against each other"]
+    parts = {name: part for name, part in PARTS.items() if name != "loop"}
+    assert objections(assemble("A", {**parts, "inputs": SOUND}, [])) == [
+        "the drift was not modelled, so that nothing says whether the profile is free of it"
+    ]
+    found = results(anomalies=[anomaly("slow", "local_temperature")])
+    assert objections(found) == [] and "local temperature" in remarks(found)[0]
+
+
+@pytest.mark.parametrize(("kind", "cause"), [("step", "step"), ("slow", "undetermined"), ("periodic", "undetermined")])
+def test_a_position_that_moves_unlike_the_others_is_an_objection(kind, cause):
+    (reason,) = objections(results(anomalies=[anomaly(kind, cause)]))
+    assert reason.startswith(f"position 3, both approaches, drifts or steps unlike the others ({kind}, cause: ")
+
+
+def lines_of(folder, **changes) -> list[str]:
+    state = read_thermal_state(folder, read_dataset(folder / "deviations.nc"))
+    origin = read_origin(folder, read_results(folder), state)
+    stated = {"words": "A control", "axis": "X", "sign": "plus", "objections": [], "remarks": []}
+    return header_lines(origin, **{**stated, **changes}, exported=datetime(2026, 11, 22, 9, 30, tzinfo=UTC))
+
+
+def test_the_header_names_source_state_and_trial_line_by_line(small_run):
+    lines = lines_of(small_run)
+    assert lines[0] == "Compensation table for A control, by thermofuse"
+    digest = hashlib.sha256((small_run / "results.json").read_bytes()).hexdigest()
+    assert lines[-1] == f"source: results.json, SHA-256 {digest}"
+    assert {
+        "machine: Mill 5, serial number 77",
+        "axis: X",
+        "verdict on the drift: explained",
+        "exported: 2026-11-22 09:30 UTC",
+        "sign: plus",
+    } <= set(lines)
+    assert any(line.startswith("How to try it: ") and "one value of 0.010 mm" in line for line in lines)
+    assert not any(line.startswith("FORCED") for line in lines)
+    # The title holds a line break and a command; a control would run what stands on a line of its own.
+    lines = lines_of(small_run, objections=["the verdict is\npartial"])
+    assert "campaign: =1+1  ; M30 axis u" in lines
+    assert lines[1] == "FORCED, although the verdict is partial"
+    assert all(line.isascii() and line.isprintable() for line in lines)
+    lines = lines_of(small_run)
+    assert (
+        "thermal state: mean of cycles 1 to 12: material 22.04 degC (20.04 to 23.99), air 21.04 degC (19.04 to 22.99)"
+        in lines
+    )
+    assert "measured: 2026-03-09 06:30 UTC to 2026-03-09 07:26 UTC" in lines
+
+
+def test_what_is_not_stated_is_said(small_run, tmp_path):
+    for name in ("deviations.nc", "results.json"):
+        (tmp_path / name).write_bytes((small_run / name).read_bytes())
+    lines = lines_of(tmp_path, axis="")
+    assert {
+        "machine: not stated",
+        "axis: not stated",
+        "compensation that was active during the test: not stated",
+        "thermal state: mean of cycles 1 to 12: material not recorded, air not recorded",
+    } <= set(lines)
+
+
+def test_what_is_not_recorded_is_said(small_run, tmp_path):
+    deviations = read_dataset(small_run / "deviations.nc")
+    untimed = deviations.assign(
+        time=deviations["time"].copy(data=np.full(deviations["time"].shape, np.datetime64("NaT", "ns")))
+    )
+    state = read_thermal_state(tmp_path, untimed)
+    assert state.temperatures_degC == {"material": None, "air": None} and state.first is state.last is None
+
+
+def test_readings_and_profile_are_complete(small_run):
+    deviations = read_dataset(small_run / "deviations.nc")
+    readings = tables.readings_table(deviations)
+    assert len(readings) == 12 * 2 * 8 and readings["deviation_um"].notna().all()
+    gap = deviations.assign(deviation=deviations["deviation"].where(deviations["cycle"] != 4))
+    assert len(tables.readings_table(gap)) == 11 * 2 * 8
+    profile = tables.profile_table(deviations)
+    assert len(profile) == 16 and set(profile["direction"]) == {"positive", "negative"}
+
+
+def test_iso230_values_are_those_of_the_standard(small_run):
+    deviations = read_dataset(small_run / "deviations.nc")
+    x = deviations["deviation"].values[:5]
+    mean, s = x.mean(axis=0), x.std(axis=0, ddof=1)
+    axis = tables.iso230_axis_table(deviations).set_index(["window", "quantity", "direction"])
+    first = axis.index[0][0]
+    assert axis.loc[(first, "B", "both"), "value_um"] == pytest.approx(np.abs(mean[0] - mean[1]).max())
+    assert axis.loc[(first, "E", "positive"), "value_um"] == pytest.approx(np.ptp(mean[0]))
+    assert axis.loc[(first, "A", "both"), "value_um"] == pytest.approx((mean + 2 * s).max() - (mean - 2 * s).min())
+    assert (axis["u_um"] > 0).all()
+
+
+def test_positions_are_of_the_window_that_the_results_state(small_run):
+    deviations, results = read_dataset(small_run / "deviations.nc"), read_results(small_run)
+    assert results.iso230.settled.window == "cycles 6 to 10"
+    positions = tables.iso230_position_table(deviations, results)
+    assert (positions["count_positive"] == 5).all()
+    np.testing.assert_allclose(positions["mean_positive_um"], deviations["deviation"].values[5:10, 0].mean(axis=0))
+    assert set(positions["window"]) == {"cycles 6 to 10"}
+    whole = tables.iso230_position_table(deviations, results.model_copy(update={"iso230": None}))
+    assert (whole["count_positive"] == 12).all()
+
+
+def test_fields_are_tabulated_on_request(tmp_path):
+    write_fields(tmp_path)
+    frame = tables.fields_table(tmp_path)
+    assert list(frame) == ["cycle", "y_mm", "x_mm", "temperature_degC", "rise_K", "rise_u_K"]
+    assert len(frame) == 10
+    assert tables.fields_megabytes(tmp_path) == pytest.approx(12 * 38e-6)
+
+
+def test_the_workbook_reads_back(small_run, tmp_path):
+    deviations = read_dataset(small_run / "deviations.nc")
+    results = read_results(small_run)
+    write_workbook(tmp_path / "results.xlsx", results, deviations)
+    book = openpyxl.load_workbook(tmp_path / "results.xlsx")
+    assert book.sheetnames == ["Summary", "ISO 230-2 axis", "ISO 230-2 positions", "Profile", "Readings"]
+    # The campaign is called =1+1.
+    cell = book["Summary"]["B2"]
+    assert (cell.data_type, cell.value.startswith("=1+1")) == ("s", True)
+    assert not any(cell.data_type == "f" for sheet in book for row in sheet.iter_rows() for cell in row)
+    names = [cell.value for cell in book["Readings"][1]]
+    first = dict(zip(names, [cell.value for cell in book["Readings"][2]], strict=True))
+    assert first["time_utc"].isoformat() == "2026-03-09T06:30:00"
+    assert first["deviation_um"] == pytest.approx(float(deviations["deviation"][0, 0, 0]))
+    assert book["Readings"].max_row == 1 + 192

@@ -1,0 +1,71 @@
+"""First-order lag: the response of a body that follows a temperature with one time constant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from fusion.common import Array
+
+if TYPE_CHECKING:
+    pass
+
+
+@njit(cache=True)
+def _respond(values: Array, seconds: Array, time_constant_s: float, start: Array) -> Array:
+    response = np.empty_like(values)
+    response[0] = start
+    for k in range(seconds.size - 1):
+        step = seconds[k + 1] - seconds[k]
+        decay = np.exp(-step / time_constant_s)
+        ramp = (values[k + 1] - values[k]) / step * time_constant_s
+        response[k + 1] = (response[k] - values[k] + ramp) * decay + values[k + 1] - ramp
+    return response
+
+
+def respond(values: Array, seconds: Array, *, time_constant_s: float, start: Array | None = None) -> Array:
+    """Return the response of a first-order system to an input that is linear between its samples.
+
+    Parameters
+    ----------
+    values : (n, columns) ndarray
+        Input at the samples, one column per system, in any unit.
+    seconds : (n,) ndarray, s
+        Times of the samples, increasing; the steps may differ.
+    time_constant_s : float, s
+        Up to 0 the response is the input itself.
+    start : (columns,) ndarray, optional
+        Response at the first sample, in the unit of the input; by default the input there (steady state before the first sample).
+
+    Returns
+    -------
+    (n, columns) ndarray
+        Response at the samples, in the unit of the input.
+
+    Notes
+    -----
+    Exact solution of ``tau dr/dt = v - r`` over a step h with ``v(t) = v0 + (v1 - v0) t / h``::
+
+        r1 = v1 - g + (r0 - v0 + g) exp(-h / tau),   g = tau (v1 - v0) / h
+
+    Examples
+    --------
+    A step of 1 K reaches 63 % after one time constant:
+
+    >>> import numpy as np
+    >>> step = np.array([[0.0], [1.0], [1.0]])
+    >>> respond(step, np.array([0.0, 1e-6, 600.0]), time_constant_s=600.0).round(3).ravel().tolist()
+    [0.0, 0.0, 0.632]
+    """
+    if time_constant_s <= 0:
+        return values
+    values = np.ascontiguousarray(values, float)
+    return _respond(values, seconds, float(time_constant_s), values[0] if start is None else start)
+
+
+def lag_operators(seconds: Array, lags_s: Sequence[float]) -> list[Array]:
+    """Return the first-order lags as matrices, since a lag is linear in its input."""
+    return [respond(np.eye(seconds.size), seconds, time_constant_s=lag) for lag in lags_s]

@@ -1,0 +1,568 @@
+"""Results folders of one machine compared: profile, scatter, drift per kelvin, ISO 230-2 values, positions that stand out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from scipy import special
+
+from fusion.common import Array, FusionError
+from fusion.results.loop import AxisLoop, Coefficient
+from fusion.results.parts import Quantity
+from fusion.results.results import Results, read_results
+from fusion.results.store import group, has, read_json_object, refuse_damaged, require_kind, require_own
+from interferometry.drift.estimate import COMPONENTS
+from thermography.common import scatter_by_median
+
+# What changed in the profile of an axis between two tests, whatever thermal state each of them was in.
+
+#: Targets of two tests are the same position within this distance, mm.
+SAME_POSITION_MM = 0.05
+#: Positions that both tests must have: the shapes of a thermal state take three of them.
+LEAST_POSITIONS = 5
+#: Share of its squared length that a shape must keep given the others to be distinguished from them.
+_LEAST_SHARE = 1e-6
+#: Shapes that the thermal state of a test may take, by drift component.
+_STATE = {"shift": "offset", "stretch": "slope", "bend": "bow"}
+
+
+class ComparisonError(FusionError):
+    """Campaigns that cannot be compared; the message says in what they differ."""
+
+
+@dataclass(frozen=True)
+class ShapeChange:
+    """One shape by which the profile differs between two tests.
+
+    Attributes
+    ----------
+    shape : {"slope", "bow", "mean reversal", "position", "reversal at a position"}
+        Slope: over the whole travel. Bow: height of a parabola over the travel. Position: both approaches together.
+    change_um, u_um : float
+        After minus before, um, and its standard uncertainty.
+    p_value : float
+        Of this change by itself, two-sided.
+    machine : bool
+        Whether no thermal state gives it, so that the machine or the set-up must have changed.
+    """
+
+    shape: str
+    position_mm: float | None
+    change_um: float
+    u_um: float
+    p_value: float
+    machine: bool
+
+
+@dataclass(frozen=True)
+class ProfileChange:
+    """How the profile differs between two tests.
+
+    Attributes
+    ----------
+    position_mm : (n,) ndarray
+        Positions that both tests have, mm.
+    left_out : int
+        Positions that one test has alone.
+    remaining_um, remaining_u_um : (n,) ndarray
+        Difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and its standard uncertainty.
+    shapes : tuple of ShapeChange
+        Slope, bow and mean reversal, then the single positions beyond the family-wise level, the strongest first.
+    tests : int
+        How many shapes were tried.
+    """
+
+    position_mm: Array
+    left_out: int
+    remaining_um: Array
+    remaining_u_um: Array
+    shapes: tuple[ShapeChange, ...]
+    tests: int
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A shape over the cells (direction, target) of both tests; `machine` as in `ShapeChange`."""
+
+    name: str
+    position_mm: float | None
+    column: Array
+    machine: bool
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """Differences of the cells that both tests hold: their places, values (um), a root of their covariance, and degrees of freedom."""
+
+    position_mm: Array
+    sign: Array
+    value: Array
+    root: Array
+    freedom: float
+
+    def fit(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
+        """Return the sizes of shapes and their covariance (um2), by generalised least squares, widened by Birge's ratio."""
+        design = np.linalg.solve(self.root, np.column_stack([shape.column for shape in shapes]))
+        value = np.linalg.solve(self.root, self.value)
+        covariance = np.linalg.pinv(design.T @ design)
+        sizes = covariance @ design.T @ value
+        left = value - design @ sizes
+        return sizes, covariance * max(1.0, float(left @ left) / max(value.size - len(shapes), 1))
+
+    def separate(self, shape: _Shape, others: Sequence[_Shape]) -> bool:
+        """Tell whether a shape can be distinguished from others."""
+        known, _ = np.linalg.qr(np.linalg.solve(self.root, np.column_stack([other.column for other in others])))
+        column = np.linalg.solve(self.root, shape.column)
+        residual = column - known @ (known.T @ column)
+        return bool(residual @ residual > _LEAST_SHARE * (column @ column))
+
+    def p_value(self, ratio: float) -> float:
+        """Return the two-sided p-value of a change over its standard uncertainty."""
+        return float(2.0 * special.stdtr(self.freedom, -abs(ratio)))
+
+
+def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tests: int = 0) -> ProfileChange:
+    """Compare the profiles of two tests of one axis."""
+    difference, left_out = _profile_difference(before, after)
+    positions = np.unique(difference.position_mm)
+    state = _state_shapes(difference, (before, after))
+    reversal = _Shape("mean reversal", None, difference.sign / 2.0, machine=True)
+    judged = np.unique(difference.sign).size == 2 and difference.separate(reversal, state)
+    candidates = [reversal] if judged else []
+    candidates += _single_positions(difference, positions)
+    found = _search(difference, state, candidates, level=level, tests=tests + len(candidates))
+    reported = [*state, *([reversal] if judged and reversal not in found else []), *found]
+    size, covariance = difference.fit(reported)
+    u = np.sqrt(np.diag(covariance))
+    shapes = tuple(
+        ShapeChange(shape.name, shape.position_mm, float(size[k]), float(u[k]), difference.p_value(size[k] / u[k]), shape.machine)
+        for k, shape in enumerate(reported)
+        if shape.name not in ("offset", "drift")
+    )  # fmt: skip
+    remaining, remaining_u = _remaining(difference, state, positions)
+    return ProfileChange(positions, left_out, remaining, remaining_u, shapes, len(candidates))
+
+
+def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Difference, int]:
+    """Return the differences at common positions and approaches, and how many positions one test has alone."""
+    pairs = [
+        (i, j)
+        for i, place in enumerate(before["position"].values)
+        for j in np.flatnonzero(np.abs(after["position"].values - place) <= SAME_POSITION_MM)[:1]
+    ]
+    if len(pairs) < LEAST_POSITIONS:
+        raise ComparisonError(
+            f"{len(pairs)} positions are the same within {SAME_POSITION_MM:g} mm; {LEAST_POSITIONS} are needed to tell a changed position "
+            "from a changed thermal state: measure at the same targets"
+        )
+    first, second = (list(places) for places in zip(*pairs, strict=True))
+    one = before.isel(target=first, other_target=first)
+    other = after.isel(target=second, other_target=second)
+    sides = [side for side in one["direction"].values if side in other["direction"].values]
+    one, other = (_by_direction(test, sides) for test in (one, other))
+    present = np.isfinite(one["profile"].values) & np.isfinite(other["profile"].values)
+    if present.sum() < LEAST_POSITIONS:
+        raise ComparisonError("no direction of approach was measured in both tests: measure both approaches")
+    covariance = sum(test["covariance"].values[present][:, present] for test in (one, other))
+    sign = np.where(np.array(sides) == "positive", 1.0, -1.0)
+    place = np.broadcast_to(one["position"].values, present.shape)[present].astype(float)
+    values = (other["profile"].values - one["profile"].values)[present]
+    freedom = min(float(np.nansum(test["scatter_freedom"].values)) for test in (one, other))
+    signs = np.broadcast_to(sign[:, None], present.shape)[present]
+    left_out = before.sizes["target"] + after.sizes["target"] - 2 * len(pairs)
+    return _Difference(
+        place, signs, values, np.asarray(np.linalg.cholesky(covariance), float), max(freedom, 1.0)
+    ), left_out
+
+
+def _by_direction(test: xr.Dataset, sides: Sequence[str]) -> xr.Dataset:
+    """Return a test with these directions only, also in its covariance."""
+    at = [list(test["direction"].values).index(side) for side in sides]
+    return test.isel(direction=at, other_direction=at).transpose(
+        ..., "direction", "target", "other_direction", "other_target"
+    )
+
+
+def _state_shapes(difference: _Difference, tests: Sequence[xr.Dataset]) -> list[_Shape]:
+    """Return the shapes that a thermal state may take: offset, slope and bow, and those in which the drift of either test moved."""
+    low, high = float(difference.position_mm.min()), float(difference.position_mm.max())
+    place = (difference.position_mm - low) / (high - low)
+    shapes = [
+        _Shape(name, None, COMPONENTS[component](difference.sign, place), machine=False)
+        for component, name in _STATE.items()
+    ]
+    for test in tests:
+        for component in test["component"].values:
+            if component in _STATE:
+                continue
+            share = test["drift_share"].sel(component=component)
+            column = _at_cells(share, test["position"].values, difference)
+            name = "mean reversal" if component == "reversal" else "drift"
+            shape = _Shape(name, None, column, machine=False)
+            if difference.separate(shape, shapes):
+                shapes.append(shape)
+    return shapes
+
+
+def _at_cells(share: xr.DataArray, position_mm: Array, difference: _Difference) -> Array:
+    """Return the share of a drift component in the cells of a difference."""
+    rows = {"positive": 1.0, "negative": -1.0}
+    values = np.zeros(difference.value.size)
+    for side in share["direction"].values:
+        chosen = difference.sign == rows[str(side)]
+        order = np.argsort(position_mm, kind="stable")
+        values[chosen] = np.interp(
+            difference.position_mm[chosen], position_mm[order], share.sel(direction=side).values[order]
+        )
+    return np.nan_to_num(values)
+
+
+def _single_positions(difference: _Difference, positions: Array) -> list[_Shape]:
+    """Return one shape for each position, and where both approaches were measured one for its reversal error."""
+    at = [difference.position_mm == place for place in positions]
+    shapes = [
+        _Shape("position", float(place), here.astype(float), machine=True)
+        for place, here in zip(positions, at, strict=True)
+    ]
+    shapes += [
+        _Shape("reversal at a position", float(place), here * difference.sign / 2.0, machine=True)
+        for place, here in zip(positions, at, strict=True)
+        if np.unique(difference.sign[here]).size == 2
+    ]
+    return shapes
+
+
+def _search(
+    difference: _Difference, state: Sequence[_Shape], candidates: Sequence[_Shape], *, level: float, tests: int
+) -> list[_Shape]:
+    """Return the shapes beyond the family-wise level, the strongest first."""
+    found: list[_Shape] = []
+    most = np.unique(difference.position_mm).size // 2
+    while len(found) < most:
+        beside = [*state, *found]
+        open_ones = [shape for shape in candidates if shape not in found and difference.separate(shape, beside)]
+        fits = [difference.fit([*beside, shape]) for shape in open_ones]
+        ratios = [float(abs(size[-1]) / np.sqrt(covariance[-1, -1])) for size, covariance in fits]
+        if not ratios or difference.p_value(max(ratios)) * tests > level:
+            break
+        found.append(open_ones[int(np.argmax(ratios))])
+    return found
+
+
+def _remaining(difference: _Difference, state: Sequence[_Shape], positions: Array) -> tuple[Array, Array]:
+    """Return what the shapes of a thermal state leave at every position, mean of the approaches, with its standard uncertainty."""
+    design = np.column_stack([shape.column for shape in state])
+    size, covariance = difference.fit(state)
+    left = difference.value - design @ size
+    spread = difference.root @ difference.root.T - design @ covariance @ design.T
+    mean = np.stack(
+        [(difference.position_mm == place) / (difference.position_mm == place).sum() for place in positions]
+    )
+    return mean @ left, np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", mean, spread, mean), 0.0))
+
+
+# Positions whose readings scatter more, or less, than before: each against the change of all others.
+
+
+#: Degrees of freedom that a position must have in both tests to be compared.
+_LEAST_FREEDOM = 2.0
+
+
+@dataclass(frozen=True)
+class ScatterChange:
+    """Change of the scatter at one position.
+
+    Attributes
+    ----------
+    position_mm : float
+    before_um, after_um : float
+        Standard deviation of a reading after profile and drift were subtracted, um.
+    p_value : float
+        Two-sided, of this position by itself.
+    """
+
+    position_mm: float
+    before_um: float
+    after_um: float
+    p_value: float
+
+
+def compare_scatters(
+    position_mm: Array, before_um: Array, after_um: Array, before_freedom: Array, after_freedom: Array
+) -> list[ScatterChange]:
+    """Compare the scatter at every position of two tests."""
+    used = (before_um > 0) & (after_um > 0) & (before_freedom >= _LEAST_FREEDOM) & (after_freedom >= _LEAST_FREEDOM)
+    if used.sum() < 5:
+        return []
+    place, one, other = position_mm[used], before_um[used], after_um[used]
+    freedoms = np.stack([before_freedom[used], after_freedom[used]]) * (1.0 - 1.0 / used.sum())
+    ratio = 2.0 * np.log(other / one)
+    beyond = ratio - np.median(ratio)
+    expected = special.polygamma(1, freedoms / 2.0).sum(axis=0)
+    spread = scatter_by_median(beyond / np.sqrt(expected), centre=0.0)
+    earlier, later = np.maximum(freedoms / max(spread, 1.0) ** 2, 1.0)
+    f_ratio = np.exp(beyond) * special.fdtri(later, earlier, 0.5)
+    p = 2.0 * np.minimum(special.fdtrc(later, earlier, f_ratio), special.fdtr(later, earlier, f_ratio))
+    return [
+        ScatterChange(float(at), float(was), float(now), float(min(chance, 1.0)))
+        for at, was, now, chance in zip(place, one, other, p, strict=True)
+    ]
+
+
+#: Level at which something counts as changed, over everything that is compared.
+LEVEL = 0.05
+#: Values by ISO 230-2 that are compared.
+_ISO230 = ("A", "R", "E", "M", "B")
+
+
+@dataclass(frozen=True)
+class ComparedCampaign:
+    """One campaign as it is compared.
+
+    Attributes
+    ----------
+    axis : str
+        Name of the measured axis; empty where the run does not tell.
+    drift : Dataset or None
+        Joint estimate with ``position`` (target; mm); None where there are no readings with times.
+    """
+
+    folder: Path
+    results: Results
+    axis: str
+    drift: xr.Dataset | None
+
+    @property
+    def name(self) -> str:
+        """Title of the campaign, with the day of its first reading."""
+        time = self.results.time
+        return self.results.campaign + (f", {time.first[:10]}" if time else "")
+
+
+@dataclass(frozen=True)
+class Change:
+    """One quantity in two campaigns.
+
+    Attributes
+    ----------
+    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}
+        What it belongs to.
+    before, after : Quantity or None
+        In both campaigns; None for a change of shape, which has no value of its own.
+    change : Quantity
+        After minus before; of a scatter the ratio, without unit.
+    p_value : float
+        Two-sided, family-wise over everything that is compared.
+    machine : bool
+        Whether no thermal state of the test gives it, so that the machine or the set-up must have changed.
+    """
+
+    quantity: str
+    group: str
+    position_mm: float | None
+    unit: str
+    before: Quantity | None
+    after: Quantity | None
+    change: Quantity
+    p_value: float
+    machine: bool
+
+    @property
+    def significant(self) -> bool:
+        """Whether it differs by more than the uncertainties allow."""
+        return self.p_value <= LEVEL
+
+
+@dataclass(frozen=True)
+class PairComparison:
+    """One campaign against the reference.
+
+    Attributes
+    ----------
+    profile : ProfileChange or None
+        Difference of the profiles; None where they cannot be compared.
+    not_compared : tuple of str
+        What cannot be compared, and why, one sentence each.
+    tests : int
+        Tests of the family, over all campaigns.
+    """
+
+    before: ComparedCampaign
+    after: ComparedCampaign
+    changes: tuple[Change, ...]
+    profile: ProfileChange | None
+    not_compared: tuple[str, ...]
+    tests: int
+
+
+def read_campaign(folder: Path) -> ComparedCampaign:
+    """Read what a comparison needs of a results folder; the fields of the camera are not read."""
+    results = read_results(folder)
+    return ComparedCampaign(folder, results, _axis(folder), _drift(folder / "deviations.nc"))
+
+
+def compare_campaigns(folders: Sequence[Path]) -> list[PairComparison]:
+    """Compare campaigns of one machine with the first of them."""
+    unique = {folder.resolve() for folder in folders}
+    if len(unique) < 2 or len(unique) < len(folders):
+        raise ComparisonError(
+            f"{len(folders)} results folders are named, {len(unique)} of them different: name at least two, each once"
+        )
+    reference, *others = [read_campaign(folder) for folder in folders]
+    return [_compare(reference, other, pairs=len(others)) for other in others]
+
+
+def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int) -> PairComparison:
+    """Compare one campaign with the reference; `pairs` campaigns share the family."""
+    if before.axis != after.axis:
+        reason = (
+            f"the axes differ ({before.axis or 'not stated'} and {after.axis or 'not stated'}): nothing is compared"
+        )
+        return PairComparison(before, after, (), None, (f"Everything: {reason}.",), 0)
+    lacks: list[str] = []
+    changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *_standard(before, after, lacks)]
+    profile = _profile(before, after, lacks, pairs=pairs, tests=len(changes) + 2)
+    if profile is not None:
+        shapes = [
+            Change(
+                one.shape, "profile", one.position_mm, "um", None, None,
+                Quantity(value=one.change_um, u=one.u_um), one.p_value, one.machine,
+            )
+            for one in profile.shapes
+        ]  # fmt: skip
+        changes = [*shapes, *changes]
+    tests = pairs * (len(changes) if profile is None else len(changes) - len(profile.shapes) + 2 + profile.tests)
+    familywise = tuple(replace(change, p_value=min(1.0, change.p_value * tests)) for change in changes)
+    return PairComparison(before, after, familywise, profile, tuple(lacks), tests)
+
+
+def _axis(folder: Path) -> str:
+    """Return the name of the axis as the run noted it."""
+    try:
+        return str(read_json_object(folder / "provenance.json")["parameters"]["campaign"].get("axis") or "")
+    except (KeyError, TypeError, AttributeError):
+        return ""
+
+
+def _drift(path: Path) -> xr.Dataset | None:
+    """Return the joint estimate of deviations.nc with its positions, without what belongs to single readings."""
+    if not path.is_file():
+        return None
+    require_own(path.parent, [path.name])
+    with refuse_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as stored:
+        if not has(require_kind(stored, "deviations", path), "drift"):
+            return None
+        drift = group(stored, "drift").assign(position=stored["position"])
+        return drift.drop_dims("cycle").load()
+
+
+def _profile(
+    before: ComparedCampaign, after: ComparedCampaign, lacks: list[str], *, pairs: int, tests: int
+) -> ProfileChange | None:
+    """Compare the profiles, or say why not."""
+    without = [one.name for one in (before, after) if one.drift is None]
+    if before.drift is None or after.drift is None:
+        lacks.append(f"Profile and scatter: no readings with times in {' and in '.join(without)}.")
+        return None
+    try:
+        found = compare_profiles(before.drift, after.drift, level=LEVEL / pairs, tests=tests)
+    except ComparisonError as reason:
+        lacks.append(f"Profile: {reason}.")
+        return None
+    if found.left_out:
+        lacks.append(f"Profile: {found.left_out} positions were measured in one of the two campaigns only.")
+    return found
+
+
+def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[Change]:
+    """The scatter at positions that both campaigns have."""
+    if before.drift is None or after.drift is None:
+        return
+    one, other = (campaign.drift.sortby("position") for campaign in (before, after) if campaign.drift is not None)
+    gaps = np.abs(one["position"].values[:, None] - other["position"].values)
+    first, second = np.nonzero(gaps <= SAME_POSITION_MM)
+    one, other = one.isel(target=first), other.isel(target=second)
+    freedom = [test["scatter_freedom"].sum("direction").values for test in (one, other)]
+    for found in compare_scatters(
+        one["position"].values, one["scatter_position"].values, other["scatter_position"].values, *freedom
+    ):
+        yield Change(
+            "scatter", "scatter", found.position_mm, "um", Quantity(value=found.before_um, u=None),
+            Quantity(value=found.after_um, u=None), Quantity(value=found.after_um / found.before_um, u=None), found.p_value, True,
+        )  # fmt: skip
+
+
+def _coefficients(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str]) -> Iterator[Change]:
+    """The coefficients per kelvin of both models, where both hold the same effects."""
+    loops = [campaign.results.loop for campaign in (before, after)]
+    without = [
+        campaign.name for campaign, loop in zip((before, after), loops, strict=True) if not isinstance(loop, AxisLoop)
+    ]
+    if without:
+        lacks.append(f"Drift per kelvin: no model of the axis in {' and in '.join(without)}.")
+        return
+    one, other = (loop for loop in loops if isinstance(loop, AxisLoop))
+    models = [{*loop.declared, *(step.effect for step in loop.steps)} for loop in (one, other)]
+    if models[0] != models[1]:
+        differing = " and ".join(", ".join(sorted(models[k] - models[1 - k])) or "nothing more" for k in (0, 1))
+        lacks.append(
+            f"Drift per kelvin: the models hold different effects ({differing.replace('_', ' ')}), so that a coefficient does not mean the "
+            "same in both."
+        )
+        return
+    found = [dict(_per_kelvin(loop)) for loop in (one, other)]
+    for name in found[0]:
+        if name in found[1] and found[0][name].unit == found[1][name].unit:
+            before_and_after = (Quantity(value=model[name].value, u=model[name].u) for model in found)
+            yield _difference(name, "drift per kelvin", found[0][name].unit, *before_and_after, machine=True)
+
+
+def _per_kelvin(loop: AxisLoop) -> Iterator[tuple[str, Coefficient]]:
+    """The coefficients of a model that are per kelvin, by effect."""
+    for declared in loop.declared_coefficients:
+        if declared.unit.endswith("/K"):
+            wider = max(declared.u or 0.0, declared.jackknife_u or 0.0)
+            yield declared.effect, declared.model_copy(update={"u": wider or None})
+    for step in loop.steps:
+        for coefficient in step.coefficients[:1]:
+            if coefficient.unit.endswith("/K"):
+                yield step.effect, coefficient
+
+
+def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str]) -> Iterator[Change]:
+    """The values by ISO 230-2 of the window that each campaign quotes."""
+    parts = [campaign.results.iso230 for campaign in (before, after)]
+    one, other = parts
+    if one is None or other is None:
+        missing = [campaign.name for campaign, part in zip((before, after), parts, strict=True) if part is None]
+        lacks.append(f"ISO 230-2: no readings in {' and in '.join(missing)}.")
+        return
+    travels = [
+        np.sort(np.array(campaign.results.drift.position_mm, float))
+        for campaign in (before, after)
+        if campaign.results.drift
+    ]
+    if len(travels) == 2 and not (
+        travels[0].size == travels[1].size and np.allclose(travels[0], travels[1], rtol=0.0, atol=SAME_POSITION_MM)
+    ):
+        lacks.append("ISO 230-2: the values belong to the targets of a test, and the campaigns have different ones.")
+        return
+    for symbol in _ISO230:
+        first, second = (getattr(part.settled or part, f"{symbol}_um") for part in (one, other))
+        if first.value is None or second.value is None:
+            lacks.append(f"ISO 230-2, {symbol}: not measured in both campaigns.")
+            continue
+        yield _difference(symbol, "ISO 230-2", "um", first, second, machine=False)
+
+
+def _difference(quantity: str, kind: str, unit: str, before: Quantity, after: Quantity, *, machine: bool) -> Change:
+    """The difference of two quantities with independent uncertainties; without an uncertainty it is shown and never significant."""
+    change = float(after.value or 0.0) - float(before.value or 0.0)
+    u = math.hypot(before.u, after.u) if before.u and after.u else None
+    p = 1.0 if u is None else float(2.0 * special.ndtr(-abs(change) / u))
+    return Change(quantity, kind, None, unit, before, after, Quantity(value=change, u=u), p, machine)

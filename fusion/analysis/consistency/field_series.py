@@ -1,0 +1,112 @@
+"""The table's temperature as series of coarse cells: what logs and drift are held against, quick to compare at many lags."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.alignment.reflections import seen_throughout
+from fusion.common import Array
+from thermography.fields.large_arrays import in_pieces, piece_slices
+
+#: Side of a coarse cell, mm: finer than heat spreads in the minutes between two frames.
+_COARSE_MM = 20.0
+#: Frames nearer to each other than this say the same, s.
+_LEAST_STEP_S = 60.0
+#: Fewest frames from which a course can be distinguished from another one.
+_LEAST_FRAMES = 12
+
+
+@dataclass(frozen=True)
+class FieldSeries:
+    """Temperature of cells over time.
+
+    Attributes
+    ----------
+    start : datetime64[ns]
+        Time of the first frame.
+    seconds : (n,) ndarray, s
+        Times since `start`, at least a minute apart.
+    temperature : (n, cells) ndarray, degC
+        Of cells that every frame shows whole.
+    x_mm, y_mm : (cells,) ndarray, mm
+        Centres of the cells.
+    """
+
+    start: np.datetime64
+    seconds: Array
+    temperature: Array
+    x_mm: Array
+    y_mm: Array
+
+    def since_start(self, times: NDArray[np.datetime64]) -> Array:
+        """Return times, (m,) datetime64, as seconds since `start`."""
+        return np.asarray((times.astype("datetime64[ns]") - self.start) / np.timedelta64(1, "s"), float)
+
+    def lagged(self, time_constant_s: float) -> Array:
+        """Return what a sensor of a time constant, s, would show on every cell, (n, cells), degC."""
+        return respond(self.temperature, self.seconds, time_constant_s=time_constant_s)
+
+
+def thin_fields(fields: xr.Dataset) -> FieldSeries | None:
+    """Reduce the fields to coarse cells and to frames at least a minute apart."""
+    frames = _thinned(fields)
+    cell_mm = abs(float(np.median(np.diff(fields["x"].values))))
+    count = max(1, round(_COARSE_MM / cell_mm))
+    parts = [
+        frames[some].coarsen(x=count, y=count, boundary="trim").reduce(np.mean) for some in piece_slices(frames.shape)
+    ]
+    return _series(xr.concat(parts, "time") if len(parts) > 1 else parts[0])
+
+
+def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries | None:
+    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it that every frame shows."""
+    frames = _thinned(fields)
+    seen = seen_throughout(frames).ravel()
+    if len(frames) < _LEAST_FRAMES or not seen.any():
+        return None
+    y_mm, x_mm = (at.ravel()[seen] for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
+    away = np.array([x_mm - place_mm[0], y_mm - place_mm[1]])
+    distance = np.hypot(*away)
+    about = np.flatnonzero(distance <= _COARSE_MM)
+    if about.size < 3:
+        weight, about = np.ones(1), np.array([np.argmin(distance)])
+    else:
+        weight = np.linalg.pinv(np.column_stack([np.ones(about.size), *away[:, about]]))[0]
+    chosen = np.flatnonzero(seen)[about]
+    temperature = np.concatenate(
+        [some.reshape(len(some), -1)[:, chosen].astype(float) @ weight for _, some in in_pieces(frames)]
+    )
+    place = np.array([[place_mm[0]], [place_mm[1]]])
+    return FieldSeries(*_clock(frames), temperature[:, None], *place)
+
+
+def _thinned(fields: xr.Dataset) -> xr.DataArray:
+    """Frames at least a minute apart."""
+    time = fields["time"].values.astype("datetime64[ns]")
+    seconds = (time - time[0]) / np.timedelta64(1, "s")
+    kept = [0]
+    for k in range(1, seconds.size):
+        if seconds[k] - seconds[kept[-1]] >= _LEAST_STEP_S:
+            kept.append(k)
+    return fields["frame_temperature"].isel(time=kept)
+
+
+def _series(frames: xr.DataArray) -> FieldSeries | None:
+    """Cells that all frames show, as series; None where there are too few frames or no such cell."""
+    values = frames.values.reshape(len(frames), -1).astype(float)
+    seen = np.isfinite(values).all(axis=0)
+    if len(frames) < _LEAST_FRAMES or not seen.any():
+        return None
+    y, x = np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij")
+    return FieldSeries(*_clock(frames), values[:, seen], x.ravel()[seen], y.ravel()[seen])
+
+
+def _clock(frames: xr.DataArray) -> tuple[np.datetime64, Array]:
+    """Time of the first frame, and seconds of all since then."""
+    time = frames["time"].values.astype("datetime64[ns]")
+    return time[0], (time - time[0]) / np.timedelta64(1, "s")

@@ -1,0 +1,330 @@
+"""Checks of fitted coefficients against their physics."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, combinations
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine
+from fusion.analysis.alignment.readings import Series
+from fusion.analysis.consistency.checks import Check, judge
+from fusion.analysis.drift_model.fit import ModelFit, Term, place_of, refit_fixed
+from fusion.analysis.effects.effect import Candidate, Prior
+from fusion.common import Array
+from fusion.results.loop import AxisLine
+from interferometry.drift.kalman import DriftModelError
+
+# Other lines on the plan, another order of the targets or the other sign of the deviations, held against the declared
+# ones.
+
+#: Origins that are tried along the plan, evenly spaced from edge to edge: closer than the field changes along a table.
+_ORIGINS = 29
+#: Shortest shift of the origin that is an alternative, as a share of the plan: a nearer line sees nearly the same field, and differs from
+#: the declared one by less than a thermogram's blur and the finite time between frames do.
+_LEAST_SHIFT = 0.1
+#: Alternatives that are compared for every choice of the added effects.
+_CLOSER_LOOKS = 3
+#: Standard deviations from the expected expansion within which an alternative is an explanation.
+_PLAUSIBLE = 2.5
+#: Share of the tests with the right line in which an alternative may be taken for it, and number of simulated tests that show it.
+_FALSE_ALARMS, _DRAWS = 2e-3, 20_000
+#: Log-likelihood within which a line explains the readings as well as the declared one.
+_AS_WELL = 2.0
+#: Share of its whitened length that the other terms must leave of a line for its expansion to be determined.
+_DETERMINED = 1e-9
+
+
+def compare_lines(model: ModelFit, declared: int, fields: xr.Dataset, axis: AxisGeometry) -> AxisLine | None:
+    """Compare the declared line with its alternatives."""
+    comparison = _Comparison.of(model, declared)
+    if comparison is None:
+        return None
+    alternatives = list(_alternatives(model, fields, axis))
+    scored = [(comparison.glance(column), words, column) for words, column in alternatives]
+    closer = sorted(scored, key=lambda tried: -tried[0])[:_CLOSER_LOOKS]
+    looked = [(comparison.best(column), words) for value, words, column in closer if np.isfinite(value)]
+    if not looked:
+        return None
+    stated = comparison.best(comparison.expansion.candidate.columns[:, 0], plausible=np.inf)
+    best, words = max(looked, key=lambda pair: pair[0].value)
+    superfluous = tuple(term.effect for term in stated.kept if all(term is not other for other in best.kept))
+    limit, as_well = comparison.by_chance([column for _, column in alternatives])
+    return AxisLine(
+        alternative=words,
+        gain=best.value - stated.value,
+        gain_limit=limit,
+        expansion_ppm_per_K=best.coefficient,
+        expansion_u_ppm_per_K=best.u,
+        superfluous=superfluous,
+        alternative_ppm_per_K=as_well,
+    )
+
+
+@dataclass(frozen=True)
+class _Scored:
+    """One line with one choice of added effects; minus infinity where the columns are collinear or the expansion is not plausible."""
+
+    value: float
+    coefficient: float
+    u: float
+    kept: tuple[Term, ...]
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Scores lines together with the other declared terms and any choice among the added ones."""
+
+    model: ModelFit
+    expansion: Term
+    prior: Prior
+    others: tuple[Term, ...]
+    added: tuple[Term, ...]
+
+    @classmethod
+    def of(cls, model: ModelFit, declared: int) -> _Comparison | None:
+        terms = model.terms[:declared]
+        expansion = next((term for term in terms if term.effect == "axis_expansion"), None)
+        if expansion is None or expansion.candidate.prior is None:
+            return None
+        others = tuple(term for term in terms if term is not expansion)
+        return cls(model, expansion, expansion.candidate.prior, others, model.terms[declared:])
+
+    def glance(self, column: Array) -> float:
+        """Score of a line with all or none of the added effects, whichever is better."""
+        return max(self.score(column, kept, _PLAUSIBLE).value for kept in ((), self.added))
+
+    def best(self, column: Array, *, plausible: float = _PLAUSIBLE) -> _Scored:
+        """The best choice among the added effects for a line."""
+        choices = chain.from_iterable(combinations(self.added, count) for count in range(len(self.added) + 1))
+        return max((self.score(column, kept, plausible) for kept in choices), key=lambda scored: scored.value)
+
+    def score(self, column: Array, kept: tuple[Term, ...], plausible: float) -> _Scored:
+        line = Term(self.expansion.effect, Candidate(column[:, None], {}, self.expansion.candidate.units))
+        terms = [line, *self.others, *kept]
+        try:
+            fit = refit_fixed(self.model, terms)
+        except DriftModelError:
+            return _Scored(-np.inf, np.nan, np.nan, kept)
+        place = place_of(terms, line, self.model.profile.shape[1]).start
+        value, u = float(fit.coefficients[place]), float(fit.coefficients_u[place])
+        off = abs(value - self.prior.mean) / float(np.hypot(u, self.prior.u))
+        if off > plausible:
+            return _Scored(-np.inf, value, u, kept)
+        count, columns = fit.response.size, sum(term.width for term in kept)
+        score = -0.5 * (count * np.log(fit.rss) + columns * np.log(count) + off**2)
+        return _Scored(float(score), value, u, kept)
+
+    def by_chance(self, columns: Sequence[Array]) -> tuple[float, tuple[float, float]]:
+        """Gain that chance exceeds rarely, and the range of the expansion along lines that explain the readings as well."""
+        gram, sigma2 = self._whitened([self.expansion.candidate.columns[:, 0], *columns])
+        lines, seen = gram[:-1, :-1], gram[:-1, -1]
+        gains, expansion = self._gains(np.diag(lines), seen[:, None], sigma2)
+        reach = _PLAUSIBLE * self.prior.u
+        plausible = np.clip(expansion[0], self.prior.mean - reach, self.prior.mean + reach)
+        values, axes = np.linalg.eigh(lines)
+        noise = np.random.default_rng(1).standard_normal((len(values), _DRAWS))
+        spread = axes * np.sqrt(sigma2 * np.maximum(values, 0.0))
+        simulated, _ = self._gains(np.diag(lines), plausible * lines[:, :1] + spread @ noise, sigma2)
+        limit = float(np.quantile(simulated.max(axis=0, initial=-np.inf), 1.0 - _FALSE_ALARMS, method="higher"))
+        as_well = np.append(expansion[0], expansion[1:][gains >= -_AS_WELL])
+        return max(limit, -float(np.log(_FALSE_ALARMS))), (float(as_well.min()), float(as_well.max()))
+
+    def _whitened(self, columns: Sequence[Array]) -> tuple[Array, float]:
+        """Products of whitened lines (declared first) and readings given all other terms, and the variance about the declared line."""
+        model, terms = self.model, (*self.others, *self.added)
+        design = [model.profile, *(term.candidate.columns for term in terms)]
+        if model.fit.system.order == 2:
+            design.append(model.readings.loadings * (model.readings.seconds / 3600.0)[:, None])
+        others = np.column_stack(design)[model.used]
+        lines = np.column_stack(columns)[model.used]
+        whole, _ = model.fit.system.normal_equations(np.column_stack([others, lines, model.fit.response]))
+        count = others.shape[1]
+        inner, across = whole[:count, :count], whole[:count, count:]
+        left = whole[count:, count:] - across.T @ np.linalg.lstsq(inner, across, rcond=1e-12)[0]
+        determined = np.diag(left) > _DETERMINED * np.diag(whole)[count:]
+        determined[[0, -1]] = True
+        left = left[np.ix_(determined, determined)]
+        residual = left[-1, -1] - left[0, -1] ** 2 / left[0, 0]
+        return left, float(residual) / (model.fit.response.size - count - 1)
+
+    def _gains(self, squares: Array, products: Array, sigma2: float) -> tuple[Array, Array]:
+        """Gain of every line over the declared one, (lines - 1, tests), and the expansions, (lines, tests)."""
+        length = squares[:, None]
+        expansion = products / length
+        off = (expansion - self.prior.mean) / np.sqrt(sigma2 / length + self.prior.u**2)
+        score = 0.5 * (products**2 / (length * sigma2) - off**2)
+        return np.where(np.abs(off[1:]) <= _PLAUSIBLE, score[1:] - score[0], -np.inf), expansion
+
+
+def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> Iterator[tuple[str, Array]]:
+    """Words and column (n,), um per ppm/K: lines along the declared one, both ways; the targets from the other end; the other sign."""
+    readings = model.readings
+    position, seconds = readings.positions_mm, readings.series["axis_integral"].seconds
+    # Axis positions on the plan, mm, one cell apart, position 0 among them.
+    x, y = fields["x"].values, fields["y"].values
+    cell = float(np.median(np.diff(x)))
+    reach = np.ceil((np.abs(axis.origin_mm).sum() + np.hypot(np.ptp(x), np.ptp(y))) / cell)
+    along = cell * np.arange(-reach, reach + 1.0)
+    at_x, at_y = axis.points(along)
+    within = (at_x >= x[0]) & (at_x <= x[-1]) & (at_y >= y[0]) & (at_y <= y[-1])
+    along_mm = np.asarray(along[within])
+    line = MeasuredLine(fields, axis, along_mm)
+    known = line.integrate_rise(fields["frame_temperature"])
+
+    def integral(ends_mm: Array) -> Array:
+        return _interpolate(ends_mm, along_mm, known)
+
+    def column(origin_mm: float, ends_mm: Array) -> Array:
+        return readings.at(Series(seconds, 1e-3 * (integral(ends_mm) - integral(np.array([origin_mm]))), "K m"))
+
+    def inside(ends_mm: Array) -> bool:
+        return bool(along_mm[0] <= ends_mm.min() and ends_mm.max() <= along_mm[-1])
+
+    for origin in np.linspace(along_mm[0], along_mm[-1], _ORIGINS):
+        x, y = axis.points(np.array([origin]))
+        for sign, way in ((1.0, "the same way"), (-1.0, "the other way round")):
+            ends = origin + sign * position
+            other = sign < 0.0 or abs(origin) >= _LEAST_SHIFT * float(np.ptp(along_mm))
+            if other and inside(ends):
+                words = f"along a line that runs {way} from x {x[0]:.0f} mm, y {y[0]:.0f} mm"
+                yield words, sign * column(float(origin), ends)
+    if inside(position) and inside(np.zeros(1)):
+        mirrored = position.min() + position.max() - position
+        yield "with the targets numbered from the other end", column(0.0, mirrored)
+        yield "with deviations of the opposite sign", -column(0.0, position)
+
+
+def _interpolate(ends: Array, places: Array, known: Array) -> Array:
+    """Rows of values that are known at places (k,), rising, interpolated linearly at ends (n,) between them, (rows, n)."""
+    after = np.clip(np.searchsorted(places, ends), 1, places.size - 1)
+    slope = (known[:, after] - known[:, after - 1]) / (places[after] - places[after - 1])
+    return np.asarray(slope * (ends - places[after - 1]) + known[:, after - 1])
+
+
+#: Standard deviations by which the readings may contradict the stated expansion coefficient.
+_LIMIT = 2.5
+#: Largest expansion coefficient of a material that tables and frames of machine tools are made of, ppm/K: aluminium alloys, and a tenth.
+_LARGEST_PPM_PER_K = 26.0
+#: Largest length of a frame that can move the laser against the table, as a multiple of the travel, and its smallest value, mm.
+_FRAME_TRAVELS, _LEAST_FRAME_MM = 5.0, 3000.0
+#: Log-likelihood by which another line must explain the readings better where it does away with a named cause: odds of 400 to 1. That
+#: cause was chosen among as many candidates as there are lines, so that the number of alternatives counts on both sides.
+_LINE_GAIN_OVER_CAUSE = 6.0
+#: Standard deviations by which a coefficient must lie beyond what is possible.
+_BEYOND_SIGMAS = 3.0
+
+
+def check_coefficients(loop: Mapping[str, Any], *, travel_mm: float) -> list[Check]:
+    """Check the coefficients of the final model against physics."""
+    declared = loop.get("declared_coefficients", [])
+    stated = [entry for entry in declared if entry["effect"] == "axis_expansion" and entry.get("prior") is not None]
+    added = [{"effect": step["effect"], **entry} for step in loop.get("steps", []) for entry in step["coefficients"]]
+    line = loop.get("axis_line")
+    return [
+        *(_expansion(entry, absorbed=_absorbed(loop.get("steps", []))) for entry in stated[:1]),
+        *_sensitivities([*declared, *added], travel_mm),
+        *([] if line is None else [_axis_line(line, loop.get("unconfirmed_effects", {}))]),
+    ]
+
+
+def _absorbed(steps: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether an added effect may be what a wrong coefficient leaves: the compensation of the material acts in proportion to it."""
+    return any("material_compensation" in (step["effect"], *step.get("tied", ())) for step in steps)
+
+
+def _expansion(entry: Mapping[str, Any], *, absorbed: bool) -> Check:
+    value, stated, stated_u = entry["value"], entry["prior"], entry["prior_u"]
+    u = entry["u"] if entry.get("u_fit") is None else entry["u_fit"]
+    weight = 1.0 / u**2 - 1.0 / stated_u**2
+    moved = _jackknife_u(entry)
+    # The readings say nothing of their own where the fit is no better known than the statement.
+    if weight <= 0.0 or math.isinf(moved):
+        alone, alone_u = stated, math.inf
+    else:
+        alone = (value / u**2 - stated / stated_u**2) / weight
+        # The stated coefficient has diluted an error of the rise's scale as it has diluted the readings.
+        scale_u = (entry.get("u_scale") or 0.0) / (1.0 - u**2 / stated_u**2)
+        alone_u = math.hypot(math.sqrt(1.0 / weight), moved, scale_u)
+    off = (alone - stated) / math.hypot(alone_u, stated_u)
+    evidence = (
+        f"The readings ask for an expansion of {alone:.3g} ± {alone_u:.2g} ppm/K, stated are {stated:.3g} ± {stated_u:.2g} ppm/K "
+        f"({off:+.1f} standard deviations, limit {_LIMIT:g})."
+        if math.isfinite(alone_u)
+        else "The readings alone do not determine the expansion of the axis; nothing contradicts the stated coefficient."
+    )
+    if absorbed:
+        evidence += " An error of the material compensation was added too, which a wrong coefficient imitates."
+    return judge(
+        "expansion_coefficient",
+        off,
+        _LIMIT,
+        evidence,
+        "Check expansion_coefficient, the emissivity, origin and direction under [plan.axis], the sign and the unit of the deviations, "
+        "the unit of the positions, and the clocks of camera and laser; or the model lacks an effect that is correlated with it.",
+        passed=abs(off) <= _LIMIT and not absorbed,
+    )
+
+
+def _jackknife_u(entry: Mapping[str, Any]) -> float:
+    moved = entry.get("jackknife_u", 0.0)
+    return math.inf if moved is None else float(moved)
+
+
+def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> list[Check]:
+    """The coefficient per kelvin that lies furthest beyond what expansion can do, or nearest to it."""
+    frame_mm = max(_FRAME_TRAVELS * travel_mm, _LEAST_FRAME_MM)
+    largest = {"ppm/K": _LARGEST_PPM_PER_K, "um/K": _LARGEST_PPM_PER_K * frame_mm * 1e-3}
+
+    def share_of(entry: Mapping[str, Any]) -> float:
+        size = abs(entry["value"]) - _BEYOND_SIGMAS * math.hypot(entry["u"], _jackknife_u(entry))
+        return float(size / largest[entry["unit"]])
+
+    compared = [entry for entry in coefficients if entry["unit"] in largest]
+    if not compared:
+        return []
+    entry = max(compared, key=share_of)
+    unit, frame = entry["unit"].replace("um", "µm"), f"the expansion of a frame of {frame_mm * 1e-3:.2g} m"
+    return [
+        judge(
+            "sensitivity",
+            max(share_of(entry), 0.0),
+            1.0,
+            f"{entry['effect'].replace('_', ' ')} has {entry['value']:.3g} {unit}, {frame} reaches {largest[entry['unit']]:.3g} {unit} "
+            "at most.",
+            "Check the scale of the temperatures (emissivity, range, unit), and the units of positions (mm) and deviations (µm).",
+            sound=f"No coefficient per kelvin is beyond what {frame} can do.",
+        )
+    ]
+
+
+def _axis_line(line: Mapping[str, Any], unconfirmed: Mapping[str, float]) -> Check:
+    limit = _LINE_GAIN_OVER_CAUSE if line["superfluous"] else line["gain_limit"]
+    # An effect that is significant but has no name yet is worth about -ln p; a line that explains less is no better explanation.
+    limit = max(limit, *(-math.log(max(p, sys.float_info.min)) for p in unconfirmed.values()), 0.0)
+    named = [name.replace("_", " ") for name in line["superfluous"]]
+    without = f", and without {', '.join(named)}" if named else ""
+    low, high = line["alternative_ppm_per_K"]
+    if line["gain"] <= 0.0:
+        none = "No other line on the plan, order of the targets or sign of the deviations explains the readings better"
+    else:
+        none = (
+            f"Of other lines on the plan, orders of the targets and signs of the deviations none explains the readings better than chance "
+            f"or an effect without a name would (log-likelihood {line['gain']:+.1f} {line['alternative']}, limit {limit:.1f})"
+        )
+    return judge(
+        "axis_line",
+        line["gain"],
+        limit,
+        f"The field explains the readings better {line['alternative']} than as declared (log-likelihood {line['gain']:+.1f}, limit "
+        f"{limit:g}), with an expansion of {line['expansion_ppm_per_K']:.3g} ± {line['expansion_u_ppm_per_K']:.2g} ppm/K{without}.",
+        "Check origin and direction under [plan.axis], the plan coordinates of the fiducials, the order of the targets and the sign "
+        "of the deviations.",
+        sound=f"{none}; lines that fit as well as the declared one indicate {low:.3g} to {high:.3g} ppm/K.",
+    )

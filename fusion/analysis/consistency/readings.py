@@ -1,0 +1,417 @@
+"""Checks of the readings alone: magnitude and unit, travel, copied cycles, exchanged directions of approach."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from scipy import sparse, special
+
+from fusion.analysis.consistency.checks import Check, Severity, judge
+from fusion.common import Array
+from thermography.common import scatter_by_median
+
+#: Largest positioning deviation that a machine can have, um per metre of travel: 1 % is no deviation but another unit.
+_LARGEST_UM_PER_M = 10_000.0
+#: Smallest random part of a reading in a machine, um: refraction in still air alone makes more over 0.1 m.
+_LEAST_NOISE_UM = 0.002
+#: Smallest travel as a share of the plan's extent along the axis.
+_LEAST_TRAVEL_SHARE = 0.03
+#: Share of equal readings from which two cycles are copies, and the share that ordinary cycles may have.
+_COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
+#: Cycles that are compared with all others at once.
+_CYCLES_AT_ONCE = 256
+#: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
+#: scatters as far, and Student's t with 4 degrees of freedom, heavier than any laser's noise, does so once in some 2,000 readings.
+_GROSS_SIGMAS = 10.0
+#: A jump of all readings is doubted from this multiple of the drift's range on either side of it, and from this size, um: a clamped mount
+#: slips by no more without being noticed, and such a slip is a cause (step_event); a new datum is anywhere.
+_DATUM_RANGES, _LEAST_DATUM_UM = 3.0, 5.0
+#: The jump is the same everywhere where targets and approaches differ by less than this share of it.
+_COMMON_SHARE = 0.1
+#: Share of the cycles with one and the same reading from which on a reading is the zero of its cycle.
+_ZEROED_SHARE = 0.9
+#: Fewest cycles on either side of an exchange of the approaches.
+_LEAST_SIDE = 3
+#: Standard errors by which the reversal error must differ before and after, and the p-value for equal size and opposite sign.
+_EXCHANGE_SIGMAS, _OPPOSITE_P = 8.0, 1e-3
+
+
+def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> list[Check]:
+    """Check what readings can say of themselves."""
+    values = deviations["deviation"].values
+    if not np.isfinite(values).any():
+        return []
+    noise_um = random_part_um(values)
+    # Smallest step between two different readings, um; 0 where all are alike.
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    return [
+        _largest_deviation(deviations),
+        _least_noise(max(noise_um, (float(steps.min()) if steps.size else 0.0) / np.sqrt(12.0))),
+        *([] if plan_extent_mm is None else [_travel(deviations, plan_extent_mm)]),
+        _copied_cycles(deviations),
+        _exchanged_approaches(deviations, noise_um),
+        _datum(deviations, noise_um),
+        _zeroed_cycles(deviations),
+    ]
+
+
+def random_part_um(values: Array) -> float:
+    """Random part of a reading from the second differences of each site over the cycles, in which a slow drift cancels."""
+    if values.shape[0] < 3:
+        return float("nan")
+    second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    second = second[np.isfinite(second)]
+    # The second difference of independent readings has six times their variance.
+    return float(scatter_by_median(second) / np.sqrt(6.0))
+
+
+def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
+    """Find readings that are errors of reading: they are left out where drift and field are compared and modelled."""
+    size = abs(standardised)
+    # The median absolute deviation about zero, in standard deviations of a normal distribution.
+    scatter = (size.median("cycle") / special.ndtri(0.75)).fillna(1.0).clip(min=1.0)
+    return size > _GROSS_SIGMAS * scatter
+
+
+def _largest_deviation(deviations: xr.Dataset) -> Check:
+    """Unit check: deviations beyond 1 % of the travel suggest another unit."""
+    position = deviations["position"].values
+    span_m = max(float(np.ptp(position)), 1e-9) * 1e-3
+    largest = float(np.nanquantile(np.abs(deviations["deviation"].values), 0.95)) / span_m
+    return judge(
+        "deviation_magnitude",
+        largest,
+        _LARGEST_UM_PER_M,
+        f"The deviations reach {largest:.3g} µm per metre of travel (limit {_LARGEST_UM_PER_M:g}).",
+        "Check the units: deviations are read as µm and positions as mm.",
+        severity=Severity.CONTRADICTION,
+    )
+
+
+def _least_noise(noise_um: float) -> Check:
+    """Unit check: repeatability below 2 nm, not from rounding, suggests values in mm."""
+    return judge(
+        "deviation_unit",
+        noise_um,
+        _LEAST_NOISE_UM,
+        f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (no machine repeats within {_LEAST_NOISE_UM:g} µm).",
+        "Check the unit of the deviations: they look like mm and are read as µm.",
+        passed=not noise_um < _LEAST_NOISE_UM,
+    )
+
+
+def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
+    """Unit check: a travel that hardly shows on the plan suggests metres or inches."""
+    travel_mm = float(np.ptp(deviations["position"].values))
+    share = travel_mm / plan_extent_mm
+    return judge(
+        "travel",
+        share,
+        _LEAST_TRAVEL_SHARE,
+        f"The targets span {travel_mm:.4g} mm, {100.0 * share:.2g} % of the plan along the axis ({plan_extent_mm:.4g} mm).",
+        "Check the unit of the positions: they are read as mm and look like m or inch.",
+        passed=share >= _LEAST_TRAVEL_SHARE,
+    )
+
+
+def _copied_cycles(deviations: xr.Dataset) -> Check:
+    """Two cycles that agree digit for digit are one cycle, entered twice."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    largest, following, copies = 0.0, [], []
+    for start, shares in _equal_shares(values):
+        later = np.triu(shares, start + 1)
+        largest = max(largest, float(later.max(initial=0.0)))
+        following.append(np.diagonal(shares, start + 1).copy())
+        copies.append(np.argwhere(later >= _COPIED_SHARE) + np.array([start, 0]))
+    pairs = []
+    # Coarsely rounded readings agree from cycle to cycle; then agreement says nothing.
+    if values.shape[0] > 1 and np.median(np.concatenate(following)) <= _ORDINARY_SHARE:
+        number = deviations["cycle"].values
+        pairs = [f"{number[a]} and {number[b]}" for a, b in np.concatenate(copies)]
+    named = ", ".join(pairs[:5]) + (f" and {len(pairs) - 5} more" if len(pairs) > 5 else "")
+    return judge(
+        "copied_cycles",
+        largest,
+        _COPIED_SHARE,
+        f"Cycles {named} agree digit for digit.",
+        "Leave one of the two cycles out of the file.",
+        passed=not pairs,
+        sound="No two cycles agree digit for digit.",
+    )
+
+
+def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:
+    """Yield the share of readings that cycles have equal digit for digit: first cycle of a few, and theirs with every
+    cycle (few, cycle).
+    """
+    present = np.isfinite(values)
+    cycle, site = np.nonzero(present)
+    _, number = np.unique(np.column_stack([site, values[present]]), axis=0, return_inverse=True)
+    holds = sparse.csr_array((np.ones(cycle.size), (cycle, number.ravel())), shape=(values.shape[0], cycle.size))
+    for start in range(0, values.shape[0], _CYCLES_AT_ONCE):
+        rows = slice(start, start + _CYCLES_AT_ONCE)
+        both = present[rows].astype(float) @ present.T.astype(float)
+        yield start, (holds[rows] @ holds.T).toarray() / np.maximum(both, 1.0)
+
+
+def _means(values: Array) -> Array:
+    """Return the mean of every column, NaN where it holds no value."""
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0))
+
+
+def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
+    """A reversal error that changes its sign and keeps its size at one cycle shows exchanged labels of approach."""
+    sound = judge("approach_labels", 0.0, _EXCHANGE_SIGMAS, "The reversal error keeps its sign over the test.")
+    if deviations.sizes["direction"] < 2 or not noise_um > 0.0:
+        return sound
+    values = deviations["deviation"].values
+    reversal = values[:, 0] - values[:, 1]
+    known = np.isfinite(reversal).any(axis=1)
+    reversal, cycles = reversal[known], deviations["cycle"].values[known]
+    best, place = 0.0, 0
+    for k in range(_LEAST_SIDE, reversal.shape[0] - _LEAST_SIDE + 1):
+        before, after = _means(reversal[:k]), _means(reversal[k:])
+        sigma = noise_um * np.sqrt(2.0) * np.sqrt(1.0 / k + 1.0 / (reversal.shape[0] - k))
+        if not np.isfinite(after - before).any():
+            continue
+        shift = float(np.nanmean(after - before) / (sigma / np.sqrt(before.size)))
+        if abs(shift) > abs(best):
+            best, place = shift, k
+    if abs(best) <= _EXCHANGE_SIGMAS:
+        return sound
+    before, after = reversal[:place], reversal[place:]
+    # Standard error of the sum of both means at every target; drift between the two readings of a target adds to the noise.
+    both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
+    early, late = before[:, both], after[:, both]
+    spread = np.sqrt(np.nanvar(early, axis=0) / early.shape[0] + np.nanvar(late, axis=0) / late.shape[0])
+    total = (np.nanmean(early, axis=0) + np.nanmean(late, axis=0)) / np.maximum(spread, 1e-12)
+    opposite = float(special.chdtrc(total.size, float(total @ total)))
+    # An exchange happens from one cycle to the next, a reversal that drifts does not.
+    near = np.nanmean(reversal[max(0, place - _LEAST_SIDE) : place]), np.nanmean(reversal[place : place + _LEAST_SIDE])
+    sudden = abs(near[1] - near[0]) > 0.7 * abs(np.nanmean(after) - np.nanmean(before))
+    if opposite < _OPPOSITE_P or near[0] * near[1] >= 0.0 or not sudden:
+        return sound
+    return judge(
+        "approach_labels",
+        abs(best),
+        _EXCHANGE_SIGMAS,
+        f"From cycle {cycles[place]} on the reversal error has the opposite sign and the same size at every target "
+        f"({near[0]:+.2f} to {near[1]:+.2f} µm).",
+        f"Check the labels of the direction of approach from cycle {cycles[place]} on.",
+    )
+
+
+def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
+    """A sudden shift of all targets and approaches alike, far larger than the drift about it, is a new datum or a slip."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    level, cycles = _levels(values), deviations["cycle"].values
+    sound = judge("datum", 0.0, _DATUM_RANGES, "The readings do not jump together at any cycle.")
+    if level.size < 2 * _LEAST_SIDE or not noise_um > 0.0:
+        return sound
+    # Over two cycles, so that a jump within a cycle counts whole; the cycle between belongs to neither side.
+    places = np.arange(_LEAST_SIDE - 1, level.size - _LEAST_SIDE + 1)
+    # Only sites that were read on both sides tell a jump from others being read.
+    places = places[np.isfinite(values[places + 1] - values[places - 1]).any(axis=1)]
+    if not places.size:
+        return sound
+    jumps = level[places + 1] - level[places - 1]
+    place = int(places[np.argmax(np.abs(jumps))])
+    jump = values[place + 1] - values[place - 1]
+    size = float(np.nanmedian(jump))
+    drift = max(float(np.ptp(level[:place])), float(np.ptp(level[place + 1 :])), noise_um)
+    if not scatter_by_median(jump) <= _COMMON_SHARE * abs(size) + 2.0 * noise_um:
+        return sound
+    multiple = abs(size) / drift
+    if multiple <= _DATUM_RANGES or abs(size) <= _LEAST_DATUM_UM:
+        return replace(sound, value=multiple)
+    # The cycle between belongs to the level that it is nearer to.
+    first = cycles[place] if 2.0 * abs(level[place] - level[place - 1]) > abs(size) else cycles[place + 1]
+    return judge(
+        "datum",
+        multiple,
+        _DATUM_RANGES,
+        f"From cycle {first} on all targets read {size:+.3g} µm in both approaches, {multiple:.2g} times the drift on either side: the "
+        "datum of the laser changed (beam broken, zeroed or set up anew), or a mount slipped.",
+        f"If the laser was zeroed or set up anew before cycle {first}, evaluate the two parts as two campaigns; if not, check the "
+        "clamping of optics and laser head.",
+    )
+
+
+def _levels(values: Array) -> Array:
+    """Level of every cycle (cycles,), um: sum of the median changes of the sites (cycle, site) from cycle to cycle."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        changes = np.nanmedian(np.diff(values, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(np.nan_to_num(changes))])
+
+
+def _zeroed_cycles(deviations: xr.Dataset) -> Check:
+    """A reading that is the same in every cycle, where all others scatter, was set to that value."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    shares = np.zeros(values.shape[1])
+    for site, column in enumerate(values.T):
+        present = column[np.isfinite(column)]
+        if present.size >= _LEAST_SIDE:
+            shares[site] = np.unique(present, return_counts=True)[1].max() / present.size
+    site = int(np.argmax(shares))
+    direction, target = np.unravel_index(site, deviations["deviation"].shape[1:])
+    return judge(
+        "zeroed_cycles",
+        shares[site],
+        _ZEROED_SHARE,
+        f"Target {deviations['target'].values[target]} in {deviations['direction'].values[direction]} approach reads the same in "
+        f"{100.0 * shares[site]:.0f} % of the cycles: the laser was set to zero there each time, so that a shift of all targets is lost.",
+        "Zero the laser once, at the start of the test; from this one only changes along the axis can be evaluated.",
+        passed=shares[site] < _ZEROED_SHARE or float(np.median(shares)) > _ORDINARY_SHARE,
+        sound="No reading is the same in every cycle.",
+    )
+
+
+# Checks of order and sign: passes against their label, targets numbered from the other end, readings mirrored against
+# the others.
+
+#: Fewest targets in which a shape can be compared.
+_LEAST_TARGETS = 5
+#: Fewest complete cycles from which the scatter between the approaches is taken.
+_LEAST_CYCLES = 5
+#: What a mirrored part leaves at most when its sign is inverted, in units of what is usual: the median step of a pass from cycle to cycle,
+#: the median distance of a target from the line through the others, or the scatter of the difference between both approaches. Normal noise
+#: exceeds five times its median once in a thousand.
+_INVERTED_AT_MOST = 3.0
+#: What it leaves at least as it was read: a drift that passes quickly through zero makes larger steps than noise does.
+_PASS_AT_LEAST, _TARGET_AT_LEAST = 8.0, 5.0
+#: Correlation of the drift of both approaches from which they run against each other.
+_OPPOSITE = -0.5
+
+
+def check_signs(deviations: xr.Dataset) -> list[Check]:
+    """Check the labels of the approaches against the travel, and the signs of the readings against one another."""
+    timed = not np.isnat(deviations["time"].values).all()
+    travel = [_travel_order(deviations)] if timed else []
+    return [*travel, _target_order(deviations), _mirrored_readings(deviations)]
+
+
+def _travel_order(deviations: xr.Dataset) -> Check:
+    """A cycle whose positive pass goes down and whose negative pass goes up has its labels exchanged."""
+    # Steps from reading to reading against the label less those along it, (cycle, direction).
+    order = np.argsort(deviations["position"].values)
+    time = deviations["time"].values[..., order].astype("datetime64[ns]")
+    with np.errstate(invalid="ignore"):
+        seconds = np.where(np.isnat(time), np.nan, time.astype(np.int64) / 1e9)
+    label = np.where(deviations["direction"].values == "positive", 1.0, -1.0)
+    steps = np.asarray(-label * np.nansum(np.sign(np.diff(seconds, axis=-1)), axis=-1))
+    contrary = (steps > 0).all(axis=1) if steps.shape[1] == 2 else np.zeros(len(steps), bool)
+    first = deviations["cycle"].values[np.argmax(contrary)]
+    return judge(
+        "travel_order",
+        contrary.mean(),
+        0.0,
+        f"In {contrary.sum()} of {contrary.size} cycles, first in cycle {first}, the readings labelled positive were taken at falling "
+        "positions and those labelled negative at growing positions.",
+        "Exchange the labels of the direction of approach, or correct the times of the readings.",
+        sound="The passes run in the direction of their labels.",
+    )
+
+
+def _target_order(deviations: xr.Dataset) -> Check:
+    """Approaches that show one profile only when the targets of one of them are read from the other end are numbered differently."""
+    as_read, turned = _distances_of_approaches(deviations)
+    return judge(
+        "target_order",
+        as_read,
+        _TARGET_AT_LEAST,
+        f"The profiles of the two approaches differ by {as_read:.1f} times their scatter from cycle to cycle, and by {turned:.1f} "
+        "times with the targets of one approach read from the other end.",
+        "Number the targets by their position in both approaches: in one of them the readings are in the order of travel.",
+        passed=not (as_read >= _TARGET_AT_LEAST and turned <= _INVERTED_AT_MOST),
+        sound="Both approaches number the targets alike, as far as their profiles show.",
+    )
+
+
+def _distances_of_approaches(deviations: xr.Dataset) -> tuple[float, float]:
+    """Distance of the passes in both approaches, apart from their level, as read and with the targets of one turned round."""
+    values = deviations["deviation"].values
+    values = values[np.isfinite(values).all(axis=(1, 2))]
+    if len(values) < _LEAST_CYCLES or values.shape[1] < 2 or values.shape[2] < _LEAST_TARGETS:
+        return 0.0, 0.0
+    levels = values.mean(axis=2)
+    if np.cov(levels.T)[0, 1] <= _OPPOSITE * np.prod(levels.std(axis=0, ddof=1)):
+        return 0.0, 0.0
+    shapes = values - levels[..., None]
+    apart, turned = shapes[:, 0] - shapes[:, 1], shapes[:, 0] - shapes[:, 1, ::-1]
+    usual = max(float(np.sqrt(np.mean(np.diff(apart, axis=0) ** 2) / 2.0)), float(np.finfo(float).tiny))
+    return float(np.sqrt(np.mean(apart**2))) / usual, float(np.sqrt(np.mean(turned**2))) / usual
+
+
+def _mirrored_readings(deviations: xr.Dataset) -> Check:
+    """Readings that are those of the others with the opposite sign."""
+    mirrored = [*_mirrored_passes(deviations), *_mirrored_targets(deviations)]
+    return judge(
+        "mirrored_readings",
+        len(mirrored),
+        0.0,
+        f"Deviations have the sign opposite to that of the others: {'; '.join(mirrored)}.",
+        "Check the sign of the deviations there.",
+        sound="The signs agree.",
+    )
+
+
+def _mirrored_passes(deviations: xr.Dataset) -> list[str]:
+    """Passes that show the shape of the others mirrored: from one cycle on, or in one direction of approach."""
+    values = deviations["deviation"].values
+    values = values[np.isfinite(values).all(axis=(1, 2))]
+    if len(values) < 2 or values.shape[2] < _LEAST_TARGETS:
+        return []
+    cycles = deviations["cycle"].values[np.isfinite(deviations["deviation"].values).all(axis=(1, 2))]
+    size, levels = _shape_size(values), values.mean(axis=2)
+    steps = np.diff(size, axis=0)
+    usual = float(np.median(np.abs(steps)))
+    sums, jumps = np.abs(size[1:] + size[:-1]).mean(axis=1), np.abs(steps).min(axis=1)
+    changes = (sums <= _INVERTED_AT_MOST * usual) & (jumps >= _PASS_AT_LEAST * usual)
+    found = [f"from cycle {cycle} on" for cycle in cycles[1:][changes]]
+    if size.shape[1] == 2:
+        mirrored = np.median(np.abs(size.sum(axis=1))) <= _INVERTED_AT_MOST * usual
+        apart = np.median(np.abs(np.diff(size, axis=1))) >= _PASS_AT_LEAST * usual
+        if mirrored and apart and np.corrcoef(levels.T)[0, 1] <= _OPPOSITE:
+            names = deviations["direction"].values
+            found.append(f"approach in {names[1]} direction against approach in {names[0]} direction")
+    return found
+
+
+def _shape_size(values: Array) -> Array:
+    """Size, with its sign, of the shape over the targets that most of the passes share, um, (cycle, direction)."""
+    shapes = values - values.mean(axis=2, keepdims=True)
+    passes = shapes.reshape(-1, shapes.shape[2])
+    _, _, axes = np.linalg.svd(passes, full_matrices=False)
+    return np.asarray((passes @ axes[0]).reshape(shapes.shape[:2]))
+
+
+def _mirrored_targets(deviations: xr.Dataset) -> list[str]:
+    """Targets that lie near the straight line through the others only when their sign is inverted."""
+    values, position = deviations["deviation"].values, deviations["position"].values
+    passes = values.reshape(-1, values.shape[2])
+    passes = passes[np.isfinite(passes).all(axis=1)]
+    if values.shape[2] < _LEAST_TARGETS or not len(passes):
+        return []
+    targets = range(values.shape[2])
+    expected = np.stack([_line_through_others(passes, position, target) for target in targets], axis=1)
+    as_read = np.sqrt(np.mean((passes - expected) ** 2, axis=0))
+    inverted = np.sqrt(np.mean((passes + expected) ** 2, axis=0))
+    usual = float(np.median(as_read))
+    found = (as_read >= _TARGET_AT_LEAST * usual) & (inverted <= _INVERTED_AT_MOST * usual)
+    return [f"target {number}" for number in deviations["target"].values[found]]
+
+
+def _line_through_others(passes: Array, position: Array, target: int) -> Array:
+    """Value at a target of the straight line through the other targets of every pass, um; by the median of the slopes between pairs."""
+    others = np.delete(np.arange(position.size), target)
+    early, late = others[: others.size // 2], others[-(others.size // 2) :]
+    slope = np.median((passes[:, late] - passes[:, early]) / (position[late] - position[early]), axis=1)
+    level = np.median(passes[:, others] - slope[:, None] * position[others], axis=1)
+    return np.asarray(level + slope * position[target])

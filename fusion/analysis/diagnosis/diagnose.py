@@ -1,0 +1,361 @@
+"""Diagnosis of anomalous targets: the cause with its probability, the evidence for and against it, and what to check on the machine.
+
+Explanations compete by likelihood: scatter (structural), scatter or a random walk that depends on the direction of approach (stick-slip),
+local temperature through a first-order lag, a step, and a random walk that none of these explains. A cause is named only if its
+probability exceeds a threshold set on simulated campaigns, its own test rejects the null hypothesis, and the fit to one direction predicts
+the other; otherwise the cause is "undetermined", because a false cause costs more than none. Method: docs/method/diagnosis.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import xarray as xr
+
+from fusion.analysis.diagnosis.causes import CAUSES, undetermined_check
+from fusion.analysis.diagnosis.explanations import (
+    LAGS_S,
+    ProfileFit,
+    RandomWalkFit,
+    Residual,
+    ScatterFit,
+    fit_profile,
+    fit_random_walk,
+    fit_scatter,
+    lagged_temperature,
+    local_residuals,
+    serial_p_value,
+    step_columns,
+    step_instant,
+    warm_up_share,
+)
+from fusion.results.axis import Cause
+from interferometry.common import one_thread
+
+#: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
+THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
+#: Log-likelihood (nats) that an explanation by the direction of approach must gain over scatter equal in both directions: amounts along
+#: the motion, more scatter in one direction, a random walk in one direction (beside its parameter). Scatter equal in both directions
+#: exceeds one of them by chance in about one case of twenty.
+APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
+#: A local temperature that follows one warm-up to at least this share of its variance is collinear with every other slow cause.
+WARM_UP_SHARE = 0.98
+#: Levels of the bootstrap tests; local temperature is the cause that costs most when it is wrong.
+LEVELS = {"step": 0.05, "local_temperature": 0.02}
+#: Level above which a serial p-value is called not significant in a sentence; it takes no part in the choice of the cause.
+_SERIAL_LEVEL = 0.05
+
+
+class Flagged(Protocol):
+    """What a diagnosis needs of an anomaly; :class:`interferometry.anomalies.Anomaly` provides it."""
+
+    @property
+    def target(self) -> int:
+        """Target number, from 1."""
+
+    @property
+    def direction(self) -> str:
+        """Affected direction: ``"positive"``, ``"negative"`` or ``"both"``."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Cause of one anomaly.
+
+    Attributes
+    ----------
+    target : int
+        Target number, from 1.
+    direction : str
+        Affected direction: "positive", "negative" or "both".
+    cause : str
+        Name of the cause, "undetermined" where the data do not decide.
+    probability : float
+        Of that cause among the explanations tried; for "undetermined", that of the best explanation.
+    evidence : dict
+        Numbers by name; the name states the unit (um, um_per_K, s, nats), or that it is a probability.
+    for_it, against_it : tuple of str
+        Sentences with numbers for the leading explanation, and against it.
+    check : str
+        What to check on the machine.
+    """
+
+    target: int
+    direction: str
+    cause: Cause
+    probability: float
+    evidence: dict[str, Any]
+    for_it: tuple[str, ...]
+    against_it: tuple[str, ...]
+    check: str
+
+    def __str__(self) -> str:
+        """Return the cause in one line, and what to check."""
+        return (
+            f"target {self.target}, {self.direction}: {self.cause} (probability {self.probability:.2f}). {self.check}"
+        )
+
+
+@dataclass(frozen=True)
+class _Case:
+    """All fits of one target."""
+
+    residual: Residual
+    random_walk: RandomWalkFit
+    scatter: ScatterFit
+    temperature: ProfileFit | None
+    step: ProfileFit
+    serial_p: float
+    warm_up_share: float
+
+    @property
+    def tested(self) -> dict[str, ProfileFit]:
+        """The explanations with a bootstrap test of their own, by name."""
+        return {"step": self.step} | ({"local_temperature": self.temperature} if self.temperature is not None else {})
+
+    @property
+    def step_cycle(self) -> int:
+        """Number of the first cycle after the best step."""
+        return int(self.residual.cycle[step_instant(self.step.best)])
+
+    @property
+    def approach_gain(self) -> float:
+        """Log-likelihood gained by scatter that depends on the direction of approach over scatter equal in both directions, nats."""
+        return max(self.scatter.one_direction, self.scatter.along_approach) - self.scatter.both
+
+
+@one_thread
+def diagnose(fused: xr.Dataset, anomalies: Sequence[Flagged], *, seed: int = 0) -> list[Diagnosis]:
+    """Diagnose the cause of every anomaly.
+
+    Parameters
+    ----------
+    fused : xarray.Dataset
+        From :func:`fusion.analysis.alignment.align.align`: `deviation`, um, and `time` (cycle, direction, target); `position` (target,),
+        mm; and, where the camera sees the targets, `local_rise_series` (frame_time, target), K.
+    anomalies : sequence of Flagged
+        Anomalous targets with their direction, as from :func:`interferometry.anomalies.detect_anomalies`; all of them are left out of the
+        estimate of the drift.
+    seed : int
+        Seed of the bootstrap; each target has its own random numbers.
+
+    Returns
+    -------
+    list of Diagnosis
+        One per anomaly, in the same order.
+
+    Raises
+    ------
+    DiagnosisError
+        A target is unknown or was read in fewer than 12 cycles, or fewer than 3 targets are free of anomalies.
+
+    Notes
+    -----
+    Explanations are compared by the Bayesian information criterion with equal prior probabilities (Schwarz 1978, Ann. Stat. 6, 461; Kass
+    and Raftery 1995, J. Am. Stat. Assoc. 90, 773); docs/method/diagnosis.md.
+
+    Examples
+    --------
+    Target 3 shifts by 1 um after 20 of 40 cycles, beside 0.1 um of noise:
+
+    >>> from types import SimpleNamespace
+    >>> rng = np.random.default_rng(1)
+    >>> deviation = 0.1 * rng.standard_normal((40, 2, 6))
+    >>> deviation[20:, :, 2] += 1.0
+    >>> time = np.datetime64("2026-03-09", "ns") + np.arange(480) * np.timedelta64(10, "s")
+    >>> dims = ("cycle", "direction", "target")
+    >>> fused = xr.Dataset(
+    ...     {"deviation": (dims, deviation), "time": (dims, time.reshape(40, 2, 6)), "position": ("target", 20.0 * np.arange(6))},
+    ...     coords={"cycle": np.arange(1, 41), "direction": ["positive", "negative"], "target": np.arange(1, 7)},
+    ... )
+    >>> (diagnosis,) = diagnose(fused, [SimpleNamespace(target=3, direction="both")])
+    >>> diagnosis.cause, diagnosis.evidence["step_cycle"]
+    ('step', 21)
+    """
+    flagged = {int(anomaly.target) for anomaly in anomalies}
+    cases = {target: _fit_explanations(fused, target, flagged, seed) for target in sorted(flagged)}
+    return [_judge(cases[int(anomaly.target)], str(anomaly.direction)) for anomaly in anomalies]
+
+
+def _fit_explanations(fused: xr.Dataset, target: int, flagged: set[int], seed: int) -> _Case:
+    """Fit every explanation to one target."""
+    rng = np.random.default_rng([seed, target])
+    residual = local_residuals(fused, target, flagged)
+    columns = lagged_temperature(residual)
+    temperature = None if columns is None else fit_profile(residual, columns, rng)
+    return _Case(
+        residual=residual,
+        random_walk=fit_random_walk(residual),
+        scatter=fit_scatter(residual),
+        temperature=temperature,
+        step=fit_profile(residual, step_columns(residual.seconds.size), rng),
+        serial_p=serial_p_value(residual, rng),
+        warm_up_share=0.0 if columns is None else warm_up_share(residual.seconds, columns[:, 0]),
+    )
+
+
+def _probabilities(case: _Case) -> dict[str, float]:
+    """Return the probabilities of the causes and of "slow" (a random walk without a cause), equal before the data."""
+    cycles = case.residual.seconds.size
+    parameter = 0.5 * float(np.log(cycles))
+    scatter = case.scatter
+    sticking = float(
+        np.logaddexp(
+            scatter.one_direction - APPROACH_NATS["one_direction"], scatter.along_approach - APPROACH_NATS["along"]
+        )
+    )
+    # The scatter's own likelihoods, of all readings, divide the probability of white noise between both explanations by scatter.
+    share = 1.0 / (1.0 + float(np.exp(np.clip(scatter.both - sticking, -50, 50))))
+    walk = case.random_walk
+    score = {
+        "structural": walk.white + float(np.log(max(1.0 - share, 1e-30))),
+        "stick_slip": max(
+            walk.white + float(np.log(max(share, 1e-30))),
+            walk.one_direction - parameter - APPROACH_NATS["slow"],
+        ),
+        "slow": walk.shared - parameter,
+        "step": case.step.log_likelihood - parameter - float(np.log(step_columns(cycles).shape[1])),
+    }
+    if case.temperature is not None:
+        score["local_temperature"] = case.temperature.log_likelihood - parameter - float(np.log(len(LAGS_S)))
+    for name, fit in case.tested.items():
+        if fit.p_value > LEVELS[name]:
+            score[name] = -np.inf
+    highest = max(score.values())
+    weight = {name: float(np.exp(value - highest)) for name, value in score.items()}
+    total = sum(weight.values())
+    return {name: value / total for name, value in weight.items()}
+
+
+def _judge(case: _Case, direction: str) -> Diagnosis:
+    """Name the leading explanation of one target, unless there is an objection to it."""
+    probability = _probabilities(case)
+    leading = max(probability, key=lambda name: probability[name])
+    against = _objections(case, leading, probability[leading])
+    cause: Cause = "undetermined" if against or leading == "slow" else leading  # type: ignore[assignment]
+    runner_up = max((name for name in probability if name != leading), key=lambda name: probability[name])
+    against.append(f"next best explanation: {_in_words(runner_up)}, probability {probability[runner_up]:.2f}")
+    against += [
+        f"{_in_words(name)}: p = {fit.p_value:.2g}, ordinary slow drift would look the same"
+        for name, fit in case.tested.items()
+        if fit.p_value > LEVELS[name]
+    ]
+    return Diagnosis(
+        target=case.residual.target,
+        direction=direction,
+        cause=cause,
+        probability=probability[leading],
+        evidence=_evidence(case, probability),
+        for_it=tuple(_support(case, leading)),
+        against_it=tuple(against),
+        check=undetermined_check(leading) if cause == "undetermined" else CAUSES[cause].check,
+    )
+
+
+def _in_words(explanation: str) -> str:
+    """Return the name of an explanation in words; a random walk is no cause."""
+    return "random walk" if explanation == "slow" else CAUSES[explanation].words  # type: ignore[index]
+
+
+def _objections(case: _Case, leading: str, probability: float) -> list[str]:
+    """Return the reasons against naming the leading explanation as the cause; empty where it is named."""
+    reasons = []
+    threshold = THRESHOLDS.get(leading, 0.0)
+    if probability < threshold:
+        reasons.append(f"probability {probability:.2f} of {_in_words(leading)} is below its threshold {threshold:.2f}")
+    fit = case.tested.get(leading)
+    if fit is not None and fit.hold_out_gain <= 0:
+        reasons.append(
+            f"the fit to one direction does not predict the other (hold-out log-likelihood {fit.hold_out_gain:+.1f} nats)"
+        )
+    if leading == "local_temperature" and case.temperature is not None:
+        positive, negative = case.temperature.by_direction
+        if positive * negative < 0:
+            reasons.append(f"the sign differs between directions ({positive:+.3f} and {negative:+.3f} µm/K)")
+        if case.warm_up_share >= WARM_UP_SHARE:
+            reasons.append(
+                f"{case.warm_up_share:.1%} of the local temperature's variance is one warm-up curve: collinear with any other slow cause"
+            )
+    if leading == "slow":
+        reasons.append(f"slow (serial p = {case.serial_p:.2g}), but neither local temperature nor a step explains it")
+    return reasons
+
+
+def _support(case: _Case, leading: str) -> list[str]:
+    """Return the sentences in favour of the leading explanation."""
+    residual = case.residual
+    scatter = float(np.nanstd(residual.values))
+    sentences = [
+        f"standard deviation {scatter:.2f} µm over both approaches, typical of the other positions {residual.typical_um:.2f} µm"
+    ]
+    if leading == "step":
+        fit = case.step
+        sentences.append(
+            f"step of {fit.coefficient:+.2f} ± {2.0 * fit.coefficient_u:.2f} µm (k = 2) at cycle {case.step_cycle} "
+            f"(p = {fit.p_value:.2g}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+        )
+    elif leading == "local_temperature" and case.temperature is not None:
+        fit = case.temperature
+        sentences.append(
+            f"{fit.coefficient:+.3f} ± {2.0 * fit.coefficient_u:.3f} µm per K (k = 2) of local temperature rise, "
+            f"lag {LAGS_S[fit.best]:.0f} s (p = {fit.p_value:.2g}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+        )
+    elif leading == "stick_slip":
+        positive, negative = residual.scatter_um
+        sentences += [
+            f"standard deviation {positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction",
+            f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats",
+        ]
+    elif leading == "structural":
+        sentences += [_serial_sentence(case.serial_p), _directions_sentence(residual)]
+    return sentences
+
+
+def _serial_sentence(p_value: float) -> str:
+    """Return what the order of the readings in time shows."""
+    if p_value > _SERIAL_LEVEL:
+        return f"no significant serial correlation (p = {p_value:.2g})"
+    return f"serial correlation p = {p_value:.2g}"
+
+
+def _directions_sentence(residual: Residual) -> str:
+    """Return the standard deviations of both directions, and whether they agree within their expanded uncertainty (k = 2)."""
+    positive, negative = residual.scatter_um
+    freedom = np.isfinite(residual.values).sum(axis=1) - 1
+    if (freedom < 1).any():
+        return "directions not compared: fewer than two readings in one of them"
+    numbers = f"{positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction"
+    u_positive, u_negative = np.array([positive, negative]) / np.sqrt(2.0 * freedom)
+    if abs(positive - negative) <= 2.0 * np.hypot(u_positive, u_negative):
+        return f"standard deviations equal within their uncertainty: {numbers}"
+    return f"standard deviation {numbers}"
+
+
+def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:
+    """Return every number that the diagnosis rests on."""
+    evidence: dict[str, Any] = {f"probability_{name}": value for name, value in probability.items()}
+    evidence |= {
+        "scatter_typical_um": case.residual.typical_um,
+        "scatter_positive_um": case.residual.scatter_um[0],
+        "scatter_negative_um": case.residual.scatter_um[1],
+        "serial_p": case.serial_p,
+        "approach_gain_nats": case.approach_gain,
+        "step_p": case.step.p_value,
+        "step_um": case.step.coefficient,
+        "step_u_um": case.step.coefficient_u,
+        "step_cycle": case.step_cycle,
+        "step_held_out_nats": case.step.hold_out_gain,
+    }
+    if case.temperature is not None:
+        evidence |= {
+            "temperature_p": case.temperature.p_value,
+            "temperature_um_per_K": case.temperature.coefficient,
+            "temperature_u_um_per_K": case.temperature.coefficient_u,
+            "temperature_lag_s": LAGS_S[case.temperature.best],
+            "temperature_held_out_nats": case.temperature.hold_out_gain,
+            "temperature_warm_up_share": case.warm_up_share,
+        }
+    return evidence

@@ -1,0 +1,1113 @@
+"""The closed loop on a positioning campaign: readings along an axis, a hold-out set of the last cycles, a second look at all of them.
+
+The last fifth of the cycles is held out. After the search on the others the hold-out set is opened once: the error before and after is
+that of predicting these cycles in open loop with frozen coefficients. What acted only there is searched for in a second look, which has
+no held-out error any more.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from html import escape
+from operator import is_
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion.analysis.alignment.align import cycle_bounds
+from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.alignment.reflections import find_switching_patch
+from fusion.analysis.diagnosis import residual as remainder
+from fusion.analysis.diagnosis.residual import Remainder
+from fusion.analysis.drift_model.admissibility import (
+    WARM_UP_SHARE,
+    AxisGrounds,
+    CandidateScorer,
+    evaluate_on_hold_out,
+    inconsistent_patterns,
+    refuse,
+    refuse_in_heteroscedastic_drift,
+    warm_up_share,
+)
+from fusion.analysis.drift_model.fit import (
+    ModelFit,
+    Term,
+    coefficient_spread,
+    fit_model,
+    recompute_term,
+    refit_fixed,
+    size_camera_errors,
+    solve,
+    unexplained_drift,
+)
+from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
+from fusion.analysis.drift_model.search import (
+    BASELINE_LAGS_MIN,
+    FINAL,
+    HOLD_OUT_SHARE,
+    LEVEL_TO_CONFIRM,
+    MOST_EFFECTS,
+    MOST_EVENTS,
+    PENALTIES,
+    Confirmation,
+    Confirmed,
+    Decision,
+    LoopState,
+    Problem,
+    Progress,
+    Reason,
+    Round,
+    Score,
+    choose,
+    doubt_of,
+    drop_superfluous,
+    error_interval,
+    errors_of_predictions,
+    has_skill,
+    kept_on_disk,
+    no_progress,
+    open_hold_out,
+    refine,
+    rivals,
+    score_effects,
+    search,
+    verdict,
+    withdraw,
+)
+from fusion.analysis.effects.effect import Candidate, Effect
+from fusion.analysis.effects.events import cycle_starts
+from fusion.analysis.effects.laser_and_camera import CAMERA_OFFSET, REFLECTED_SOURCE
+from fusion.analysis.effects.library import library
+from fusion.common import Array, FusionError
+from fusion.results import loop as schema
+from fusion.results.parts import Number
+from interferometry.common import one_thread
+from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Detection limits: how large an effect must be to be found in a campaign, and which effects look alike in it.
+
+#: Standard normal quantile of the power: an effect of the stated size is found in 80 % of such campaigns.
+_POWER_QUANTILE = 0.84
+#: Share of an effect's visible variance from which on another effect is said to look alike.
+_ALIKE_SHARE = 0.9
+#: Largest size that is looked for, um per reading, and simulated campaigns that suffice for the scatter that a drift leaves.
+_LARGEST_UM = 1e3
+_DRAWS = 20
+
+
+def detection_limits(
+    scorer: CandidateScorer,
+    products: Sequence[Products],
+    model: ModelFit,
+    families: Mapping[str, Sequence[Candidate]],
+    scores: Sequence[Score],
+    effects: Mapping[str, Effect],
+) -> list[schema.DetectionLimit]:
+    """Say for every effect how large it must be to be found and what it looks like."""
+    candidates = [candidate for some in families.values() for candidate in some]
+    names = np.repeat(list(families), [len(some) for some in families.values()])
+    critical = {score.name: score.critical for score in scores}
+    wanted = np.array([0.5 * (np.sqrt(2.0 * critical[name]) + _POWER_QUANTILE) ** 2 for name in names])
+    own, left, spread = _beside(model, candidates)
+    smallest = _smallest(products, spread, wanted)
+    # A column that never moves has no size.
+    sizes = np.where(own > 0.0, own, np.inf) * smallest
+    share = left / np.maximum(own, 1e-300)
+    # Of every effect the candidate that shows like the median of them.
+    places = {name: np.flatnonzero(names == name) for name in families}
+    typical = [int(own_places[np.argsort(sizes[own_places])[own_places.size // 2]]) for own_places in places.values()]
+    alike = _alike(scorer, candidates, names, typical)
+    limits = []
+    for row, name in enumerate(families):
+        here = sizes[places[name]]
+        seen = here[np.isfinite(here)]
+        limits.append(
+            schema.DetectionLimit(
+                effect=name,
+                detectable_um=float(np.median(seen)) if seen.size else None,
+                best_um=float(seen.min()) if seen.size else None,
+                worst_um=float(seen.max()) if seen.size else None,
+                visible_share=float(np.median(share[places[name]])),
+                confounded_with=tuple(sorted(alike[row] - {name})),
+                note=_note(effects[name], candidates[int(places[name][np.argmin(here)])], model, seen.size),
+            )
+        )
+    return limits
+
+
+def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Array, Array]:
+    """Size of every candidate's first column, (candidates,) each."""
+    site = model.readings.subset(model.used).site
+    number = np.maximum(np.bincount(site), 1)
+    q, _ = np.linalg.qr(model.fit.design)
+    own, left, spread = np.empty((3, len(candidates)))
+    for k, candidate in enumerate(candidates):
+        column = candidate.columns[model.used][:, 0]
+        own[k] = np.sqrt(np.mean((column - (np.bincount(site, column) / number)[site]) ** 2))
+        left[k] = np.sqrt(np.mean((column - q @ (q.T @ column)) ** 2))
+        spread[k] = column.std()
+    return own, left, spread
+
+
+def _smallest(sums: Sequence[Products], spread: Array, wanted: Array) -> Array:
+    """Coefficient of every first column at which its expected gain is as wanted, the drift being free with it and without it."""
+    n, energy, noise, penalty = sums[0].readings, [], [], []
+    for products in (held.of_candidates() for held in sums):
+        freed = orthogonalise(products)
+        noise.append(np.mean(freed.squares[1 : 1 + _DRAWS]))
+        first = np.empty(wanted.size)
+        for group, slots, within in zip(products.groups, products.slots(), products.within, strict=True):
+            # Columns that are no evidence stand before the first one.
+            along = freed.along_design[:, slots[group.beside]]
+            first[group.places] = within[:, group.beside, group.beside] - np.einsum("qm,qm->m", along, along)
+        energy.append(np.maximum(first, 0.0))
+        penalty.append(products.log_spread)
+    scatter, without_name = np.array(noise)[:, None], np.array(penalty)[:, None]
+    nothing = np.max(-0.5 * (n * np.log(scatter) + without_name), axis=0)
+    low, high = np.zeros(wanted.size), _LARGEST_UM / np.maximum(spread, 1e-12)
+
+    def gain(size: Array) -> Array:
+        swallowed = -0.5 * (n * np.log(scatter + size**2 * np.array(energy)) + without_name)
+        return np.asarray(nothing - swallowed.max(axis=0))
+
+    never = gain(high) < wanted
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        enough = gain(middle) >= wanted
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    return np.where(never, np.inf, high)
+
+
+def _alike(
+    scorer: CandidateScorer, candidates: Sequence[Candidate], names: NDArray[np.str_], typical: Sequence[int]
+) -> list[set[str]]:
+    """For every effect's typical candidate the effects of which some candidate explains nearly all that is visible of it."""
+    design = scorer.fit.design
+    shown = np.column_stack([candidates[k].columns[scorer.used][:, 0] for k in typical])
+    shown = shown - design @ np.linalg.lstsq(design, shown, rcond=None)[0]
+    (held,) = sum_products([scorer.fit.system], [shown], design, by_width(candidates, scorer.used))
+    products = held.of_candidates()
+    freed = orthogonalise(products)
+    reduced, given, _ = reductions(products, freed)
+    alike = reduced - given > _ALIKE_SHARE * np.maximum(freed.squares, 1e-300)[:, None]
+    return [set(names[row].tolist()) for row in alike]
+
+
+def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> str:
+    """What stands in the way of an effect in this campaign."""
+    part = model.readings.subset(model.used)
+    if not seen:
+        return "the declared model contains it, or nothing excites it"
+    if effect.excited_by and warm_up_share(part, candidate.on(model.used)) > WARM_UP_SHARE:
+        return "one warm-up is all that excites it; switch the load on purpose to tell it from others"
+    return effect.limitation(part)
+
+
+LEAST_CYCLES = 10
+#: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, and the
+#: second look. Every effect that is found opens the search again with the same probability, and a campaign may lack two: half of the 5 %
+#: that a wrong name may have.
+SEARCH_LEVEL, SECOND_LEVEL = 0.02, 0.005
+ENTRY_LEVEL = SEARCH_LEVEL + SECOND_LEVEL
+#: An effect with a larger p-value, uncorrected, is not worth a question to the hold-out set.
+_LEVEL_TO_EVALUATE = 0.1
+
+AxisState = LoopState[ModelFit]
+
+
+class LoopError(FusionError):
+    """The campaign cannot be modelled; the message says what is missing."""
+
+
+@one_thread
+def close_loop(
+    fused: xr.Dataset | Readings,
+    declared: Sequence[str],
+    *,
+    seed: int = 1,
+    set_aside: Collection[tuple[int, str]] = (),
+    effects: Mapping[str, Effect] | None = None,
+    progress: Progress = no_progress,
+) -> LoopResult:
+    """Close the loop on a positioning campaign.
+
+    Parameters
+    ----------
+    fused : Dataset or Readings
+        What `align` returns: readings in um, and the rises and logs beside them. Or its readings in the order of time, as `read_fused`
+        returns them.
+    declared : sequence of str
+        Names of the effects the user believes to act, such as ``["axis_expansion", "table_offset"]``.
+    seed : int
+        Of the simulated campaigns behind the p-values, so that a run can be repeated.
+    set_aside : collection of (int, str)
+        Sites (target, direction) whose anomaly has its own diagnosis.
+    effects : mapping of str to Effect, optional
+        The library by name; None: the built-in one with the user's own.
+    progress : callable
+        Called with steps done, steps in total, and what is done.
+
+    Returns
+    -------
+    LoopResult
+        Steps with their errors on the hold-out set in um, verdict, what remains, and both models. It prints a summary, and `plot` draws
+        the errors.
+
+    Raises
+    ------
+    LoopError
+        If fewer than 10 cycles are there, or a declared effect cannot be computed from these readings.
+    ReadingsError
+        If fewer than three cycles or targets have readings within the frames' time.
+
+    Notes
+    -----
+    Procedure, assumptions and error rates: docs/method/closed-loop.md.
+    """
+    readings = fused if isinstance(fused, Readings) else read_fused(fused)
+    effects = library() if effects is None else effects
+    used, description = hold_out(readings)
+    terms = declare(readings, declared, effects)
+    progress(0, MOST_EFFECTS + 2, "fitting the declared model")
+    problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
+    start = problem.start(terms)
+    state = search(problem, start, progress=progress)
+    state = reject_inconsistent_patterns(problem, state)
+    progress(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the hold-out set")
+    state = problem.evaluate_on_hold_out(open_hold_out(problem, state))
+    decided = state.model.terms
+    state = replace(state, model=size_camera_errors(fit_model(readings, decided), effects))
+    progress(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
+    state = reject_inconsistent_patterns(problem, second_search(problem, state))
+    left = examine_remainder(state.model, seed, set_aside)
+    steps = report_steps(state, inconsistent_patterns(state.model, state.added, effects))
+    # Effects that are not confirmed must not move the coefficients of the declared ones.
+    doubtful = [place for place, step in enumerate(steps) if not step.confirmed]
+    sure = fit_model(readings, state.kept(doubtful)) if doubtful else state.model
+    errors = {"declared": problem.hold_out_errors(terms), "final": problem.hold_out_errors(decided)}
+    errors |= plain_errors(readings, used)
+    result = LoopResult(
+        declared=list(declared),
+        declared_coefficients=declared_coefficients(sure, len(terms)),
+        held_out=description,
+        noise_floor_um=state.model.fit.sigma,
+        rmse_declared_um=state.errors_um[0],
+        rmse_final_um=state.errors_um[-1],
+        hold_out={
+            name: error_interval(missed, readings.cycle[~used], np.random.default_rng(seed))
+            for name, missed in errors.items()
+        },
+        hold_out_errors=errors,
+        skill=problem.has_skill(state),
+        steps=steps,
+        unnamed=state.unnamed(SECOND_LEVEL),
+        remainder=left,
+        residual_drift=residual_drift_size(state.model),
+        state=state,
+        before=start.model,
+        after=state.model,
+    )
+    progress(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
+    return result
+
+
+class AxisProblem(Problem[ModelFit]):
+    """The readings of a campaign, the training part of them, and the library, for :mod:`fusion.analysis.drift_model.search`."""
+
+    effects: Mapping[str, Effect]
+    entry_level = SEARCH_LEVEL
+
+    def __init__(
+        self, readings: Readings, used: NDArray[np.bool_], effects: Mapping[str, Effect], rng: np.random.Generator
+    ) -> None:
+        self.readings, self.used, self.effects, self.rng = readings, used, effects, rng
+        self._fits: deque[ModelFit] = deque(maxlen=2 * MOST_EFFECTS)
+
+    def start(self, declared: Sequence[Term]) -> AxisState:
+        """The state before the search: the declared model, and the effects that these readings cannot show."""
+        present = {term.effect for term in declared}
+        missing = {
+            name: effect.needs(self.readings) or (None if name in present else effect.masked_by(self.readings))
+            for name, effect in self.effects.items()
+        }
+        return AxisState(self.fitted(declared)).without_effects(missing)
+
+    def fitted(self, terms: Sequence[Term]) -> ModelFit:
+        """The model of these terms on the training part, fitted once: the search and the hold-out set ask for the same ones."""
+        for model in self._fits:
+            if len(model.terms) == len(terms) and all(map(is_, model.terms, terms)):
+                return model
+        self._fits.append(fit_model(self.readings, terms, used=self.used))
+        return self._fits[-1]
+
+    def refit(self, model: ModelFit, terms: Sequence[Term]) -> ModelFit:
+        """Fit other terms to the readings that a model was fitted to."""
+        if model.used is self.used:
+            return self.fitted(terms)
+        return fit_model(self.readings, terms, used=model.used)
+
+    def score(self, state: AxisState) -> Round:
+        """Score the library; effects worth it are looked at more closely before they are compared, and are confirmed."""
+        model = state.model
+        scorer = CandidateScorer.of(model, self.rng)
+        families, faults = self.families(state, self.readings.seconds.size)
+        if not families:
+            return Round((), tuple(faults))
+        products = scorer.products([candidate for candidates in families.values() for candidate in candidates])
+        scores, decisions = score_effects(families, scorer.gains_by(products), level=SEARCH_LEVEL)
+        limits = [] if state.rounds else detection_limits(scorer, products, model, families, scores, self.effects)
+        measured = partial(scorer.gains, simulated=False)
+        worth = [
+            refine(score, partial(self.near, score.name, model), measured)
+            for score in scores
+            if score.candidate is not None and score.p_value < LEVEL_TO_CONFIRM
+        ]
+        confirmed = {score.name: score for score in scorer.confirm(worth, families)}
+        closer = [confirmed.get(score.name, score) for score in scores]
+        best_first = tuple(sorted(closer, key=lambda score: -score.excess))
+        return Round(best_first, (*faults, *decisions), detection_limits=tuple(limits))
+
+    def refuse(self, score: Score, model: ModelFit) -> Decision | None:
+        """Refuse an effect that these readings do not identify, and an event that faster drift about its instant explains as well."""
+        refusal = refuse(score.name, self.effects[score.name].excited_by, score.best, AxisGrounds(model))
+        return refusal or refuse_in_heteroscedastic_drift(score, model)
+
+    def loss_without(self, model: ModelFit, term: Term) -> float:
+        """Log-likelihood lost without a term, the drift's variances kept."""
+        kept = [other for other in model.terms if other is not term]
+        return 0.5 * model.fit.response.size * float(np.log(refit_fixed(model, kept).rss / model.fit.rss))
+
+    def hold_out_error(self, terms: Sequence[Term]) -> float:
+        """Open-loop error on the hold-out cycles, root mean square, um."""
+        return rmse(self.hold_out_errors(terms))
+
+    def hold_out_errors(self, terms: Sequence[Term]) -> Array:
+        """Open-loop errors on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
+        if not any(self.is_late(term) for term in terms):
+            return self.fitted(terms).open_loop_errors()[0]
+        half = self.readings.target_index % 2 == 0
+        errors = np.full(self.used.size, np.nan)
+        for fitted in (half, ~half):
+            used = self.used | fitted
+            errors[~used] = fit_model(self.readings, terms, used=used).open_loop_errors()[0]
+        return errors[~self.used]
+
+    def is_late(self, term: Term) -> bool:
+        """Whether a term is an event among the hold-out cycles, of which the cycles before say nothing."""
+        first = self.readings.seconds[~self.used].min()
+        cycle_s = float(np.median(np.diff(cycle_starts(self.readings))))
+        return term.candidate.event_s is not None and term.candidate.event_s >= first - cycle_s
+
+    def has_skill(self, state: AxisState) -> bool:
+        """Whether the final model predicts the hold-out cycles better than the last values and the means before them."""
+        late = any(step.is_from_second_search for step in state.steps)
+        error_um = self.hold_out_error(state.model.terms) if late else state.errors_um[-1]
+        plain = {name: rmse(errors) for name, errors in plain_errors(self.readings, self.used).items()}
+        return has_skill(error_um, plain["last_value"], plain["mean"], state.model.fit.sigma, remainder.DRIFT_SHARE)
+
+    def evaluate_on_hold_out(self, state: AxisState) -> AxisState:
+        """Say what the hold-out set thinks of the strongest candidate that the search could not decide on; it enters in no case."""
+        blocked = state.blocked()
+        for score in state.rounds[-1].scores:
+            if score.candidate is None or score.p_value > _LEVEL_TO_EVALUATE or score.name in blocked:
+                continue
+            refusal = self.refuse(score, state.model)
+            if refusal is not None:
+                state = state.decide(refusal.on_evidence(search_p=score.family_wise_p))
+                continue
+            before_um, after_um, p_value = evaluate_on_hold_out(state.model, score.best, self.rng)
+            errors = {"rmse_before_um": before_um, "rmse_after_um": after_um, "p_value": p_value}
+            question = schema.HoldOutQuestion(
+                effect=score.name, parameters=score.best.parameters, **errors, entered=False
+            )
+            return replace(state, question=question)
+        return state
+
+    def offer(self, name: str, model: ModelFit, near: Candidate | None) -> list[Candidate]:
+        """Candidates of an effect whose event, if they have one, has enough cycles on both sides and is not in the model."""
+        starts = cycle_starts(self.readings.subset(model.used))
+        offered = self.effects[name].candidates(self.readings, model.coefficients(), near)
+        inside = (one for one in offered if one.event_s is None or starts[2] <= one.event_s <= starts[-2])
+        if near is not None:
+            return list(inside)
+        # One event happens once, however its column was weighed when it was found.
+        happened = {(term.effect, term.candidate.event_s) for term in model.terms if term.candidate.event_s is not None}
+        return list(kept_on_disk(one for one in inside if (name, one.event_s) not in happened))
+
+
+def hold_out(readings: Readings) -> tuple[NDArray[np.bool_], str]:
+    """Divide the cycles into a training part and a hold-out set."""
+    numbers = np.unique(readings.cycle)
+    if numbers.size < LEAST_CYCLES:
+        raise LoopError(
+            f"{numbers.size} cycles are too few to hold some out and to model the others; measure at least {LEAST_CYCLES}, better 50"
+        )
+    first = numbers[-max(2, round(HOLD_OUT_SHARE * numbers.size))]
+    return (
+        readings.cycle < first,
+        f"cycles {first} to {numbers[-1]} held out; coefficients frozen at cycle {first - 1}, drift state carried in open loop",
+    )
+
+
+def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, Effect]) -> list[Term]:
+    """Make the terms of the declared model."""
+    terms = []
+    for name in declared:
+        if name not in effects:
+            raise LoopError(f"declared effect {name!r} is not in the library: {', '.join(effects)}")
+        reason = effects[name].needs(readings)
+        if reason is not None:
+            raise LoopError(f"declared effect {name!r} cannot be computed: {reason}")
+        candidates = list(effects[name].candidates(readings, {}, None))
+        if len(candidates) != 1:
+            raise LoopError(
+                f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
+                "search tries it anyway"
+            )
+        if not np.any(candidates[0].columns):
+            raise LoopError(
+                f"declared effect {name!r} is zero at every reading: what it follows does not change during the test; check that the "
+                "frames are not copies of one (camera frozen) and that the logs move, or leave it out of [model] declared"
+            )
+        terms.append(Term(name, replace(candidates[0], prior=effects[name].prior)))
+    return terms
+
+
+def second_search(problem: AxisProblem, state: AxisState) -> AxisState:
+    """Search once more, in all cycles: what acted only in the hold-out set could not be found before."""
+    decided = len(state.steps)
+    if any(decision.reason in FINAL for decision in state.decisions):
+        return state
+    while len(state.steps) < MOST_EFFECTS:
+        state, score = choose(problem, state.scored(problem.score(state)), level=SECOND_LEVEL)
+        if score is None or state.events + (score.name == "step_event") > MOST_EVENTS:
+            return state
+        model = size_camera_errors(
+            fit_model(problem.readings, [*state.model.terms, Term(score.name, score.best)]), problem.effects
+        )
+        state = drop_superfluous(problem, state.entered(model, score, Confirmed.SECOND_SEARCH), first=decided)
+    return state
+
+
+def reject_inconsistent_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
+    """Withdraw the name of an effect whose pattern along the axis is not what the readings show; it was the nearest, not the cause."""
+    wrong = {
+        place: decision
+        for place, decision in inconsistent_patterns(state.model, state.added, problem.effects).items()
+        if not state.errors_um or state.steps[place].is_from_second_search
+    }
+    if not wrong:
+        return state
+    first = min(wrong)
+    places = range(first, len(state.steps))
+    decisions = []
+    for place in places:
+        step = state.steps[place]
+        found_beside = Decision(step.effect, Reason.DEPENDS_ON_WITHDRAWN, {"beside": state.steps[first].effect})
+        decisions.append(wrong.get(place, found_beside).on_evidence(search_p=step.score.family_wise_p))
+    return reject_inconsistent_patterns(problem, withdraw(problem, state, places, decisions))
+
+
+def examine_remainder(model: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> remainder.Remainder:
+    """Describe what a model leaves: a shape among the sites or, where there is none, an unexplained drift of all of them."""
+    left = remainder.examine(model.readings, model.fit, np.random.default_rng(seed), set_aside=set_aside)
+    return left if left.shape else remainder.with_drift(left, model.fit)
+
+
+def set_aside_sites(result: LoopResult, sites: Collection[tuple[int, str]], *, seed: int = 1) -> LoopResult:
+    """Count sites whose anomaly has its own diagnosis no longer as a remainder."""
+    return replace(result, remainder=examine_remainder(result.after, seed, sites))
+
+
+def on_corrected_fields(
+    result: LoopResult,
+    readings: Readings,
+    errors: Collection[str],
+    *,
+    effects: Mapping[str, Effect] | None = None,
+    seed: int = 1,
+) -> LoopResult:
+    """Fit the model again on fields from which the camera's errors have been taken out."""
+    effects = library() if effects is None else effects
+    kept = [term for term in result.after.terms if term.effect not in errors]
+    terms = [recompute_term(term, readings, result.after.coefficients(), effects) for term in kept]
+    used, _ = hold_out(readings)
+    problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
+    model = fit_model(readings, terms)
+    late = {
+        id(term)
+        for term, step in zip(result.state.added, result.state.steps, strict=True)
+        if step.is_from_second_search
+    }
+    decided = [term for term, old in zip(terms, kept, strict=True) if id(old) not in late]
+    errors_um = problem.hold_out_errors(decided)
+    interval = error_interval(errors_um, readings.cycle[~used], np.random.default_rng(seed))
+    return replace(
+        result,
+        declared_coefficients=declared_coefficients(model, len(result.declared)),
+        noise_floor_um=model.fit.sigma,
+        rmse_final_um=interval.rmse_um,
+        hold_out={**result.hold_out, "final": interval},
+        hold_out_errors={**result.hold_out_errors, "final": errors_um},
+        remainder=examine_remainder(model, seed, ()),
+        residual_drift=residual_drift_size(model),
+        after=model,
+    )
+
+
+# Correction of the fields: errors of the camera that the loop found are taken out of the fields, and all is computed
+# again.
+
+#: Standard uncertainties within which the sizes from the drift and from the field agree.
+_AGREEMENT = 3.0
+
+
+class FieldFault(schema.FieldCorrection):
+    """One error of the camera, as the loop found it, with the correction of every frame."""
+
+    course_K: Array
+    """(time,) K, what is to be added to every frame where the pattern is 1."""
+    pattern: Array
+    """(y, x) where it is to be added, and which share of it."""
+
+
+def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldFault]:
+    """Return every error of the camera that entered the model, with the correction of the frames."""
+    errors = []
+    time = fields["time"].values.astype("datetime64[ns]")
+    # The loop counts its seconds from the first reading.
+    read = fused["time"].values.astype("datetime64[ns]")
+    start = read[np.isfinite(fused["deviation"].values) & ~np.isnat(read)].min()
+    frame_cycle = _cycle_of(time, fused)
+    for step in result.steps:
+        if step.effect not in (CAMERA_OFFSET.name, REFLECTED_SOURCE.name):
+            continue
+        size, u = np.array([step.coefficients[0].value, step.coefficients[0].u], float).tolist()
+        if step.effect == CAMERA_OFFSET.name:
+            size = _agreed(size, u, float(step.parameters["jump_of_the_field_K"]))
+            # A microsecond of slack: the instant went through seconds in floating point.
+            late = (time - start) / np.timedelta64(1, "s") >= float(step.parameters["time_s"]) - 1e-6
+            error, pattern = size * late, np.ones(fields["frame_temperature"].shape[1:])
+            text = f"the camera read {size:+.3f} ± {2.0 * u:.3f} K (k = 2) too high"
+        else:
+            patch = find_switching_patch(fields["frame_temperature"])
+            if patch is None:
+                continue
+            # A warm body adds to what the camera sees: the lowest state is the one without it.
+            course = patch.course - patch.course.min()
+            size = _agreed(size, u, 1.0)
+            error, pattern = size * course, patch.pattern
+            height = float(course.max())
+            text = f"a reflected source added up to {size * height:.2f} ± {2.0 * u * height:.2f} K (k = 2) over a patch"
+            size, u = size * height, u * height
+        touched = np.flatnonzero(error)
+        first = int(frame_cycle[touched[0]]) if touched.size else int(frame_cycle[-1])
+        errors.append(
+            FieldFault(
+                effect=step.effect,
+                text=f"{text} from cycle {first} on",
+                size_K=size,
+                size_u_K=u,
+                first_cycle=first,
+                course_K=-np.asarray(error, float),
+                pattern=pattern,
+            )
+        )
+    return errors
+
+
+def _agreed(fitted: float, u: float, seen: float) -> float:
+    """The size that the field shows, or that fitted to the drift where both disagree."""
+    return seen if abs(seen - fitted) <= _AGREEMENT * u else fitted
+
+
+def correct_fields(fields: xr.Dataset, errors: list[FieldFault]) -> xr.Dataset:
+    """Take the camera's errors out of every frame."""
+    if not errors:
+        return fields
+    frames = fields["frame_temperature"]
+    corrected = empty_array(frames.shape, float)
+    for some, values in in_pieces(frames):
+        corrected[some] = values + _correction(errors, some)
+        give_back(corrected)
+    return fields.assign(frame_temperature=frames.copy(data=corrected))
+
+
+def _correction(errors: Sequence[FieldFault], frames: slice | NDArray[np.bool_]) -> Array:
+    """What is to be added to some frames, (some, y, x) K."""
+    return np.asarray(np.sum([one.course_K[frames, None, None] * one.pattern for one in errors], axis=0))
+
+
+def corrected_variables(fields: xr.Dataset, fused: xr.Dataset, errors: list[FieldFault]) -> dict[str, xr.Variable]:
+    """Corrected fields per cycle and the correction of every frame, for fusion.nc."""
+    frames, cycles = fields["frame_temperature"], fields["temperature"]
+    total = fill_array(frames.shape, np.float32, lambda some: _correction(errors, some))
+    temperature, rise = (empty_array(cycles.shape, np.float32) for _ in range(2))
+    frame_cycle = _cycle_of(fields["time"].values.astype("datetime64[ns]"), fused)
+
+    def of_cycle(cycle: int) -> Array:
+        """Mean correction of a cycle's frames, (y, x) K; of one without frames that of the frame before."""
+        own = frame_cycle == cycle
+        if not own.any():
+            own[np.flatnonzero(frame_cycle < cycle)[-1:]] = True
+        return np.asarray(_correction(errors, own).mean(axis=0)) if own.any() else np.zeros(errors[0].pattern.shape)
+
+    start = of_cycle(fields["cycle"].values[0])
+    for (some, mean), (_, risen) in zip(in_pieces(cycles), in_pieces(fields["temperature_rise"]), strict=True):
+        added = np.stack([of_cycle(cycle) for cycle in fields["cycle"].values[some]])
+        temperature[some], rise[some] = mean + added, risen + added - start
+        give_back(temperature, rise)
+    plan = ("plan_y", "plan_x")
+    kelvin = {"units": "K", "units_metadata": "temperature: difference"}
+    why = "; ".join(one.text for one in errors)
+    return {
+        "field_correction": xr.Variable(
+            ("frame_time", *plan),
+            total,
+            {**kelvin, "long_name": "to be added to frame_temperature of fields.nc", "comment": why},
+        ),
+        "temperature_corrected": xr.Variable(
+            ("cycle", *plan),
+            temperature,
+            {"units": "degC", "units_metadata": "temperature: on_scale", "comment": why},
+        ),
+        "temperature_rise_corrected": xr.Variable(("cycle", *plan), rise, {**kelvin, "comment": why}),
+    }
+
+
+def _cycle_of(frame_time: Array, fused: xr.Dataset) -> Array:
+    """Cycle of every frame; those outside all cycles count to the nearest before, or to the first."""
+    bounds = cycle_bounds(fused)
+    place = np.clip(np.searchsorted(bounds[:, 0], frame_time, side="right") - 1, 0, None)
+    return np.asarray(fused["cycle"].values[place])
+
+
+# What is reported: errors of plain predictions and of left-out blocks, and the result.
+
+#: Parts of the training cycles; those of the later half choose the penalty, each predicted from the parts before it.
+_PARTS = 4
+
+
+def plain_errors(readings: Readings, used: NDArray[np.bool_]) -> dict[str, Array]:
+    """Errors of plain predictions of the hold-out readings."""
+    static = _by_site(readings, used)
+    now, late = _standardised(readings, used, ()), _standardised(readings, used, BASELINE_LAGS_MIN)
+    predicted: Mapping[str, Array] = {
+        "last_value": static["last"],
+        "mean": static["mean"],
+        "least_squares": _regressed(readings, used, static["mean"], now, [0.0]),
+        "ridge": _regressed(readings, used, static["mean"], now, PENALTIES.tolist()),
+        "ridge_with_lags": _regressed(readings, used, static["mean"], late, PENALTIES.tolist()),
+    }
+    return {name: (readings.response - values)[~used] for name, values in predicted.items()}
+
+
+def _by_site(readings: Readings, used: NDArray[np.bool_]) -> dict[str, Array]:
+    """Last value and mean of every site's training readings, at every reading (n,); NaN at a site without any."""
+    site = readings.site
+    last, mean = (np.full(site.max() + 1, np.nan) for _ in range(2))
+    for number in np.unique(site[used]):
+        own = readings.response[used & (site == number)]
+        last[number], mean[number] = own[-1], own.mean()
+    return {"last": last[site], "mean": mean[site]}
+
+
+def _standardised(readings: Readings, used: NDArray[np.bool_], lags_min: tuple[float, ...]) -> Array:
+    """Every series and its lagged copies, common and along the axis, freed of each site's mean, of unit variance in training (n, k)."""
+    columns = []
+    for series in readings.series.values():
+        for minutes in (0.0, *lags_min):
+            column = readings.at(series.lagged(60.0 * minutes))
+            columns += [column] if series.values.ndim == 2 else [column, column * readings.share]
+    if not columns:
+        return np.empty((readings.seconds.size, 0))
+    site = readings.site
+    laid = np.column_stack(columns)
+    for number in np.unique(site):
+        here = site == number
+        laid[here] -= laid[here & used].mean(axis=0) if (here & used).any() else np.nan
+    scale = laid[used].std(axis=0)
+    moves = scale > 1e-12
+    return laid[:, moves] / scale[moves]
+
+
+def _regressed(
+    readings: Readings, used: NDArray[np.bool_], mean: Array, columns: Array, penalties: Sequence[float]
+) -> Array:
+    """Prediction by a regression beside every site's mean, (n,), under the penalty that chained best."""
+    y = readings.response - mean
+    if len(penalties) == 1:
+        return np.asarray(mean + columns @ _ridge(columns[used], y[used], penalties[0]))
+    cycles = np.unique(readings.cycle[used])
+    part = np.searchsorted(cycles, readings.cycle) * _PARTS // cycles.size
+    errors = np.zeros(len(penalties))
+    for number in range(_PARTS // 2, _PARTS):
+        before, asked = used & (part < number), used & (part == number)
+        for k, penalty in enumerate(penalties):
+            predicted = columns[asked] @ _ridge(columns[before], y[before], penalty)
+            errors[k] += float(((y[asked] - predicted) ** 2).mean())
+    return np.asarray(mean + columns @ _ridge(columns[used], y[used], penalties[int(np.argmin(errors))]))
+
+
+def _ridge(x: Array, y: Array, penalty: float) -> Array:
+    """Coefficients of a ridge regression; without a penalty those of smallest norm."""
+    normal = x.T @ x / max(1, y.size) + penalty * np.eye(x.shape[1])
+    return np.asarray(np.linalg.lstsq(normal, x.T @ y / max(1, y.size), rcond=None)[0])
+
+
+#: Blocks of cycles, each as long as the hold-out set; all but the first are left out in turn. The first alone knows in which state the
+#: machine was when the log began, so that nothing predicts it.
+_BLOCKS = 5
+
+
+def cross_errors(model: ModelFit, event_s: float | None = None) -> Array:
+    """Errors of predicting blocks of cycles from all others."""
+    errors = np.full(int(model.used.sum()), np.nan)
+    if event_s is not None:
+        blocks = [_around(model, event_s)]
+    else:
+        # Consecutive fifths of the cycles but the first.
+        cycle = model.readings.cycle[model.used]
+        numbers = np.unique(cycle)
+        fifth = np.searchsorted(numbers, cycle) * _BLOCKS // numbers.size
+        blocks = [fifth == number for number in range(1, _BLOCKS)]
+    for block in blocks:
+        errors[block] = _left_out(model, block)
+    return errors
+
+
+def _around(model: ModelFit, event_s: float) -> NDArray[np.bool_]:
+    """A fifth of the cycles around an event, fewer where that would leave none on one side."""
+    cycle = model.readings.cycle[model.used]
+    numbers = np.unique(cycle)
+    later = model.readings.seconds[model.used] >= event_s
+    at = int(np.searchsorted(numbers, cycle[later][0] if later.any() else numbers[-1]))
+    half = max(1, min(numbers.size // (2 * _BLOCKS), at - 1, numbers.size - at - 1))
+    place = np.searchsorted(numbers, cycle)
+    return (place >= at - half) & (place < at + half)
+
+
+def _left_out(model: ModelFit, block: NDArray[np.bool_]) -> Array:
+    """Errors of predicting the readings of a block from those outside it, um."""
+    fit = model.fit
+    system = replace(fit.system, observed=~block)
+    columns = np.column_stack([fit.response, fit.design])
+    whitened, _ = system.whiten(columns)
+    y, x = whitened[:, :1], whitened[:, 1:]
+    for place, prior in model.priors():
+        row = np.zeros((1, x.shape[1]))
+        row[0, place] = fit.sigma / prior.u
+        y, x = np.vstack([y, [[fit.sigma * prior.mean / prior.u]]]), np.vstack([x, row])
+    coefficients = solve(x.T @ x, x.T @ y)[:, 0]
+    levels = system.smooth(columns).levels
+    drift = np.einsum("nc,ncp->np", fit.system.loadings, levels)
+    through = columns[:, 1:] - drift[:, 1:]
+    errors = columns[:, 0] - drift[:, 0] - through @ coefficients
+    site = model.readings.site[model.used]
+    return np.where(np.isin(site, site[~block]), errors, np.nan)[block]
+
+
+class AddedEffect(schema.AxisStep):
+    """An effect that was added, with the errors by which it is judged where the hold-out set says nothing of it.
+
+    An error on the hold-out set is NaN for an effect that entered when that set had been opened.
+    """
+
+    cross_errors_before_um: Array
+    """(n,) errors of predicting blocks of all cycles from the others without it, NaN where there is none; of an event only its block."""
+    cross_errors_after_um: Array
+    """(n,) the same with it."""
+
+
+@dataclass(frozen=True, repr=False)
+class LoopResult:
+    """Result of the closed loop; it prints a summary, and `plot` draws its errors.
+
+    Attributes
+    ----------
+    declared : list of str
+        Names of the declared effects.
+    declared_coefficients : list of DeclaredCoefficient
+        Their coefficients beside the effects that are confirmed.
+    held_out : str
+        Which cycles were held out, in words.
+    noise_floor_um : float, um
+        Standard deviation of one reading about the final model.
+    rmse_declared_um, rmse_final_um : float, um
+        Hold-out error of the declared model, and with the effects that were decided on the training part.
+    hold_out : mapping of str to ErrorInterval
+        The same errors with their intervals, as ``declared`` and ``final``, and those of plain predictions.
+    hold_out_errors : mapping of str to (n_held_out,) ndarray, um
+        The errors of single readings behind them, by the same names.
+    skill : bool
+        Whether the model predicts the hold-out cycles better than their last values and means.
+    steps : list of AddedEffect
+        Effects that were added.
+    unnamed : mapping of str to float
+        Effects that are significant and have no name, with their p-value.
+    remainder : Remainder
+        Structure that the final model leaves.
+    residual_drift : ResidualDrift
+        Size of the unexplained drift.
+    state : LoopState
+        The last state of the loop: every round and every decision.
+    before, after : ModelFit
+        The declared model on the training part, and the final model on all cycles.
+    """
+
+    declared: list[str]
+    declared_coefficients: list[schema.DeclaredCoefficient]
+    held_out: str
+    noise_floor_um: float
+    rmse_declared_um: Number
+    rmse_final_um: Number
+    hold_out: Mapping[str, schema.ErrorInterval]
+    hold_out_errors: Mapping[str, Array]
+    skill: bool
+    steps: list[AddedEffect]
+    unnamed: Mapping[str, float]
+    remainder: Remainder
+    residual_drift: schema.ResidualDrift
+    state: LoopState[ModelFit]
+    before: ModelFit
+    after: ModelFit
+
+    def __repr__(self) -> str:
+        added = ", ".join(f"{step.effect} (p = {step.p_value:.2g})" for step in self.steps) or "nothing"
+        return (
+            f"LoopResult: {self.verdict}; declared {', '.join(self.declared) or 'nothing'}; added {added}; "
+            f"held-out error {self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} um"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {text}" for name, text in self._summary())
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in self._summary())
+        return f"<table>{''.join(rows)}</table>"
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """Names and texts of what was found."""
+        added = [
+            (
+                "added",
+                f"{step.effect} ({', '.join(map(_words_of, step.parameters.items()))}), p = {step.p_value:.2g}, "
+                f"{'confirmed' if step.confirmed else 'not confirmed'}",
+            )
+            for step in self.steps
+        ]
+        return [
+            ("verdict", self.verdict.replace("_", " ")),
+            ("declared", ", ".join(self.declared) or "nothing"),
+            *(added or [("added", "nothing")]),
+            ("held out", self.held_out),
+            ("held-out error", f"{self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} µm"),
+            ("last value repeated", f"{self.rmse_persistence_um:.3g} µm"),
+            ("noise floor", f"{self.noise_floor_um:.3g} µm"),
+            ("what remains", self.remainder.shape or "nothing that these data show"),
+        ]
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Plot the errors on the hold-out set with their 95 % intervals; see `fusion.results.plots.plot_loop`."""
+        from fusion.results.plots import plot_loop
+
+        return plot_loop(self, ax)
+
+    @property
+    def rmse_persistence_um(self) -> Number:
+        """Hold-out error of repeating every site's last reading of the training part, um."""
+        return self.hold_out["last_value"].rmse_um
+
+    @property
+    def verdict(self) -> schema.Verdict:
+        """Word for the outcome."""
+        return verdict(
+            confirmed=any(step.confirmed for step in self.steps),
+            doubtful=not all(step.confirmed for step in self.steps),
+            tested=bool(self.unnamed) or self.remainder.is_tested,
+            remains=bool(self.remainder.shape),
+            skill=self.skill,
+        )
+
+    def described(
+        self,
+        residual_tests: schema.ResidualTestsPart,
+        *,
+        field_corrections: Sequence[schema.FieldCorrection] = (),
+        axis_line: schema.AxisLine | None = None,
+    ) -> schema.AxisLoop:
+        """Return the part ``loop`` of results.json, with what was found beside the loop."""
+        return schema.AxisLoop(
+            declared=self.declared,
+            declared_coefficients=self.declared_coefficients,
+            held_out=self.held_out,
+            noise_floor_um=self.noise_floor_um,
+            rmse_persistence_um=self.rmse_persistence_um,
+            rmse_declared_um=self.rmse_declared_um,
+            rmse_final_um=self.rmse_final_um,
+            **errors_of_predictions(self.hold_out),
+            steps=self.steps,
+            verdict=self.verdict,
+            unconfirmed_effects=self.unnamed,
+            unexplained=self._unexplained(),
+            residual_drift=self.residual_drift,
+            held_out_test=self.state.question or schema.Nothing(),
+            search=[[_score_of(score) for score in scored.scores] for scored in self.state.rounds],
+            identifiability=[limit for scored in self.state.rounds for limit in scored.detection_limits],
+            not_tried=self.state.not_tried(),
+            not_admitted=self.state.blocked(),
+            field_corrections=field_corrections,
+            residual_tests=residual_tests,
+            axis_line=axis_line,
+        )
+
+    def _unexplained(self) -> schema.AxisUnexplained:
+        """What is left, with the effect that explains the largest share of it."""
+        added = {step.effect for step in self.steps}
+        scores = [score for scored in self.state.rounds for score in scored.scores]
+        others = [score for score in scores if score.candidate and score.name not in added]
+        nearest: dict[str, Any] = {"closest_effect": "", "closest_effect_p": None, "closest_effect_share": None}
+        if self.remainder.shape and others:
+            shares = [self.remainder.share_of(np.asarray(score.best.columns)) for score in others]
+            best = int(np.argmax(shares))
+            nearest = {
+                "closest_effect": others[best].name,
+                "closest_effect_p": others[best].family_wise_p,
+                "closest_effect_share": shares[best],
+            }
+        left = self.remainder
+        return schema.AxisUnexplained(shape=left.shape, rms_um=left.rms_um, p_value=left.p_value, **nearest)
+
+
+def _words_of(parameter: tuple[str, Any]) -> str:
+    """Name and value of a parameter, numbers to three digits."""
+    name, value = parameter
+    return f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+
+
+def _score_of(score: Score) -> schema.AxisScore:
+    confirmation = score.confirmation or Confirmation(False, Confirmed.LATER_CYCLES)
+    return schema.AxisScore(
+        effect=score.name,
+        parameters=score.candidate.parameters if score.candidate else {},
+        gain=score.gain,
+        excess_gain=score.excess,
+        p_value=score.p_value,
+        family_wise_p=score.family_wise_p,
+        held_out_gain=confirmation.gain,
+        held_out_p=confirmation.p_value,
+        collinear_share=score.collinear,
+    )
+
+
+def report_steps(state: LoopState[ModelFit], wrong: Mapping[int, Decision]) -> list[AddedEffect]:
+    """Describe the steps of a loop whose hold-out set has been opened."""
+    return [_added_effect(state, place, wrong.get(place)) for place in range(len(state.steps))]
+
+
+def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None) -> AddedEffect:
+    model, term, step = state.model, state.added[place], state.steps[place]
+    event_s = term.candidate.event_s
+    tied, runner_up = rivals(step.score, step.round.scores)
+    before_um, after_um, without_um = (np.nan,) * 3
+    if not step.is_from_second_search:
+        before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
+    without = fit_model(model.readings, state.kept([place]), used=model.used)
+    cross_before_um, cross_after_um = (cross_errors(one, event_s) for one in (without, model))
+    event_cycle = None
+    if event_s is not None:
+        # The cycle of the first reading at or after the event.
+        later = np.flatnonzero(model.readings.seconds >= event_s)
+        event_cycle = int(model.readings.cycle[later[0] if later.size else -1])
+    # The drift that is carried into the hold-out set has learnt an early step by then, and what happened only in the hold-out set makes
+    # every error there larger.
+    held_out_tells = event_s is None and not any(one.is_from_second_search for one in state.steps)
+    if wrong is not None:
+        doubt = wrong.sentence
+    elif held_out_tells:
+        doubt = doubt_of(state.errors_um[-1], without_um, model.fit.sigma, "on the hold-out set")
+    else:
+        errors_um = rmse(cross_after_um), rmse(cross_before_um)
+        doubt = doubt_of(*errors_um, model.fit.sigma, "of blocks that are left out")
+    return AddedEffect(
+        effect=term.effect,
+        parameters=term.candidate.parameters,
+        parameter_ranges=step.score.ranges,
+        coefficients=coefficients_of(model, term),
+        p_value=step.score.family_wise_p,
+        held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
+        rmse_before_um=before_um,
+        rmse_after_um=after_um,
+        rmse_without_um=without_um,
+        cross_errors_before_um=cross_before_um,
+        cross_errors_after_um=cross_after_um,
+        cross_rmse_before_um=rmse(cross_before_um),
+        cross_rmse_after_um=rmse(cross_after_um),
+        rms_um=_size(model, term),
+        tied=tied,
+        runner_up=runner_up,
+        confirmed=not doubt,
+        doubt=doubt,
+        confirmed_by=str(step.confirmed),
+        event_cycle=event_cycle,
+    )
+
+
+def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:
+    """Coefficients of the declared effects, and how far they move when parts of the readings are left out."""
+    spread = coefficient_spread(model)
+    return [
+        schema.DeclaredCoefficient(effect=term.effect, jackknife_u=moved, **coefficient.model_dump(exclude_unset=True))
+        for term in model.terms[:declared]
+        for coefficient, moved in zip(coefficients_of(model, term), spread[model.place(term)], strict=True)
+    ]
+
+
+def coefficients_of(model: ModelFit, term: Term) -> list[schema.Coefficient]:
+    """Coefficients of a term with standard uncertainty and unit, and with the prior that went into the first one."""
+    place, prior = model.place(term), term.candidate.prior
+    values, u = model.fit.coefficients[place], model.fit.coefficients_u[place]
+    expected = {} if prior is None else {"prior": prior.mean, "prior_u": prior.u}
+    return [
+        schema.Coefficient(value=value, u=spread, unit=unit, **({} if k else expected))
+        for k, (value, spread, unit) in enumerate(zip(values, u, term.candidate.units, strict=True))
+    ]
+
+
+def _size(model: ModelFit, term: Term) -> float:
+    """Root mean square of a term's contribution after its mean at every site is removed, um."""
+    series = model.series(term)[0]
+    site = model.readings.site
+    total = np.bincount(site, series, minlength=site.max() + 1)
+    number = np.maximum(np.bincount(site, minlength=site.max() + 1), 1)
+    return float(np.sqrt(np.mean((series - (total / number)[site]) ** 2)))
+
+
+def rmse(errors: Array) -> float:
+    """Root mean square of errors, those of sites without a prediction left out."""
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def residual_drift_size(model: ModelFit) -> schema.ResidualDrift:
+    """Size of the unexplained drift beside profile and effects: of its common part and of its stretch."""
+    drift, _ = unexplained_drift(model.fit)
+    common, stretch = model.fit.drift_rate[:2]
+    sizes = {
+        "common_rms_um": np.sqrt(np.mean(drift[:, 0] ** 2)),
+        "stretch_rms_um": np.sqrt(np.mean(drift[:, 1] ** 2)),
+    }
+    if model.fit.system.order == 1:
+        return schema.ResidualDrift(
+            kind="random walk", **sizes, common_um_per_sqrt_h=common, stretch_um_per_sqrt_h=stretch
+        )
+    return schema.ResidualDrift(
+        kind="integrated random walk", **sizes, common_um_in_1_h=common, stretch_um_in_1_h=stretch
+    )

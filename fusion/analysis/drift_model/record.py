@@ -1,0 +1,1354 @@
+"""The closed loop on a record: sensors examined, candidates made, scored, confirmed and predicted, the result and what remains.
+
+Every channel has a drift and coefficients of its own. Whether an effect is there is asked under a drift in every channel that may
+explain the same thing (generalised least squares); it enters only if the parts of the training time that follow are also predicted
+better with it. What the model predicts for hours ahead is asked of coefficients that are shrunk together, how strongly decided by forward
+chaining: many alike sensors determine their coefficients badly, and such coefficients extrapolate badly. The procedure is that of
+:mod:`fusion.analysis.drift_model.search`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
+from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualStructure, permutation_test
+from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
+from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems
+from fusion.analysis.drift_model.gains import by_width, profile_gains
+from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk
+from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
+from fusion.analysis.drift_model.search import (
+    BASELINE_LAGS_MIN,
+    BUILT_IN,
+    HOLD_OUT_SHARE,
+    MOST_EFFECTS,
+    PENALTIES,
+    Confirmation,
+    Confirmed,
+    Decision,
+    Gains,
+    LoopState,
+    Problem,
+    Progress,
+    Reason,
+    Round,
+    Score,
+    doubt_of,
+    error_interval,
+    errors_of_predictions,
+    exceeds_noise,
+    has_skill,
+    no_progress,
+    not_confirmed,
+    open_hold_out,
+    refine,
+    rivals,
+    score_effects,
+    search,
+    verdict,
+    withdraw,
+)
+from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
+from fusion.analysis.effects.events import detect_jumps, periods_min
+from fusion.analysis.effects.library import library
+from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
+from fusion.common import Array
+from fusion.results import loop as schema
+from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
+from interferometry.drift.kalman import DriftModelError
+
+# Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training
+# part.
+
+#: Times that runs are left out at most; of more runs several are left out together.
+MOST_LEFT_OUT = 8
+#: Share of the training blocks that must lie before a part for its prediction to be counted.
+_LATER = 0.5
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A prediction of all blocks of a record from some of them.
+
+    Attributes
+    ----------
+    predicted : (blocks, channels) um
+    coefficients : (p, channels) of the columns, um per unit of each
+    centre : (p,) values of the columns at which the prediction is the channel's mean
+    penalty : the shrinkage that forward chaining chose
+    chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN where there is none
+    """
+
+    predicted: Array
+    coefficients: Array
+    centre: Array
+    penalty: float
+    chained_rmse: float
+
+
+def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Prediction:
+    """Predict every block of a record from the training blocks alone."""
+    asked = folds(record, train)
+    errors = np.full((len(asked), PENALTIES.size), np.nan)
+    for place, (before, part) in enumerate(asked):
+        for k, (predicted, _, _) in enumerate(_paths(record, columns, before)):
+            errors[place, k] = rmse(record, predicted, part)
+    mean = known_mean(errors, axis=0)
+    best = int(np.argmin(mean)) if np.isfinite(mean).all() else PENALTIES.size // 2
+    return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
+
+
+def folds(record: Record, train: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Blocks that are predicted for the choice of the penalty, and those that they are predicted from."""
+    runs = np.unique(record.run[train])
+    if runs.size > 1:
+        left_out = [np.isin(record.run, some) for some in np.array_split(runs, min(runs.size, MOST_LEFT_OUT))]
+        return [(train & ~some, train & some) for some in left_out]
+    return [(train & (record.chained < one), train & (record.chained == one)) for one in chained_parts(record, train)]
+
+
+def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
+    """Last training value of every channel in every run; in a run without any, its zero."""
+    last = np.zeros(record.displacement.shape)
+    for run in range(len(record.first)):
+        here = record.run == run
+        for channel, column in enumerate(record.displacement.T):
+            values = column[train & here & np.isfinite(column)]
+            last[here, channel] = values[-1] if values.size else 0.0
+    return last
+
+
+def predict_left_out(record: Record, columns: Array, penalty: float) -> Array:
+    """Predict every part of a record, or every run of several, from all others, earlier and later ones."""
+    predicted = np.full(record.displacement.shape, np.nan)
+    place = int(np.flatnonzero(penalty == PENALTIES)[0])
+    numbers = record.run if record.runs else record.chained
+    for number in np.unique(numbers):
+        part = numbers == number
+        predicted[part] = _paths(record, columns, ~part)[place][0][part]
+    return predicted
+
+
+def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
+    """Parts of the training blocks that are predicted from those before them: those of the later half."""
+    numbers, counts = np.unique(record.chained[train], return_counts=True)
+    before = np.cumsum(counts) - counts
+    return [int(number) for number, rows in zip(numbers, before, strict=True) if rows >= _LATER * counts.sum()]
+
+
+def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
+    """Root mean square error over some blocks, mean over the channels that were measured there."""
+    return float(known_mean(channel_rmse(record, predicted, where)))
+
+
+def known_mean(values: Array, axis: int | None = None) -> Array:
+    """Mean over the values that are known, NaN where there is none."""
+    known = np.isfinite(values)
+    number = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
+
+
+def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
+    """Root mean square error of every channel over some blocks."""
+    squares = (record.displacement - predicted)[where] ** 2
+    number = np.isfinite(squares).sum(axis=0)
+    return np.asarray(np.sqrt(np.where(number > 0, np.nansum(squares, axis=0) / np.maximum(number, 1), np.nan)))
+
+
+def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array, Array]]:
+    """Predictions (blocks, channels), coefficients (p, channels) and centre (p,) under every penalty."""
+    centre, scale = columns[train].mean(axis=0), columns[train].std(axis=0)
+    scale = np.where(scale > 0.0, scale, np.inf)
+    standard = (columns - centre) / scale
+    coefficients = np.zeros((PENALTIES.size, columns.shape[1], len(record.channels)))
+    levels = np.zeros((PENALTIES.size, len(record.channels)))
+    for channel in range(len(record.channels)):
+        here = train & np.isfinite(record.displacement[:, channel])
+        x, y = standard[here], record.displacement[here, channel]
+        # A channel that misses blocks has its mean where the columns of the others have theirs.
+        offset, middle = x.mean(axis=0), float(y.mean())
+        values, vectors = np.linalg.eigh((x - offset).T @ (x - offset) / here.sum())
+        projected = vectors.T @ ((x - offset).T @ (y - middle) / here.sum())
+        coefficients[:, :, channel] = (projected / (np.maximum(values, 0.0) + PENALTIES[:, None])) @ vectors.T
+        levels[:, channel] = middle - coefficients[:, :, channel] @ offset
+    return [(standard @ one + levels[k], one / scale[:, None], centre) for k, one in enumerate(coefficients)]
+
+
+# Plain predictions of a record's hold-out set, which the model has to beat: last value, mean, and regressions on all
+# that was logged.
+
+
+def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Array]:
+    """Predict every block of a record without a model of the machine."""
+    now = np.column_stack([record.rise, *(values for powers in record.drivers.values() for values in powers.values())])
+    late = [record.series(now, "1").lagged(60.0 * minutes).values for minutes in BASELINE_LAGS_MIN]
+    design = np.column_stack([np.ones(train.size), now])
+    least_squares = np.empty(record.displacement.shape)
+    for channel, response in enumerate(record.displacement.T):
+        here = train & np.isfinite(response)
+        # The solution of smallest norm where columns depend on each other.
+        least_squares[:, channel] = design @ np.linalg.lstsq(design[here], response[here], rcond=None)[0]
+    return {
+        "last_value": last_values(record, train),
+        "mean": np.broadcast_to(known_mean(record.displacement[train], axis=0), record.displacement.shape),
+        "least_squares": least_squares,
+        "ridge": predict(record, now, train).predicted,
+        "ridge_with_lags": predict(record, np.column_stack([now, *late]), train).predicted,
+    }
+
+
+# Hold-out set and declared model of a record.
+
+#: Runs that a sentence names.
+_MOST_NAMED = 4
+
+
+def hold_out(record: Record) -> tuple[NDArray[np.bool_], str]:
+    """Divide a record into a training part and a hold-out set: the runs that are held out, or the last fifth of the
+    time of a single run.
+    """
+    if record.runs:
+        train = ~np.array([one.held_out for one in record.runs])[record.run]
+        named, others = ([one.name for one in record.runs if one.held_out is out] for out in (True, False))
+        description = f"{_named(named)} held out; coefficients from {_named(others)}, every run from its own zero"
+    else:
+        first = record.seconds[0] + (1.0 - HOLD_OUT_SHARE) * (record.seconds[-1] - record.seconds[0])
+        train = record.seconds < first
+        last_h = record.seconds[-1] / 3600.0
+        description = (
+            f"{first / 3600.0:.1f} h to {last_h:.1f} h held out; coefficients from the time before, nothing re-zeroed"
+        )
+    description += "; error is the mean over channels"
+    if not np.isfinite(record.displacement[~train]).any():
+        raise RecordError(
+            f"no displacement was measured in what is held out ({description}); leave the end of the record out"
+        )
+    return train, description
+
+
+def _named(runs: Sequence[str]) -> str:
+    """Runs in words, the first of them by name."""
+    shown = ", ".join(runs[:_MOST_NAMED]) + (f" and {len(runs) - _MOST_NAMED} more" if len(runs) > _MOST_NAMED else "")
+    return f"run {shown}" if len(runs) == 1 else f"runs {shown}"
+
+
+def declare(declared: Sequence[str], record: Record) -> list[Term]:
+    """Make the terms of the declared model."""
+    terms = []
+    for name in declared:
+        if name != QUASI_STATIC:
+            raise RecordError(
+                f'declared effect {name!r} cannot be computed from a record; declare "{QUASI_STATIC}" (every displacement linear '
+                "in the temperatures), the search tries the rest of the library"
+            )
+        terms += [Term(QUASI_STATIC, one) for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
+    return terms
+
+
+#: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
+_LEAST_PER_COEFFICIENT = 2
+#: Blocks per column of one effect; what has more columns is reduced to its principal components for the test.
+_PER_COLUMN = 8
+
+
+@dataclass(frozen=True)
+class RecordFit:
+    """A model fitted to a part of a record.
+
+    Attributes
+    ----------
+    record, used : the record, and the blocks (blocks,) that the fit was made from
+    terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
+    channels : the generalised least-squares fit of every channel under its own drift
+    rows : the blocks of each channel's fit, as indices
+    levels : number of each channel's constants, the first columns of its design: one for every run
+    """
+
+    record: Record
+    used: NDArray[np.bool_]
+    terms: tuple[Term, ...]
+    channels: tuple[DriftFit, ...]
+    rows: tuple[NDArray[np.intp], ...]
+    levels: tuple[int, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Noise of one block mean in every channel, um."""
+        return np.array([fit.sigma for fit in self.channels])
+
+
+def columns_of(record: Record, terms: Sequence[Term]) -> Array:
+    """Columns of all terms side by side."""
+    return np.concatenate([np.empty((record.seconds.size, 0)), *(term.candidate.columns for term in terms)], axis=1)
+
+
+def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -> RecordFit:
+    """Fit every channel by itself: a constant for every run, terms, and a drift whose order and size come from restricted likelihood."""
+    most = int(used.sum()) // _PER_COLUMN
+    parts = [_leading(np.asarray(term.candidate.columns), used, most) for term in terms]
+    columns = np.concatenate([columns_of(record, []), *parts], axis=1)
+    columns = columns[:, independent(columns[used])]
+    rng = np.random.default_rng(0)
+    fits, rows, levels = [], [], []
+    for k, name in enumerate(record.channels):
+        response = record.displacement[:, k]
+        here = np.flatnonzero(used & np.isfinite(response))
+        design, constants = _with_levels(record, columns, here)
+        if here.size < _LEAST_PER_COEFFICIENT * design.shape[1]:
+            raise RecordError(
+                f'channel "{name}" has {here.size} blocks for a model of {design.shape[1]} coefficients; record for longer, or leave it '
+                "out of [record]"
+            )
+        # A displacement that follows the columns exactly leaves no noise to weigh with: it is given a millionth of its range.
+        shaken = response[here] + 1e-6 * np.ptp(response[here]) * rng.standard_normal(here.size)
+        fits.append(_estimate(name, record.seconds[here], shaken, design))
+        rows.append(here)
+        levels.append(constants)
+    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows), tuple(levels))
+
+
+def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> DriftFit:
+    """Robust estimate of one channel; where a column differs from others only in outliers, all blocks count alike."""
+    loadings = np.ones((seconds.size, 1))
+    try:
+        return estimate(seconds, loadings, response, design, robust=True)
+    except DriftModelError:
+        pass
+    try:
+        return estimate(seconds, loadings, response, design)
+    except DriftModelError as error:
+        raise RecordError(
+            f'channel "{channel}" cannot be fitted ({error}); leave it, or sensors that hardly move, out of [record]'
+        ) from None
+
+
+def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> tuple[Array, int]:
+    """Design of one channel at its blocks: a constant for every run, then the columns; and the number of constants."""
+    run = record.run[here]
+    later = np.unique(run)[1:]
+    if not later.size:
+        return np.column_stack([np.ones(here.size), columns[here]]), 1
+    levels = (run[:, None] == later).astype(float)
+    both = np.column_stack([levels, columns[here]])
+    return np.column_stack([np.ones(here.size), both[:, independent(both)]]), 1 + later.size
+
+
+def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:
+    """The columns, or where there are more than `most` their leading principal components over the used blocks (blocks, most)."""
+    if columns.shape[1] <= most:
+        return columns
+    centre, scale = columns[used].mean(axis=0), columns[used].std(axis=0)
+    standard = (columns - centre) / np.where(scale > 0.0, scale, np.inf)
+    _, _, directions = np.linalg.svd(standard[used], full_matrices=False)
+    return np.asarray(standard @ directions[:most].T)
+
+
+def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int) -> list[Array]:
+    """Simulate displacements in which only the model's drifts and noise act."""
+    noises, shocks = [], []
+    for fit in model.channels:
+        noise, share = fit.noise()
+        noises.append(noise / np.sqrt(np.maximum(share, 1e-12)))
+        whitened, _ = fit.system.whiten(fit.residual()[:, None])
+        shocks.append(whitened[:, 0])
+    blocks = model.record.seconds.size
+    laid = np.full((blocks, len(noises)), np.nan)
+    for k, rows in enumerate(model.rows):
+        laid[rows, k] = shocks[k]
+    root = np.linalg.cholesky(_correlation(laid) + 1e-6 * np.eye(len(noises)))
+    correlated = rng.standard_normal((2, blocks, draws, len(noises))) @ root.T
+    picked = rng.integers(0, blocks, (blocks, draws))
+    simulated = []
+    for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
+        pool = np.zeros(blocks)
+        pool[rows] = noises[k]
+        drawn = pool[picked[rows]] * np.sqrt(fit.system.variance)[:, None]
+        ratios = plausible_ratios(fit, rng, draws=draws)[:, 0]
+        first, second = correlated[..., k][:, rows]
+        (walk,) = random_walk(fit.system, [(first, second)])
+        drawn += fit.sigma * np.sqrt(ratios) * walk
+        simulated.append(drawn)
+    return simulated
+
+
+def _correlation(shocks: Array) -> Array:
+    """Correlation of the channels' shocks (blocks, channels), NaN where one is missing; none where too few blocks hold all of them."""
+    channels = shocks.shape[1]
+    known = shocks[np.isfinite(shocks).all(axis=1)]
+    if channels == 1 or known.shape[0] <= channels or not known.std(axis=0).all():
+        return np.eye(channels)
+    clipped = np.clip(known / known.std(axis=0), -3.0, 3.0)
+    return np.corrcoef(clipped.T) if clipped.std(axis=0).all() else np.eye(channels)
+
+
+def channel_gains(model: RecordFit, candidates: Sequence[Candidate], draws: Sequence[Array] = ()) -> Gains:
+    """Gain in log-likelihood of every candidate, all channels together."""
+    draws = draws or [np.empty((rows.size, 0)) for rows in model.rows]
+    total = np.zeros((len(candidates), 1 + draws[0].shape[1]))
+    separable = np.zeros(len(candidates), bool)
+    for fit, rows, drawn in zip(model.channels, model.rows, draws, strict=True):
+        here = np.zeros(model.record.seconds.size, bool)
+        here[rows] = True
+        gains = profile_gains(
+            scaled_systems(fit, SINGLE),
+            np.column_stack([fit.response, drawn]),
+            fit.design,
+            by_width(candidates, here),
+        )
+        total += np.where(gains.separable[:, None], gains.gain, 0.0)
+        separable |= gains.separable
+    widths = np.array([candidate.columns.shape[1] for candidate in candidates])
+    penalty = len(model.channels) * (widths - 1.0)
+    return Gains(total - penalty[:, None], np.zeros(len(candidates), int), separable)
+
+
+# The library of effects for a record: the same physics as along an axis, every channel with coefficients of its own.
+
+#: Name of the mean of all sensors among the sensors that may lag.
+MEAN = "mean of all"
+#: A load acts at once (bearings widen with the speed), warms the part beside it, then what that part is joined to: states a factor of
+#: four apart in their time constants.
+_CHAIN = (0.0, 0.25, 1.0, 4.0)
+#: Time constants of the middle part, min.
+_SOURCE_MIN = (5.0, 10.0, 20.0, 40.0, 80.0)
+#: An event needs this share of the record on either side to be told from a drift.
+_EVENT_MARGIN = 0.05
+#: Instants at which an event is tried.
+_EVENT_INSTANTS = 200
+#: Shares of a block that a closer look tries as the part of it that lies after an event; coarser, and one event needs two steps.
+_SHARES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
+#: A sensor's jump belongs to the sensor alone where it exceeds that of the others' mean so many times.
+_OWN_JUMP = 5.0
+#: A sensor that jumps alone more often is a quick one close to a source, not a faulty one.
+_MOST_FAULTS = 2
+#: Fewer periods than this are no rhythm: any slow drift looks like them.
+_LEAST_PERIODS = 6.0
+
+
+def _thermal_lag(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """Lagged copies of one sensor, or of the mean of all."""
+    block_min = record.block_s / 60.0
+    named = {name: record.rise[:, k] for k, name in enumerate(record.sensors)}
+    named[MEAN] = record.rise.mean(axis=1)
+    for name, rise in named.items():
+        if near is not None and near.parameters["sensor"] != name:
+            continue
+        for minutes in _around(near, LAGS_MIN):
+            if minutes >= 2.0 * block_min:
+                lagged = record.series(rise, "K").lagged(60.0 * minutes).values
+                yield Candidate(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
+
+
+def _unseen_heat_source(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """States of a chain of parts that a driver heats, in proportion to the driver and to its square."""
+    for name, powers in record.drivers.items():
+        if near is not None and near.parameters["follows"] != name:
+            continue
+        for minutes in _around(near, _SOURCE_MIN):
+            states = [
+                record.series(powers[exponent], "1").lagged(60.0 * minutes * share).values
+                for share in _CHAIN
+                for exponent in EXPONENTS
+            ]
+            parameters: dict[str, float | str] = {
+                "follows": name,
+                "time_constant_min": minutes,
+                "chain": "at once, " + ", ".join(f"{minutes * share:.3g} min" for share in _CHAIN[1:]),
+            }
+            yield Candidate(np.column_stack(states), parameters, ("um",) * len(states))
+
+
+def _step_event(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """A level shift at one instant, in every channel by its own amount."""
+    first, last = record.seconds[0], record.seconds[-1]
+    margin = _EVENT_MARGIN * (last - first)
+    if near is None or near.event_s is None:
+        every = max(1, record.seconds.size // _EVENT_INSTANTS)
+        instants = record.seconds[::every]
+    else:
+        instants = record.seconds[np.abs(record.seconds - near.event_s) <= 0.01 * (last - first)]
+    for instant in instants:
+        if not first + margin <= instant <= last - margin:
+            continue
+        for share in (0.0,) if near is None else _SHARES:
+            late = (record.seconds >= instant).astype(float)
+            place = int(np.argmax(late))
+            if record.run[place - 1] == record.run[place]:
+                late[place - 1] = share
+            yield Candidate(late[:, None], {"time_s": float(instant - share * record.block_s)}, ("um",), float(instant))
+
+
+def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """Waves in time."""
+    shortest = 4.0 * record.block_s / 60.0
+    if near is None:
+        periods = periods_min(record.view())
+    else:
+        span = float(record.seconds[-1] - record.seconds[0]) / 60.0
+        periods = 1.0 / (1.0 / float(near.parameters["period_min"]) + np.linspace(-0.5, 0.5, 21) / span)
+    longest = float(record.seconds[-1] - record.seconds[0]) / 60.0 / _LEAST_PERIODS
+    for period in periods[(periods >= shortest) & (periods <= longest)]:
+        phase = 2 * np.pi * record.seconds / (60.0 * period)
+        yield Candidate(np.column_stack([np.cos(phase), np.sin(phase)]), {"period_min": float(period)}, ("um", "um"))
+
+
+def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
+    """Detect sensors that jump alone."""
+    faults = []
+    switched = record.switched()
+    for k in range(len(record.sensors)):
+        others = np.delete(record.rise, k, axis=1)
+        common = others.mean(axis=1) if others.shape[1] else np.zeros(record.seconds.size)
+        own = []
+        runs = record.series(record.rise[:, k], "K").runs()
+        for before, after, size in (jump for run in runs for jump in detect_jumps(run)):
+            at = np.searchsorted(record.seconds, (before, after))
+            alone = abs(size) > _OWN_JUMP * abs(common[at[1]] - common[at[0]])
+            if alone and not switched[at[0] : at[1] + 1].any():
+                own.append((k, after, size))
+        if len(own) <= _MOST_FAULTS:
+            faults += own
+    return faults
+
+
+def _sensor_fault(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """What the jump of a sensor does to the prediction: a step, since the displacement does not follow it."""
+    for k, instant, size in sensor_faults(record):
+        if near is None or near.event_s == instant:
+            late = (record.seconds >= instant).astype(float)
+            parameters: dict[str, float | str] = {"sensor": record.sensors[k], "time_s": instant, "jump_K": size}
+            yield Candidate(late[:, None], parameters, ("um",), instant)
+
+
+def _around(near: Candidate | None, grid: tuple[float, ...]) -> tuple[float, ...]:
+    if near is None:
+        return grid
+    chosen = float(near.parameters["time_constant_min"])
+    return tuple(float(chosen * factor) for factor in np.geomspace(0.6, 1.6, 7))
+
+
+_CANDIDATES = {
+    "thermal_lag": _thermal_lag,
+    "unseen_heat_source": _unseen_heat_source,
+    "step_event": _step_event,
+    "periodic_disturbance": _periodic_disturbance,
+    "sensor_fault": _sensor_fault,
+}
+
+
+@dataclass(frozen=True)
+class RecordEffect:
+    """An effect of the library in a record: a built-in one with columns of its own, a user's with those of the record's readings."""
+
+    effect: Effect
+
+    @property
+    def excited_by(self) -> str:
+        """As in the library."""
+        return self.effect.excited_by
+
+    @property
+    def repeats(self) -> bool:
+        """As in the library."""
+        return self.effect.repeats
+
+    def candidates(self, record: Record, near: Candidate | None) -> Iterator[Candidate]:
+        """Columns (blocks, q) that every channel follows with its own coefficients, for a closer look those near a candidate."""
+        if self.effect.name in _CANDIDATES:
+            return _CANDIDATES[self.effect.name](record, near)
+        return self.effect.candidates(record.view(), {}, near)
+
+    def needs(self, record: Record) -> str | None:
+        """Why it cannot be tried with this record, or None."""
+        if self.effect.name not in _CANDIDATES:
+            return self.effect.needs(record.view())
+        if self.effect.name == "unseen_heat_source" and not record.drivers:
+            return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
+        if self.effect.name == "sensor_fault" and not sensor_faults(record):
+            return "no sensor jumps alone"
+        return None
+
+
+def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, RecordEffect], dict[str, str]]:
+    """Effects that can act in a record, and why the others of the library are not tried."""
+    offered = {name: RecordEffect(effect) for name, effect in (library() if effects is None else effects).items()}
+    not_tried = {name: "a record has no positions" for name in offered if name in BUILT_IN - _CANDIDATES.keys()}
+    return {name: effect for name, effect in offered.items() if name not in not_tried}, not_tried
+
+
+# Grounds of a record: excitation by its drivers, noise of its sensors, and the course of a delayed sensor.
+
+#: A driver of which a single step explains more than this share was switched only once.
+_ONE_SWITCHING = 0.99
+
+
+class RecordGrounds:
+    """Grounds of a record: the record and a model of it without the candidate.
+
+    Parameters
+    ----------
+    model : RecordFit
+        Without the candidate.
+    least_gain : float
+        Log-likelihood that an event has to gain beside a shift at a switching, or it only stands in for that one.
+    """
+
+    def __init__(self, model: RecordFit, *, least_gain: float = 0.0) -> None:
+        self._model = model
+        self._record = model.record
+        self._least_gain = least_gain
+
+    def is_admissible(self, candidate: Candidate) -> bool:
+        """Whether nothing speaks against a candidate before any fit: it is no event at a switching, and no lag of a noisy sensor."""
+        if candidate.event_s is not None:
+            return not self._is_switched(candidate.event_s)
+        if "sensor" not in candidate.parameters:
+            return True
+        _, noise, limit = self.noise_of_lag(candidate)
+        return noise <= limit
+
+    def _is_switched(self, event_s: float) -> bool:
+        return bool(self._record.switched()[np.searchsorted(self._record.seconds, event_s)])
+
+    def at_switching(self, candidate: Candidate) -> float | None:
+        """Hours since the start of the switching at which an event happened, or whose response it stands in for."""
+        if candidate.event_s is None:
+            return None
+        if self._is_switched(candidate.event_s):
+            return candidate.event_s / 3600.0
+        if self._least_gain <= 0.0:
+            return None
+        record = self._record
+        shifts = [
+            Candidate((record.seconds >= instant).astype(float)[:, None], {}, ("um",), float(instant))
+            for instant in record.seconds[record.switched() & self._model.used]
+        ]
+        if not shifts:
+            return None
+        rival = shifts[int(np.argmax(channel_gains(self._model, shifts).gain[:, 0]))]
+        both = replace(candidate, columns=np.column_stack([candidate.columns, rival.columns]), beside=1)
+        gain = float(channel_gains(self._model, [both]).gain[0, 0])
+        return None if gain >= self._least_gain else float(rival.event_s or 0.0) / 3600.0
+
+    def heat_is_logged(self) -> bool:
+        """Whether a driver was logged."""
+        return bool(self._record.drivers)
+
+    def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
+        """Noise of a block mean of the delayed sensor over the range of its rise."""
+        name = str(candidate.parameters["sensor"])
+        record = self._record
+        if name in record.sensors:
+            noise = float(record.temperature_noise[record.sensors.index(name)])
+        else:
+            noise = float(np.sqrt(np.mean(record.temperature_noise**2) / len(record.sensors)))
+        rise = _sensor_rise(record, name)[self._model.used]
+        return name, noise / max(float(np.ptp(rise)), 1e-12), NOISE_SHARE
+
+    def refuse_single_excitation(self, effect: str, excited_by: str, candidate: Candidate) -> Decision | None:
+        """Refuse a source whose driver was switched only once: all single warm-ups are alike."""
+        if excited_by != "driver":
+            return None
+        driver = str(candidate.parameters["follows"])
+        share = one_switching_share(self._record.drivers[driver][1][self._model.used])
+        if share <= _ONE_SWITCHING:
+            return None
+        return Decision(effect, Reason.SINGLE_SWITCHING, {"driver": driver, "share_percent": 100.0 * share})
+
+    def follows_rate(self, candidate: Candidate) -> bool:
+        """Whether most of what a delayed copy explains is the sensor's rate, or acts before the sensor."""
+        model = self._model
+        rise = _sensor_rise(self._record, str(candidate.parameters["sensor"]))
+        weight = {True: 0.0, False: 0.0}
+        for fit, rows, levels in zip(model.channels, model.rows, model.levels, strict=True):
+            course = rise[rows] - rise[rows].mean()
+            size = fit.design.shape[1]
+            together = fit_fixed_effects(
+                fit.system, fit.response, np.column_stack([fit.design, candidate.columns[rows]])
+            )
+            delayed = float(together.coefficients[-1])
+            own = slice(levels, size)
+            share = fit.design[:, own].T @ course / max(float(course @ course), 1e-300)
+            alone, beside = (float(share @ each.coefficients[own]) for each in (fit, together))
+            alone_u = float(np.sqrt(share @ fit.covariance[own, own] @ share))
+            cancels = beside * delayed < 0.0 and abs(beside + delayed) < 0.5 * max(abs(beside), abs(delayed))
+            leads = alone * delayed < 0.0 and abs(alone) > 2.0 * alone_u
+            weight[cancels or leads] += abs(delayed) / max(fit.sigma, 1e-12)
+        return weight[True] > weight[False]
+
+    def advantage_over_smoothing(self, candidate: Candidate) -> float:
+        """Gain over the sensor averaged over a window as wide as the lag's memory."""
+        rise = _sensor_rise(self._record, str(candidate.parameters["sensor"]))
+        smooth = _smoothed(self._record, rise, float(candidate.parameters["time_constant_min"]))
+        gains = channel_gains(self._model, [candidate, Candidate(smooth[:, None], {}, ("um/K",))])
+        return float(gains.gain[0, 0] - gains.gain[1, 0])
+
+
+def _sensor_rise(record: Record, name: str) -> Array:
+    """Rise of one sensor, or of the mean of all, K (blocks,)."""
+    return record.rise[:, record.sensors.index(name)] if name in record.sensors else record.rise.mean(axis=1)
+
+
+def _smoothed(record: Record, values: Array, minutes: float) -> Array:
+    """Mean over a centred window as wide as the lag's memory, without delay, (blocks,)."""
+    half = max(1, round(60.0 * minutes / record.block_s))
+    place = np.arange(values.size)
+    begin = np.asarray(record.first)[record.run]
+    end = np.array([*record.first[1:], values.size])[record.run]
+    first, last = np.maximum(place - half, begin), np.minimum(place + half + 1, end)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray((total[last] - total[first]) / (last - first))
+
+
+def one_switching_share(driver: Array) -> float:
+    """Share of a driver's variance that the best single step explains."""
+    n = driver.size
+    before = np.cumsum(driver)[:-1]
+    count = np.arange(1, n)
+    between = (before / count - (driver.sum() - before) / (n - count)) ** 2 * count * (n - count) / n
+    return float(between.max() / max(float(((driver - driver.mean()) ** 2).sum()), 1e-300))
+
+
+#: Probability of adding an effect where only drift and noise act. A drift that wanders at random is a stand-in for what a real machine
+#: does, and its sensors are late, so the probability is smaller than along an axis: that of an error of three standard deviations.
+ENTRY_LEVEL = 0.001
+#: An effect must bring the error of predicting later parts down to this share of what it was, or it only follows chance.
+MAX_ERROR_RATIO_TO_ENTER = 0.98
+#: An event may make that error larger by this factor: chance, not harm.
+MAX_ERROR_RATIO_OF_EVENT = 1.01
+RecordState = LoopState[RecordFit]
+
+
+class RecordProblem(Problem[RecordFit]):
+    """A record, the blocks of it that may be used, and the library, for :mod:`fusion.analysis.drift_model.search`."""
+
+    effects: Mapping[str, RecordEffect]
+    entry_level = ENTRY_LEVEL
+
+    def __init__(
+        self,
+        record: Record,
+        train: NDArray[np.bool_],
+        effects: Mapping[str, Effect] | None,
+        rng: np.random.Generator,
+    ) -> None:
+        self.record, self.train, self.rng = record, train, rng
+        self.effects, self._not_tried = record_library(effects)
+
+    def start(self, declared: Sequence[Term]) -> RecordState:
+        """The state before the search: the declared model, and the effects that this record cannot show."""
+        missing = {name: effect.needs(self.record) for name, effect in self.effects.items()}
+        return RecordState(fit_record(self.record, declared, self.train)).without_effects(
+            {**self._not_tried, **missing}
+        )
+
+    def refit(self, model: RecordFit, terms: Sequence[Term]) -> RecordFit:
+        """Fit other terms to the blocks that a model was fitted to."""
+        return fit_record(self.record, terms, model.used)
+
+    def score(self, state: RecordState) -> Round:
+        """Score the library under drifts that wander by themselves in every channel."""
+        model = state.model
+        families, faults = self.families(state, self.record.seconds.size)
+        start = self.predict(model.terms).chained_rmse
+        if not families:
+            return Round((), tuple(faults), start)
+        draws = simulate_channels(model, self.rng, draws=DRAWS)
+        gains = channel_gains(model, [candidate for candidates in families.values() for candidate in candidates], draws)
+        scores, decisions = score_effects(
+            families, gains, level=ENTRY_LEVEL, is_admissible=RecordGrounds(model).is_admissible
+        )
+        return Round(tuple(scores), (*faults, *decisions), start)
+
+    def refuse(self, score: Score, model: RecordFit) -> Decision | None:
+        """Refuse an effect that this record does not identify; a user's own effect is only held against the switchings."""
+        excited_by = self.effects[score.name].excited_by if score.name in BUILT_IN else ""
+        return refuse(score.name, excited_by, score.best, RecordGrounds(model, least_gain=score.critical))
+
+    def confirm(self, score: Score, state: RecordState) -> Score:
+        """Look at the effect more closely, and predict the later parts of the training time with it."""
+        score = refine(score, partial(self.near, score.name, state.model), partial(channel_gains, state.model))
+        before = state.rounds[-1].start_error_um
+        after = self.predict([*state.model.terms, Term(score.name, score.best)]).chained_rmse
+        # A level shift is learnt again by the coefficients of the next part, so an event must only not harm.
+        passed = (
+            after < MAX_ERROR_RATIO_TO_ENTER * before
+            or (score.is_event and after <= MAX_ERROR_RATIO_OF_EVENT * before)
+            or not np.isfinite(after)
+        )
+        return replace(score, confirmation=Confirmation(passed, Confirmed.LATER_PARTS, error_um=after))
+
+    def loss_without(self, model: RecordFit, term: Term) -> float:
+        """Log-likelihood lost without a term."""
+        without = self.refit(model, [other for other in model.terms if other is not term])
+        gains = channel_gains(without, [term.candidate])
+        return float(gains.gain[0, 0]) if gains.separable[0] else 0.0
+
+    def hold_out_error(self, terms: Sequence[Term]) -> float:
+        """Error of predicting the blocks that may not be used, mean over the channels, um."""
+        return float(known_mean(channel_rmse(self.record, self.predict(terms).predicted, ~self.train)))
+
+    def predict(self, terms: Sequence[Term]) -> Prediction:
+        """Predict all blocks from the training part."""
+        return predict(self.record, columns_of(self.record, terms), self.train)
+
+    def offer(self, name: str, model: RecordFit, near: Candidate | None) -> list[Candidate]:
+        """Candidates of an effect that vary over the training part."""
+        offered = self.effects[name].candidates(self.record, near)
+        return [one for one in offered if (np.ptp(one.columns[self.train], axis=0) > 0.0).all()]
+
+    def near(self, name: str, model: RecordFit, chosen: Candidate) -> list[Candidate]:
+        """Candidates of an effect about one that was chosen, the chosen one where there is no other."""
+        return super().near(name, model, chosen) or [chosen]
+
+
+class ChainedResult(schema.ChainedPart):
+    """One part of a record, predicted from all before it by a search that had not seen it."""
+
+    channel_rmse_final_um: Array
+    """(channels,) errors of the final model."""
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def search_record(
+    record: Record,
+    train: NDArray[np.bool_],
+    declared: Sequence[Term],
+    *,
+    seed: int = 1,
+    effects: Mapping[str, Effect] | None = None,
+    progress: Progress = no_progress,
+) -> tuple[RecordProblem, RecordState]:
+    """Search the library for what the declared terms lack, on the training part alone."""
+    problem = RecordProblem(record, train, effects, np.random.default_rng(seed))
+    return problem, search(problem, problem.start(declared), progress=progress)
+
+
+def chain_forward(
+    record: Record,
+    declared: Sequence[Term],
+    *,
+    seed: int = 1,
+    effects: Mapping[str, Effect] | None = None,
+    progress: Progress = no_progress,
+) -> list[ChainedResult]:
+    """Predict every part of the record from the third on by the whole procedure applied to the time before it; runs from the other runs."""
+    train, _ = hold_out(record)
+    parts = []
+    asked = chained_folds(record, train)
+    for done, (before, part) in enumerate(asked):
+        progress(done, len(asked), "predicting part after part")
+        problem, state = search_record(record, before, declared, seed=seed, effects=effects)
+        hours = record.seconds[part] / 3600.0
+        final_um = channel_rmse(record, problem.predict(state.model.terms).predicted, part)
+        runs: dict[str, Any] = (
+            {"runs": tuple(record.runs[run].name for run in np.unique(record.run[part]))} if record.runs else {}
+        )
+        parts.append(
+            ChainedResult(
+                first_h=hours[0],
+                last_h=hours[-1],
+                in_training=bool(train[part].all()),
+                effects=tuple(step.effect for step in state.steps),
+                **runs,
+                rmse_persistence_um=known_mean(channel_rmse(record, last_values(record, before), part)),
+                rmse_declared_um=known_mean(channel_rmse(record, problem.predict(state.declared).predicted, part)),
+                rmse_final_um=known_mean(final_um),
+                channel_rmse_final_um=final_um,
+            )
+        )
+    return parts
+
+
+def chained_folds(record: Record, train: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Parts that the whole procedure predicts, and what it predicts them from."""
+    if np.unique(record.run[train]).size > 1:
+        return folds(record, train)
+    within = train if record.runs else np.ones_like(train)
+    return [
+        (within & (record.chained < one), within & (record.chained == one))
+        for one in np.unique(record.chained[within])[2:]
+    ]
+
+
+# Structure in the residual of a record: permutation tests, and a description in words.
+
+#: What may be left beside the noise of a block mean, as a multiple of it: three standard deviations, beyond which a block is off by more
+#: than noise.
+RESIDUAL_SHARE = 3.0
+_COURSE, _RHYTHM, _SWITCHING = "autocorrelation", "periodicity", "switching"
+_WORDS = {
+    _COURSE: "changes that come and go within a few blocks, too quick for the drift",
+    _SWITCHING: "quick responses where a driver is switched",
+}
+#: A wave that holds this share of the course's variance is a rhythm, whatever else is left.
+_RHYTHM_SHARE = 0.5
+_LAGS = 12
+_CLIP = 4.0
+
+
+@dataclass(frozen=True)
+class RecordRemainder(ResidualStructure):
+    """What a model of a record leaves, with the share of each displacement's variance that it leaves in the hold-out set (channels,)."""
+
+    variance_share: Array
+
+
+def examine(model: RecordFit, hold_out_rmse: Array, rng: np.random.Generator) -> RecordRemainder:
+    """Test what is left."""
+    record = model.record
+    innovations = np.zeros(record.displacement.shape)
+    for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
+        whitened, _ = fit.system.whiten(fit.residual()[:, None])
+        scale = 1.4826 * np.median(np.abs(whitened)) or 1.0
+        innovations[rows, k] = np.clip(whitened[:, 0] / scale, -_CLIP, _CLIP)
+    innovations -= innovations.mean(axis=0)
+    switched = record.switched()
+    test = _test(innovations, switched, rng)
+    share = hold_out_rmse**2 / np.nanvar(record.displacement, axis=0)
+    words = _shapes(test, innovations, record, rng) if test.p_value < LEVEL else []
+    error_um, noise_um = float(np.sqrt(known_mean(hold_out_rmse**2))), float(np.sqrt(np.mean(model.sigma**2)))
+    if exceeds_noise(error_um, noise_um, RESIDUAL_SHARE):
+        words.append(
+            f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
+        )
+    shape = " and ".join(words)
+    return RecordRemainder(
+        test.p_value, test.p_values, shape, float(known_mean(hold_out_rmse)) if words else 0.0, share
+    )
+
+
+def _test(innovations: Array, switched: NDArray[np.bool_], rng: np.random.Generator) -> PermutationTest:
+    """Three statistics of the innovations (blocks, channels), blocks being exchangeable where only drift and noise act."""
+    return permutation_test(
+        innovations, lambda matrix: _statistics(matrix, switched), rng.permutation, names=(_COURSE, _RHYTHM, _SWITCHING)
+    )
+
+
+def _shapes(test: PermutationTest, innovations: Array, record: Record, rng: np.random.Generator) -> list[str]:
+    """What a significant test shows, in words."""
+    if test.p_values[_RHYTHM] >= LEVEL:
+        return [_WORDS[test.strongest]]
+    frequency, left, share = _without_wave(innovations)
+    rest = _test(left, record.switched(), rng)
+    if share < _RHYTHM_SHARE and rest.p_values[_COURSE] < LEVEL:
+        return [_WORDS[_COURSE if test.strongest == _RHYTHM else test.strongest]]
+    words = [f"a rhythm of about {record.block_s / 60.0 / frequency:.0f} min"]
+    return [*words, _WORDS[rest.strongest]] if rest.p_value < LEVEL and rest.strongest in _WORDS else words
+
+
+def _without_wave(innovations: Array) -> tuple[float, Array, float]:
+    """Frequency per block of the strongest wave, the innovations without it, and its share of the leading course's variance."""
+    blocks = np.arange(innovations.shape[0])
+    course = _leading_course(innovations)
+    line = _strongest_line(course)[0]
+
+    def wave(frequency: float) -> Array:
+        phase = 2.0 * np.pi * frequency * blocks
+        return np.column_stack([np.cos(phase), np.sin(phase)])
+
+    def left(frequency: float, values: Array) -> Array:
+        return np.asarray(values - wave(frequency) @ np.linalg.lstsq(wave(frequency), values, rcond=None)[0])
+
+    near = (line + np.linspace(-0.5, 0.5, 21)) / blocks.size
+    best = float(min(near, key=lambda one: float((left(one, course) ** 2).sum())))
+    share = 1.0 - float((left(best, course) ** 2).sum()) / float(course @ course)
+    return best, left(best, innovations), share
+
+
+def _leading_course(innovations: Array) -> Array:
+    """The channels' leading common course (blocks,)."""
+    u, s, _ = np.linalg.svd(innovations, full_matrices=False)
+    return np.asarray(u[:, 0] * s[0])
+
+
+def _strongest_line(course: Array) -> tuple[int, float]:
+    """Number of the strongest line of a course's spectrum, and its power over the mean of all lines."""
+    spectrum = np.abs(np.fft.rfft(course))[1 : course.size // 2] ** 2
+    return int(np.argmax(spectrum)) + 1, float(spectrum.max() / spectrum.mean())
+
+
+def _statistics(innovations: Array, switched: NDArray[np.bool_]) -> Array:
+    """Three statistics of the channels' leading common course that grow with structure."""
+    course = _leading_course(innovations)
+    n = course.size
+    power = float(course @ course) / n
+    autocorrelation = np.array([float(course[k:] @ course[:-k]) / n / power for k in range(1, _LAGS + 1)])
+    near = course[switched] ** 2
+    excess = float(near.mean() / power) if near.size else 0.0
+    return np.array([float((autocorrelation**2).sum()), _strongest_line(course)[1], excess])
+
+
+def _largest(record: Record, rmse: Array) -> str:
+    """Channels with the larger errors, in words."""
+    strong = [name for name, error in zip(record.channels, rmse, strict=True) if error >= 0.7 * np.nanmax(rmse)]
+    return "all channels alike" if 1 < len(strong) == len(record.channels) else ", ".join(strong)
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """Result of the closed loop on a record.
+
+    Attributes
+    ----------
+    state : what the search on the training part found, effects that were withdrawn left out
+    record : the record on its blocks
+    hold_out : (blocks,) True for the hold-out set
+    held_out : which part that is, in words
+    predictions : of the declared model and after every added effect, from the training part
+    errors : (1 + effects, channels) their errors on the hold-out set, um
+    plain : (blocks, channels) each, plain predictions from the training part, by name
+    left_out : (blocks, channels) each, predictions of every part from all others, um: by the final model, then without each of its effects
+    whole : the final model fitted to all blocks, for its residual
+    remainder : structure that the final model leaves
+    chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
+    without : predictions of the final model without each of its effects in turn; of a record of several runs
+    """
+
+    state: RecordState
+    record: Record
+    hold_out: NDArray[np.bool_]
+    held_out: str
+    predictions: list[Prediction]
+    errors: Array
+    plain: Mapping[str, Array]
+    left_out: list[Array]
+    whole: RecordFit
+    remainder: RecordRemainder
+    chained: list[ChainedResult]
+    without: list[Prediction] = field(default_factory=list)
+
+    @property
+    def noise_um(self) -> float:
+        """Noise of a block mean, mean over the channels, um."""
+        return float(np.mean(self.whole.sigma))
+
+    @property
+    def cross_um(self) -> list[float]:
+        """Error of predicting every part from all others, um: of the final model, then without each of its effects."""
+        everywhere = np.ones(self.hold_out.size, bool)
+        return [rmse(self.record, predicted, everywhere) for predicted in self.left_out]
+
+    @property
+    def hold_out_intervals(self) -> dict[str, schema.ErrorInterval]:
+        """Errors on the hold-out set with their intervals: of the declared and the final model, and of plain predictions."""
+        declared, final = (self.predictions[k].predicted for k in (0, -1))
+        predicted = {"declared": declared, "final": final, **self.plain}
+        rows = np.flatnonzero(self.hold_out)
+        errors = {name: (self.record.displacement - values)[rows] for name, values in predicted.items()}
+        return {name: error_interval(one, rows, np.random.default_rng(1)) for name, one in errors.items()}
+
+    @property
+    def skill(self) -> bool:
+        """Whether the final model predicts the hold-out set better than last value and mean of the training part."""
+        last, mean = (rmse(self.record, self.plain[name], self.hold_out) for name in ("last_value", "mean"))
+        return has_skill(float(known_mean(self.errors[-1])), last, mean, self.noise_um, RESIDUAL_SHARE)
+
+    @property
+    def doubts(self) -> list[str]:
+        """For every step why the hold-out set does not confirm it; empty where it does."""
+        after = float(known_mean(self.errors[-1]))
+        where = "on the hold-out set"
+        return [doubt_of(after, without, self.noise_um, where) for without in self.state.errors_without_um]
+
+    @property
+    def verdict(self) -> schema.Verdict:
+        """Word for the outcome."""
+        return self._verdict(self.doubts, remains=bool(self.remainder.shape), skill=self.skill)
+
+    def _verdict(self, doubts: Sequence[str], *, remains: bool, skill: bool) -> schema.Verdict:
+        tested = bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested
+        return verdict(confirmed=not all(doubts), doubtful=any(doubts), tested=tested, remains=remains, skill=skill)
+
+    def _run(self, number: int) -> schema.RunPart:
+        """One run, judged by its own errors where it is held out."""
+        described, here = self.record.runs[number], self.record.run == number
+        time = self.record.time[here]
+        last = declared = final = np.nan
+        word: schema.Verdict | Literal[""] = ""
+        if described.held_out:
+            last, mean = (rmse(self.record, self.plain[name], here) for name in ("last_value", "mean"))
+            declared, final = (rmse(self.record, self.predictions[k].predicted, here) for k in (0, -1))
+            doubts = [
+                doubt_of(final, rmse(self.record, one.predicted, here), self.noise_um, "in this run")
+                for one in self.without
+            ]
+            word = self._verdict(
+                doubts,
+                remains=exceeds_noise(final, self.noise_um, RESIDUAL_SHARE),
+                skill=has_skill(final, last, mean, self.noise_um, RESIDUAL_SHARE),
+            )
+        return schema.RunPart(
+            file=described.name,
+            held_out=described.held_out,
+            duration_h=float((time[-1] - time[0]) / np.timedelta64(1, "s") + self.record.block_s) / 3600.0,
+            blocks=int(here.sum()),
+            rmse_persistence_um=last,
+            rmse_declared_um=declared,
+            rmse_final_um=final,
+            verdict=word,
+        )
+
+    def described(self, sensor_faults: Sequence[schema.SensorFaultPart]) -> schema.RecordLoop:
+        """Return the part ``loop`` of results.json; errors are means over the channels."""
+        mean = known_mean(self.errors, axis=1)
+        persistence_um = channel_rmse(self.record, self.plain["last_value"], self.hold_out)
+        last = self.state.rounds[-1].scores
+        runs: dict[str, Any] = (
+            {"runs": [self._run(number) for number in range(len(self.record.runs))]} if self.record.runs else {}
+        )
+        return schema.RecordLoop(
+            declared=[term.effect for term in self.state.declared],
+            held_out=self.held_out,
+            noise_floor_um=self.noise_um,
+            rmse_persistence_um=known_mean(persistence_um),
+            rmse_declared_um=mean[0],
+            rmse_final_um=mean[-1],
+            steps=[self._step(place) for place in range(len(self.state.steps))],
+            **errors_of_predictions(self.hold_out_intervals),
+            verdict=self.verdict,
+            unconfirmed_effects=self.state.unnamed(ENTRY_LEVEL),
+            unexplained=schema.RecordUnexplained(
+                shape=self.remainder.shape,
+                rms_um=self.remainder.rms_um,
+                p_value=self.remainder.p_value,
+                p_values=self.remainder.p_values,
+                variance_share=known_mean(self.remainder.variance_share),
+                closest_effect=last[0].name if self.remainder.shape and last else "",
+            ),
+            channels={
+                name: schema.ChannelErrors(
+                    rmse_persistence_um=persistence_um[k],
+                    rmse_declared_um=self.errors[0, k],
+                    rmse_final_um=self.errors[-1, k],
+                    noise_um=self.whole.sigma[k],
+                    variance_share=self.remainder.variance_share[k],
+                )
+                for k, name in enumerate(self.record.channels)
+            },
+            chained=self.chained,
+            **runs,
+            search=[_round_scores(scored) for scored in self.state.rounds],
+            not_tried=self.state.not_tried(),
+            not_admitted=self.state.blocked(),
+            sensor_faults=sensor_faults,
+        )
+
+    def _step(self, place: int) -> schema.RecordStep:
+        step, term = self.state.steps[place], self.state.added[place]
+        tied, runner_up = rivals(step.score, step.round.scores)
+        squares = self.contribution(term) ** 2
+        return schema.RecordStep(
+            effect=term.effect,
+            parameters=term.candidate.parameters,
+            parameter_ranges=step.score.ranges,
+            p_value=step.score.family_wise_p,
+            rmse_before_um=known_mean(self.errors[place]),
+            rmse_after_um=known_mean(self.errors[place + 1]),
+            rmse_without_um=self.state.errors_without_um[place],
+            cross_rmse_before_um=self.cross_um[1 + place],
+            cross_rmse_after_um=self.cross_um[0],
+            rms_um=np.sqrt(np.mean(squares)),
+            rms_by_channel_um={name: np.sqrt(np.mean(squares[:, k])) for k, name in enumerate(self.record.channels)},
+            chained_rmse_before_um=step.round.start_error_um,
+            chained_rmse_after_um=step.score.error_um,
+            tied=tied,
+            runner_up=runner_up,
+            rejected=_rejected(step.round),
+            confirmed=not self.doubts[place],
+            doubt=self.doubts[place],
+            confirmed_by=str(step.confirmed),
+            event_s=term.candidate.event_s,
+        )
+
+    def contribution(self, term: Term) -> Array:
+        """Contribution of a term to the prediction by the final model, about its mean."""
+        place = place_of(self.state.model.terms, term)
+        series = term.candidate.columns @ self.predictions[-1].coefficients[place]
+        return np.asarray(series - series.mean(axis=0))
+
+
+def _rejected(scored: Round) -> dict[str, str]:
+    """Effects of a round that were significant and not confirmed, with the reason in words."""
+    return {
+        score.name: not_confirmed(score, scored).sentence
+        for score in scored.scores
+        if score.confirmation is not None and not score.is_confirmed
+    }
+
+
+def _round_scores(scored: Round) -> list[schema.RecordScorePart]:
+    rejected = _rejected(scored)
+    return [
+        schema.RecordScorePart(
+            effect=score.name,
+            parameters=score.candidate.parameters if score.candidate else {},
+            gain=score.gain,
+            excess_gain=score.excess,
+            p_value=score.p_value,
+            family_wise_p=score.family_wise_p,
+            chained_rmse_before_um=scored.start_error_um,
+            chained_rmse_after_um=score.error_um,
+            chosen=score.is_confirmed,
+            rejected=rejected.get(score.name, ""),
+        )
+        for score in scored.scores
+    ]
+
+
+# The closed loop on a record: what the quasi-static model of the temperatures lacks, and the error before and after.
+
+
+def close_record(
+    record: Record,
+    declared: Sequence[str],
+    *,
+    seed: int = 1,
+    effects: Mapping[str, Effect] | None = None,
+    progress: Progress = no_progress,
+) -> RecordResult:
+    """Close the loop on a record."""
+    terms = declare(declared, record)
+    train, description = hold_out(record)
+    problem, state = search_record(record, train, terms, seed=seed, effects=effects, progress=progress)
+    chained = chain_forward(record, terms, seed=seed, effects=effects, progress=progress)
+    state = open_hold_out(problem, withdraw_unreplicated(problem, state, chained))
+    progress(MOST_EFFECTS, MOST_EFFECTS, "examining the residual")
+    whole = fit_record(record, state.model.terms, np.ones_like(train))
+    predictions = [problem.predict(some) for some in state.chain]
+    errors = np.array([channel_rmse(record, one.predicted, ~train) for one in predictions])
+    return RecordResult(
+        state=state,
+        record=record,
+        hold_out=~train,
+        held_out=description,
+        predictions=predictions,
+        without=[problem.predict(state.kept([place])) for place in range(len(state.steps))] if record.runs else [],
+        errors=errors,
+        plain=plain_predictions(record, train),
+        left_out=[
+            # The penalty is that from the training part.
+            predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
+            for terms in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
+        ],
+        whole=whole,
+        remainder=examine(whole, errors[-1], np.random.default_rng(seed)),
+        chained=chained,
+    )
+
+
+def withdraw_unreplicated(
+    problem: RecordProblem, state: RecordState, chained: Sequence[schema.ChainedPart]
+) -> RecordState:
+    """Withdraw effects that the same procedure also added on earlier time, and predicted no better with."""
+    for place, step in enumerate(state.steps):
+        tried = [part for part in chained if part.in_training and step.effect in part.effects]
+        if not tried or step.score.is_event:
+            continue
+        before = float(known_mean(np.array([part.rmse_declared_um for part in tried])))
+        after = float(known_mean(np.array([part.rmse_final_um for part in tried])))
+        if after >= MAX_ERROR_RATIO_TO_ENTER * before:
+            evidence = {"parts": len(tried), "without_um": before, "with_um": after}
+            evidence |= dict.fromkeys(("p_value", "search_p"), step.score.family_wise_p)
+            decision = Decision(step.effect, Reason.NOT_REPEATED, evidence)
+            return withdraw_unreplicated(problem, withdraw(problem, state, [place], [decision]), chained)
+    return state
+
+
+@dataclass(frozen=True)
+class SensorHealth:
+    """Sensors that are faulty or suspected.
+
+    Attributes
+    ----------
+    table : the record without the faulty sensors; suspected ones stay
+    names : sensors of the record as it was read
+    faults : in the order of the sensors
+    errors_um : error of the declared model on the hold-out set with a faulty sensor, by sensor; NaN where it has too few readings
+    sound_um : the same without all faulty sensors, um
+    runs : of a record of several runs, the one that shows the fault, by place of the sensor; onsets count from its start
+    """
+
+    table: xr.Dataset
+    names: tuple[str, ...]
+    faults: tuple[SensorFault, ...]
+    errors_um: dict[str, float]
+    sound_um: float
+    runs: dict[int, str] = field(default_factory=dict)
+
+    def described(self) -> list[schema.SensorFaultPart]:
+        """Return the part ``loop.sensor_faults`` of results.json."""
+        return [
+            schema.SensorFaultPart(
+                sensor=self.names[fault.sensor],
+                kind=fault.kind.value,
+                state="left_out" if fault.is_clear else "suspected",
+                **({"run": self.runs[fault.sensor]} if self.runs else {}),
+                onset_s=fault.onset_s,
+                onset_u_s=fault.onset_u_s,
+                size=fault.size,
+                ratio=fault.ratio,
+                limit=fault.limit,
+                reason=fault.reason,
+                rmse_with_um=self.errors_um[self.names[fault.sensor]] if fault.is_clear else np.nan,
+                rmse_without_um=self.sound_um if fault.is_clear else np.nan,
+            )
+            for fault in self.faults
+        ]
+
+
+def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
+    """Examine the sensors of a record, and leave out those that are faulty."""
+    names = tuple(str(name) for name in table["sensor"].values)
+    faults, where = _examine_runs(table)
+    faulty = [fault.sensor for fault in faults if fault.is_clear]
+    if not faulty:
+        return SensorHealth(table, names, faults, {}, np.nan, where)
+    kept = [k for k in range(len(names)) if k not in faulty]
+    if not kept:
+        told = "; ".join(
+            f"{names[fault.sensor]}: {fault.kind} from {fault.onset_s / 3600.0:.2f} h on" for fault in faults
+        )
+        raise RecordError(
+            f"{table.attrs.get('source', 'record')}: no temperature sensor is sound ({told}); repeat the test"
+        )
+    errors = {names[k]: _declared_error(table.isel(sensor=sorted([*kept, k])), declared) for k in faulty}
+    sound = table.isel(sensor=kept)
+    return SensorHealth(sound, names, faults, errors, _declared_error(sound, declared), where)
+
+
+def _examine_runs(table: xr.Dataset) -> tuple[tuple[SensorFault, ...], dict[int, str]]:
+    """Faults, at most one per sensor, and of several runs the one that shows it, by sensor; every run is examined by itself."""
+    runs = json.loads(table.attrs.get("runs", '[""]'))
+    number = table["run"].values if "run" in table.coords else np.zeros(table.sizes["time"], int)
+    chosen: dict[int, tuple[SensorFault, str]] = {}
+    for k, run in enumerate(runs):
+        here = table.isel(time=number == k)
+        seconds = np.asarray((here["time"].values - here["time"].values[0]) / np.timedelta64(1, "s"), np.float64)
+        for fault in examine_sensors(seconds, here["temperature"].values, here["driver"].values):
+            earlier = chosen.get(fault.sensor)
+            if earlier is None or (fault.is_clear and not earlier[0].is_clear):
+                chosen[fault.sensor] = (fault, run)
+    faults = tuple(chosen[sensor][0] for sensor in sorted(chosen))
+    return faults, {sensor: run for sensor, (_, run) in chosen.items() if run}
+
+
+def _declared_error(table: xr.Dataset, declared: Sequence[str]) -> float:
+    """Error of the declared model on the hold-out set, um; nan where a sensor has too few readings."""
+    try:
+        record = reduce_record(table)
+        train, _ = hold_out(record)
+    except RecordError:
+        return np.nan
+    return rmse(record, predict(record, columns_of(record, declare(declared, record)), train).predicted, ~train)

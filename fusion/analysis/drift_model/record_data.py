@@ -1,0 +1,408 @@
+"""A record of sensors and channels, reduced to blocks of time on which its displacements are modelled.
+
+A record holds thousands of samples in which a machine hardly moves. They are averaged over blocks that are short beside any thermal
+time constant; drivers are averaged after they are raised to a power, because heat follows a power of the speed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion.analysis.alignment.readings import Readings, Series, sample_noise
+from fusion.analysis.effects.thermal import SENSOR_PREFIX
+from fusion.common import Array, FusionError
+
+#: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
+MOST_BLOCKS = 600
+#: Blocks below which nothing can be held out.
+LEAST_BLOCKS = 40
+#: Blocks below which a run of several shows nothing.
+LEAST_RUN_BLOCKS = 10
+#: Powers of a driver in the heat it makes: friction of a torque that is constant and of one that grows with the speed.
+EXPONENTS = (1, 2)
+#: A load cycle starts where a driver leaves its rest; rest is this share of its range above its minimum.
+_REST_SHARE = 0.02
+#: A driver is switched where it changes by this share of its range from one block to the next.
+_SWITCHED = 0.2
+#: Coordinate that names the columns, smallest and largest value of every variable: absolute zero and 3000 degC, a displacement of 1 m, and
+#: for a driver, whose unit is free, a tenth of the largest single-precision number, which loggers write for no value.
+_POSSIBLE = {
+    "temperature": ("sensor", -273.15, 3000.0),
+    "displacement": ("channel", -1e6, 1e6),
+    "driver": ("driver_name", -3e37, 3e37),
+}
+#: Share of its largest size by which a constant may differ from its mean.
+_ROUNDING = 1e-12
+#: Blocks on either side of a switching that are near it.
+_NEAR_SWITCHING = 2
+#: Most and fewest parts that a record is cut into for forward chaining.
+_MOST_CHAINED = 8
+_LEAST_CHAINED = 4
+
+
+class RecordError(FusionError):
+    """A record that cannot be modelled; the message says what is missing and what to do."""
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """One run of a record.
+
+    Attributes
+    ----------
+    name : of its table
+    start : time of its first sample, UTC
+    first_s : that time on the record's own axis, s
+    held_out : whether it is held out
+    """
+
+    name: str
+    start: np.datetime64
+    first_s: float
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record on its blocks. Runs follow each other on one axis of time, with a border of one block between them.
+
+    Attributes
+    ----------
+    start : time of the first sample, UTC
+    seconds : (blocks,) middle of each block, s since the first sample, time between runs left out
+    block_s : length of a block, s
+    displacement : (blocks, channels) mean, um, of several runs minus that of each run's first block; NaN where a block holds no sample
+    temperature : (blocks, sensors) mean, degC, gaps interpolated
+    temperature_noise : (sensors,) standard uncertainty of a block mean from the scatter of the samples, K
+    drivers : driver to its powers, exponent to (blocks,) values as a share of the driver's largest size
+    channels, sensors : names
+    duplicates : sensors left out because they are a linear combination of the others
+    chained : (blocks,) number of the chronological block of each row for forward chaining, from 0
+    gaps : values that were interpolated, by column
+    impossible : samples beyond what can be measured, which count as missing, by column
+    runs : of a record of several runs; empty where there is one
+    first : number of the first block of every run
+    driver_sizes : driver to its largest size and the unit of that
+    """
+
+    start: np.datetime64
+    seconds: Array
+    block_s: float
+    displacement: Array
+    temperature: Array
+    temperature_noise: Array
+    drivers: Mapping[str, Mapping[int, Array]]
+    channels: tuple[str, ...]
+    sensors: tuple[str, ...]
+    duplicates: tuple[str, ...]
+    chained: NDArray[np.int64]
+    gaps: Mapping[str, int]
+    impossible: Mapping[str, int] = field(default_factory=dict)
+    runs: tuple[RecordedRun, ...] = ()
+    first: tuple[int, ...] = (0,)
+    driver_sizes: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+
+    @property
+    def rise(self) -> Array:
+        """Temperatures minus those of the run's first block, K (blocks, sensors)."""
+        zero = self.temperature[np.asarray(self.first)[self.run]] if self.runs else self.temperature[0]
+        return self.temperature - zero
+
+    @property
+    def run(self) -> NDArray[np.int64]:
+        """Number of each block's run, from 0 (blocks,)."""
+        return np.searchsorted(self.first, np.arange(self.seconds.size), side="right") - 1
+
+    @property
+    def time(self) -> NDArray[np.datetime64]:
+        """Time of the middle of each block, UTC (blocks,)."""
+        elapsed = np.round(self.seconds * 1e9).astype("m8[ns]")
+        if not self.runs:
+            return np.asarray(self.start + elapsed)
+        zero = np.array([one.start - np.round(one.first_s * 1e9).astype("m8[ns]") for one in self.runs])
+        return np.asarray(zero[self.run] + elapsed)
+
+    def series(self, values: Array, units: str) -> Series:
+        """Values on the blocks as a series that begins anew with every run."""
+        return Series(self.seconds, values, units, self.first)
+
+    def switched(self) -> NDArray[np.bool_]:
+        """Blocks within two blocks of a switching of any driver (blocks,): what happens there may be its consequence."""
+        near = np.zeros(self.seconds.size, bool)
+        for powers in self.drivers.values():
+            change = np.abs(np.diff(powers[1], prepend=powers[1][0])) > _SWITCHED * np.ptp(powers[1])
+            change[list(self.first)] = False
+            switched = np.flatnonzero(change)
+            for beside in range(-_NEAR_SWITCHING, _NEAR_SWITCHING + 1):
+                here = np.clip(switched + beside, 0, near.size - 1)
+                near[here[self.run[here] == self.run[switched]]] = True
+        return near
+
+    def view(self) -> Readings:
+        """The record as readings of one place, so that effects that only need time, series and drivers work on it."""
+        one = np.ones(self.seconds.size)
+        known = np.isfinite(self.displacement)
+        total = np.where(known, self.displacement, 0.0).sum(axis=1)
+        rise = self.rise
+        series = {"mean_rise": self.series(rise.mean(axis=1), "K")}
+        series |= {f"{SENSOR_PREFIX}{name}": self.series(rise[:, k], "K") for k, name in enumerate(self.sensors)}
+        series |= {name: self.series(powers[1], "1") for name, powers in self.drivers.items()}
+        return Readings(
+            seconds=self.seconds,
+            response=np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan),
+            cycle=np.arange(1, self.seconds.size + 1),
+            target=one.astype(np.int64),
+            position_mm=one,
+            sign=one,
+            targets=np.array([1]),
+            positions_mm=np.array([1.0]),
+            series=series,
+            drivers=tuple(self.drivers),
+            left_out={},
+        )
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """How samples fall into blocks: place of each sample among the blocks that hold any, middle of each of those, s; first one, and time
+    of the first sample, of each run.
+    """
+
+    source: str
+    place: NDArray[np.intp]
+    seconds: Array
+    length_s: float
+    zero_s: tuple[float, ...]
+    first: tuple[int, ...]
+    names: tuple[str, ...]
+    gaps: dict[str, int]
+
+    def mean(self, values: Array) -> Array:
+        """Mean over each block, NaN where it holds no value."""
+        known = np.isfinite(values)
+        total = np.bincount(self.place[known], values[known], minlength=self.seconds.size)
+        number = np.bincount(self.place[known], minlength=self.seconds.size)
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+    def filled(self, name: str, values: Array) -> Array:
+        """Mean over each block, gaps interpolated and counted."""
+        column = self.mean(values)
+        known = np.isfinite(column)
+        if known.sum() < 0.5 * known.size:
+            raise RecordError(
+                f'{self.source}: column "{name}" has values in {known.sum()} of {known.size} blocks of {self.length_s:g} s; leave it '
+                "out of [record]"
+            )
+        if not known.all():
+            self.gaps[name] = int((~known).sum())
+        filled = []
+        # Nothing is taken from another run.
+        for run, rows in zip(self.names, self.rows(), strict=True):
+            seconds, values = self.seconds[rows], column[rows]
+            known = np.isfinite(values)
+            if not known.any():
+                raise RecordError(
+                    f'{run}: column "{name}" has no value in this run; leave the column or the run out of [record]'
+                )
+            filled.append(np.interp(seconds, seconds[known], values[known]))
+        return np.concatenate(filled)
+
+    def rows(self) -> list[slice]:
+        """Blocks of every run."""
+        return [slice(first, last) for first, last in pairwise([*self.first, self.seconds.size])]
+
+    def zeroed(self, channel: str, values: Array) -> Array:
+        """Block means of a channel; of several runs each minus its own first one, its zero."""
+        mean = self.mean(values)
+        if len(self.first) > 1:
+            for run, rows in enumerate(self.rows()):
+                known = mean[rows][np.isfinite(mean[rows])]
+                if not known.size:
+                    raise RecordError(
+                        f'{self.names[run]}: channel "{channel}" has no value in this run; leave the channel or the run out of [record]'
+                    )
+                mean[rows] -= known[0]
+        return mean
+
+
+def reduce_record(table: xr.Dataset) -> Record:
+    """Average a record over blocks; blocks without any sample (a pause) are left out."""
+    time = table["time"].values.astype("datetime64[ns]")
+    elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
+    table, impossible = _without_impossible(table)
+    blocks = _lay_blocks(table, elapsed)
+    channels = tuple(str(name) for name in table["channel"].values)
+    displacement = np.column_stack(
+        [blocks.zeroed(name, table["displacement"].values[:, k]) for k, name in enumerate(channels)]
+    )
+    for k, name in enumerate(channels):
+        known = displacement[np.isfinite(displacement[:, k]), k]
+        if known.size < LEAST_BLOCKS or np.ptp(known) == 0.0:
+            fault = "never moves" if known.size >= LEAST_BLOCKS else "holds too few values"
+            raise RecordError(f'{blocks.source}: channel "{name}" {fault}; leave it out of [record]')
+    sensors = [str(name) for name in table["sensor"].values]
+    samples = table["temperature"].values
+    temperature = np.column_stack([blocks.filled(name, samples[:, k]) for k, name in enumerate(sensors)])
+    kept = independent(temperature)
+    if not kept:
+        raise RecordError(
+            f"{blocks.source}: no temperature changes; nothing that a displacement could follow; add sensors that warm"
+        )
+    per_block = max(1.0, elapsed.size / blocks.seconds.size)
+    drivers = _drivers(table, blocks)
+    return Record(
+        start=time[0],
+        seconds=blocks.seconds,
+        block_s=blocks.length_s,
+        displacement=displacement,
+        temperature=temperature[:, kept],
+        temperature_noise=np.array([sample_noise(samples[np.isfinite(samples[:, k]), k]) for k in kept])
+        / np.sqrt(per_block),
+        drivers=drivers,
+        channels=channels,
+        sensors=tuple(sensors[k] for k in kept),
+        duplicates=tuple(name for k, name in enumerate(sensors) if k not in kept),
+        chained=_chained_runs(blocks, [powers[1] for powers in drivers.values()]),
+        gaps=blocks.gaps,
+        impossible=impossible,
+        runs=_runs(table, blocks),
+        first=blocks.first,
+        driver_sizes=_driver_sizes(table, drivers),
+    )
+
+
+def _runs(table: xr.Dataset, blocks: _Blocks) -> tuple[RecordedRun, ...]:
+    """The runs of a table of several; none of one."""
+    if "runs" not in table.attrs:
+        return ()
+    test = json.loads(table.attrs["test"])
+    time, run = table["time"].values.astype("datetime64[ns]"), table["run"].values
+    return tuple(
+        RecordedRun(name, time[run == k][0], zero_s, k in test)
+        for k, (name, zero_s) in enumerate(zip(blocks.names, blocks.zero_s, strict=True))
+    )
+
+
+def _chained_runs(blocks: _Blocks, drivers: list[Array]) -> NDArray[np.int64]:
+    """Parts for forward chaining, numbered through all runs; none holds blocks of two."""
+    parts: list[NDArray[np.int64]] = []
+    for rows in blocks.rows():
+        start = int(parts[-1][-1]) + 1 if parts else 0
+        parts.append(start + chained_blocks(blocks.seconds[rows], [values[rows] for values in drivers]))
+    return np.concatenate(parts)
+
+
+def _without_impossible(table: xr.Dataset) -> tuple[xr.Dataset, dict[str, int]]:
+    """The record without samples beyond what can be measured, which loggers write for no value, and their number by column."""
+    counts: dict[str, int] = {}
+    kept = {}
+    for variable, (names, low, high) in _POSSIBLE.items():
+        values = table[variable]
+        wrong = np.asarray((values < low) | (values > high))
+        counts |= {str(name): int(n) for name, n in zip(values[names].values, wrong.sum(axis=0), strict=True) if n}
+        kept[variable] = values.where(~wrong) if wrong.any() else values
+    return table.assign(kept), counts
+
+
+def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
+    """Cut the time of the samples (s since the first) into blocks of equal length, every run from its own first sample on."""
+    source = str(table.attrs.get("source", "record"))
+    names = tuple(json.loads(table.attrs["runs"])) if "runs" in table.attrs else (source,)
+    run = table["run"].values if "runs" in table.attrs else np.zeros(elapsed.size, int)
+    times = [np.unique(elapsed[run == k]) for k in range(len(names))]
+    samples = sum(one.size for one in times)
+    if samples < LEAST_BLOCKS:
+        raise RecordError(
+            f"{source}: {samples} samples are too few to hold a part out; a record needs at least {LEAST_BLOCKS}"
+        )
+    step = float(np.median(np.concatenate([np.diff(one) for one in times])))
+    length = step * max(1, int(np.ceil(samples / MOST_BLOCKS)))
+    places, seconds, first, zeros, start = [], [], [0], [], 0.0
+    for k, one in enumerate(times):
+        # A sample that comes a little early still belongs to its own block.
+        number = np.floor((elapsed[run == k] - one[0] + 0.5 * step) / length).astype(int)
+        numbers, place = np.unique(number, return_inverse=True)
+        if len(times) > 1 and numbers.size < LEAST_RUN_BLOCKS:
+            raise RecordError(
+                f"{names[k]}: the run fills {numbers.size} blocks of {length:g} s, fewer than {LEAST_RUN_BLOCKS}; leave it out of "
+                "record.files"
+            )
+        places.append(place + first[-1])
+        seconds.append(start + (numbers + 0.5) * length - 0.5 * step)
+        first.append(first[-1] + numbers.size)
+        zeros.append(start)
+        # A border of one block lies between two runs.
+        start += (float(numbers[-1]) + 2.0) * length
+    return _Blocks(
+        source, np.concatenate(places), np.concatenate(seconds), length, tuple(zeros), tuple(first[:-1]), names, {}
+    )
+
+
+def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:
+    """Powers of every driver as shares of its largest size; one that never changes is left out."""
+    drivers: dict[str, dict[int, Array]] = {}
+    for k, name in enumerate(str(one) for one in table["driver_name"].values):
+        values = table["driver"].values[:, k]
+        largest = float(np.nanmax(np.abs(values), initial=0.0))
+        if largest == 0.0 or np.nanmin(values) == np.nanmax(values):
+            continue
+        drivers[name] = {exponent: blocks.filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
+    return drivers
+
+
+def _driver_sizes(table: xr.Dataset, kept: Collection[str]) -> dict[str, tuple[float, str]]:
+    """Largest size of every driver that was kept, with its unit ("1" where the table states none)."""
+    units = table["driver_units"].values if "driver_units" in table else ["1"] * table.sizes["driver_name"]
+    largest = np.nanmax(np.abs(table["driver"].values), axis=0, initial=0.0)
+    return {
+        str(name): (float(size), str(unit))
+        for name, size, unit in zip(table["driver_name"].values, largest, units, strict=True)
+        if str(name) in kept
+    }
+
+
+def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
+    """Columns of which a part is not a linear combination of those before."""
+    kept: list[int] = []
+    centred = columns - columns.mean(axis=0)
+    basis = np.empty((columns.shape[0], 0))
+    for k in range(columns.shape[1]):
+        # What a constant differs from its mean by is rounding.
+        moves = np.abs(centred[:, k]).max(initial=0.0) > _ROUNDING * np.abs(columns[:, k]).max(initial=0.0)
+        own = float(centred[:, k] @ centred[:, k]) if moves else 0.0
+        left = centred[:, k] - basis @ (basis.T @ centred[:, k])
+        left -= basis @ (basis.T @ left)
+        rest = float(left @ left)
+        if own > 0.0 and rest > tolerance * own:
+            kept.append(k)
+            basis = np.column_stack([basis, left / np.sqrt(rest)])
+    return kept
+
+
+def chained_blocks(seconds: Array, drivers: list[Array]) -> NDArray[np.int64]:
+    """Divide a record into parts for forward chaining: load cycles where a driver starts from rest often enough, else equal parts."""
+    least = (seconds[-1] - seconds[0]) / _MOST_CHAINED
+    starts: list[float] = []
+    for values in drivers:
+        rest = values <= values.min() + _REST_SHARE * np.ptp(values)
+        starts += list(seconds[1:][rest[:-1] & ~rest[1:]])
+    bounds: list[float] = []
+    for start in sorted(starts):
+        # The first block may hold what was logged before the first load.
+        early = start - seconds[0] < least
+        if not early and (not bounds or start - bounds[-1] >= least) and seconds[-1] - start >= 0.5 * least:
+            bounds.append(start)
+    if len(bounds) + 1 < _LEAST_CHAINED:
+        bounds = list(np.linspace(seconds[0], seconds[-1], _MOST_CHAINED + 1)[1:-1])
+    # A load that hardly ever rests leaves parts too long to tell anything from their few predictions.
+    edges = [float(seconds[0]), *bounds, float(seconds[-1])]
+    longest = (seconds[-1] - seconds[0]) / _LEAST_CHAINED
+    cuts = [np.linspace(first, last, int(np.ceil((last - first) / longest)) + 1)[1:] for first, last in pairwise(edges)]
+    return np.searchsorted(np.concatenate(cuts)[:-1], seconds, side="right").astype(np.int64)

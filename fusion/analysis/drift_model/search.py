@@ -1,0 +1,881 @@
+"""The closed loop: search the training part for what a model lacks, then open the hold-out set once to report the error before and after.
+
+One procedure for a campaign along an axis and for a record of channels. What differs between them, how candidates are made, fitted, scored
+and predicted, is behind :class:`Problem`. An effect enters only if its gain exceeds what the whole search finds under the null hypothesis,
+if it is admissible, and if it is confirmed on readings of the training part that its coefficients were not fitted to. The hold-out set
+decides nothing: an effect that it does not support is reported as not confirmed. Procedure and error rates: docs/method/closed-loop.md.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.analysis.drift_model.fit import Term
+from fusion.analysis.drift_model.gains import Gains
+from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
+from fusion.analysis.effects.effect import Candidate, Separable, Wave
+from fusion.analysis.effects.library import LIBRARY
+from fusion.common import Array, FusionError
+from fusion.results import loop as schema
+from thermography.fields.large_arrays import IN_MEMORY_BYTES, copy_to_disk, give_back
+
+# Decisions of the search: which effect entered, was refused or was withdrawn, for which reason and on what evidence.
+
+
+class Reason(StrEnum):
+    """Why an effect is in the model, or why it is not."""
+
+    ENTERED = "entered"
+    #: Not tried at all.
+    NOT_AVAILABLE = "not available"
+    NOT_COMPUTABLE = "not computable"
+    #: Tried, and not admissible or not confirmed.
+    COLLINEAR = "collinear"
+    SINGLE_WARM_UP = "single warm-up"
+    SINGLE_SWITCHING = "single switching"
+    AT_SWITCHING = "at a switching"
+    HETEROSCEDASTIC_DRIFT = "heteroscedastic drift"
+    TEMPERATURE_NOISE = "temperature noise"
+    FOLLOWS_RATE = "follows the rate"
+    SMOOTHING = "smoothing"
+    UNLOGGED_HEAT = "unlogged heat"
+    NOT_CONFIRMED = "not confirmed"
+    NOT_PREDICTED = "later parts not predicted better"
+    WEAKER_THAN_UNCONFIRMED = "weaker than an unconfirmed effect"
+    #: In the model for a while, and taken out again.
+    SUPERFLUOUS = "superfluous"
+    TOO_MANY_EVENTS = "too many events"
+    INCONSISTENT_PATTERN = "inconsistent pattern"
+    SHARED_PATTERN = "shared pattern"
+    DEPENDS_ON_WITHDRAWN = "depends on a withdrawn effect"
+    NOT_REPEATED = "not repeated"
+
+
+NOT_TRIED = frozenset({Reason.NOT_AVAILABLE, Reason.NOT_COMPUTABLE})
+#: Decisions that say nothing against an effect: it is in, the data did not decide, or a later effect does its work.
+_NEUTRAL = frozenset({Reason.ENTERED, Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED, Reason.SUPERFLUOUS})
+#: Reasons against the name of an effect.
+BLOCKING = frozenset(Reason) - NOT_TRIED - _NEUTRAL
+#: Reasons that keep an effect out for the rest of the search.
+FINAL = frozenset(
+    {Reason.INCONSISTENT_PATTERN, Reason.SHARED_PATTERN, Reason.DEPENDS_ON_WITHDRAWN, Reason.NOT_REPEATED}
+)
+#: Reasons for which an effect that had entered was taken out again without another doing its work.
+WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS}
+#: Reasons for which a significant effect has no name: it shows that something is missing all the same.
+WITHHELD = (BLOCKING - {Reason.COLLINEAR}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
+
+_SENTENCES: Mapping[Reason, str] = {
+    Reason.ENTERED: "added to the model",
+    Reason.NOT_AVAILABLE: "{because}",
+    Reason.NOT_COMPUTABLE: "its columns cannot be computed: {because}",
+    Reason.COLLINEAR: (
+        "no part of it is independent of the model: its columns are constant, or collinear with the static profile, the declared effects "
+        "and the effects added before"
+    ),
+    Reason.SINGLE_WARM_UP: (
+        "the machine was excited by a single warm-up ({share_percent:.1f} % of the candidate is a plain warm-up), and beside free "
+        "warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to separate it"
+    ),
+    Reason.SINGLE_SWITCHING: (
+        "{driver} was switched only once (a single step explains {share_percent:.1f} % of its course), and all single warm-ups are alike; "
+        "switch the load on purpose to separate it"
+    ),
+    Reason.AT_SWITCHING: "a driver was switched at {hours:.2f} h: a shift there is a response to the load, not an event of its own",
+    Reason.HETEROSCEDASTIC_DRIFT: (
+        "drift that moved {times:.2g} times as much between {start_h:.2f} h and {end_h:.2f} h as in the rest of the test, as in a warm-up "
+        "or after a change of the load, would gain {drift_gain:.1f} in log-likelihood; the event gains {event_gain:.1f}, and its name "
+        "needs {needed:.0f} more than such drift"
+    ),
+    Reason.TEMPERATURE_NOISE: (
+        "the noise of {series} is {noise_percent:.2g} % of its range; above {limit_percent:.1g} % a lagged copy, which is smoother, fits "
+        "better by its smoothness alone"
+    ),
+    Reason.FOLLOWS_RATE: (
+        "beside the delayed copy the direct coefficient of {series} takes the opposite sign or nearly cancels it: the readings follow the "
+        "rate of change, which is the power of a source nearby or a late sensor, not a lag"
+    ),
+    Reason.SMOOTHING: (
+        "a copy of {series} that is smoothed but not delayed fits as well (log-likelihood {advantage:+.1f}): the gain comes from "
+        "denoising, not from a lag"
+    ),
+    Reason.UNLOGGED_HEAT: (
+        "nothing that makes heat was logged: the delayed response to a source that is not logged cannot be told from a lag, nor from a "
+        "drift; log duty, speed or load"
+    ),
+    Reason.NOT_CONFIRMED: "significant (p = {p_value:.2g}), but not confirmed on readings that its coefficients were not fitted to",
+    Reason.NOT_PREDICTED: (
+        "significant (p = {p_value:.2g}), but the later parts of the training time are predicted no better with it ({before_um:.3g} to "
+        "{after_um:.3g} µm)"
+    ),
+    Reason.WEAKER_THAN_UNCONFIRMED: (
+        "significant (p = {p_value:.2g}; with {stronger} in the model {beside_p:.2g}), but much weaker than {stronger}, which is not "
+        "confirmed: it may explain a part of the same"
+    ),
+    Reason.SUPERFLUOUS: "removed: an effect added later explains the same (log-likelihood lost without it: {loss:.1f})",
+    Reason.TOO_MANY_EVENTS: "more than {most} events would be needed: that is a switching, for which the library has no name",
+    Reason.INCONSISTENT_PATTERN: (
+        "its course in time is present, but the pattern along the axis and by direction is not that of this effect "
+        "(p = {p_value:.1g})"
+    ),
+    Reason.SHARED_PATTERN: (
+        "{first} and {second} fit no better than one course in time with a free pattern: together they are one pattern that "
+        "the library does not hold"
+    ),
+    Reason.DEPENDS_ON_WITHDRAWN: "withdrawn: it was found beside {beside}, whose name was withdrawn afterwards",
+    Reason.NOT_REPEATED: (
+        "withdrawn: it was found in the training part (p = {p_value:.2g}), but the {parts} earlier part(s) of the record on which the same "
+        "procedure added it were predicted no better ({without_um:.3g} to {with_um:.3g} µm)"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided about one effect.
+
+    Attributes
+    ----------
+    effect : name of the effect
+    reason : why
+    evidence : the numbers and names behind it, by the fields of the reason's sentence
+    """
+
+    effect: str
+    reason: Reason
+    evidence: Mapping[str, float | str] = field(default_factory=dict)
+
+    def on_evidence(self, **evidence: float | str) -> Decision:
+        """The same decision with further evidence."""
+        return replace(self, evidence={**self.evidence, **evidence})
+
+    @property
+    def sentence(self) -> str:
+        """The decision in words."""
+        return _SENTENCES[self.reason].format_map(dict(self.evidence))
+
+
+# Values of the nonlinear parameters of an effect that fit as well as the best: profile likelihood intervals.
+
+#: Log-likelihood by which the best may beat a value that a 95 % interval still holds: half of chi-squared, 1 degree of freedom.
+_WITHIN = 1.92
+#: Values that differ by less than this share are one value, computed twice.
+_SAME = 1e-6
+#: Words that only spell out a number: what a wave may be mistaken for, and the time constants of a chain of parts.
+DERIVED_WORDS = frozenset({"possible_leads", "chain"})
+
+#: Lowest and highest value, None where what was looked at ends before the likelihood has fallen; or the words that fit as well.
+Range = list[float | None] | list[str]
+
+
+def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, best_gain: float) -> dict[str, Range]:
+    """Values of the parameters that fit as well as the best, by profile likelihood (95 %)."""
+    alike = [candidate for candidate, gain in zip(near, gains, strict=True) if gain >= best_gain - _WITHIN]
+    ranges: dict[str, Range] = {}
+    words = _words(best, DERIVED_WORDS)
+    for name, value in best.parameters.items():
+        if name in DERIVED_WORDS:
+            continue
+        if isinstance(value, str):
+            others = {str(candidate.parameters[name]) for candidate in alike if name in candidate.parameters} - {value}
+            if others:
+                ranges[name] = sorted(others)
+            continue
+        # A body that is not there has a time constant of zero.
+        tried, fitting = (
+            np.array([float(one.parameters.get(name, 0.0)) for one in some if _words(one, DERIVED_WORDS) == words])
+            for some in (near, alike)
+        )
+        if np.unique(tried).size > 1:
+            # The values next to those that fit: the likelihood falls somewhere between, so the interval is rather too wide.
+            low, high = min(value, *fitting), max(value, *fitting)
+            below, above = tried[tried < low - _SAME * abs(low)], tried[tried > high + _SAME * abs(high)]
+            lowest = float(below.max()) if below.size else 0.0 if low == 0.0 else None
+            ranges[name] = [lowest, float(above.min()) if above.size else None]
+    return ranges
+
+
+def _words(candidate: Candidate, left_out: Collection[str]) -> dict[str, str]:
+    """Parameters of a candidate that are words."""
+    named = candidate.parameters.items()
+    return {name: value for name, value in named if isinstance(value, str) and name not in left_out}
+
+
+# State of the closed loop: an immutable value that every step takes and returns.
+
+#: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
+TIE_GAIN = 3.0
+#: An effect that is not significant by itself is no rival.
+_RIVAL_LEVEL = 0.05
+
+
+class SearchError(FusionError):
+    """An effect does not keep its contract; the message names it."""
+
+
+class Confirmed(StrEnum):
+    """How an added effect was confirmed."""
+
+    LATER_CYCLES = "confirmed on later blocks of cycles, coefficients frozen"
+    OTHER_TARGETS = "confirmed on the other half of the targets, coefficients frozen"
+    BY_EVIDENCE = "confirmed by the evidence of all training cycles; their later blocks alone do not decide"
+    SECOND_SEARCH = "found in all cycles after the hold-out set was opened: it has no held-out error"
+    LATER_PARTS = "confirmed on later parts of the training time, each predicted from those before it"
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """How an effect did on readings that its coefficients were not fitted to.
+
+    Attributes
+    ----------
+    passed : whether it may enter
+    way : how it was asked
+    gain, p_value : gain in predictive log-density, and the probability of such a gain under the null hypothesis
+    error_um : error of predicting later parts of the training time with it, um; NaN where this was not computed
+    """
+
+    passed: bool
+    way: Confirmed
+    gain: float = 0.0
+    p_value: float = 1.0
+    error_um: float = np.nan
+
+
+@dataclass(frozen=True)
+class Score:
+    """What the best candidate of an effect explains.
+
+    Attributes
+    ----------
+    name : the effect
+    candidate : its best candidate, None where no candidate is independent of the model
+    gain : gain in profile log-likelihood of the best candidate
+    excess : gain minus the mean gain that the same search finds under the null hypothesis
+    p_value : probability of such a gain under the null hypothesis, for this effect alone
+    family_wise_p : the same for the best of all effects that were tried
+    collinear : share of the candidates that the model contains already
+    drift_place : which drift variance of the grid suits the candidate best
+    critical : gain at which the effect becomes significant
+    confirmation : on readings that were not used for the coefficients, None where it was not worth asking
+    ranges : values of the parameters that fit as well (profile likelihood, 95 %), where they were looked at closely
+    """
+
+    name: str
+    candidate: Candidate | None
+    gain: float = 0.0
+    excess: float = 0.0
+    p_value: float = 1.0
+    family_wise_p: float = 1.0
+    collinear: float = 0.0
+    drift_place: int = 0
+    critical: float = np.inf
+    confirmation: Confirmation | None = None
+    ranges: Mapping[str, Range] = field(default_factory=dict)
+
+    @property
+    def best(self) -> Candidate:
+        """The best candidate."""
+        if self.candidate is None:
+            raise SearchError(f"effect {self.name!r} has no candidate that is independent of the model")
+        return self.candidate
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether it passed its confirmation."""
+        return self.confirmation is not None and self.confirmation.passed
+
+    @property
+    def error_um(self) -> float:
+        """Error of predicting later parts of the training time with it, um; NaN where this was not computed."""
+        return self.confirmation.error_um if self.confirmation else np.nan
+
+    @property
+    def is_event(self) -> bool:
+        """Whether the best candidate acts from one instant on."""
+        return self.candidate is not None and self.candidate.event_s is not None
+
+
+def rivals(score: Score, scores: Sequence[Score]) -> tuple[list[str], schema.RunnerUp | schema.Nothing]:
+    """Effects that these data cannot separate from the chosen one, and the runner-up."""
+    others = [other for other in scores if other.name != score.name and other.candidate is not None]
+    tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
+    if not others:
+        return tied, schema.Nothing()
+    behind = score.excess - others[0].excess
+    return tied, schema.RunnerUp(effect=others[0].name, gain_deficit=behind, p_value=others[0].family_wise_p)
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of the search.
+
+    Attributes
+    ----------
+    scores : of all effects that were tried, best excess first
+    decisions : about effects that could not be scored
+    start_error_um : error of predicting later parts of the training time without a further effect, um; NaN where it is not used
+    detection_limits : how large each effect must be to be found; from the first round only
+    """
+
+    scores: tuple[Score, ...]
+    decisions: tuple[Decision, ...] = ()
+    start_error_um: float = np.nan
+    detection_limits: tuple[schema.DetectionLimit, ...] = ()
+
+
+@dataclass(frozen=True)
+class Step:
+    """An effect that was added: its score, the round in which it was chosen, and how it was confirmed."""
+
+    score: Score
+    round: Round
+    confirmed: Confirmed
+
+    @property
+    def effect(self) -> str:
+        """Name of the effect."""
+        return self.score.name
+
+    @property
+    def is_from_second_search(self) -> bool:
+        """Whether it entered after the hold-out set had been opened."""
+        return self.confirmed is Confirmed.SECOND_SEARCH
+
+
+class Model(Protocol):
+    """What the loop asks of a fitted model."""
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The effects, declared ones first."""
+
+
+M = TypeVar("M", bound=Model)
+
+
+@dataclass(frozen=True)
+class LoopState(Generic[M]):
+    """Everything the loop has found so far.
+
+    Attributes
+    ----------
+    model : the fitted model; its terms are the declared effects, then one for each step
+    steps : the added effects in turn
+    decisions : every decision in turn
+    rounds : every round of the search in turn
+    errors_um : hold-out error of the declared model and after each step that was decided on the training part, um; empty until the
+        hold-out set is opened
+    errors_without_um : hold-out error of the last of these models without each of these steps, um
+    question : what the hold-out set says of an undecided candidate
+    """
+
+    model: M
+    steps: tuple[Step, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+    rounds: tuple[Round, ...] = ()
+    errors_um: tuple[float, ...] = ()
+    errors_without_um: tuple[float, ...] = ()
+    question: schema.HoldOutQuestion | None = None
+
+    @property
+    def declared(self) -> tuple[Term, ...]:
+        """The declared terms."""
+        return self.model.terms[: len(self.model.terms) - len(self.steps)]
+
+    @property
+    def added(self) -> tuple[Term, ...]:
+        """The terms of the steps."""
+        return self.model.terms[len(self.model.terms) - len(self.steps) :]
+
+    @property
+    def chain(self) -> list[tuple[Term, ...]]:
+        """The declared terms, then these with the first step, and so on."""
+        return [self.model.terms[: len(self.declared) + count] for count in range(len(self.steps) + 1)]
+
+    @property
+    def events(self) -> int:
+        """Number of events among the steps."""
+        return sum(step.effect == "step_event" for step in self.steps)
+
+    @property
+    def latest(self) -> dict[str, Decision]:
+        """The latest decision about every effect."""
+        return {decision.effect: decision for decision in self.decisions}
+
+    def not_tried(self) -> dict[str, str]:
+        """Effects that could not be tried, with the reason in words."""
+        return {one.effect: one.sentence for one in self.decisions if one.reason in NOT_TRIED}
+
+    def blocked(self) -> dict[str, str]:
+        """Effects against whose name the latest decision speaks, with the reason in words."""
+        return {name: decision.sentence for name, decision in self.latest.items() if decision.reason in BLOCKING}
+
+    def unnamed(self, level: float) -> dict[str, float]:
+        """Effects that are significant and have no name, with their family-wise p-value."""
+        last = self.rounds[-1].scores if self.rounds else ()
+        significant = {one.name: one.family_wise_p for one in last if one.candidate and one.family_wise_p <= level}
+        return {
+            name: significant[name] if name in significant else float(decision.evidence["search_p"])
+            for name, decision in self.latest.items()
+            if decision.reason in WITHDRAWN or (decision.reason in WITHHELD and name in significant)
+        }
+
+    def is_withdrawn(self, effect: str) -> bool:
+        """Whether an effect may not enter any more."""
+        return effect in self.latest and self.latest[effect].reason in FINAL
+
+    def decide(self, *decisions: Decision) -> LoopState[M]:
+        """The same state with further decisions."""
+        return replace(self, decisions=(*self.decisions, *decisions))
+
+    def without_effects(self, reasons: Mapping[str, str | None]) -> LoopState[M]:
+        """The same state without the effects for which there is a reason that they cannot be tried."""
+        missing = {name: because for name, because in reasons.items() if because is not None}
+        return self.decide(
+            *(Decision(name, Reason.NOT_AVAILABLE, {"because": because}) for name, because in missing.items())
+        )
+
+    def scored(self, scored: Round) -> LoopState[M]:
+        """The same state with a further round and its decisions."""
+        return replace(self.decide(*scored.decisions), rounds=(*self.rounds, scored))
+
+    def rescored(self, score: Score) -> LoopState[M]:
+        """The same state with one score of the last round replaced by a closer look at the same effect."""
+        last = self.rounds[-1]
+        scores = tuple(score if other.name == score.name else other for other in last.scores)
+        return replace(self, rounds=(*self.rounds[:-1], replace(last, scores=scores)))
+
+    def entered(self, model: M, score: Score, confirmed: Confirmed) -> LoopState[M]:
+        """The state after an effect was added to the model."""
+        step = Step(score, self.rounds[-1], confirmed)
+        decided = self.decide(Decision(score.name, Reason.ENTERED))
+        return replace(decided, model=model, steps=(*self.steps, step))
+
+    def without(self, places: Collection[int], model: M, decisions: Sequence[Decision]) -> LoopState[M]:
+        """The state after some steps were taken out again; ``model`` is fitted without them."""
+        steps = tuple(step for place, step in enumerate(self.steps) if place not in places)
+        return replace(self.decide(*decisions), model=model, steps=steps)
+
+    def kept(self, places: Collection[int]) -> tuple[Term, ...]:
+        """Declared terms and those of the steps that are not among ``places``."""
+        return (*self.declared, *(term for place, term in enumerate(self.added) if place not in places))
+
+
+HOLD_OUT_SHARE = 0.2
+MOST_EFFECTS = 4
+#: More events than this are a switching that the library has no name for.
+MOST_EVENTS = 2
+#: An effect whose absence costs less log-likelihood than this is superfluous.
+SUPERFLUOUS_GAIN = 2.0
+
+Progress = Callable[[int, int, str], None]
+
+
+def no_progress(done: int, total: int, what: str) -> None:
+    """Report nothing."""
+
+
+class LibraryEffect(Protocol):
+    """What the search asks of an effect of the library."""
+
+    @property
+    def repeats(self) -> bool:
+        """Whether it may be present more than once."""
+
+
+class Problem(ABC, Generic[M]):
+    """The data, as the procedure sees them.
+
+    Attributes
+    ----------
+    effects : the library by name
+    entry_level : family-wise p-value up to which an effect may enter
+    """
+
+    effects: Mapping[str, LibraryEffect]
+    entry_level: float
+
+    @abstractmethod
+    def refit(self, model: M, terms: Sequence[Term]) -> M:
+        """Fit other terms to the readings that ``model`` was fitted to."""
+
+    @abstractmethod
+    def offer(self, name: str, model: M, near: Candidate | None) -> list[Candidate]:
+        """Candidates of an effect beside a model, for a closer look those near one that was chosen."""
+
+    @abstractmethod
+    def score(self, state: LoopState[M]) -> Round:
+        """Score the whole library against the model, best excess first."""
+
+    @abstractmethod
+    def refuse(self, score: Score, model: M) -> Decision | None:
+        """The decision against an effect that is not admissible."""
+
+    def confirm(self, score: Score, state: LoopState[M]) -> Score:
+        """The score with its confirmation, unless it was confirmed when it was scored."""
+        return score
+
+    @abstractmethod
+    def loss_without(self, model: M, term: Term) -> float:
+        """Log-likelihood that is lost without one of the model's terms."""
+
+    @abstractmethod
+    def hold_out_error(self, terms: Sequence[Term]) -> float:
+        """Error of predicting the hold-out set from the training part, root mean square, um."""
+
+    def families(self, state: LoopState[M], rows: int) -> tuple[Families, list[Decision]]:
+        """Candidates of every effect that can be tried beside the model, those without any left out."""
+        repeating = {name for name, effect in self.effects.items() if effect.repeats}
+        present = {term.effect for term in state.model.terms} - repeating
+        tried = [name for name in self.effects if name not in present and name not in state.not_tried()]
+        offers = {name: partial(self.offer, name, state.model, None) for name in tried}
+        families, faults = collect_candidates(offers, rows, built_in=BUILT_IN)
+        return {name: candidates for name, candidates in families.items() if candidates}, faults
+
+    def near(self, name: str, model: M, chosen: Candidate) -> list[Candidate]:
+        """Candidates of an effect that differ from one that was chosen in its numbers."""
+        return [one for one in self.offer(name, model, chosen) if of_same_kind(one, chosen)]
+
+
+def search(problem: Problem[M], state: LoopState[M], *, progress: Progress = no_progress) -> LoopState[M]:
+    """Add effects one by one, without a look at the hold-out set."""
+    for number in range(1, MOST_EFFECTS + 1):
+        progress(number, MOST_EFFECTS + 2, f"searching for effect {number}")
+        state, score = choose(problem, state.scored(problem.score(state)))
+        if score is None:
+            return state
+        state = drop_superfluous(problem, enter(problem, state, score))
+        if state.events > MOST_EVENTS:
+            events = [place for place, step in enumerate(state.steps) if step.effect == "step_event"]
+            evidence = {"most": MOST_EVENTS, "search_p": state.steps[-1].score.family_wise_p}
+            return withdraw(problem, state, events, [Decision("step_event", Reason.TOO_MANY_EVENTS, evidence)])
+    return state
+
+
+def choose(
+    problem: Problem[M], state: LoopState[M], *, level: float | None = None
+) -> tuple[LoopState[M], Score | None]:
+    """Choose the best effect of the last round that is significant, admissible and confirmed."""
+    unconfirmed: Score | None = None
+    for score in state.rounds[-1].scores:
+        limit = problem.entry_level if level is None else level
+        if score.candidate is None or score.family_wise_p > limit or state.is_withdrawn(score.name):
+            continue
+        refusal = problem.refuse(score, state.model)
+        if refusal is not None:
+            state = state.decide(refusal.on_evidence(search_p=score.family_wise_p))
+            continue
+        # Where a stronger effect could not be confirmed, a much weaker one may only stand in for it.
+        if unconfirmed is not None and score.excess < unconfirmed.excess - TIE_GAIN:
+            beside = conditional_p_value(problem, state.model, score, unconfirmed)
+            # A lasting effect may predict in place of another even where both are significant together; an event happens at its instant.
+            if beside > limit or not score.is_event:
+                decision = Decision(
+                    score.name, Reason.WEAKER_THAN_UNCONFIRMED, {"stronger": unconfirmed.name, "beside_p": beside}
+                )
+                state = state.decide(decision.on_evidence(p_value=score.family_wise_p))
+                continue
+        score = problem.confirm(score, state)
+        state = state.rescored(score)
+        if score.is_confirmed:
+            return state, score
+        state = state.decide(not_confirmed(score, state.rounds[-1]))
+        if unconfirmed is None or score.excess > unconfirmed.excess:
+            unconfirmed = score
+    return state, None
+
+
+def conditional_p_value(problem: Problem[M], model: M, score: Score, stronger: Score) -> float:
+    """The family-wise p-value of an effect with a stronger one in the model; that of the search where it gains as much as by itself."""
+    weaker = Term(score.name, score.best)
+    joint = problem.refit(model, [*model.terms, Term(stronger.name, stronger.best), weaker])
+    lost = max(score.gain - problem.loss_without(joint, weaker), 0.0)
+    return min(1.0, score.family_wise_p * float(np.exp(lost)))
+
+
+def not_confirmed(score: Score, scored: Round) -> Decision:
+    """The decision about a significant effect that was not confirmed."""
+    evidence = {"p_value": score.family_wise_p}
+    if not np.isfinite(score.error_um):
+        return Decision(score.name, Reason.NOT_CONFIRMED, evidence)
+    errors = {"before_um": scored.start_error_um, "after_um": score.error_um}
+    return Decision(score.name, Reason.NOT_PREDICTED, evidence | errors)
+
+
+def enter(problem: Problem[M], state: LoopState[M], score: Score) -> LoopState[M]:
+    """Add a confirmed effect to the model and fit it again."""
+    assert score.confirmation is not None
+    model = problem.refit(state.model, [*state.model.terms, Term(score.name, score.best)])
+    return state.entered(model, score, score.confirmation.way)
+
+
+def drop_superfluous(problem: Problem[M], state: LoopState[M], *, first: int = 0) -> LoopState[M]:
+    """Take out effects that the newest one has made superfluous, one after the other."""
+    for place, term in enumerate(state.added[:-1]):
+        if place < first:
+            continue
+        loss = problem.loss_without(state.model, term)
+        if loss < SUPERFLUOUS_GAIN:
+            decision = Decision(term.effect, Reason.SUPERFLUOUS, {"loss": loss})
+            return drop_superfluous(problem, withdraw(problem, state, [place], [decision]), first=first)
+    return state
+
+
+def withdraw(
+    problem: Problem[M], state: LoopState[M], places: Collection[int], decisions: Sequence[Decision]
+) -> LoopState[M]:
+    """Take steps out of the model again and fit what is kept."""
+    return state.without(places, problem.refit(state.model, state.kept(places)), decisions)
+
+
+def open_hold_out(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
+    """Predict the hold-out set once: with the declared model, after each step, and with the last model without each of its effects."""
+    return replace(
+        state,
+        errors_um=tuple(problem.hold_out_error(terms) for terms in state.chain),
+        errors_without_um=tuple(problem.hold_out_error(state.kept([place])) for place in range(len(state.steps))),
+    )
+
+
+# Scores of effects: what the best candidate of each explains, and the p-value of that gain for the whole search.
+
+#: Effects with a larger family-unaware p-value are not looked at more closely, because they will not enter anyway.
+LEVEL_TO_CONFIRM = 0.1
+#: Neighbourhoods that are looked at in turn: the search tries few states for every wave, and the best may be two neighbours away.
+#: A gain in log-likelihood below the second number does not justify another one.
+_MOST_REFINEMENTS = 3
+_LEAST_PROGRESS = 0.1
+#: Words that a closer look may change: those that follow from numbers, the state that scales a pattern, and how the load began.
+_OPEN_WORDS = DERIVED_WORDS | {"follows", "start"}
+
+Families = Mapping[str, Sequence[Candidate]]
+BUILT_IN = frozenset(effect.name for effect in LIBRARY)
+
+
+def collect_candidates(
+    offers: Mapping[str, Callable[[], Sequence[Candidate]]], rows: int, *, built_in: frozenset[str]
+) -> tuple[dict[str, list[Candidate]], list[Decision]]:
+    """Collect the candidates of all effects and check their columns."""
+    families: dict[str, list[Candidate]] = {}
+    decisions = []
+    for name, offer in offers.items():
+        try:
+            candidates = list(offer())
+            _check_columns(candidates, rows)
+        except Exception as fault:
+            # A user's effect must not end the search for the others; a fault of the library itself must be seen.
+            if name in built_in:
+                raise
+            because = f"{type(fault).__name__}: {fault}"
+            decisions.append(Decision(name, Reason.NOT_COMPUTABLE, {"because": because}))
+            continue
+        families[name] = candidates
+    return families, decisions
+
+
+def kept_on_disk(candidates: Iterable[Candidate]) -> Iterator[Candidate]:
+    """Yield the same candidates, their columns in temporary files where many are large: those of a long test fill the memory."""
+    held: list[Candidate] = []
+    for candidate in candidates:
+        held.append(candidate)
+        dense = {k: one.columns for k, one in enumerate(held) if isinstance(one.columns, np.ndarray)}
+        if sum(columns.nbytes for columns in dense.values()) > IN_MEMORY_BYTES:
+            stored = dict(zip(dense, copy_to_disk(list(dense.values())), strict=True))
+            yield from (replace(one, columns=stored[k]) if k in stored else one for k, one in enumerate(held))
+            held = []
+    yield from held
+
+
+def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
+    """Refuse columns that are not one finite number per row."""
+    for candidate in candidates:
+        columns = candidate.columns if isinstance(candidate.columns, Separable) else np.asarray(candidate.columns)
+        if len(columns.shape) != 2 or columns.shape[0] != rows:
+            raise SearchError(f"columns have shape {columns.shape}; expected ({rows}, columns)")
+        # Of columns that share courses these are looked at, and all columns only where one is not finite.
+        parts = (*map(_made_of, columns.courses), columns.weights) if isinstance(columns, Separable) else (columns,)
+        finite = all(np.isfinite(part).all() for part in parts)
+        give_back(*parts)
+        if not finite:
+            not_finite = int((~np.isfinite(np.asarray(columns))).sum())
+            raise SearchError(f"{not_finite} values are not finite at {dict(candidate.parameters)}")
+        if len(candidate.units) != columns.shape[1]:
+            raise SearchError(
+                f"{columns.shape[1]} columns but {len(candidate.units)} units at {dict(candidate.parameters)}"
+            )
+
+
+def _made_of(course: Array | Wave) -> Array:
+    """The numbers that decide whether a course is finite."""
+    return course.seconds if isinstance(course, Wave) else course
+
+
+def score_effects(
+    families: Families,
+    gains: Gains,
+    *,
+    level: float,
+    is_admissible: Callable[[Candidate], bool] = lambda candidate: True,
+) -> tuple[list[Score], list[Decision]]:
+    """Score every effect by its best candidate."""
+    scores, decisions = [], []
+    start = 0
+    for name, candidates in families.items():
+        rows = np.arange(start, start + len(candidates))
+        start += len(candidates)
+        usable = rows[gains.separable[rows]]
+        collinear = 1.0 - usable.size / rows.size
+        if usable.size == 0:
+            scores.append(Score(name, None, collinear=collinear))
+            decisions.append(Decision(name, Reason.COLLINEAR))
+            continue
+        admissible = [row for row in usable if is_admissible(candidates[row - int(rows[0])])]
+        usable = np.array(admissible) if admissible else usable
+        best = int(usable[np.argmax(gains.gain[usable, 0])])
+        null = gains.gain[usable, 1:].max(axis=0)
+        gain = float(gains.gain[best, 0])
+        p_value = tail_probability(gain, null)
+        scores.append(
+            Score(
+                name,
+                candidates[best - int(rows[0])],
+                gain,
+                gain - float(null.mean()),
+                p_value,
+                sidak(p_value, len(families)),
+                collinear,
+                int(gains.drift_place[best]),
+                critical_gain(sidak_level(level, len(families)), null),
+            )
+        )
+    return sorted(scores, key=lambda score: -score.excess), decisions
+
+
+def refine(
+    score: Score, near: Callable[[Candidate], Sequence[Candidate]], gains: Callable[[Sequence[Candidate]], Gains]
+) -> Score:
+    """Move to the best candidate of the neighbourhood, and of that one's, as long as the gain grows."""
+    for _ in range(_MOST_REFINEMENTS):
+        before = score.gain
+        score = _best_near(score, near(score.best), gains)
+        if score.gain < before + _LEAST_PROGRESS:
+            break
+    return score
+
+
+def _best_near(score: Score, near: Sequence[Candidate], gains: Callable[[Sequence[Candidate]], Gains]) -> Score:
+    """The same score with the best candidate of a neighbourhood, or with its own where none is better."""
+    if not near:
+        raise SearchError(
+            f"effect {score.name!r} offers no candidate near one it offered before: {dict(score.best.parameters)}"
+        )
+    looked = gains(near)
+    best = int(np.argmax(np.where(looked.separable, looked.gain[:, 0], -np.inf)))
+    gain = float(looked.gain[best, 0])
+    if looked.separable[best] and gain >= score.gain:
+        score = replace(
+            score,
+            candidate=near[best],
+            gain=gain,
+            excess=score.excess + gain - score.gain,
+            drift_place=int(looked.drift_place[best]),
+        )
+    return replace(score, ranges=parameter_ranges(near, looked.gain[:, 0], score.best, score.gain))
+
+
+def of_same_kind(candidate: Candidate, chosen: Candidate) -> bool:
+    """Whether two candidates differ in numbers only, or in words that a closer look may change."""
+    return _words(chosen, _OPEN_WORDS).items() <= candidate.parameters.items()
+
+
+# What the evidence allows to say: intervals of errors, whether a name is confirmed, whether the model has skill, and the verdict.
+
+#: Penalties of a ridge regression, as shares of a standardised column's variance.
+PENALTIES = 10.0 ** np.arange(-5.0, 1.6, 0.5)
+#: Time constants of the lagged copies of a series, min: a factor of four apart.
+BASELINE_LAGS_MIN = (5.0, 20.0, 80.0)
+_RESAMPLES = 1000
+_PERCENT = (2.5, 97.5)
+
+
+def error_interval(errors: Array, unit: NDArray[np.int64], rng: np.random.Generator) -> schema.ErrorInterval:
+    """Root mean square error, mean over channels, and its interval from a circular block bootstrap."""
+    errors = errors[:, None] if errors.ndim == 1 else errors
+    place = np.unique(unit, return_inverse=True)[1]
+    known = np.isfinite(errors)
+    squares, number = (
+        np.column_stack([np.bincount(place, column) for column in values.T])
+        for values in (np.where(known, errors, 0.0) ** 2, known.astype(float))
+    )
+    units = squares.shape[0]
+    length = max(1, round(units**0.5))
+    starts = rng.integers(0, units, (_RESAMPLES, -(-units // length)))
+    rows = (starts[:, :, None] + np.arange(length)).reshape(_RESAMPLES, -1)[:, :units] % units
+    resampled = _rmse(squares[rows].sum(axis=1), number[rows].sum(axis=1))
+    low, high = np.nanpercentile(resampled, _PERCENT)
+    return schema.ErrorInterval(rmse_um=_rmse(squares.sum(axis=0), number.sum(axis=0)), low_um=low, high_um=high)
+
+
+def _rmse(squares: Array, number: Array) -> Array:
+    """Root mean square over the last axis' channels, mean over those with a value."""
+    known = number > 0.0
+    each = np.sqrt(np.where(known, squares / np.maximum(number, 1.0), 0.0))
+    channels = known.sum(axis=-1)
+    return np.asarray(np.where(channels > 0, each.sum(axis=-1) / np.maximum(channels, 1), np.nan))
+
+
+#: An effect is confirmed where it takes at least this share from the squared error beyond the noise, 2 % of the error itself: a model that
+#: follows chance changes an error by less than that either way.
+GAIN_SHARE = 0.04
+
+
+def is_confirmed(with_um: float, without_um: float, noise_um: float) -> bool:
+    """Whether a prediction is better with an effect by more than chance changes it."""
+    beyond_noise = max(0.0, without_um**2 - noise_um**2)
+    return with_um < without_um and without_um**2 - with_um**2 >= GAIN_SHARE * beyond_noise
+
+
+def doubt_of(with_um: float, without_um: float, noise_um: float, where: str) -> str:
+    """Why an effect is not confirmed, in words; empty where it is."""
+    if is_confirmed(with_um, without_um, noise_um):
+        return ""
+    return f"the error {where} is {without_um:.3g} µm without it and {with_um:.3g} µm with it"
+
+
+def exceeds_noise(error_um: float, noise_um: float, share: float) -> bool:
+    """Whether an error holds more than noise."""
+    return error_um**2 > (1.0 + share**2) * noise_um**2
+
+
+def has_skill(error_um: float, last_value_um: float, mean_um: float, noise_um: float, share: float) -> bool:
+    """Whether a model predicts the hold-out set better than the last value and the mean of the training part do."""
+    return error_um < min(last_value_um, mean_um) or not exceeds_noise(error_um, noise_um, share)
+
+
+def verdict(*, confirmed: bool, doubtful: bool, tested: bool, remains: bool, skill: bool) -> schema.Verdict:
+    """Word for the outcome."""
+    if not skill and not tested:
+        return "no_skill"
+    left = doubtful or tested or remains
+    if confirmed:
+        return "partial" if left else "explained"
+    return "unexplained" if left else "complete"
+
+
+def errors_of_predictions(hold_out: Mapping[str, schema.ErrorInterval]) -> dict[str, Any]:
+    """Errors on the hold-out set with their intervals, as ``errors``, ``baselines`` and ``best_baseline`` of a `Loop`."""
+    plain = {name: one for name, one in hold_out.items() if name not in schema.ModelErrors.model_fields}
+    return {
+        "errors": schema.ModelErrors(declared=hold_out["declared"], final=hold_out["final"]),
+        "baselines": schema.Baselines(**plain),
+        "best_baseline": min(plain, key=lambda name: plain[name].rmse_um),  # type: ignore[arg-type, return-value]
+    }

@@ -1,0 +1,176 @@
+"""What happens at an instant or in a rhythm: a slip of the set-up, and disturbances that switch in a fixed period."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fusion.analysis.alignment.readings import ENVIRONMENT, Readings, Series
+from fusion.analysis.effects.effect import Candidate, Effect, Separable, Wave
+from fusion.common import Array
+
+# Episodes in what was logged or seen: isolated jumps, sensors that stick, and the instants at which a reading could
+# step.
+
+#: Instants per cycle at which an event is tried: a knock may come at any target, and is dated to a quarter of a cycle.
+_EVENTS_PER_CYCLE = 4
+#: More instants than this are thinned, so that a long campaign takes no longer per reading; a closer look dates an event all the same.
+_MOST_INSTANTS = 240
+#: An event needs this many cycles on either side, or it cannot be told from an outlier.
+_EVENT_MARGIN_CYCLES = 2
+#: A jump in a log or in the field counts as one where it exceeds its neighbours' changes this many times (robust sigma).
+_JUMP_SIGMAS = 8.0
+
+
+def cycle_starts(readings: Readings) -> Array:
+    """Time of the first reading of every cycle."""
+    # Readings are sorted by time, so the first of a cycle is its earliest.
+    _, first = np.unique(readings.cycle, return_index=True)
+    return np.asarray(readings.seconds[first])
+
+
+def event_instants(readings: Readings) -> Array:
+    """Instants at which an event is tried: quarters of every cycle that has enough cycles on both sides, fewer in a long campaign."""
+    starts = cycle_starts(readings)
+    margin = _EVENT_MARGIN_CYCLES
+    if starts.size <= 2 * margin + 1:
+        return np.empty(0)
+    inner = starts[margin : starts.size - margin + 1]
+    parts = np.arange(_EVENTS_PER_CYCLE) / _EVENTS_PER_CYCLE
+    return np.asarray((inner[:-1, None] + np.diff(inner)[:, None] * parts).ravel()[:: _stride(starts.size)])
+
+
+def _stride(cycles: int) -> int:
+    """Every how many quarters of a cycle an event is tried."""
+    return max(1, int(np.ceil(_EVENTS_PER_CYCLE * cycles / _MOST_INSTANTS)))
+
+
+def instants_near(readings: Readings, instant: float) -> Array:
+    """Instants of a closer look: the readings up to the next instants that were tried."""
+    starts = cycle_starts(readings)
+    reach = float(np.median(np.diff(starts))) / _EVENTS_PER_CYCLE * _stride(starts.size)
+    return np.unique(readings.seconds[np.abs(readings.seconds - instant) <= reach])
+
+
+def detect_jumps(series: Series) -> list[tuple[float, float, float]]:
+    """Detect isolated jumps of a series."""
+    values = series.values if series.values.ndim == 1 else series.values.mean(axis=1)
+    changes = np.diff(values)
+    if changes.size < 9:
+        return []
+    excess = np.empty_like(changes)
+    for k in range(changes.size):
+        low, high = max(0, k - 3), min(changes.size, k + 4)
+        excess[k] = changes[k] - np.median(np.delete(changes[low:high], k - low))
+    scatter = 1.4826 * np.median(np.abs(excess - np.median(excess)))
+    # A log in steps of its resolution has no finer scatter than one step.
+    steps = np.abs(changes[changes != 0.0])
+    resolution = float(steps.min()) if steps.size and np.unique(np.round(steps, 9)).size < steps.size / 2 else 0.0
+    far = np.flatnonzero(np.abs(excess) > _JUMP_SIGMAS * max(scatter, resolution, 1e-9))
+    return [(float(series.seconds[k]), float(series.seconds[k + 1]), float(excess[k])) for k in far]
+
+
+def detect_sensor_jumps(readings: Readings) -> list[tuple[str, float, float, float]]:
+    """Detect isolated jumps in the environment log."""
+    present = [name for name in ENVIRONMENT if name in readings.series]
+    return [(name, *jump) for name in present for jump in detect_jumps(readings.series[name])]
+
+
+def detect_stuck_sensors(readings: Readings) -> list[tuple[str, float]]:
+    """Detect sensors whose reading stays constant to the end of the log."""
+    stuck = []
+    for name in ("air_temperature", "air_pressure", "material_temperature"):
+        if name not in readings.series:
+            continue
+        series = readings.series[name]
+        moved = np.flatnonzero(np.diff(series.values) != 0.0)
+        if moved.size < 10:
+            continue
+        last = int(moved[-1]) + 1
+        usual = float(np.quantile(np.diff(moved), 0.95))
+        if series.values.size - last > 10 * usual:
+            stuck.append((name, float(series.seconds[last])))
+    return stuck
+
+
+#: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
+_MOST_PERIODS = 300
+#: So many readings have waves that are held: they take 60 MB, and the search 1/20 less time than if computed for every block.
+_HELD_READINGS = 12_000
+
+
+def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Steps at the instants that can be tried."""
+    tried = event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
+    place, alike = np.zeros(readings.seconds.size, int), np.ones((1, 1))
+    for instant in tried:
+        late = Separable((readings.seconds >= instant,), place, alike)
+        yield Candidate(late, {"time_s": float(instant)}, ("um",), instant)
+
+
+def periods_min(readings: Readings) -> Array:
+    """Periods that are tried: evenly spaced in frequency at half the resolution of the recording, from 3 min to a third of it."""
+    span = _span_min(readings)
+    return np.asarray(1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
+
+
+def _span_min(readings: Readings) -> float:
+    return float(readings.seconds[-1] - readings.seconds[0]) / 60.0
+
+
+def off_the_cycle(readings: Readings, frequencies: Array) -> Array:
+    """Leave out frequencies within four lines of the cycle's own frequency or a multiple of it."""
+    cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
+    order = np.maximum(1.0, np.round(frequencies / cycle))
+    return np.asarray(frequencies[np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings)])
+
+
+def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Waves in time, flat or along the axis."""
+    # A long campaign tells so many periods apart that the shortest are left out: the search stays linear in the readings.
+    periods = (
+        periods_min(readings)[:_MOST_PERIODS]
+        if near is None
+        else _close_periods(readings, float(near.parameters["period_min"]))
+    )
+    place, share = readings.target_index, readings.positions_mm / readings.span_mm
+    weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
+    for period in periods:
+        waves: tuple[Array | Wave, ...] = tuple(
+            Wave(shape, readings.seconds, 60.0 * period) for shape in (np.cos, np.sin)
+        )
+        if readings.seconds.size <= _HELD_READINGS:
+            waves = tuple(map(np.asarray, waves))
+        for shape, weight in weights.items():
+            yield Candidate(
+                Separable(waves, place, weight), {"period_min": float(period), "shape": shape}, ("um", "um")
+            )
+
+
+def _close_periods(readings: Readings, chosen_min: float) -> Array:
+    """Periods about a chosen one, as close as the recording can separate; none beyond those of the search."""
+    span = _span_min(readings)
+    near = 1.0 / chosen_min + np.linspace(-0.5, 0.5, 21) / span
+    near = near[(near > 2.999 / span) & (near < 1.001 / 3.0)]
+    return np.asarray(1.0 / off_the_cycle(readings, near))
+
+
+STEP_EVENT = Effect(
+    name="step_event",
+    physics="A mount, clamp or optic slips once, or the laser gets a new zero: all readings after that instant are shifted.",
+    source="level shift at one instant",
+    candidates=_step_event,
+    repeats=True,
+    label="sudden step or new zero",
+    remedy="Ask whether the laser was zeroed or its beam broken at that time; if not, look at the clamping of optics and laser head.",
+)
+PERIODIC_DISTURBANCE = Effect(
+    name="periodic_disturbance",
+    physics="Cooling, coolant or air conditioning switches in a fixed rhythm.",
+    source="line in the spectrum of the readings' own times",
+    candidates=_periodic_disturbance,
+    repeats=True,
+    label="periodic disturbance",
+    remedy="Compare its period with coolant, hydraulics and air conditioning.",
+)

@@ -1,0 +1,287 @@
+"""Heat: expansion with the seen field, its delayed copies, and sources out of the camera's sight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fusion.analysis.alignment.readings import Readings
+from fusion.analysis.effects.effect import (
+    LAGS_MIN,
+    Candidate,
+    Effect,
+    Parameters,
+    Prior,
+    Separable,
+    first_order_responses,
+    thermal_states,
+    um_per,
+    unit_of_state,
+    unmeasured_expansion,
+    values_near,
+)
+from fusion.common import Array
+
+# Geometry that changes with a thermal state: bending, reversal, and the cyclic error of the screw.
+
+#: Shortest lead of a screw that is tried where the targets are spaced unevenly.
+SHORTEST_LEAD_MM = 4.0
+#: Smallest amplitude of a wave at the targets that is more than rounding.
+_VISIBLE = 1e-6
+
+
+def _needs_both_directions(readings: Readings) -> str | None:
+    return None if np.unique(readings.sign).size == 2 else "only one direction of approach was measured"
+
+
+def _angular_growth(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """States times the square of the position."""
+    for state, parameters in thermal_states(readings, near):
+        yield Candidate((state * readings.share**2)[:, None], parameters, (unit_of_state(readings, parameters),))
+
+
+def _reversal_drift(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """States times half the direction of approach."""
+    for state, parameters in thermal_states(readings, near):
+        yield Candidate((state * 0.5 * readings.sign)[:, None], parameters, (unit_of_state(readings, parameters),))
+
+
+def _spatial_frequencies(readings: Readings) -> Array:
+    """Frequencies along the axis (1/mm) from two periods over the travel up to what the targets can show."""
+    positions = np.sort(readings.positions_mm)
+    travel = positions[-1] - positions[0]
+    highest = 0.5 * (positions.size - 1) if _evenly_spaced(readings) else travel / SHORTEST_LEAD_MM
+    return np.arange(2.0, highest + 1e-9, 0.5) / travel
+
+
+def _evenly_spaced(readings: Readings) -> bool:
+    """Whether targets are so even that a lead and its alias look alike: to a hundredth of the spacing."""
+    spacing = np.diff(np.sort(readings.positions_mm))
+    return bool(np.ptp(spacing) < 0.01 * spacing.mean())
+
+
+def _aliased_lead_mm(readings: Readings, frequency: float) -> str:
+    """Leads between 2 and 50 mm that evenly spaced targets show as the same frequency."""
+    spacing = np.diff(np.sort(readings.positions_mm))
+    if not _evenly_spaced(readings):
+        return f"{1 / frequency:.3g} mm (targets unevenly spaced: no alias)"
+    sampling = 1.0 / spacing.mean()
+    orders = np.arange(0, int(0.5 / sampling) + 2)
+    leads = {1 / f for k in orders for f in (k * sampling + frequency, k * sampling - frequency) if 1 / 50 <= f <= 0.5}
+    return ", ".join(f"{lead:.3g}" for lead in sorted(leads, reverse=True)) + " mm"
+
+
+def hidden_leads_mm(readings: Readings) -> str:
+    """Leads between 2 and 50 mm of which evenly spaced targets see one phase only."""
+    if not _evenly_spaced(readings):
+        return ""
+    spacing = float(np.ptp(readings.positions_mm)) / (readings.positions_mm.size - 1)
+    leads = [spacing / k for k in range(1, int(spacing / 2.0) + 1) if 2.0 <= spacing / k <= 50.0]
+    return ", ".join(f"{lead:.3g}" for lead in leads) + " mm" if leads else ""
+
+
+def _pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Waves along the axis times slow states."""
+    states = list(thermal_states(readings, near))
+    if near is None:
+        states = [pair for pair in states if pair[1]["time_constant_min"] in {0.0, 40.0, 60.0}]
+    if near is None and not _evenly_spaced(readings):
+        # Uneven targets leave a hundred and more waves to try; each then follows one course of every kind only.
+        states = [p for p in states if p[1]["time_constant_min"] != 0.0 and p[1].get("start") != "at rest"]
+    frequencies = _spatial_frequencies(readings)
+    if near is not None:
+        close = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(readings.positions_mm)
+        # A wave longer than half the travel is a bending, not a screw's.
+        frequencies = close[(close > 0.999 * frequencies[0]) & (close < 1.001 * frequencies[-1])]
+    place = readings.target_index
+    measured = np.unique(place)
+    for frequency in frequencies:
+        phase = 2 * np.pi * frequency * readings.positions_mm
+        waves = np.column_stack([np.cos(phase), np.sin(phase)])
+        # Targets at every half wave show one phase only; what is left of the other is rounding.
+        waves = waves[:, np.abs(waves[measured]).max(axis=0) > _VISIBLE]
+        for state, followed in states:
+            parameters: Parameters = {
+                **followed,
+                "period_mm": float(1 / frequency),
+                "possible_leads": _aliased_lead_mm(readings, frequency),
+            }
+            along = Separable((state,) * waves.shape[1], place, waves)
+            yield Candidate(along, parameters, (unit_of_state(readings, followed),) * waves.shape[1])
+
+
+def _hidden_leads(readings: Readings) -> str:
+    """Leads of which evenly spaced targets see one phase only, in words."""
+    hidden = hidden_leads_mm(readings)
+    return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all" if hidden else ""
+
+
+ANGULAR_GROWTH = Effect(
+    name="angular_growth",
+    physics="Guide or table bends as it warms; the Abbe offset turns the growing angle into an error that is quadratic along the axis.",
+    source="Abbe principle, Bryan 1979: 1 arcsec x 100 mm = 0.48 um",
+    candidates=_angular_growth,
+    masked_by=unmeasured_expansion,
+    patterned=True,
+    label="growing pitch or yaw of the axis",
+    remedy="Measure pitch and yaw while the machine warms up; keep the Abbe offset short.",
+)
+REVERSAL_DRIFT = Effect(
+    name="reversal_drift",
+    physics="Backlash or wind-up changes with temperature: both directions move apart by the same amount at every position.",
+    source="ISO 230-2, reversal value B",
+    candidates=_reversal_drift,
+    needs=_needs_both_directions,
+    patterned=True,
+    label="reversal that changes with time",
+    remedy="Check screw preload, gibs and the scale's coupling; measure the reversal warm and cold.",
+)
+PITCH_ERROR = Effect(
+    name="pitch_error",
+    physics="The cyclic error of the screw changes as it warms: a wave along the axis whose size follows a thermal state.",
+    source="periodic error of the lead; aliased where the spacing is a multiple of the lead",
+    candidates=_pitch_error,
+    patterned=True,
+    limitation=_hidden_leads,
+    label="pitch error of the screw",
+    remedy="Repeat with a target spacing that is no multiple of the screw's lead.",
+)
+
+
+#: Standard uncertainty of an expansion coefficient from a table: steels and cast irons lie between 9 and 14 ppm/K.
+EXPANSION_U_PPM_PER_K = 2.0
+#: Name of the declared model of a record: every displacement a linear function of the temperatures.
+QUASI_STATIC = "quasi_static"
+#: Prefix of the series that are temperature sensors of a record.
+SENSOR_PREFIX = "temperature "
+#: Time constant of a second body that the search tries, as a share of the first one's.
+_SECOND_BODY_TRIED = (0.25,)
+
+
+def needs_field(readings: Readings) -> str | None:
+    """Say that a campaign without thermal frames cannot show an effect, or return None."""
+    return None if "mean_rise" in readings.series else "the campaign holds no temperature of the table"
+
+
+def _needs_driver(readings: Readings) -> str | None:
+    needed = "nothing that drives a heat source was logged; log duty, speed or load as [drivers]"
+    return None if readings.drivers else needed
+
+
+def _axis_expansion(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Integral of the seen rise along the measured line: K mm times 1e-6 is 1e-3 um per ppm/K."""
+    yield Candidate((readings.at(readings.series["axis_integral"]) * 1e-3)[:, None], {}, ("ppm/K",))
+
+
+def _table_offset(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Mean rise of the seen table."""
+    yield Candidate(readings.at(readings.series["mean_rise"])[:, None], {}, ("um/K",))
+
+
+def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Delayed copies of the seen temperatures, flat and along the axis."""
+    # Between two frames the field is a straight line; a shorter lag is not in the data.
+    frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
+    for minutes in values_near(near, "time_constant_min", LAGS_MIN, ratio=1.5):
+        if minutes < 2.0 * frames_min:
+            continue
+        axis = readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) * 1e-3
+        offset = readings.at(readings.series["mean_rise"].lagged(60.0 * minutes))
+        yield Candidate(offset[:, None], {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
+        yield Candidate(axis[:, None], {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))
+        both: Parameters = {"time_constant_min": minutes, "shape": "flat and linear"}
+        yield Candidate(np.column_stack([offset, axis]), both, ("um/K", "ppm/K"))
+
+
+def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Responses to the logged drivers, flat and along the axis."""
+    for name in readings.drivers:
+        unit = um_per(readings.series[name].units)
+        for lagged, response in first_order_responses(
+            readings.series[name], near, LAGS_MIN, ratio=1.5, second=_SECOND_BODY_TRIED
+        ):
+            settled = readings.at(lagged)
+            # What the body was before the log began is not known; its memory of it dies away with the same time constant.
+            memory = np.exp(-readings.seconds / (60.0 * float(response["time_constant_min"])))
+            for shape, along in (
+                ("flat", (1.0,)),
+                ("linear", (readings.share,)),
+                ("flat and linear", (1.0, readings.share)),
+            ):
+                parameters: Parameters = {"follows": name, **response, "shape": shape}
+                follow = [settled * factor for factor in along]
+                start = [memory * factor for factor in along]
+                units = (unit,) * len(along)
+                yield Candidate(np.column_stack(follow), {**parameters, "start": "settled"}, units)
+                both, units = np.column_stack([*follow, *start]), units + ("um",) * len(along)
+                yield Candidate(both, {**parameters, "start": "free"}, units, beside=len(along))
+
+
+def _quasi_static(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Rise of every temperature sensor."""
+    sensors = [series for name, series in readings.series.items() if name.startswith(SENSOR_PREFIX)]
+    yield Candidate(np.column_stack([readings.at(series) for series in sensors]), {}, ("um/K",) * len(sensors))
+
+
+AXIS_EXPANSION = Effect(
+    name="axis_expansion",
+    physics="The table lengthens along the measured line as it warms: one coefficient times the integral of the seen rise.",
+    source="ISO/TR 16015; steel 11.7 ppm/K",
+    candidates=_axis_expansion,
+    needs=needs_field,
+    follows_field=True,
+    prior=Prior(11.7, EXPANSION_U_PPM_PER_K),
+    declarable=True,
+    label="expansion of the axis",
+    remedy="Check the expansion coefficient and the probe place that the laser's compensation uses.",
+)
+TABLE_OFFSET = Effect(
+    name="table_offset",
+    physics=(
+        "Everything between table and laser moves together with the table's mean temperature: the same shift at all positions."
+    ),
+    source="ISO 230-3, thermal distortion",
+    candidates=_table_offset,
+    needs=needs_field,
+    follows_field=True,
+    declarable=True,
+    label="shift with the table's mean temperature",
+    remedy="Look at the thermal path from table to scale and at the table's clamping.",
+)
+THERMAL_LAG = Effect(
+    name="thermal_lag",
+    physics="A remote or massive part follows the seen table late, with a time constant of its own, and goes on moving after it.",
+    source="first-order response of a lumped heat capacity",
+    candidates=_thermal_lag,
+    needs=needs_field,
+    follows_field=True,
+    excited_by="field",
+    label="thermal lag of a remote structure",
+    remedy="Wait longer before measuring, or log the temperature of the column and the bed.",
+)
+UNSEEN_HEAT_SOURCE = Effect(
+    name="unseen_heat_source",
+    physics=(
+        "A source out of the camera's sight (spindle, motor, bearing) warms with the logged load and moves the reading with its "
+        "own time constant."
+    ),
+    source="Mayr et al. 2012, CIRP Annals 61, 771",
+    candidates=_unseen_heat_source,
+    needs=_needs_driver,
+    masked_by=unmeasured_expansion,
+    excited_by="driver",
+    label="unseen heat source",
+    remedy=(
+        "Look for the source where neither camera nor sensors reach: spindle, motor, drive, screw bearing, hydraulics; log its duty."
+    ),
+)
+QUASI_STATIC_RESPONSE = Effect(
+    name=QUASI_STATIC,
+    physics="Every displacement follows the temperatures at once: the declared model of a record.",
+    source="ISO 230-3",
+    candidates=_quasi_static,
+    declarable=True,
+    label="quasi-static response to the temperatures",
+    remedy="Check that the sensors sit on the parts that move the tool and the work.",
+)

@@ -1,0 +1,227 @@
+"""The screen *Compare*."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import panel as pn
+import xarray as xr
+
+from fusion.analysis.comparison import ComparedCampaign, PairComparison, compare_campaigns
+from fusion.app import parts as ui
+from fusion.app.results.charts import shown_if, table_of
+from fusion.common import FusionError
+from fusion.report.charts.style import (
+    CATEGORIES,
+    Chart,
+    add_band,
+    add_series,
+    add_zero_line,
+    new_figure,
+    of_rank,
+    span_words,
+)
+from fusion.report.comparison import campaign_names, changes_table, conclude_comparison, side_by_side
+from fusion.results.results import read_results
+from interferometry.plots import ACCENT
+
+# Charts of a comparison: profiles over one another, what remains of their difference, scatter by position.
+
+_MARKS = ("circle", "square", "triangle", "diamond", "inverted_triangle", "x")
+#: Values of a campaign over position, and half their 95 % intervals, from its drift in order of position.
+_Values = Callable[[xr.Dataset], tuple[np.ndarray, np.ndarray]]
+
+
+def plot_profiles(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> Chart | None:
+    """Draw the profiles of all campaigns, mean of the approaches, each about its mean, with their 95 % bands."""
+
+    def profile(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+        value = drift["profile"].mean("direction").values
+        return value - np.nanmean(value), 2 * drift["profile_u"].mean("direction").values
+
+    seen = "Profiles about their means"
+    return _plot_campaigns(campaigns, names, profile, "deviation about its mean", seen, line=True)
+
+
+def plot_scatters(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> Chart | None:
+    """Draw the scatter at every position of all campaigns."""
+
+    def scatter(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+        value, freedom = drift["scatter_position"].values, drift["scatter_freedom"].sum("direction").values
+        return value, 2 * value / np.sqrt(2 * np.maximum(freedom, 1.0))
+
+    return _plot_campaigns(campaigns, names, scatter, "scatter s", "Scatter of single readings by position", line=False)
+
+
+def _plot_campaigns(
+    campaigns: Sequence[ComparedCampaign],
+    names: Sequence[str],
+    values: _Values,
+    quantity: str,
+    seen: str,
+    *,
+    line: bool,
+) -> Chart | None:
+    """Draw one quantity of every campaign with readings over position: as lines with bands about zero, or as points from zero."""
+    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", legend_columns=1)
+    columns: dict[str, np.ndarray] = {}
+    told = []
+    for k, (campaign, name) in enumerate(zip(campaigns, names, strict=True)):
+        if campaign.drift is None:
+            continue
+        drift = campaign.drift.sortby("position")
+        x = drift["position"].values.astype(float)
+        value, half = values(drift)
+        looks = of_rank(k)
+        if line:
+            add_band(drawn, x, value - half, value + half, looks["colour"])
+        add_series(drawn, x, value, name=name, half=half, marker=_MARKS[k % len(_MARKS)], line=line, **looks)
+        columns |= {f"position, {name} / mm": x, f"{quantity.split()[0]}, {name} / µm": value}
+        told.append(f"{name} {span_words(value, 'µm')}")
+    if not told:
+        return None
+    if line:
+        add_zero_line(drawn)
+    else:
+        drawn.y_range.start = 0.0
+    return Chart(drawn, f"{seen}: {'; '.join(told)}.", columns)
+
+
+def plot_remaining(pair: PairComparison) -> Chart | None:
+    """Draw the difference of two profiles beyond offset, slope and bow with its 95 % interval; positions that changed are marked."""
+    if pair.profile is None:
+        return None
+    x, value, half = pair.profile.position_mm, pair.profile.remaining_um, 2 * pair.profile.remaining_u_um
+    drawn = new_figure(x="position / mm", y="difference / µm")
+    add_zero_line(drawn)
+    style: dict[str, Any] = {"colour": CATEGORIES[0], "line": False, "marker": "circle", "legend": False}
+    add_series(drawn, x, value, name="after − before", half=half, **style)
+    changed = [change.position_mm for change in pair.changes if change.group == "profile" and change.significant]
+    places = sorted({place for place in changed if place is not None})
+    at = np.isin(x, places)
+    if at.any():
+        drawn.scatter(x[at], value[at], marker="circle", size=17, fill_color=None, line_color=ACCENT, line_width=2.5)
+    marked = f"changed: {', '.join(f'{place:g} mm' for place in places)}" if places else "no position changed"
+    seen = f"Difference of the profiles beyond offset, slope and bow: {span_words(value, 'µm')}; {marked}."
+    return Chart(drawn, seen, {"position / mm": x, "difference / µm": value, "95 % interval ± / µm": half})
+
+
+#: Folders below the one of the application in which results are looked for, and most results that are listed.
+_DEPTH, _MOST = 4, 200
+
+
+def find_results(root: Path) -> tuple[list[Path], bool]:
+    """Find results folders of finished runs."""
+    found: list[Path] = []
+    for place, folders, files in os.walk(root):
+        here = Path(place)
+        if "results.json" in files and "provenance.json" in files:
+            found.append(here)
+            folders.clear()
+        depth = len(here.relative_to(root).parts)
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and depth < _DEPTH)
+        if len(found) > _MOST:
+            break
+    return sorted(found[:_MOST]), len(found) <= _MOST
+
+
+def label_of(root: Path, folder: Path) -> str:
+    """Return what the list shows of a results folder: its path, and the campaign with the day of its first reading."""
+    name = folder.relative_to(root).as_posix()
+    try:
+        results = read_results(folder)
+    except (FusionError, OSError):
+        return f"{name} (cannot be read)"
+    day = f", {results.time.first[:10]}" if results.time else ""
+    return f"{name}: {results.campaign}{day}"
+
+
+class CompareScreen:
+    """Chooses campaigns and shows what differs between them."""
+
+    def __init__(self, state: ui.State) -> None:
+        self._state = state
+        self._reference = pn.widgets.Select(
+            label="Reference (before a repair, or the oldest)", options={}, sizing_mode="stretch_width"
+        )
+        self._others = pn.widgets.CheckBoxGroup(label="Compared with it", options={})
+        look = pn.widgets.Button(label="Look for results again")
+        self._compare = pn.widgets.Button(label="Compare", color="primary")
+        self._told, self._found = ui.column(), ui.column()
+        look.on_click(lambda event: self._list())
+        self._compare.on_click(self._show)
+        self._reference.param.watch(lambda event: self._offer(), "value")
+        self._list()
+        choice = (self._reference, ui.paragraph("Compared with it:"), self._others, pn.Row(self._compare, look))
+        self.view = ui.column(ui.heading("Compare"), *choice, self._told, self._found)
+
+    def _list(self) -> None:
+        """List the results that there are."""
+        folders, whole = find_results(self._state.root)
+        self._labels = {label_of(self._state.root, folder): folder for folder in folders}
+        self._reference.options = dict(self._labels)
+        self._offer()
+        self._compare.disabled = len(folders) < 2
+        told = (
+            [] if whole else [ui.paragraph(f"More than {_MOST} results folders: the first are listed.", kind="warning")]
+        )
+        if self._compare.disabled:
+            count = "one results folder" if folders else "no results folder"
+            told.append(
+                ui.note(f"There is {count} of a finished run in {self._state.root}; a comparison needs two or more.")
+            )
+        self._told[:] = told
+
+    def _offer(self) -> None:
+        """Offer every folder but the reference."""
+        chosen = [folder for folder in self._others.value or [] if folder != self._reference.value]
+        offered = {label: folder for label, folder in self._labels.items() if folder != self._reference.value}
+        # In one message: a box that is ticked between two of them would be emptied by the second.
+        self._others.param.update(options=offered, value=chosen)
+
+    async def _show(self, event: object) -> None:
+        others = list(self._others.value or [])
+        if not others:
+            self._found[:] = ui.faults("Choose at least one campaign to compare with the reference.")
+            return
+        with ui.disabled_during(self._compare):
+            try:
+                pairs = await asyncio.to_thread(compare_campaigns, [self._reference.value, *others])
+                ui.schedule_parts(self._found, comparison_parts(pairs))
+            except (FusionError, OSError) as error:
+                ui.schedule_parts(self._found, [ui.paragraph(str(error), kind="fault")])
+
+
+def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
+    """Return a comparison as parts of a screen: what changed first, then the figures side by side, charts, and every quantity."""
+    names = campaign_names(pairs)
+    campaigns = [pairs[0].before, *(pair.after for pair in pairs)]
+    compared = list(zip(names[1:], pairs, strict=True))
+    parts: ui.Parts = []
+    for name, pair in compared:
+        parts.append(ui.heading(f"From {names[0]} to {name}", level=3))
+        parts += [ui.paragraph(sentence) for sentence in conclude_comparison(pair)]
+        if pair.not_compared:
+            parts += [ui.paragraph("Not compared:"), ui.bullets(pair.not_compared)]
+    figures = table_of(side_by_side(pairs), "Figures of every campaign, expanded uncertainties (k = 2)")
+    parts += [ui.heading("Side by side", level=3), figures]
+    profiles = "Drift-free profiles, mean of both approaches, each about its mean, with 95 % bands."
+    parts += shown_if(plot_profiles(campaigns, names), profiles)
+    parts += shown_if(plot_scatters(campaigns, names), "Scatter of single readings with 95 % intervals.")
+    for name, pair in compared:
+        left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed: changed."
+        parts += shown_if(plot_remaining(pair), left)
+        if pair.changes:
+            every = f"Everything that was compared, {names[0]} before and {name} after"
+            parts.append(table_of(changes_table(pair), every))
+    return parts
+
+
+def compare_screen(state: ui.State) -> pn.viewable.Viewable:
+    """Build the screen *Compare* for a page."""
+    return CompareScreen(state).view

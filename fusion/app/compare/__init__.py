@@ -1,1 +1,0 @@
-"""Compare: campaigns of one machine over months, and what changed by more than the uncertainties."""

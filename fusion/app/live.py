@@ -1,0 +1,263 @@
+"""The screen *Live*."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import panel as pn
+import xarray as xr
+from bokeh.models import LinearColorMapper
+
+from fusion.app import parts as ui
+from fusion.app.results.charts import draw_cells, shown_if
+from fusion.campaign.config import load_campaign
+from fusion.common import FusionError
+from fusion.pipeline.check import BAD_INPUT
+from fusion.pipeline.watch import Enough, LiveState, follow
+from fusion.report.charts.style import CATEGORIES, Chart, add_series, add_zero_line, new_figure, palette, span_words
+from fusion.report.wording import number
+from fusion.results.progress import counted
+from interferometry.plots import ACCENT, INK, MUTED
+
+# A running test, followed beside the page in a thread of its own.
+
+#: Most warnings that are kept, the latest ones.
+_MOST_WARNINGS = 30
+
+
+@dataclass
+class Course:
+    """What a test has shown so far; of the fields only the latest is kept.
+
+    Drifts in um, of the last target of the file in ``far_drift_um``; the rise in K; temperatures in degC; NaN where there is no value.
+    """
+
+    cycle: list[int] = field(default_factory=list)
+    mean_drift_um: list[float] = field(default_factory=list)
+    far_drift_um: list[float] = field(default_factory=list)
+    rise_K: list[float] = field(default_factory=list)
+    iso230_cycle: list[int] = field(default_factory=list)
+    iso230_um: list[dict[str, float]] = field(default_factory=list)
+    latest_field: xr.DataArray | None = None
+    field_cycle: int = 0
+    field_range_degC: tuple[float, float] = (np.inf, -np.inf)
+    enough: Enough | None = None
+    frames: int = 0
+    readings: int = 0
+    window: str = ""
+    warnings: list[str] = field(default_factory=list)
+
+    def take(self, state: LiveState) -> None:
+        """Add what is new."""
+        self.frames, self.readings = state.frames, state.readings
+        self.warnings = [*self.warnings, *state.warnings][-_MOST_WARNINGS:]
+        self.enough = state.enough or self.enough
+        cycle = state.cycle
+        if cycle is None:
+            return
+        self.cycle.append(cycle.number)
+        self.mean_drift_um.append(cycle.mean_drift_um)
+        self.far_drift_um.append(float(cycle.drift_um[-1]) if cycle.drift_um.size else float("nan"))
+        self.rise_K.append(cycle.rise_K)
+        if state.iso230_um:
+            self.iso230_cycle.append(cycle.number)
+            self.iso230_um.append(dict(state.iso230_um))
+            self.window = state.iso230_window
+        if cycle.field is not None and cycle.field_range_degC is not None:
+            self.latest_field, self.field_cycle = cycle.field, cycle.number
+            (low, high), (new_low, new_high) = self.field_range_degC, cycle.field_range_degC
+            self.field_range_degC = (min(low, new_low), max(high, new_high))
+
+    def values(self, symbol: str) -> np.ndarray:
+        """Return one quantity of ISO 230-2 after every evaluation, um."""
+        return np.array([values.get(symbol, np.nan) for values in self.iso230_um])
+
+
+class LiveSession:
+    """Follows one campaign, whose files may still be growing, until it is ended.
+
+    ``version`` grows with everything that is new; ``fault`` says why it ended by itself, empty while it runs and after `end`.
+    """
+
+    def __init__(self, campaign: Path, *, wanted_u_um: float, poll_s: float = 1.0) -> None:
+        self._campaign = load_campaign(campaign)
+        self._wanted_u_um, self._poll_s = wanted_u_um, poll_s
+        self.course, self.version, self.fault = Course(), 0, ""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="live", daemon=True)
+        self._thread.start()
+
+    @property
+    def runs(self) -> bool:
+        """Whether the test is still followed."""
+        return self._thread.is_alive()
+
+    def end(self, timeout_s: float | None = None) -> None:
+        """Tell it to end."""
+        self._stop.set()
+        if timeout_s is not None:
+            self._thread.join(timeout_s)
+
+    def _follow(self) -> None:
+        try:
+            for state in follow(self._campaign, poll_s=self._poll_s, wanted_u_um=self._wanted_u_um, stop=self._stop):
+                self.course.take(state)
+                self.version += 1
+        except BAD_INPUT as error:
+            self.fault = str(error)
+        except Exception as error:  # the page must say that nothing is followed any more, whatever the reason
+            self.fault = f"fault of the program, not of the input: {type(error).__name__}; run the campaign when the test is over"
+        self.version += 1
+
+
+# Charts of a running test: latest field, drift and rise over the cycles, values by ISO 230-2.
+
+
+def plot_field(course: Course) -> Chart | None:
+    """Draw the latest field, on the scale of all fields so far."""
+    if course.latest_field is None:
+        return None
+    low, high = course.field_range_degC
+    mapper = LinearColorMapper(palette(), low=low, high=max(high, low + 0.1), nan_color="#e1e5e7")
+    drawn, _ = draw_cells(course.latest_field, mapper, "temperature", "°C", height=320)
+    seen = f"Temperature of the table in cycle {course.field_cycle}: {span_words(course.latest_field, '°C')}."
+    return Chart(drawn, seen, {})
+
+
+def plot_course(course: Course) -> Chart | None:
+    """Draw drift and rise over the cycles."""
+    if not course.cycle:
+        return None
+    cycle, told = np.array(course.cycle, float), []
+    series = (
+        ("drift, mean of the targets / µm", course.mean_drift_um, CATEGORIES[0], "circle"),
+        ("drift at the last target / µm", course.far_drift_um, CATEGORIES[1], "square"),
+        ("rise of the table / K", course.rise_K, ACCENT, "triangle"),
+    )
+    drawn = new_figure(x="cycle", y="since the first cycle / µm or K", legend_columns=1)
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {"cycle": cycle}
+    for name, values, colour, marker in series:
+        line = np.array(values, float)
+        if np.isfinite(line).any():
+            add_series(drawn, cycle, line, name=name, colour=colour, marker=marker)
+            columns[name] = line
+            told.append(f"{name.partition(' /')[0]} {span_words(line, name.rpartition('/ ')[2])}")
+    return Chart(drawn, f"{len(course.cycle)} cycles: {'; '.join(told) or 'no value yet'}.", columns)
+
+
+def plot_standard(course: Course) -> Chart | None:
+    """Draw accuracy A, repeatability R and reversal B of the last five cycles, after every cycle."""
+    if not course.iso230_cycle:
+        return None
+    cycle = np.array(course.iso230_cycle, float)
+    drawn = new_figure(x="cycle", y="A, R, B / µm")
+    columns: dict[str, np.ndarray] = {"cycle": cycle}
+    told = []
+    marks = (("A", INK, "circle"), ("R", ACCENT, "square"), ("B", MUTED, "diamond"))
+    for symbol, colour, marker in marks:
+        values = course.values(symbol)
+        if np.isfinite(values).any():
+            add_series(drawn, cycle, values, name=symbol, colour=colour, marker=marker)
+            columns[f"{symbol} / µm"] = values
+            told.append(f"{symbol} {span_words(values[-1:], 'µm').partition(' to ')[0]} µm")
+    return Chart(drawn, f"By ISO 230-2, {course.window}: {', '.join(told)}.", columns)
+
+
+_INTERVAL_MS = 1000
+
+
+class LiveScreen:
+    """Follows a running test and shows what it has shown so far."""
+
+    def __init__(self, state: ui.State) -> None:
+        self._state = state
+        self._session: LiveSession | None = None
+        self._seen = -1
+        beginning = state.campaign or (state.folder or state.root) / "campaign.toml"
+        self._campaign = ui.text_field("Campaign file of the running test", beginning)
+        wanted = {"label": "Wanted standard uncertainty of a position / µm", "value": 0.1, "start": 0.001, "step": 0.01}
+        self._wanted = pn.widgets.FloatInput(**wanted, width=330)
+        self._start = pn.widgets.Button(label="Follow", color="primary")
+        self._end = pn.widgets.Button(label="Stop following", disabled=True)
+        self._told, self._charts = ui.markup(""), ui.column()
+        self._start.on_click(self._on_start)
+        self._end.on_click(lambda event: self.end())
+        state.param.watch(lambda event: event.new and self._campaign.param.update(value=str(event.new)), "campaign")
+        what = (
+            "Follows a test while camera and laser write their files. Readings are shown as they were written; the results of the test "
+            "are those of Run."
+        )
+        buttons = pn.Row(self._start, self._end)
+        self.view = ui.column(
+            ui.heading("Live"), ui.note(what), self._campaign, self._wanted, buttons, self._told, self._charts
+        )
+
+    def end(self) -> None:
+        """Stop following: the page is closed, or the user asked for it."""
+        if self._session is not None:
+            self._session.end()
+
+    def _on_start(self, event: object) -> None:
+        try:
+            campaign = ui.allowed_path(self._state.root, self._campaign.value)
+            self._session = LiveSession(campaign, wanted_u_um=self._wanted.value or 0.1)
+        except FusionError as error:
+            self._session = None
+            self._charts[:] = ui.faults(error)
+            return
+        self._seen = -1
+        self._charts[:] = []
+        self.update()
+
+    def update(self) -> None:
+        """Show what is new."""
+        session = self._session
+        runs = session is not None and session.runs
+        self._start.disabled, self._end.disabled = runs, not runs
+        if session is None or session.version == self._seen:
+            return
+        self._seen = session.version
+        course = session.course
+        self._told.object = standing(course, self._wanted.value or 0.1, runs=runs)
+        drawn = [
+            *([ui.paragraph(session.fault, kind="fault")] if session.fault else []),
+            *shown_if(plot_field(course), "Latest field, on the scale of all fields so far."),
+            *shown_if(plot_course(course), "Drift of the readings and rise of the table since the first cycle."),
+            *shown_if(plot_standard(course), "By ISO 230-2, the last five cycles after every cycle."),
+        ]
+        if course.warnings:
+            drawn += [ui.heading("Noticed", level=3), ui.bullets(dict.fromkeys(course.warnings))]
+        self._charts[:] = drawn
+
+
+def standing(course: Course, wanted_u_um: float, *, runs: bool) -> str:
+    """Return how the test stands, as markup that is read aloud when it changes."""
+    seen = ((len(course.cycle), "finished cycle"), (course.frames, "frame"), (course.readings, "reading"))
+    verb = "Following" if runs else "No longer followed"
+    head = f"{verb}: {', '.join(counted(count, noun) for count, noun in seen)}."
+    return f'<p role="status">{ui.as_markup(head)} {ui.as_markup(enough_words(course, wanted_u_um))}</p>'
+
+
+def enough_words(course: Course, wanted_u_um: float) -> str:
+    """Return whether the cycles are enough, in words."""
+    enough = course.enough
+    if enough is None:
+        return "Whether the cycles are enough cannot be told yet."
+    lacks = f" {enough.lacks[:1].upper()}{enough.lacks[1:]}." if enough.lacks else ""
+    verdict = "The cycles are enough" if enough.is_enough else "The cycles are not enough yet"
+    return (
+        f"{verdict}: after {enough.cycles} of them the standard uncertainty of a position against the first one is "
+        f"{number(enough.u_um, 2)} µm, and {enough.cycles_for_wanted} cycles reach {wanted_u_um:g} µm.{lacks}"
+    )
+
+
+def live_screen(state: ui.State) -> pn.viewable.Viewable:
+    """Build the screen *Live* for a page."""
+    screen = LiveScreen(state)
+    pn.state.add_periodic_callback(lambda: ui.schedule_update(screen.update), _INTERVAL_MS)
+    pn.state.on_session_destroyed(lambda context: screen.end())
+    return screen.view

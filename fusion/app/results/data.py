@@ -1,0 +1,244 @@
+"""What the screen *Results* reads of a results folder: small tables at once, the fields of the camera one cycle or one place at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import param
+import xarray as xr
+from bokeh.events import Tap
+from bokeh.models import Span
+from bokeh.plotting import figure
+
+from fusion.app.parts import schedule_update
+from fusion.report.charts.plan import LAYERS, Layer, scale_of
+from fusion.results.loop import RecordLoop
+from fusion.results.results import Results, read_results
+from fusion.results.store import group, has, open_in_file, read_json_object, read_product, require_kind, require_own
+from interferometry.plots import ACCENT
+
+#: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
+_SCALE_CYCLES = 60
+#: A fields.nc of up to so many bytes is compared with the hash of its run; reading a larger one takes longer than a screen may wait.
+_HASHED_BYTES = 100_000_000
+
+
+class Products:
+    """The products of a finished run by its results folder, as a screen shows them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.results: Results = read_results(folder)
+        self._scales: dict[str, tuple[dict[str, Any], bool]] = {}
+
+    def __del__(self) -> None:
+        """Close fields.nc where it was opened."""
+        if "fields" in self.__dict__ and self.fields is not None:
+            self.fields.close()
+
+    @cached_property
+    def provenance(self) -> dict[str, Any]:
+        """Content of provenance.json; empty where it is missing."""
+        return read_json_object(self.folder / "provenance.json")
+
+    @cached_property
+    def fields(self) -> xr.Dataset | None:
+        """fields.nc, opened and not read; None without a camera."""
+        path = self.folder / "fields.nc"
+        if not path.is_file():
+            return None
+        if path.stat().st_size <= _HASHED_BYTES:
+            require_own(self.folder, [path.name])
+        return require_kind(open_in_file(path), "fields", path)
+
+    @cached_property
+    def deviations(self) -> xr.Dataset | None:
+        """Content of deviations.nc; None without a laser."""
+        return read_product(self.folder, "deviations") if (self.folder / "deviations.nc").is_file() else None
+
+    @cached_property
+    def drift(self) -> xr.Dataset | None:
+        """The joint estimate of profile and drift; None where the readings have no times, or there are none."""
+        read = self.deviations
+        return group(read, "drift") if read is not None and has(read, "drift") else None
+
+    @cached_property
+    def fusion(self) -> xr.Dataset | None:
+        """Root of fusion.nc; None where a run has none."""
+        kind = "record" if isinstance(self.results.loop, RecordLoop) else "fusion"
+        return read_product(self.folder, kind) if (self.folder / "fusion.nc").is_file() else None
+
+    @cached_property
+    def loop(self) -> xr.Dataset | None:
+        """The closed loop of an axis; None of a record, and where there was no model."""
+        root = self.fusion
+        if root is None or isinstance(self.results.loop, RecordLoop) or not has(root, "loop"):
+            return None
+        return group(root, "loop")
+
+    @property
+    def layers(self) -> list[Layer]:
+        """The quantities of the map."""
+        return [] if self.fields is None else [layer for layer in LAYERS if layer.variable in self.fields]
+
+    @property
+    def cycles(self) -> np.ndarray:
+        """Numbers of the cycles, of the camera or else of the laser."""
+        for product in (self.fields, self.deviations):
+            if product is not None:
+                return np.asarray(product["cycle"].values, int)
+        return np.array([], int)
+
+    @property
+    def targets(self) -> list[tuple[int, float]]:
+        """Number and position (mm) of every target, in the order of the axis."""
+        read = self.deviations
+        if read is None:
+            return []
+        pairs = zip(read["target"].values.tolist(), read["position"].values.tolist(), strict=True)
+        return sorted(((int(number), float(place)) for number, place in pairs), key=lambda one: one[1])
+
+    @property
+    def camera(self) -> xr.Dataset:
+        """fields.nc of a run that has a camera."""
+        assert self.fields is not None
+        return self.fields
+
+    def map_of(self, layer: Layer, cycle: int) -> np.ndarray:
+        """Return one quantity in one cycle, (y, x)."""
+        return np.asarray(self.camera[layer.variable].sel(cycle=cycle).values)
+
+    def scale(self, layer: Layer) -> tuple[dict[str, Any], bool]:
+        """Return the one colour scale of a quantity, and whether all cycles entered it; the maps are read one at a time."""
+        if layer.words not in self._scales:
+            count = self.camera.sizes["cycle"]
+            chosen = np.unique(np.linspace(0, count - 1, min(count, _SCALE_CYCLES)).astype(int))
+            maps = [self.camera[layer.variable].isel(cycle=int(at)).values for at in chosen]
+            self._scales[layer.words] = scale_of(np.stack(maps), layer), chosen.size == count
+        return self._scales[layer.words]
+
+    def place_over_time(self, layer: Layer, x_mm: float, y_mm: float, size_mm: float) -> tuple[np.ndarray, int]:
+        """Return the mean of one quantity over a square of the plan in every cycle, (cycle,), and how many cells it has."""
+        columns, rows = (_within(self.camera[axis].values, at, size_mm) for axis, at in (("x", x_mm), ("y", y_mm)))
+        chosen = self.camera[layer.variable].isel(x=columns, y=rows)
+        return chosen.mean(["x", "y"]).values, chosen[0].size
+
+    @cached_property
+    def field_hours(self) -> np.ndarray:
+        """Mean time of the frames of every cycle, h since the first reading of the laser, or since the first cycle."""
+        times = self.camera["cycle_time"].values
+        read = times[:1] if self.deviations is None else self.deviations["time"].values
+        known = read[~np.isnat(read)]
+        return np.asarray((times - (known.min() if known.size else times[0])) / np.timedelta64(1, "h"), float)
+
+
+def _within(cells: np.ndarray, at: float, size: float) -> slice:
+    """Return the cells whose middle lies within half a size of a place, at least the nearest one."""
+    inside = np.flatnonzero(np.abs(cells - at) <= size / 2)
+    if inside.size == 0:
+        inside = np.array([int(np.argmin(np.abs(cells - at)))])
+    return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
+# What is chosen on the screen *Results*: a cycle, a position, and places on the plan; every part of the screen
+# watches it.
+
+#: What a coordinate of a chart is, so that a click on it chooses something.
+Axis = str
+POSITION, CYCLE, HOURS = "position", "cycle", "hours"
+
+
+class Place(NamedTuple):
+    """Middle and side of a square of the plan whose mean temperature is shown over time, in `unit`; side 0 is one cell."""
+
+    x_mm: float
+    y_mm: float
+    size_mm: float
+    unit: str = "mm"
+
+    @property
+    def words(self) -> str:
+        """The place as a legend names it."""
+        size = f", {self.size_mm:g} {self.unit} square" if self.size_mm else ""
+        return f"x {self.x_mm:.0f} {self.unit}, y {self.y_mm:.0f} {self.unit}{size}"
+
+
+class Selection(param.Parameterized):
+    """The choice of one page; no target without a laser, places in the order in which they were added."""
+
+    cycle: int = param.Integer()
+    target: int | None = param.Integer(default=None, allow_None=True)
+    places: list[Place] = param.List(item_type=Place)
+
+    def watch(self, update: Callable[[], None], name: str) -> param.parameterized.Watcher:
+        """Let a chart follow one of the choices."""
+        return self.param.watch(lambda event: schedule_update(update), name)
+
+    def add(self, place: Place) -> None:
+        """Add a place, once."""
+        if place not in self.places:
+            self.places = [*self.places, place]
+
+
+class Linker:
+    """Links charts to a selection: a line at what is chosen, and a click that chooses.
+
+    `targets` are numbers and positions (mm), `hours` the times of the cycles on the axes of the charts; None where there are none.
+    """
+
+    def __init__(
+        self, selection: Selection, targets: list[tuple[int, float]], cycles: np.ndarray, hours: np.ndarray | None
+    ) -> None:
+        self._selection = selection
+        self._targets = targets
+        #: Cycles, and where they are on an axis of charts.
+        self._cycles, self._shown = cycles, {CYCLE: cycles.astype(float), HOURS: hours}
+
+    def link(self, drawn: figure, *, x: Axis = "", y: Axis = "") -> Callable[[], None]:
+        """Mark the selection in a chart, and let a click on it choose; returns what ends that."""
+        sides = [(x, "height"), (y, "width")]
+        known = [(axis, side) for axis, side in sides if axis == POSITION or self._shown.get(axis) is not None]
+        watchers = [self._mark(drawn, axis, side) for axis, side in known]
+
+        def choose(event: Tap) -> None:
+            for axis, at in ((x, event.x), (y, event.y)):
+                if axis and at is not None:
+                    self._choose(axis, float(at))
+
+        drawn.on_event(Tap, choose)
+
+        def end() -> None:
+            for watcher in watchers:
+                self._selection.param.unwatch(watcher)
+
+        return end
+
+    def _mark(self, drawn: figure, axis: Axis, dimension: str) -> param.parameterized.Watcher:
+        """Draw a line at what is chosen, and move it with the choice."""
+        looks = {"line_color": ACCENT, "line_width": 2, "line_dash": "dashed", "name": f"chosen {axis}"}
+        span = Span(location=self._place(axis), dimension=dimension, **looks)
+        drawn.add_layout(span)
+        watched = "target" if axis == POSITION else "cycle"
+        return self._selection.watch(lambda: span.update(location=self._place(axis)), watched)
+
+    def _place(self, axis: Axis) -> float | None:
+        """Return where the selection lies on an axis; None where it has no place there."""
+        if axis == POSITION:
+            return dict(self._targets).get(self._selection.target or 0)
+        shown, at = self._shown[axis], np.flatnonzero(self._cycles == self._selection.cycle)
+        place = float(shown[at[0]]) if shown is not None and at.size else float("nan")
+        return place if np.isfinite(place) else None
+
+    def _choose(self, axis: Axis, at: float) -> None:
+        """Choose what lies nearest on an axis."""
+        if axis == POSITION:
+            if self._targets:
+                self._selection.target = min(self._targets, key=lambda one: abs(one[1] - at))[0]
+            return
+        shown = self._shown[axis]
+        if shown is not None and np.isfinite(shown).any():
+            self._selection.cycle = int(self._cycles[int(np.nanargmin(np.abs(shown - at)))])

@@ -1,1 +1,0 @@
-"""Run: the pipeline in a process of its own, watched from the page."""

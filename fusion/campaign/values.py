@@ -1,0 +1,298 @@
+"""Values of a campaign file as types: quantities with their unit, shares, patches, time zones, patterns; each names what is wrong."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import re
+from pathlib import Path
+from typing import Annotated
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
+
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
+
+from fusion.common import FusionError, suggest
+
+# Values that carry their unit: ``"5 mm"`` to a number in the unit that the calculation uses.
+
+#: Accepted units per canonical unit, as ``(factor, offset)``: canonical = value * factor + offset.
+_UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "mm": {
+        "nm": (1e-6, 0.0), "um": (1e-3, 0.0), "mm": (1.0, 0.0), "cm": (10.0, 0.0), "m": (1e3, 0.0), "in": (25.4, 0.0),
+    },
+    "um": {"nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0), "in": (25.4e3, 0.0)},
+    "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)},
+    "K": {"mK": (1e-3, 0.0), "K": (1.0, 0.0), "degC": (1.0, 0.0), "degF": (5.0 / 9.0, 0.0)},
+    "s": {"ms": (1e-3, 0.0), "s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
+    "ppm": {"ppb": (1e-3, 0.0), "ppm": (1.0, 0.0), "um/m": (1.0, 0.0), "%": (1e4, 0.0)},
+    "ppm/K": {"ppm/K": (1.0, 0.0), "um/m/K": (1.0, 0.0), "1/K": (1e6, 0.0)},
+    "mm/min": {"mm/min": (1.0, 0.0), "m/min": (1e3, 0.0), "mm/s": (60.0, 0.0)},
+    "px": {"px": (1.0, 0.0)},
+}  # fmt: skip
+_SPELLINGS = {
+    "µm": "um", "μm": "um", "°C": "degC", "℃": "degC", "C": "degC", "°F": "degF", "F": "degF", "sec": "s",
+    "µm/m": "um/m", "μm/m": "um/m", "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
+    "K^-1": "1/K", "pixel": "px", "pixels": "px",
+}  # fmt: skip
+#: Units written out, in any case.
+_WORDS = {
+    "deg c": "degC", "degree c": "degC", "degrees c": "degC", "celsius": "degC", "degree celsius": "degC", "degrees celsius": "degC",
+    "kelvin": "K", "deg f": "degF", "fahrenheit": "degF", "micron": "um", "microns": "um", "micrometer": "um", "micrometers": "um",
+    "micrometre": "um", "micrometres": "um", "millimeter": "mm", "millimetre": "mm", "second": "s", "seconds": "s", "minute": "min",
+    "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
+}  # fmt: skip
+_EXAMPLES = {
+    "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
+    "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min", "px": "4 px",
+}  # fmt: skip
+_KINDS = {
+    "mm": "a length", "um": "a displacement", "degC": "a temperature", "K": "a temperature difference", "s": "a time",
+    "ppm": "a share of a length", "ppm/K": "an expansion coefficient", "mm/min": "a feed rate",
+    "px": "a number of pixels",
+}  # fmt: skip
+#: Between a value and its standard uncertainty.
+_PLUS_MINUS = re.compile(r"\s*(?:\+/?-|±)\s*")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")
+
+
+#: Heading of a column with its unit, ``"name [unit]"`` or ``"name(unit)"``.
+_HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+
+
+class QuantityError(FusionError):
+    """A value whose number or unit cannot be understood; the message says what to write instead."""
+
+
+def unit_name(text: str) -> str:
+    """Return the house spelling of a unit (``"°C"`` -> ``"degC"``), or the text itself where none is known."""
+    text = text.strip()
+    return _SPELLINGS.get(text) or _WORDS.get(text.lower(), text)
+
+
+def name_and_unit(heading: str) -> tuple[str, str]:
+    """Return name and unit of the heading of a column; the unit is empty where it has none."""
+    match = _HEADING.fullmatch(heading)
+    return (match.group(1), unit_name(match.group(2))) if match else (heading.strip(), "")
+
+
+def conversion(unit: str, target: str) -> tuple[float, float]:
+    """Return ``(factor, offset)`` that bring values in `unit` to the canonical unit `target`."""
+    known = _UNITS[target]
+    name = unit_name(unit)
+    if name not in known:
+        raise QuantityError(f'"{unit}" is not a unit of {_KINDS[target]}; use one of {", ".join(known)}')
+    return known[name]
+
+
+def read_quantity(value: object, target: str) -> float:
+    """Return a number with unit, written as text, in the canonical unit."""
+    example = f'write for example "{_EXAMPLES[target]}"'
+    if isinstance(value, bool) or not isinstance(value, str):
+        raise QuantityError(f"{_KINDS[target]} needs its unit in the value; {example}")
+    match = _QUANTITY.fullmatch(value)
+    if match is None:
+        raise QuantityError(f"this is not {_KINDS[target]} with a unit; {example}")
+    number, unit = match.groups()
+    if unit is None:
+        raise QuantityError(f"{_KINDS[target]} needs its unit in the value; {example}")
+    factor, offset = conversion(unit, target)
+    result = float(number) * factor + offset
+    if not math.isfinite(result):
+        raise QuantityError(f"the number is not finite; {example}")
+    return result
+
+
+def read_option(option: str, text: str, target: str) -> float:
+    """Return the value of an option of the command in its canonical unit."""
+    try:
+        return read_quantity(text, target)
+    except QuantityError as error:
+        raise QuantityError(f'{option} "{text}": {error}') from None
+
+
+def split_uncertainty(text: str) -> tuple[str, str | None]:
+    """Return value and standard uncertainty of a text such as ``"22 +- 1 degC"``, each with its unit.
+
+    Parameters
+    ----------
+    text : str
+        Value, ``+-`` or ``±``, and standard uncertainty; a unit at the end belongs to both.
+
+    Returns
+    -------
+    value, uncertainty : str
+        ``"22 degC"`` and ``"1 degC"``; the uncertainty is None where none is given.
+
+    Examples
+    --------
+    >>> split_uncertainty("1.2 m +- 5 cm"), split_uncertainty("0.97 ± 0.01"), split_uncertainty("22 degC")
+    (('1.2 m', '5 cm'), ('0.97', '0.01'), ('22 degC', None))
+    """
+    value, *uncertainty = _PLUS_MINUS.split(text.strip(), maxsplit=1)
+    if not uncertainty:
+        return value, None
+    bare, stated = _QUANTITY.fullmatch(value), _QUANTITY.fullmatch(uncertainty[0])
+    if bare is not None and bare.group(2) is None and stated is not None and stated.group(2) is not None:
+        value = f"{value} {stated.group(2)}"
+    return value, uncertainty[0]
+
+
+#: Folders of a pattern, each of which is searched within the one before.
+_MAX_PARTS = 64
+
+
+def _quantity(unit: str) -> BeforeValidator:
+    """Return a validator from text with unit to a number in `unit`."""
+    return BeforeValidator(lambda value: read_quantity(value, unit))
+
+
+def _within(low: float, high: float, meaning: str) -> AfterValidator:
+    """Return a validator that accepts ``low < value <= high``."""
+
+    def validate(value: float) -> float:
+        if not low < value <= high:
+            raise ValueError(f"{meaning} must be above {low:g} and at most {high:g}")
+        return value
+
+    return AfterValidator(validate)
+
+
+def _share_u(value: float) -> float:
+    """Accept a standard uncertainty that is a share: 0 to 1."""
+    if not 0.0 <= value <= 1.0:
+        fault = f"the standard uncertainty {value:g} of a share lies outside 0 to 1"
+        raise ValueError(f'{fault}; write a number such as 0.02, or "2 %"')
+    return value
+
+
+def _fraction(value: object) -> object:
+    """Accept ``"45 %"`` as well as ``0.45``."""
+    if isinstance(value, str) and (match := re.fullmatch(r"\s*([\d.]+)\s*%\s*", value)):
+        return float(match.group(1)) / 100.0
+    return value
+
+
+def _written(example: str) -> WithJsonSchema:
+    """How a quantity looks in the file, for the JSON Schema."""
+    return WithJsonSchema({"type": "string", "description": "number with unit", "examples": [example]})
+
+
+Millimetres = Annotated[float, _quantity("mm"), _written("5 mm")]
+PositiveMillimetres = Annotated[float, _quantity("mm"), _within(0.0, 1e5, "this length in mm"), _written("5 mm")]
+Metres = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), _written("1.2 m")]
+Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temperature in degC"), _written("22 degC")]
+#: A camera whose clock was never set may be decades off; nanoseconds in 64 bits hold 292 years.
+Seconds = Annotated[float, _quantity("s"), _within(-3e9, 3e9, "this time in s"), _written("37 s")]
+PositiveSeconds = Annotated[float, _quantity("s"), _within(0.0, 1e6, "this time in s"), _written("2 s")]
+Pixels = Annotated[int, _quantity("px"), _within(0.0, 1e5, "this number of pixels"), _written("4 px")]
+PositiveMicrometres = Annotated[float, _quantity("um"), _within(0.0, 1e6, "this displacement in um"), _written("10 um")]
+PartsPerMillion = Annotated[
+    float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K"), _written("11.7 ppm/K")
+]
+Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
+Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
+#: Standard uncertainties.
+FractionU = Annotated[
+    float, BeforeValidator(_fraction), AfterValidator(_share_u), Field(json_schema_extra={"minimum": 0, "maximum": 1})
+]
+PartsPerMillionU = Annotated[
+    float, _quantity("ppm/K"), _within(1e-3, 200.0, "a standard uncertainty in ppm/K"), _written("0.5 ppm/K")
+]
+KelvinU = Annotated[float, _quantity("K"), Field(ge=0.0), _written("1 K")]
+ShareOfLengthU = Annotated[float, _quantity("ppm"), Field(ge=0.0), _written("0.25 ppm")]
+MicrometresU = Annotated[float, _quantity("um"), Field(ge=0.0), _written("0.4 um")]
+MetresU = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), Field(ge=0.0), _written("5 cm")]
+
+
+def _zone(name: str) -> str:
+    """Accept the IANA name of a time zone."""
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError(
+            f'there is no such time zone; {suggest(name, available_timezones())}write an IANA name such as "Europe/Vienna", or "UTC"'
+        ) from None
+    return name
+
+
+TimeZone = Annotated[str, AfterValidator(_zone)]
+
+
+def _patch(values: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    """Accept a patch that holds a pixel."""
+    if min(values[:2]) < 0 or min(values[2:]) < 1:
+        raise ValueError(
+            "this patch contains no pixel of a frame; write first column and first row, from 0 on, and the number of columns and of rows, "
+            "at least 1 each, for example [8, 8, 24, 16]"
+        )
+    return values
+
+
+#: First column and row, number of columns and rows.
+PixelPatch = Annotated[tuple[int, int, int, int], AfterValidator(_patch)]
+
+
+def area_mm2(corners: tuple[tuple[float, float], ...]) -> float:
+    """Return the area of a polygon by Gauss's formula, without its sense."""
+    pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
+    return abs(sum(x * y_next - x_next * y for (x, y), (x_next, y_next) in pairs)) / 2.0
+
+
+def corner_words(corners: tuple[tuple[float, float], ...]) -> str:
+    """Return the corners of a polygon for a message."""
+    return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"
+
+
+def not_a_file(path: Path) -> str:
+    """Return why something that is there is no file, or nothing."""
+    if os.path.isdir(path):  # noqa: PTH112 - a name that no file can have is none
+        return f"{path} is a folder; name a file in it"
+    if os.path.exists(path) and not os.path.isfile(path):  # noqa: PTH110, PTH113
+        return f"{path} is a pipe, a socket or a device; name a file"
+    return ""
+
+
+def matching_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files that a pattern matches; a link whose file is gone counts, so that it is missed."""
+    there = [path for path in _matches(folder, pattern) if path.is_file() or (path.is_symlink() and not path.exists())]
+    if Path(pattern).anchor:
+        return there
+    real = {place: place.resolve() for place in {path.parent for path in there}}
+    return [
+        real[path.parent] / path.name if not path.is_symlink() else path.resolve() if path.exists() else path
+        for path in there
+    ]
+
+
+def matching_pipes(folder: Path, pattern: str) -> list[Path]:
+    """Return the pipes, sockets and devices that a pattern matches, none of which is ever opened."""
+    return [path for path in _matches(folder, pattern) if path.exists() and not (path.is_file() or path.is_dir())]
+
+
+def _matches(folder: Path, pattern: str) -> list[Path]:
+    """Return all that a pattern matches, folders too; nothing where it is too long for a name."""
+    given = Path(pattern)
+    start = Path(given.anchor) if given.anchor else folder
+    try:
+        return list(start.glob(str(given.relative_to(given.anchor))))
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return []
+        raise
+
+
+def check_pattern(folder: Path, pattern: str) -> None:
+    """Refuse a pattern for which a whole disk would be searched."""
+    parts = Path(pattern).parts
+    if len(parts) > _MAX_PARTS:
+        raise ValueError(f"has more than {_MAX_PARTS} folders; name the files from a folder closer to them")
+    if "**" not in parts:
+        return
+    first = next(k for k, part in enumerate(parts) if set(part) & set("*?["))
+    start = folder.joinpath(*parts[:first]).resolve()
+    if start == Path(start.anchor):
+        raise ValueError(
+            f"would search folders of any depth (**) below {start}, the root of a disk; name the folder of the files before the first "
+            f"wildcard, for example {start / 'thermal' / '*.jpg'}"
+        )

@@ -1,1 +1,0 @@
-"""Many campaigns in one command: one process for each, and one table of what they found."""

@@ -1,1 +1,0 @@
-"""The closed loop (level 4): search for the missing effect, test, admissibility, hold-out, result."""

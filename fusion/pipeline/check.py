@@ -1,0 +1,192 @@
+"""Checks of a campaign that need no long work: the file, what it names, clocks and overlap, the axis on the plan, a few frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion.analysis.alignment.align import camera_on_laser_clock
+from fusion.analysis.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
+from fusion.campaign.config import Campaign, load_campaign
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_source
+from fusion.campaign.logs import read_drivers
+from fusion.common import FusionError
+from fusion.pipeline import record as record_stage
+from fusion.pipeline.checks import check_source
+from fusion.pipeline.inspect import Recording, time_bars
+from fusion.results.progress import counted
+from fusion.results.results import Notice
+from interferometry.common import InterferometryError
+from interferometry.io.readings import read_deviations, read_environment
+from thermography.common import ThermographyError
+from thermography.registration.plan import read_fiducials
+from thermography.registration.projection import read_lens
+
+#: What the readers raise for input that cannot be used.
+BAD_INPUT = (FusionError, ThermographyError, InterferometryError, OSError)
+
+
+@dataclass(frozen=True)
+class CampaignCheck:
+    """What is known of a campaign before it is run: ``faults`` say why it would be refused, ``notices`` what would be left out."""
+
+    path: Path
+    title: str = ""
+    content: tuple[str, ...] = ()
+    recordings: tuple[Recording, ...] = ()
+    faults: tuple[str, ...] = ()
+    checks: tuple[Check, ...] = ()
+    accepted: tuple[str, ...] = ()
+    notices: tuple[Notice, ...] = field(default=())
+
+    @property
+    def doubts(self) -> list[Check]:
+        """Checks that are not passed, nor accepted, and that a run would name first."""
+        return open_doubts(self.checks, self.accepted)
+
+    def lines(self, *, quiet: bool = False) -> list[str]:
+        """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only."""
+        doubts = [f"doubt ({check.code}): {check.evidence} {check.remedy}" for check in self.doubts]
+        faults = [f"fault: {fault}" for fault in self.faults]
+        if quiet:
+            return [*doubts, *faults]
+        title = [f"{self.path}: {self.title}"] if self.title else []
+        details = [f"  {line}" for line in (*self.content, *time_bars(self.recordings))]
+        notices = [f"note: {notice.message} {notice.remedy}".rstrip() for notice in self.notices]
+        if faults:
+            verdict = f"not ready: {counted(len(faults), 'fault')}"
+        elif self.checks:
+            doubted = f", {counted(len(doubts), 'doubt')}" if doubts else ""
+            verdict = f"ready to run: {counted(len(self.checks) - len(doubts), 'check')} passed{doubted}"
+        else:
+            verdict = "ready to run"
+        return [*title, *details, *notices, *doubts, *faults, verdict]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the check as a mapping of JSON's own types."""
+        return {
+            "campaign": self.title,
+            "ready": not self.faults,
+            "content": list(self.content),
+            "recordings": [
+                {"name": recording.name, "stretches": [[f"{a}Z", f"{b}Z"] for a, b in recording.stretches()]}
+                for recording in self.recordings
+            ],
+            "faults": list(self.faults),
+            "doubts": [{"code": one.code, "evidence": one.evidence, "remedy": one.remedy} for one in self.doubts],
+            "notices": [{"code": one.code, "message": one.message, "remedy": one.remedy} for one in self.notices],
+            "checks_passed": len(self.checks) - len(self.doubts),
+        }
+
+
+def check_campaign(path: Path) -> CampaignCheck:
+    """Check a campaign without running it; where it cannot be read, each of its files by itself."""
+    try:
+        campaign = load_campaign(path)
+    except BAD_INPUT as error:
+        return CampaignCheck(path, faults=tuple(dict.fromkeys(_words(error).splitlines())))
+    title = campaign.campaign.title
+    try:
+        if campaign.record is not None:
+            return _check_record(campaign)
+        source = read_source(campaign)
+        checks = tuple(check_source(source))
+    except BAD_INPUT as error:
+        faults = dict.fromkeys([_words(error), *_faults_of_files(campaign)])
+        return CampaignCheck(campaign.path, title, faults=tuple(faults))
+    try:
+        refuse_contradictions(checks)
+        contradictions = []
+    except ContradictionError as error:
+        contradictions = str(error).splitlines()
+    return CampaignCheck(
+        campaign.path,
+        title,
+        content=tuple(_content(source)),
+        recordings=tuple(_recordings(source)),
+        faults=tuple(contradictions),
+        checks=checks,
+        accepted=campaign.accept.doubts,
+        notices=tuple(source.notices),
+    )
+
+
+def _check_record(campaign: Campaign) -> CampaignCheck:
+    """Check a campaign whose data are a record."""
+    source = record_stage.read_source(campaign)
+    runs, table = len(campaign.record_paths()), source.health.table
+    content = (
+        f"record: {counted(runs, 'run')}, {counted(len(source.health.names), 'temperature')}, "
+        f"{counted(table.sizes['channel'], 'displacement')}, {counted(table.sizes['time'], 'row')}",
+    )
+    recordings = (Recording("record", table["time"].values),)
+    return CampaignCheck(campaign.path, campaign.campaign.title, content, recordings, notices=tuple(source.notices))
+
+
+def _content(source: Inputs) -> Iterator[str]:
+    """Say what was read."""
+    if isinstance(source, LaserInputs):
+        readings, position = source.deviations["deviation"], source.deviations["position"].values
+        yield (
+            f"readings: {counted(readings.sizes['cycle'], 'cycle')}, {counted(readings.sizes['target'], 'target')} from "
+            f"{position.min():g} to {position.max():g} mm, {int(readings.notnull().sum())} of {readings.size}"
+        )
+    if isinstance(source, CameraInputs):
+        first, grid = source.frames[0], source.grid
+        serial = f", serial {first.camera.serial}" if first.camera.serial else ""
+        yield (
+            f"frames: {len(source.frames)} of {first.shape[1]} x {first.shape[0]}, camera {first.camera.model or 'unknown'}{serial}, "
+            f"{len(source.frames_rejected)} left out"
+        )
+        if source.plan.in_pixels:
+            yield (
+                f"plan: the picture of {grid.width_mm:g} x {grid.height_mm:g} px in cells of {grid.cell_size_mm:g} px, no scale in mm"
+            )
+        else:
+            yield f"plan: {grid.width_mm:g} x {grid.height_mm:g} mm, {counted(len(source.fiducials), 'fiducial')}"
+    if source.sensors is not None:
+        yield f"contact sensors: {', '.join(source.sensors.names)}, {counted(source.sensors.temperature.sizes['time'], 'row')}"
+    for name, log in (("environment", source.environment), ("drivers", source.drivers)):
+        if log is not None:
+            yield f"{name}: {counted(log.sizes['time'], 'row')}, {', '.join(str(column) for column in log.data_vars)}"
+
+
+def _recordings(source: Inputs) -> Iterator[Recording]:
+    """Return what was recorded when, on the laser's clock."""
+    if isinstance(source, CameraInputs):
+        offset_s = source.thermography.clock_offset_s or 0.0
+        yield Recording("frames", camera_on_laser_clock(source.frame_times, offset_s))
+    if isinstance(source, LaserInputs):
+        yield Recording("readings", source.deviations["time"].values.ravel())
+    if source.sensors is not None:
+        yield Recording("contact sensors", source.sensors.temperature["time"].values)
+    for name, log in (("environment", source.environment), ("drivers", source.drivers)):
+        if log is not None:
+            yield Recording(name, np.asarray(log["time"].values))
+
+
+def _faults_of_files(campaign: Campaign) -> Iterator[str]:
+    """Read every file of a campaign by itself, and yield why it cannot be used."""
+    readers: tuple[tuple[Callable[[Path], object], object, str], ...] = (
+        (read_deviations, campaign.interferometry, "deviations"),
+        (read_environment, campaign.interferometry, "environment"),
+        (read_drivers, campaign.drivers, "file"),
+        (read_fiducials, campaign.plan, "fiducials"),
+        (read_lens, campaign.thermography, "lens"),
+    )
+    for read, table, key in readers:
+        name = getattr(table, key, None)
+        if name is not None:
+            try:
+                read(campaign.resolve(name))
+            except BAD_INPUT as error:
+                yield _words(error)
+
+
+def _words(error: Exception) -> str:
+    """Return a fault as a sentence; the system's own errors with the file that they name."""
+    return f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)

@@ -1,0 +1,402 @@
+"""A campaign file for a folder: what its files tell, what was answered, and marked lines for the rest."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fusion.campaign.values import QuantityError, read_quantity
+from fusion.common import FusionError
+from fusion.pipeline.inspect import (
+    FolderContent,
+    Kind,
+    Recognised,
+    column_unit,
+    is_displacement,
+    is_temperature,
+    is_time,
+    scan_folder,
+)
+from fusion.results.progress import counted
+from fusion.results.store import is_text, write_text
+from interferometry.common import InterferometryError
+from interferometry.io.readings import read_deviations
+from interferometry.io.tables import NO_ZONE
+from thermography.io.other_cameras import StackOptions, TemperatureReader, find_reader
+from thermography.registration.plan import Fiducial, read_fiducials
+
+# What the files of a folder cannot tell: asked at the terminal, or left as a marked line to be filled in.
+
+#: Mark of a line that somebody has to fill in before the campaign can run.
+TO_FILL = "FILL IN"
+#: ``ask(question, default)`` returns the answer; an empty one leaves the line to be filled in.
+Ask = Callable[[str, str], str]
+
+
+@dataclass(frozen=True)
+class Asker:
+    """Answers to questions from the terminal, or from defaults where ``ask`` is None; ``complain`` shows why an answer is refused."""
+
+    ask: Ask | None
+    complain: Callable[[str], None] = lambda text: None
+
+    def text(self, question: str, default: str) -> str:
+        """Return an answer of any text."""
+        return default if self.ask is None else self.ask(question, default)
+
+    def quantity(self, question: str, unit: str, default: str = "") -> str:
+        """Return a number with unit as the campaign file writes it, quoted; the mark of a line to fill in where there is no answer."""
+        while True:
+            answer = self.text(question, default).strip()
+            if not answer:
+                return json.dumps(TO_FILL)
+            try:
+                read_quantity(answer, unit)
+            except QuantityError as error:
+                if self.ask is None:
+                    raise
+                self.complain(str(error))
+                continue
+            return json.dumps(answer, ensure_ascii=False)
+
+    def choice(self, question: str, names: tuple[str, ...]) -> str:
+        """Return one of several names; the first where nothing is asked."""
+        while True:
+            answer = self.text(f"{question} ({', '.join(names)})", names[0]) if len(names) > 1 else names[0]
+            if answer in names:
+                return answer
+            self.complain(f'"{answer}" is not one of the choices')
+
+
+_FILE = "campaign.toml"
+#: Beginning of a drafted file, by which its examples in comments are distinguished from comments that somebody wrote.
+DRAFTED = "# Written by thermofuse init."
+#: How places of the frames can be given.
+_PLACES = ("pixels", "fiducials")
+#: Heading of the files that the campaign file does not name.
+_NOT_USED = "# Files in this folder that are not used:"
+#: Kinds that no campaign reads.
+_NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE)
+#: What can be done with a file that is not used.
+_HINTS = {
+    Kind.DEVIATIONS: "; one campaign takes one file of deviations: join the tables of one test",
+    Kind.STACK: ", not mixed with the frames of a FLIR camera",
+    Kind.PLACES: ", for [sensors] together with [plan]: docs/reference/campaign-file.md",
+}
+#: Values above this are kelvins and no temperatures of a machine table in degC.
+_WARMEST_DEGC = 150.0
+
+
+class DraftError(FusionError):
+    """A folder for which no campaign file can be written; the message says why and what to do."""
+
+
+def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
+    """Look at a folder and write a commented campaign file into it."""
+    path = folder / _FILE
+    if not folder.is_dir():
+        raise DraftError(f"{folder}: no such folder; name the folder that holds the files of the measurement")
+    if path.exists():
+        raise DraftError(f"{path} exists already and is not replaced; thermofuse check {path} says what it lacks")
+    if (folder / "results.json").is_file():
+        raise DraftError(
+            f"{folder}: holds the results of a run; name the folder that holds the files of the measurement"
+        )
+    content = scan_folder(folder.resolve())
+    lines = list(draft_lines(content, asker))
+    unnamed = next((line for line in lines if not is_text(line)), None)
+    if unnamed is not None:
+        raise DraftError(f"{folder}: the name of a file in it is not UTF-8 ({unnamed!a}); give that file another name")
+    write_text(path, "\n".join(lines) + "\n")
+    return path, [
+        f"line {number}: {line}"
+        for number, line in enumerate(lines, start=1)
+        if f'"{TO_FILL}"' in line and not line.startswith("#")
+    ]
+
+
+def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
+    """Yield the lines of a campaign file, last the files of the folder that it does not name."""
+    lines = list(_used_lines(content, asker))
+    yield from lines
+    yield from _not_used(content, lines)
+
+
+def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
+    """Yield what names and asks for everything that the campaign uses."""
+    readings, records = content.of(Kind.DEVIATIONS), content.of(Kind.RECORD)
+    if not (content.frames or readings or records):
+        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason}" for one in content.unknown[:3])
+        raise DraftError(
+            f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
+            + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
+        )
+    yield f"{DRAFTED} Every quantity carries its unit in the value; paths start from the folder of this file."
+    yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {_FILE} says what is still missing.'
+    yield ""
+    yield "[campaign]"
+    yield f"title = {_quoted(asker.text('Title of the report', content.folder.name or 'Campaign'))}"
+    if readings:
+        yield f"axis = {_quoted(asker.text('Axis that was measured', 'X'))}"
+    yield from _time_zone(readings, asker)
+    if content.frames:
+        yield from _thermography(content, asker)
+        yield from _plan(content, asker, along_axis=bool(readings))
+    if readings:
+        yield from _interferometry(content, asker)
+        yield from _report(asker)
+    if content.frames or readings:
+        yield from _drivers(content)
+    else:
+        yield from _record(content, records, asker)
+
+
+def unused_files(path: Path) -> list[str]:
+    """Return what a campaign file of `write_campaign` says of the files next to it that it does not name."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    start = lines.index(_NOT_USED) + 1 if _NOT_USED in lines else len(lines)
+    return [line.removeprefix("#   ") for line in lines[start:]]
+
+
+def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
+    """Yield as comments every file with measurements that no line names, and what was not understood."""
+    active = "\n".join(line for line in lines if not line.startswith("#"))
+    measured = [one for kind, files in content.files.items() if kind not in _NO_INPUT for one in files]
+    left = [one for one in measured if _quoted(content.relative(one.path)) not in active]
+    if left or content.unknown:
+        yield from ("", _NOT_USED)
+        yield from (f"#   {_plain(content.relative(one.path))}: {one.kind}{_HINTS.get(one.kind, '')}" for one in left)
+        yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
+
+
+def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
+    """Yield the zone of times that the readings give without one."""
+    without = [one.path.name for one in readings if _times(one.path).get("reference") == NO_ZONE]
+    if not without:
+        yield '# time_zone = "Europe/Vienna"            # only where files give times without their zone'
+        return
+    zone = asker.text(f"Time zone of the times in {without[0]}, an IANA name such as Europe/Vienna", "UTC")
+    doubt = "   # taken, as the file gives none: check it" if asker.ask is None else ""
+    yield f"time_zone = {_quoted(zone)}{doubt}"
+
+
+def _thermography(content: FolderContent, asker: Asker) -> Iterator[str]:
+    yield from ("", "[thermography]")
+    yield f"frames = [{', '.join(_quoted(pattern) for pattern in content.frames)}]   # {counted(len(content.frame_files), 'file')}"
+    if content.of_temperatures:
+        yield from _stack(content, asker)
+        return
+    emissivity = asker.text("Emissivity of the table, such as 0.95 or 0.95 +- 0.02; empty: as stored in the frames", "")
+    example = '# emissivity = "0.95 +- 0.02"            # left out: as stored in the frames'
+    yield f"emissivity = {_quoted(emissivity)}" if emissivity else example
+    yield '# reflected_temperature = "22 degC"        # this and the next three: left out = as stored in the frames'
+    yield '# atmospheric_temperature = "22 degC"'
+    yield "# relative_humidity = 0.45"
+    yield '# object_distance = "1.2 m"'
+    yield '# clock_offset = "0 s"                     # camera clock minus laser clock; 0 s where both follow one time server'
+    yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
+    yield from _optional("lens", content, Kind.LENS)
+
+
+def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
+    """Yield what files of temperatures do not hold themselves."""
+    first = content.frame_files[0]
+    reader = find_reader(first)
+    assert isinstance(reader, TemperatureReader)
+    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
+    contents = reader.frame_contents(first, stored)
+    yield '# camera_offset_u = "1 K"                  # accuracy in the camera\'s data sheet; left out = that of an uncooled camera'
+    yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
+    yield from _optional("lens", content, Kind.LENS)
+    yield from ("", "[thermography.stack]                     # temperatures of another camera: docs/formats.md")
+    values = reader.read_values(first, 0, stored)
+    if values.dtype.kind in "iu":
+        yield f'scale = {_quoted(TO_FILL)}   # of one count, for example 0.04 with unit = "K"'
+    if not contents.unit:
+        guess = "K" if np.nanmedian(values) > _WARMEST_DEGC else "degC"
+        yield f"unit = {_quoted(asker.choice('Unit of the temperatures', tuple(sorted(('degC', 'K'), key=guess.__ne__))))}"
+    if contents.times is None:
+        pattern = _time_in_name(first.name)
+        if pattern:
+            yield f"time_in_name = {_quoted(pattern)}   # local time: write its time_zone below"
+        else:
+            yield f'start = {_quoted(TO_FILL)}   # or times = "times.csv" (file,frame,time), or time_in_name = "%Y%m%d_%H%M%S"'
+    if contents.frames > 1 and contents.times is None:
+        yield f"interval = {asker.quantity('Time from one frame to the next', 's')}"
+    yield '# time_zone = "Europe/Vienna"              # of these times; left out = UTC'
+    yield "# emissivity = 0.95                        # as it was set in the camera's program, with reflected_temperature"
+
+
+def _time_in_name(name: str) -> str:
+    """Return the pattern of a date and a time of day in a name, "" where there is none."""
+    found = re.search(r"(?:19|20)\d{2}([-_]?)\d{2}\1\d{2}([-_T ]+)\d{2}([-_.]?)\d{2}\3\d{2}", name)
+    if found is None:
+        return ""
+    day, between, clock = found.groups()
+    return f"%Y{day}%m{day}%d{between}%H{clock}%M{clock}%S"
+
+
+def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
+    listed = content.of(Kind.FIDUCIALS)
+    if not (listed or along_axis):
+        where = asker.choice(
+            "No table of fiducials was found: places in pixels of the picture, or on a plan in mm", _PLACES
+        )
+        if where == "pixels":
+            yield from ("", "[plan]")
+            yield 'registration = "pixels"                  # no fiducials were found: the picture is the plan, without millimetres'
+            yield '# cell_px = "4 px"                     # side of a cell, a divisor of both sides of the picture; left out: a usual one'
+            yield "# for a plan in mm: size, cell_size and fiducials (at least four places on the table that are known in mm)"
+            return
+    yield ""
+    yield "[plan]                                   # the table in mm: x to the right, y down, from one corner"
+    fiducials = read_fiducials(listed[0].path) if listed else []
+    width, height = _extent(fiducials)
+    sides = {"Width (x)": width, "Height (y)": height}
+    size = [asker.quantity(f"{name} of the plan", "mm", default) for name, default in sides.items()]
+    guess = "   # guessed from the fiducials, with the same margin on both sides: check it"
+    guessed = guess if asker.ask is None and width else ""
+    yield f"size = [{', '.join(size)}]{guessed}"
+    yield f"cell_size = {asker.quantity('Size of a cell of the field; it divides both sides', 'mm', '5 mm')}"
+    name = _quoted(content.relative(listed[0].path) if listed else TO_FILL)
+    yield f"fiducials = {name}   # name,x_mm,y_mm,diameter_mm[,column_px,row_px]"
+    if not listed:
+        yield "# a table of at least four places that are known in mm: discs on the table, or points picked by hand with their pixel"
+        yield "# (column_px,row_px) and an empty diameter; init finds it in the folder"
+    yield from _others("fiducials", content, listed)
+    yield from _optional("regions", content, Kind.REGIONS)
+    if not along_axis:
+        return
+    yield from ("", "[plan.axis]")
+    x = asker.quantity("Plan point under the spindle at axis position 0, x", "mm")
+    y = asker.quantity("Plan point under the spindle at axis position 0, y", "mm")
+    yield f"origin = [{x}, {y}]   # plan point under the spindle at axis position 0"
+    yield f"direction = {_direction(asker)}   # how that point moves as the axis position grows: [1, 0] right, [-1, 0] left, [0, 1] down"
+
+
+def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
+    readings = content.of(Kind.DEVIATIONS)
+    names = tuple(content.relative(one.path) for one in readings)
+    chosen = asker.choice("Which file holds the deviations", names)
+    yield from ("", "[interferometry]")
+    yield f"deviations = {_quoted(chosen)}"
+    yield from (f"# deviations = {_quoted(name)}   # also found" for name in names if name != chosen)
+    yield from _optional(
+        "environment", content, Kind.ENVIRONMENT, lacking='# environment = "environment.csv"   # none was found'
+    )
+    coefficient = asker.quantity(
+        "Expansion coefficient of the part that carries the scale or the workpiece", "ppm/K", "11.7 ppm/K"
+    )
+    yield f"expansion_coefficient = {coefficient}"
+    yield f"dead_path = {asker.quantity('Dead path of the laser', 'mm', '0 mm')}"
+    if _times(content.folder / chosen).get("origin") == "reconstructed":
+        yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
+        yield '# dwell = "2 s"'
+
+
+def _times(path: Path) -> dict[str, str]:
+    """Return what is known of the times of a file of deviations; nothing where it cannot be read, which the check says."""
+    try:
+        return {str(name): str(value) for name, value in read_deviations(path)["time"].attrs.items()}
+    except InterferometryError:
+        return {}
+
+
+def _report(asker: Asker) -> Iterator[str]:
+    """Yield the conditions that the ISO 230-2 page and compensation tables print."""
+    machine = asker.text("Machine, as the report names it; empty: not stated", "")
+    if machine:
+        yield from ("", "[report]", f"machine = {_quoted(machine)}")
+    else:
+        yield ""
+        yield "# [report]                               # conditions of the test, printed with the ISO 230-2 values"
+        yield '# machine = "name of the machine"'
+    yield '# machine_compensation = "none"           # what was active during the test'
+
+
+def _drivers(content: FolderContent) -> Iterator[str]:
+    listed = content.of(Kind.DRIVERS)
+    if listed:
+        yield from ("", "[drivers]")
+        yield f"file = {_quoted(content.relative(listed[0].path))}"
+        yield from _others("file", content, listed)
+    if content.frames and content.of(Kind.DEVIATIONS):
+        yield from ("", "[model]", 'declared = ["axis_expansion", "table_offset"]')
+
+
+def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker) -> Iterator[str]:
+    """Yield a record: all files with the columns of the first are runs of one test."""
+    first = records[0]
+    runs = [one for one in records if one.headings == first.headings]
+    headings = first.headings
+    time = next(name for name in headings if is_time(name))
+    temperatures = [name for name in headings if is_temperature(name) and name != time]
+    displacements = [name for name in headings if is_displacement(name) and name != time]
+    others = [name for name in headings if name not in (time, *temperatures, *displacements) and column_unit(name)]
+    yield from ("", "[record]                                 # temperatures and displacements over time")
+    names = [_quoted(content.relative(one.path)) for one in runs]
+    yield f"files = [{', '.join(names)}]" if len(names) > 1 else f"file = {names[0]}"
+    yield f"time = {_quoted(time)}"
+    yield f"temperatures = {_list(temperatures)}"
+    yield f"displacements = {_list(displacements)}"
+    if others:
+        yield f"drivers = {_list(others)}   # heat sources only: remove the others"
+    yield from _others("file", content, [one for one in records if one not in runs], all_of_them=True)
+
+
+def _optional(key: str, content: FolderContent, kind: Kind, *, lacking: str = "") -> Iterator[str]:
+    """Yield the line of a file that a campaign may have."""
+    listed = content.of(kind)
+    if listed:
+        yield f"{key} = {_quoted(content.relative(listed[0].path))}"
+        yield from _others(key, content, listed)
+    elif lacking:
+        yield lacking
+
+
+def _others(
+    key: str, content: FolderContent, listed: Sequence[Recognised], *, all_of_them: bool = False
+) -> Iterator[str]:
+    """Yield files that could stand in place of the first as comments."""
+    for one in listed if all_of_them else listed[1:]:
+        yield f"# {key} = {_quoted(content.relative(one.path))}   # also found"
+
+
+def _extent(fiducials: Sequence[Fiducial]) -> tuple[str, str]:
+    """Return width and height of a plan on which the fiducials have about the same margin on both sides; empty without fiducials."""
+    if not fiducials:
+        return "", ""
+    radius = max(one.diameter_mm for one in fiducials) / 2.0
+    sides = []
+    for places in ([one.x_mm for one in fiducials], [one.y_mm for one in fiducials]):
+        tens = max(round((min(places) + max(places)) / 10.0), math.ceil((max(places) + radius) / 10.0))
+        sides.append(f"{10 * tens} mm")
+    return sides[0], sides[1]
+
+
+def _direction(asker: Asker) -> str:
+    """Return the direction of the axis on the plan as a list of two numbers."""
+    known = {"right": "[1, 0]", "left": "[-1, 0]", "down": "[0, 1]", "up": "[0, -1]"}
+    if asker.ask is None:
+        return _quoted(TO_FILL)
+    return known[asker.choice("How that point moves over the plan as the axis position grows", tuple(known))]
+
+
+def _list(names: Sequence[str]) -> str:
+    return f"[{', '.join(_quoted(name) for name in names)}]"
+
+
+def _quoted(text: str) -> str:
+    """Return a text as a TOML string."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _plain(text: str) -> str:
+    """Return a text that stays on its line of comment."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)

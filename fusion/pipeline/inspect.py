@@ -1,0 +1,733 @@
+"""Files and folders looked into one after the other: none of them stops the others, and a series of frames is summed up."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import itertools
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.campaign.values import name_and_unit
+from fusion.common import FusionError, TomlError, read_toml
+from fusion.report.wording import duration, join, moment, print_unit
+from fusion.results.folder import MANIFEST
+from fusion.results.progress import counted, left_out_notices, listed
+from fusion.results.store import OutputError, write_atomically
+from interferometry.common import InterferometryError
+from interferometry.io.faults import LaserFormatError
+from thermography.common import ThermographyError
+from thermography.inspection import check_series, describe_stack, inspect_file, is_flir_file, thumbnail
+from thermography.io.flir import FrameReference, index_frames
+from thermography.io.frame import CameraParameters
+from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader
+from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate
+from thermography.registration.plan import read_fiducials
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# What kind of file something is, recognised by its content: the campaign's own files, recordings, logs and plans.
+
+#: Bytes that are read to tell the kind of a text.
+_START = 65_536
+#: Longest reason why a file is not understood, characters.
+_LONGEST_REASON = 160
+_TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
+_RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
+_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
+#: Reason of a table whose columns nobody can know.
+_BARE = (
+    "a table of numbers without headings; write a first line that names every column with its unit, such as "
+    "time [s],spindle [degC],nose [um]"
+)
+
+
+class Kind(StrEnum):
+    """Kinds of files, in the words of a message."""
+
+    CAMPAIGN = "campaign file"
+    RECIPE = "recipe of a simulation"
+    FRAMES = "thermal frames"
+    STACK = "frames of temperatures"
+    DEVIATIONS = "deviations"
+    ENVIRONMENT = "environment log"
+    FIDUCIALS = "fiducials"
+    REGIONS = "regions of the plan"
+    PLACES = "places of contact sensors"
+    LENS = "lens calibration"
+    DRIVERS = "log of drivers"
+    RECORD = "record of temperatures and displacements"
+    UNKNOWN = "not understood"
+    UNREADABLE = "cannot be opened"
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """A file and its kind, why it is not understood or cannot be opened, and of a table the headings of its columns."""
+
+    path: Path
+    kind: Kind
+    reason: str = ""
+    headings: tuple[str, ...] = ()
+
+
+def recognise(path: Path) -> Recognised:
+    """Tell the kind of a file by its content."""
+    from interferometry.io.readings import is_environment_log, read_deviations
+    from interferometry.io.tables import read_table
+
+    if path.is_symlink() and not path.exists():
+        return Recognised(path, Kind.UNREADABLE, f"a link to {path.readlink()}, where there is no file")
+    if path.exists() and not path.is_file():
+        return Recognised(path, Kind.UNREADABLE, "is a pipe, a socket or a device; name a file")
+    if path.suffix.lower() == ".toml":
+        return _toml(path)
+    if is_flir_file(path):
+        references, rejected = index_frames([path])
+        return Recognised(path, Kind.FRAMES) if references else Recognised(path, Kind.UNKNOWN, rejected[0].reason)
+    reader = find_reader(path)
+    if isinstance(reader, TemperatureReader) and not isinstance(reader, TextReader):
+        return Recognised(path, Kind.STACK)
+    if reader is not None and not isinstance(reader, TextReader):
+        reason = f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
+        return Recognised(path, Kind.UNKNOWN, reason)
+    text = _text_start(path)
+    if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
+        return Recognised(path, Kind.LENS)
+    try:
+        headings = _headings(text) if text is not None else _sheet_headings(path)
+        kind = _by_headings(headings)
+        if kind is Kind.REGIONS:
+            # A sensor has one place; a region has a line for each of its corners.
+            names = [
+                fields["name"].strip() for _, fields in read_table(path, ("name",)).records() if fields is not None
+            ]
+            kind = Kind.PLACES if 1 < len(names) == len(set(names)) else kind
+        if kind is None:
+            kind = Kind.ENVIRONMENT if is_environment_log(path) else Kind.DEVIATIONS
+        if kind is Kind.DEVIATIONS and not _holds_deviations(path):
+            read_deviations(path, rotary=True)
+    except InterferometryError as error:
+        # Text may be one frame of temperatures; what is neither is refused as the table that it is not.
+        if isinstance(reader, TextReader) and reader.holds_a_frame(path):
+            return Recognised(path, Kind.STACK)
+        first = () if text is None else _headings(text)
+        if len(first) > 1 and all(_NUMBER.fullmatch(number.lstrip("\ufeff")) for number in first):
+            return Recognised(path, Kind.UNKNOWN, _BARE)
+        reason = str(error).removeprefix(f"{path}").lstrip(":, ")
+        shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
+        return Recognised(path, Kind.UNKNOWN, shortened)
+    return Recognised(path, kind, headings=headings)
+
+
+def column_unit(heading: str) -> str:
+    """Return the unit in a heading such as ``"t1 [degC]"``; empty where it has none."""
+    return name_and_unit(heading)[1]
+
+
+def is_temperature(heading: str) -> bool:
+    """Return whether a heading is that of a temperature."""
+    return column_unit(heading) in ("degC", "K", "degF")
+
+
+def is_displacement(heading: str) -> bool:
+    """Return whether a heading is that of a displacement."""
+    return column_unit(heading) in ("um", "nm", "mm")
+
+
+def is_time(heading: str) -> bool:
+    """Return whether a heading is that of the time: ``time`` or ``date`` in a language that is read, or a column in units of time."""
+    from interferometry.io.tables import read_heading
+
+    return read_heading(heading).role in ("time", "date") or column_unit(heading) in ("s", "ms", "min", "h")
+
+
+def _holds_deviations(path: Path) -> bool:
+    """Whether a file has the columns of deviations, whatever is in them; where not, its reader says what is missing."""
+    from interferometry.io.readings import find_long_table, find_wide_table
+    from interferometry.io.renishaw import is_ecmc_log
+    from interferometry.io.tables import read_grids
+
+    with path.open("rb") as stream:
+        start = stream.read(4096)
+    if b"HEADER::" in start or is_ecmc_log(start):
+        return True
+    return any(find_long_table(grid) is not None or find_wide_table(grid) is not None for grid in read_grids(path))
+
+
+def _toml(path: Path) -> Recognised:
+    """Tell campaign files from recipes by their tables."""
+    try:
+        content, _ = read_toml(path)
+    except (TomlError, UnicodeDecodeError) as error:
+        return Recognised(path, Kind.UNKNOWN, f"this is not TOML: {error}")
+    if any(name in content for name in _RECIPE):
+        return Recognised(path, Kind.RECIPE)
+    if any(name in content for name in _TABLES):
+        return Recognised(path, Kind.CAMPAIGN)
+    return Recognised(path, Kind.UNKNOWN, "neither a campaign nor a recipe: no table of either")
+
+
+def _text_start(path: Path) -> str | None:
+    """Return the beginning of a text; None where the file is no text."""
+    from interferometry.io.tables import decode_text
+
+    with path.open("rb") as file:
+        start = file.read(_START)
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return start.decode("utf-16", errors="ignore")
+    if b"\0" in start:
+        return None
+    if len(start) == _START and b"\n" in start:
+        # A character may be cut in two by the end of what was read.
+        start = start[: start.rindex(b"\n")]
+    try:
+        return decode_text(path, start)
+    except LaserFormatError:
+        return None
+
+
+def _headings(text: str) -> tuple[str, ...]:
+    """Return the fields of the first line that is neither empty nor a comment."""
+    line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    delimiter = max(",;\t", key=line.count)
+    return tuple(name.strip() for name in next(csv.reader([line], delimiter=delimiter), []))
+
+
+def _by_headings(headings: tuple[str, ...]) -> Kind | None:
+    """Return the kind whose columns these are, None where they are of no kind of its own."""
+    names = set(headings)
+    if {"name", "x_mm", "y_mm"} <= names:
+        return Kind.FIDUCIALS if "diameter_mm" in names else Kind.REGIONS
+    if all(any(map(of_kind, headings)) for of_kind in (is_time, is_temperature, is_displacement)):
+        return Kind.RECORD
+    if "time" in names and len(headings) > 1 and all(column_unit(name) for name in headings if name != "time"):
+        return Kind.DRIVERS
+    return None
+
+
+def _sheet_headings(path: Path) -> tuple[str, ...]:
+    """Return the headings of the first sheet of a spreadsheet; none where the file is neither that nor text."""
+    from interferometry.io.spreadsheets import is_workbook, read_sheets
+
+    if not is_workbook(path.read_bytes()):
+        return ()
+    first, *_ = read_sheets(path).values()
+    return tuple(name.strip() for name in first[0][1])
+
+
+# What a file holds, in lines of text: every kind that a run reads, with warnings about implausible content.
+
+
+def describe_file(found: Recognised) -> list[str]:
+    """Return what a file holds, with warnings about implausible content."""
+    if found.kind is Kind.FRAMES:
+        return inspect_file(found.path).lines()
+    if found.kind is Kind.STACK:
+        return describe_stack(found.path)
+    first, *lines = _DESCRIBERS[found.kind](found)
+    return [f"{found.path}: {first}", *(f"  {line}" for line in lines)]
+
+
+def _describe_deviations(found: Recognised) -> list[str]:
+    from interferometry.inspection import describe_test
+    from interferometry.io.readings import read_deviations
+
+    deviations = read_deviations(found.path, rotary=True)
+    values, time, position = (deviations[name] for name in ("deviation", "time", "position"))
+    timed = time.values[~np.isnat(time.values)]
+    when = (
+        f"{moment(timed.min())} to {moment(timed.max())}, times {time.attrs['origin']}{_zone(deviations)}"
+        if timed.size
+        else "no times: thermofuse run evaluates them by ISO 230-2, and needs one per reading for drift and causes"
+    )
+    return [
+        f"deviations, {counted(deviations.sizes['cycle'], 'cycle')}, {counted(deviations.sizes['target'], 'target')} from "
+        f"{position.values.min():g} to {position.values.max():g} {position.attrs['units']}, "
+        f"{int(np.isfinite(values).sum())} of {values.size} readings",
+        f"deviation {float(values.min()):.3f} to {float(values.max()):.3f} {print_unit(values.attrs['units'])}",
+        when,
+        *describe_test(deviations),
+        *_warnings(deviations),
+    ]
+
+
+def _describe_log(name: str, log: xr.Dataset) -> list[str]:
+    first, last = log["time"].values[0], log["time"].values[-1]
+    lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}{_zone(log)}"]
+    for variable, values in log.data_vars.items():
+        unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
+        lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
+    return lines + _warnings(log)
+
+
+def _describe_environment(found: Recognised) -> list[str]:
+    from interferometry.io.readings import read_environment
+
+    return _describe_log("environment", read_environment(found.path))
+
+
+def _describe_drivers(found: Recognised) -> list[str]:
+    from fusion.campaign.logs import read_drivers
+
+    return _describe_log("drivers", read_drivers(found.path))
+
+
+def _describe_record(found: Recognised) -> list[str]:
+    from interferometry.io.tables import read_grids
+
+    time = next(name for name in found.headings if is_time(name))
+    columns: dict[str, list[str]] = {"temperature": [], "displacement": [], "other column": []}
+    for name in found.headings:
+        if is_temperature(name) or is_displacement(name):
+            columns["temperature" if is_temperature(name) else "displacement"].append(name)
+        elif name != time:
+            columns["other column"].append(name)
+    rows = len(read_grids(found.path)[0].rows) - 1
+    described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
+    return [f"record, {counted(rows, 'row')}, time in the column {time}", *described]
+
+
+def _describe_fiducials(found: Recognised) -> list[str]:
+    listed = read_fiducials(found.path)
+    points = sum(one.is_point for one in listed)
+    markers = sum(one.marker is not None for one in listed)
+    kinds = ((len(listed) - points - markers, "disc"), (points, "point"), (markers, "marker"))
+    columns, rows = [one.x_mm for one in listed], [one.y_mm for one in listed]
+    return [
+        f"fiducials, {join([counted(count, noun) for count, noun in kinds if count])}, "
+        f"x {min(columns):g} to {max(columns):g} mm, y {min(rows):g} to {max(rows):g} mm",
+        f"{sum(one.hint_px is not None for one in listed)} with a rough place in the frame",
+    ]
+
+
+def _describe_regions(found: Recognised) -> list[str]:
+    from fusion.analysis.attribution.modes import read_regions
+
+    names = [region.name for region in read_regions(found.path)]
+    return [f"{counted(len(names), 'region')} of the plan: {join(names)}"]
+
+
+def _describe_places(found: Recognised) -> list[str]:
+    from interferometry.io.tables import read_table
+
+    rows = [fields for _, fields in read_table(found.path, ("name",)).records() if fields is not None]
+    return [
+        f"places of {counted(len(rows), 'contact sensor')} on the plan: {join([row['name'].strip() for row in rows])}",
+        "[sensors] of a campaign file names it as places, with the file of their temperatures",
+    ]
+
+
+def _describe_lens(found: Recognised) -> list[str]:
+    from thermography.registration.projection import read_lens  # compiled: other files are described without it
+
+    lens = read_lens(found.path)
+    column, row = lens.principal_point_px
+    return [f"lens, focal length {lens.focal_length_px:.1f} px, centre {column:.1f}, {row:.1f} px"]
+
+
+def _describe_campaign(found: Recognised) -> list[str]:
+    from fusion.campaign.config import load_campaign
+
+    campaign = load_campaign(found.path)
+    named = ("thermography", "plan", "interferometry", "drivers", "record")
+    tables = [f"[{name}]" for name in named if getattr(campaign, name) is not None]
+    frames = len(campaign.frame_paths())
+    files = f"{counted(frames, 'file')} of thermal frames, {len(campaign.input_files())} files in all"
+    return [
+        f"campaign, {campaign.campaign.title}",
+        f"{join(tables)}, every key is understood",
+        *([files] if frames else []),
+        f"thermofuse check {campaign.path} checks them",
+    ]
+
+
+def _describe_recipe(found: Recognised) -> list[str]:
+    title = read_toml(found.path)[0].get("campaign", {}).get("title", "")
+    return [f"recipe of a simulation, {title}".rstrip(", "), f"thermofuse simulate {found.path} --out FOLDER"]
+
+
+_DESCRIBERS: dict[Kind, Callable[[Recognised], list[str]]] = {
+    Kind.DEVIATIONS: _describe_deviations,
+    Kind.ENVIRONMENT: _describe_environment,
+    Kind.DRIVERS: _describe_drivers,
+    Kind.RECORD: _describe_record,
+    Kind.FIDUCIALS: _describe_fiducials,
+    Kind.REGIONS: _describe_regions,
+    Kind.PLACES: _describe_places,
+    Kind.LENS: _describe_lens,
+    Kind.CAMPAIGN: _describe_campaign,
+    Kind.RECIPE: _describe_recipe,
+}
+
+
+def _zone(table: xr.Dataset) -> str:
+    """Say how times came to UTC, where the reader says it."""
+    reference = table["time"].attrs.get("reference", "")
+    return f", {reference}" if reference else ""
+
+
+def _warnings(table: xr.Dataset) -> list[str]:
+    return [f"warning: {notice.message} {notice.remedy}" for notice in left_out_notices(table, "left_out")]
+
+
+# What a folder holds for a campaign: frames by pattern, readings, logs, the plan, and what is not understood.
+
+#: Files of folders that hold results, not inputs.
+_RESULTS = ("results.json", MANIFEST)
+#: Files of a series, those of one folder and ending, that decide whether it holds thermal frames.
+_LOOKED_INTO = 3
+
+
+@dataclass(frozen=True)
+class FolderContent:
+    """Files of a folder by what a campaign needs them for.
+
+    ``frames`` are patterns relative to the folder, ``frame_files`` the files that they match; ``unknown`` holds files that are not
+    understood, links whose file is gone, pipes, sockets and devices; ``of_temperatures`` tells whether the frames hold temperatures of
+    another camera and not FLIR counts.
+    """
+
+    folder: Path
+    frames: tuple[str, ...] = ()
+    frame_files: tuple[Path, ...] = ()
+    files: dict[Kind, tuple[Recognised, ...]] = field(default_factory=dict)
+    unknown: tuple[Recognised, ...] = ()
+    of_temperatures: bool = False
+
+    def of(self, kind: Kind) -> tuple[Recognised, ...]:
+        """Return the files of a kind, sorted by name."""
+        return self.files.get(kind, ())
+
+    def relative(self, path: Path) -> str:
+        """Return a path as a campaign file in the folder writes it."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def scan_folder(folder: Path) -> FolderContent:
+    """Look at every file of a folder and its subfolders."""
+    paths = list(input_files(folder))
+    series = thermal_series(path for path in paths if path.suffix.lower() != ".toml")
+    thermal = {path for members in series.values() for path in members}
+    patterns, frames = [], []
+    found = [recognise(path) for path in paths if path not in thermal]
+    for (parent, suffix), members in series.items():
+        # A long series is read whole by the run, which names the frames that it leaves out.
+        looked = [recognise(path) for path in members[:_LOOKED_INTO]]
+        if any(one.kind is Kind.FRAMES for one in looked):
+            patterns.append((parent.relative_to(folder) / f"*{suffix}").as_posix())
+            frames += members
+        else:
+            found += [Recognised(path, Kind.UNKNOWN, looked[0].reason) for path in members]
+    known: dict[Kind, list[Recognised]] = {}
+    for one in found:
+        known.setdefault(one.kind, []).append(one)
+    unknown = [*known.pop(Kind.UNKNOWN, []), *known.pop(Kind.UNREADABLE, [])]
+    of_temperatures = not patterns and Kind.STACK in known
+    if of_temperatures:
+        frames = [one.path for one in known.pop(Kind.STACK)]
+        for (parent, suffix), members in _by_series(frames).items():
+            whole = members == _by_series(paths)[parent, suffix]
+            patterns += [
+                path.relative_to(folder).as_posix() for path in ([parent / f"*{suffix}"] if whole else members)
+            ]
+    files = {kind: tuple(members) for kind, members in known.items()}
+    return FolderContent(folder, tuple(patterns), tuple(frames), files, tuple(unknown), of_temperatures)
+
+
+def thermal_series(paths: Iterable[Path]) -> dict[tuple[Path, str], list[Path]]:
+    """Return the thermal files of a FLIR camera by folder and ending."""
+    return _by_series(path for path in paths if is_thermal(path))
+
+
+def is_thermal(path: Path) -> bool:
+    """Return whether a path is a file of a FLIR camera that can be opened."""
+    try:
+        return path.is_file() and is_flir_file(path)
+    except OSError:
+        return False
+
+
+def _by_series(paths: Iterable[Path]) -> dict[tuple[Path, str], list[Path]]:
+    series: dict[tuple[Path, str], list[Path]] = {}
+    for path in paths:
+        series.setdefault((path.parent, path.suffix), []).append(path)
+    return series
+
+
+def input_files(folder: Path, seen: set[Path] | None = None) -> Iterator[Path]:
+    """Yield the files of a folder and its subfolders, sorted, without hidden ones and without results of a run."""
+    seen = set() if seen is None else seen
+    if folder.resolve() in seen:
+        return
+    seen.add(folder.resolve())
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if not path.is_dir():
+            yield path
+        elif not any((path / name).is_file() for name in _RESULTS):
+            yield from input_files(path, seen)
+
+
+#: Thermal files of one folder and ending that are described one by one; more are a series.
+_ONE_BY_ONE = 3
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """What was found in a file or a series.
+
+    ``label`` is its path, or the pattern of a series; ``fault`` says why it cannot be used; ``named`` tells whether it was asked for by
+    name, and not found in a folder.
+    """
+
+    label: str
+    kind: Kind
+    lines: tuple[str, ...] = ()
+    fault: str = ""
+    named: bool = True
+
+    @property
+    def fails(self) -> bool:
+        """Whether something that was asked for, or that is of a known kind, cannot be used."""
+        return bool(self.fault) and (self.named or self.kind is not Kind.UNKNOWN)
+
+    def shown(self, *, quiet: bool = False) -> list[str]:
+        """Return the lines for the terminal; `quiet` leaves faults and warnings, each with its file."""
+        if self.fault:
+            return [f"{self.label}: {self.kind.value}: {self.fault}"] if self.fails or not quiet else []
+        if not quiet:
+            return list(self.lines)
+        return [f"{self.label}: {line.strip()}" for line in self.lines if line.startswith("  warning")]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as a mapping of JSON's own types."""
+        lines = [line.strip() for line in self.lines]
+        return {"file": self.label, "kind": self.kind.value, "lines": lines, "fault": self.fault}
+
+
+def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
+    """Look into files and folders."""
+    named, files = set(paths), _files(paths)
+    for path in paths:
+        if path.is_dir() and not any(True for _ in input_files(path)):
+            fault = "contains no file to inspect (hidden files and results are skipped); name the folder of the measured files"
+            yield Inspected(str(path), Kind.UNKNOWN, fault=fault, named=True)
+    summed_up = {
+        path: members for members in thermal_series(files).values() if len(members) > _ONE_BY_ONE for path in members
+    }
+    for path in files:
+        members = summed_up.get(path, [])
+        if not members:
+            yield _inspect(path, named=path in named)
+        elif path == members[0]:
+            yield _inspect_series(members, label=str(path.parent / f"*{path.suffix}"))
+
+
+def write_thumbnails(paths: Sequence[Path], folder: Path) -> Iterator[Path]:
+    """Write a small picture of the first frame of every thermal file as ``<file>.png``."""
+    written: set[str] = set()
+    for path in filter(is_thermal, _files(paths)):
+        try:
+            picture = thumbnail(path)
+        except ThermographyError:
+            continue
+        name = f"{path.name}.png" if f"{path.name}.png" not in written else f"{path.parent.name}_{path.name}.png"
+        if name not in written and (folder / name).exists():
+            raise OutputError(f"{folder / name} exists already; name another folder with --thumbnails, or remove it")
+        written.add(name)
+        yield write_atomically(folder / name, lambda part, picture=picture: part.write_bytes(picture))  # type: ignore[misc]
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    """Return files, and those of folders, each once."""
+    return list(dict.fromkeys(file for path in paths for file in (input_files(path) if path.is_dir() else [path])))
+
+
+def _inspect(path: Path, *, named: bool) -> Inspected:
+    """Look into one file."""
+    kind = Kind.UNKNOWN
+    try:
+        found = recognise(path)
+        kind = found.kind
+        if found.reason:
+            return Inspected(str(path), kind, fault=found.reason, named=named)
+
+        return Inspected(str(path), kind, tuple(describe_file(found)), named=named)
+    except (FusionError, ThermographyError, InterferometryError) as error:
+        fault = str(error).removeprefix(str(path)).lstrip(":, ")
+    except OSError as error:
+        kind, fault = Kind.UNREADABLE, str(error.strerror)
+    return Inspected(str(path), kind, fault=fault, named=named)
+
+
+def _inspect_series(paths: Sequence[Path], *, label: str) -> Inspected:
+    """Sum up a series of thermal files."""
+    try:
+        return Inspected(label, Kind.FRAMES, tuple(describe_series(paths, label=label)))
+    except ThermographyError as error:
+        return Inspected(label, Kind.UNKNOWN, fault=str(error).removeprefix(f"{label}: "), named=False)
+
+
+# What was recorded when, as bars of text on one time axis.
+
+_FULL, _EMPTY = "█", "·"
+#: Samples further apart than this many times their usual distance have a gap between them.
+_GAP_STEPS = 10.0
+#: Times before this one count from a start that is not stated.
+_NO_DATE = np.datetime64("1980-01-01")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording of a campaign: its samples (n,) in UTC on the laser's clock, empty where it has no times."""
+
+    name: str
+    times: NDArray[np.datetime64]
+
+    def stretches(self) -> list[tuple[np.datetime64, np.datetime64]]:
+        """Return start and end of every stretch without a gap."""
+        times = np.sort(self.times[~np.isnat(self.times)]).astype("datetime64[ns]")
+        if times.size == 0:
+            return []
+        steps = np.diff(times).astype(np.int64)
+        moving = steps[steps > 0]
+        usual = float(np.median(moving)) if moving.size else 0.0
+        cuts = np.flatnonzero(steps > _GAP_STEPS * usual) if usual else np.array([], dtype=int)
+        starts, ends = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [times.size - 1]])
+        return list(zip(times[starts], times[ends], strict=True))
+
+
+def time_bars(recordings: Sequence[Recording], *, width: int = 60) -> list[str]:
+    """Return a bar per recording, filled where it has samples, above one time axis."""
+    stretches = {recording.name: recording.stretches() for recording in recordings}
+    ends = [end for parts in stretches.values() for part in parts for end in part]
+    if not ends:
+        return []
+    first, last = min(ends), max(ends)
+    label = max(len(name) for name in (*stretches, "UTC"))
+    lines = []
+    for name, parts in stretches.items():
+        gaps = f"  {counted(len(parts) - 1, 'gap')}" if len(parts) > 1 else ""
+        lines.append(f"{name:<{label}}  {_bar(parts, first, last, width)}{gaps}")
+    length = duration(float((last - first) / np.timedelta64(1, "s")))
+    if first < _NO_DATE:
+        return [*lines, f"{'':<{label}}  {'start':<{width - len(length)}}{length}"]
+    left, right = (np.datetime_as_string(time, unit="m").replace("T", " ") for time in (first, last))
+    middle = f"{length:^{max(width - len(left) - len(right), 0)}}"
+    return [*lines, f"{'UTC':<{label}}  {left}{middle}{right}"]
+
+
+def _bar(
+    parts: Sequence[tuple[np.datetime64, np.datetime64]], first: np.datetime64, last: np.datetime64, width: int
+) -> str:
+    """Return a bar whose characters are filled where a stretch touches their share of the time."""
+    if not parts:
+        return f"{'no times':{_EMPTY}<{width}}"
+    whole = max(float((last - first) / np.timedelta64(1, "ns")), 1.0)
+    filled = np.zeros(width, dtype=bool)
+    for start, end in parts:
+        low, high = (float((time - first) / np.timedelta64(1, "ns")) / whole * width for time in (start, end))
+        filled[min(int(low), width - 1) : max(int(np.ceil(high)), int(low) + 1)] = True
+    return "".join(_FULL if is_filled else _EMPTY for is_filled in filled)
+
+
+# A series of thermal frames in about ten lines: one camera? gaps in time? the same settings? anything left out?
+
+#: Frames whose pixels are read, spread evenly over the series.
+_FRAMES_READ = 8
+
+
+def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
+    """Return what a series of thermal files holds."""
+    frames, rejected = index_frames(paths)
+    if not frames:
+        raise ThermographyError(f"{label}: no frame can be read; {rejected[0].reason}")
+    sizes = join(sorted({f"{frame.shape[1]} x {frame.shape[0]}" for frame in frames}))
+    lines = [
+        f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} of {sizes}",
+        f"  camera {_cameras(frames)}",
+        *(f"  {line}" for line in _times(frames)),
+        f"  settings {_settings(frames)}",
+        f"  temperature {_temperatures(frames)}",
+    ]
+    if len({frame.shape for frame in frames}) > 1:
+        lines.append("  warning: frames of several sizes; a run keeps those of the commonest")
+    if rejected:
+        reasons = listed(f"{one.path.name}: {one.reason.removeprefix(f'{one.path}').lstrip(': ')}" for one in rejected)
+        lines.append(f"  warning: {counted(len(rejected), 'frame')} left out: {reasons}")
+    return lines + [f"  warning: {each.message} {each.remedy}" for each in check_series(frames)]
+
+
+def _cameras(frames: Sequence[FrameReference]) -> str:
+    """Say which cameras, with serial number and lens, recorded the frames."""
+    cameras = dict.fromkeys(
+        f"{frame.camera.model or 'unknown'}"
+        + (f", serial {frame.camera.serial}" if frame.camera.serial else "")
+        + (f", lens {frame.camera.lens_model}" if frame.camera.lens_model else "")
+        for frame in frames
+    )
+    return next(iter(cameras)) if len(cameras) == 1 else f"{len(cameras)}: {'; '.join(cameras)}"
+
+
+def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
+    """Say when the frames were taken, how far apart, and where there are gaps."""
+    times = np.array([frame.time for frame in frames], dtype="datetime64[ns]")
+    timed = np.sort(times[~np.isnat(times)])
+    if timed.size == 0:
+        yield "no times: the frames cannot be matched with readings"
+        return
+    length_s = float((timed[-1] - timed[0]) / np.timedelta64(1, "s"))
+    zones = sorted({frame.utc_offset_minutes or 0 for frame in frames})
+    zone = join([f"{minutes / 60:+g} h" if minutes else "UTC" for minutes in zones])
+    yield f"{moment(timed[0])} to {moment(timed[-1])}, {duration(length_s)} (camera set to {zone})"
+    if timed.size < 2:
+        return
+    gaps = [
+        f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
+        for (_, end), (start, _) in itertools.pairwise(Recording("frames", timed).stretches())
+    ]
+    step_s = float(np.median(np.diff(timed).astype(np.int64))) * 1e-9
+    rate = f"{1 / step_s:.3g} frames per second" if step_s > 0 else "frames of one time"
+    every = f"a frame every {duration(step_s)}" if step_s >= 1 else rate
+    yield f"{every}, {counted(len(gaps), 'gap')}{': ' + listed(gaps) if gaps else ''}"
+
+
+def _settings(frames: Sequence[FrameReference]) -> str:
+    """Say which settings are stored, and which of them vary."""
+    p = frames[0].parameters
+    stored = (
+        f"emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
+        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} degC, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} degC, "
+        f"relative humidity {p.relative_humidity:.0%}"
+    )
+    names = [each.name for each in fields(CameraParameters)]
+    varying = [name for name in names if len({getattr(frame.parameters, name) for frame in frames}) > 1]
+    return f"{stored}: {'the same in all frames' if not varying else f'of the first frame; not the same in all: {join(varying)}'}"
+
+
+def _temperatures(frames: Sequence[FrameReference]) -> str:
+    """Say which temperatures a few frames show with their own parameters."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _FRAMES_READ).round().astype(int))
+    lows, highs = [], []
+    for frame in (frames[index] for index in chosen):
+        try:
+            values = calibrate(frame.read_counts(), frame.parameters)
+        except ThermographyError:
+            continue
+        if np.isfinite(values).any():
+            lows.append(float(np.nanmin(values)))
+            highs.append(float(np.nanmax(values)))
+    if not lows:
+        return "cannot be determined from the stored parameters"
+    return f"{min(lows):.2f} to {max(highs):.2f} degC in {counted(len(lows), 'frame')} spread over the series"

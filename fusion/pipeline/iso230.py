@@ -1,0 +1,413 @@
+"""Evaluation of a test by ISO 230-2: windows of cycles, and the most settled of them with its budget."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.campaign.config import (
+    AcceptanceTable,
+    Campaign,
+    CampaignError,
+    InterferometryTable,
+    ReportTable,
+    load_campaign,
+)
+from fusion.campaign.inputs import read_laser
+from fusion.campaign.recompensation import Origin, StatedBudget, material_by_cycle
+from fusion.report.wording import moment
+from fusion.results.axis import Iso230Part
+from fusion.results.progress import left_out_notices
+from fusion.results.results import read_results
+from fusion.results.store import group, has, joined, plain, read_product
+from interferometry.common import InterferometryError
+from interferometry.drift.estimate import estimate_drift
+from interferometry.drift.planning import estimate_settling
+from interferometry.inspection import describe_notes
+from interferometry.io.readings import read_deviations
+from interferometry.iso230 import (
+    CONTRIBUTIONS,
+    QUANTITIES,
+    SAMPLING,
+    STANDARD_CYCLES,
+    Iso230Budget,
+    evaluate_iso230,
+    evaluate_other_standards,
+    evaluate_windows,
+    settled_window,
+)
+from interferometry.iso230.conditions import check_conditions, decide
+from interferometry.iso230.uncertainty import SCATTER_ALONE
+from interferometry.plots import time_span
+
+_RULE = f"of the windows of {STANDARD_CYCLES} cycles in the second half of the test, the one with the least drift by the joint estimate"
+_RULE_WITHOUT_DRIFT = f"the last window of {STANDARD_CYCLES} cycles, as no drift could be estimated"
+_RULE_ONE = "the only window of the test"
+_AXIS = (*QUANTITIES, "mean_reversal")
+#: Unit of each input, and the field of `interferometry.iso230.Iso230Budget` that holds it.
+_INPUTS = {
+    "device": ("device_ppm", "ppm"),
+    "alignment": ("alignment_ppm", "ppm"),
+    "material_temperature": ("material_temperature_K", "K"),
+    "expansion_coefficient": ("expansion_coefficient_ppm_per_K", "ppm/K"),
+}
+
+
+def evaluate_standard(
+    deviations: xr.Dataset,
+    budget: StatedBudget,
+    *,
+    drift: xr.DataArray | None,
+    material_degC: xr.DataArray | None,
+    cycles: list[int] | None = None,
+) -> tuple[xr.Dataset, xr.Dataset, dict[str, Any]]:
+    """Evaluate windows of a test by ISO 230-2, and say which of them shows the warmed-up axis."""
+    windows = evaluate_windows(deviations, budget=budget.budget, drift=drift, material_degC=material_degC)
+    numbers = deviations["cycle"].values
+    blocks = [
+        numbers[(numbers >= first) & (numbers <= last)].tolist()
+        for first, last in zip(windows["first_cycle"].values, windows["last_cycle"].values, strict=True)
+    ]
+    quoted = blocks[settled_window(windows)] if cycles is None else cycles
+    first, settled = (
+        evaluate_iso230(deviations, cycles=window, budget=budget.budget, drift=drift, material_degC=material_degC)
+        for window in (blocks[0], quoted)
+    )
+    of_standard = windows.isel(window=slice(0, -1)) if windows.sizes["window"] > 1 else windows
+    if cycles is not None:
+        rule = ""
+    elif of_standard.sizes["window"] == 1:
+        rule = _RULE_ONE
+    else:
+        rule = _RULE_WITHOUT_DRIFT if drift is None else _RULE
+    # What was measured beside the readings tells where two inputs of the budget come from.
+    part_of = partial(_window_part, budget=budget, drift=drift is not None, material=material_degC is not None)
+    part = {
+        "window": first.attrs["window"],
+        **{f"{name}_um": _quantity(first, name) for name in _AXIS},
+        "B_of_scatter_um": float(first["B_of_scatter"]),
+        "settled": part_of(settled, quoted),
+        "settled_rule": rule,
+        "first": part_of(first, blocks[0]),
+        "range_um": {
+            name: {"lowest": float(of_standard[name].min()), "highest": float(of_standard[name].max())}
+            for name in QUANTITIES
+        },
+    }
+    return windows, settled, part
+
+
+def _quantity(result: xr.Dataset, name: str, **where: str) -> dict[str, float]:
+    """Return value and standard uncertainty of a quantity."""
+    return {"value": float(result[name].sel(where)), "u": float(result[f"{name}_u"].sel(where))}
+
+
+def _window_part(
+    result: xr.Dataset, cycles: list[int], *, budget: StatedBudget, drift: bool, material: bool
+) -> dict[str, Any]:
+    """Return the values of one window with its budget, as in results.json."""
+    by_direction = {
+        direction: {f"{name}_um": _quantity(result, f"{name}_unidirectional", direction=direction) for name in "ARE"}
+        for direction in ("positive", "negative")
+    }
+    other = [name for name in CONTRIBUTIONS if name not in SAMPLING]
+    without = (result["contribution"].sel(contributor=other) ** 2).sum("contributor", skipna=False) ** 0.5
+    one_way = {
+        name: float((found.sel(contributor=other) ** 2).sum() ** 0.5) for name, found in _one_way_shares(result).items()
+    }
+    return {
+        "window": result.attrs["window"],
+        "cycles": cycles,
+        **{f"{name}_um": _quantity(result, name) for name in _AXIS},
+        "B_of_scatter_um": float(result["B_of_scatter"]),
+        **by_direction,
+        "u_without_sampling_um": {name: float(without.sel(quantity=name)) for name in _AXIS} | one_way,
+        "contributions": [_contribution(result, name, budget, drift, material) for name in CONTRIBUTIONS],
+    }
+
+
+def _one_way_shares(result: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the contributions to A, R and E of every direction that was measured."""
+    shares = {
+        f"{name}_{direction}": result[f"{name}_unidirectional_contribution"].sel(direction=direction)
+        for direction in ("positive", "negative")
+        for name in "ARE"
+    }
+    return {name: found for name, found in shares.items() if found.notnull().all()}
+
+
+def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, drift: bool, material: bool) -> dict[str, Any]:
+    """Return one row of the budget."""
+    parts = {f"{symbol}_um": float(result["contribution"].sel(quantity=symbol, contributor=name)) for symbol in _AXIS}
+    u: float | None = None
+    unit, origin = "um", "from the readings"
+    if name in _INPUTS:
+        field, unit = _INPUTS[name]
+        u, origin = getattr(budget.budget, field), budget.origins[name]
+        if name == "expansion_coefficient" and not budget.budget.is_scatter_alone:
+            logged = "" if material else "an assumed "
+            origin += f"; material at {logged}{float(result['temperature_difference']):.2g} K from 20 °C"
+    elif name == "environmental_variation":
+        u = float(result["environmental_variation"])
+        found = "standard deviation of the drift within the window" if drift else "not known, not contained"
+        origin = budget.origins.get(name, found)
+    elif name == "extremes":
+        origin = "mean excess in simulated tests like this one"
+    one_way = {key: float(found.sel(contributor=name)) for key, found in _one_way_shares(result).items()}
+    return {"contributor": name, "u": u, "unit": unit, "origin": origin, **parts, "unidirectional_um": one_way}
+
+
+# What the test sheet of ISO 230-2 holds in addition to the values: tolerances, conditions stated and checked, other
+# standards.
+
+_ARROWS = {"positive": "↑", "negative": "↓"}
+
+
+def complete_sheet(
+    part: Mapping[str, Any], dataset: xr.Dataset, *, campaign: Campaign | None, environment: xr.Dataset | None
+) -> dict[str, Any]:
+    """Return the part ``iso230`` of the results with tolerances, conditions and other standards of its settled window."""
+    cycles = part["settled"]["cycles"]
+    report = ReportTable() if campaign is None else campaign.report
+    limits = (AcceptanceTable() if campaign is None else campaign.acceptance).limits()
+    settling = estimate_settling(dataset, group(dataset, "drift")) if has(dataset, "drift") else None
+    checks = check_conditions(dataset, cycles=cycles, lead_mm=report.screw_lead_mm, settling=settling)
+    return {
+        **part,
+        "tolerances": [row for symbol, limit in limits.items() for row in _judge(part["settled"], symbol, limit)],
+        "checks": [asdict(check) for check in checks],
+        "conditions": [
+            {"name": name, "text": text} for name, text in _conditions(dataset, report, campaign, environment).items()
+        ],
+        "other_standards": [asdict(value) for value in evaluate_other_standards(dataset, cycles=cycles)],
+    }
+
+
+def _judge(settled: Mapping[str, Any], symbol: str, limit: float) -> list[dict[str, Any]]:
+    """Judge a quantity, each direction by itself where it is unidirectional."""
+    if symbol.endswith("_unidirectional"):
+        short = symbol.removesuffix("_unidirectional")
+        found = {f"{short}{arrow}": settled[direction][f"{short}_um"] for direction, arrow in _ARROWS.items()}
+    else:
+        found = {symbol: settled[f"{symbol}_um"]}
+    rows = []
+    for name, quantity in found.items():
+        value, expanded = quantity["value"], 2 * quantity["u"]
+        decision = decide(value, expanded, limit) if np.isfinite([value, expanded]).all() else "not measured"
+        judged = {"limit_um": limit, "value_um": value, "expanded_u_um": expanded, "decision": decision}
+        rows.append({"quantity": name, **judged})
+    return rows
+
+
+def _conditions(
+    dataset: xr.Dataset, report: ReportTable, campaign: Campaign | None, environment: xr.Dataset | None
+) -> dict[str, str]:
+    """Return the conditions of the test by name, empty where they are not stated; logged values where there is a log."""
+    laser = None if campaign is None else campaign.interferometry
+    position = dataset["position"].values
+    feed = report.feed_mm_per_min or (laser.feed_mm_per_min if laser else None)
+    dwell = report.dwell_s or (laser.dwell_s if laser else None)
+    compensation = {
+        "as recorded": "as the laser compensated them",
+        "redo": "compensated again with the logged conditions",
+    }
+    temperatures = {
+        name: _pair(
+            getattr(report, f"{name}_before_degC"), getattr(report, f"{name}_after_degC"), dataset, environment, name
+        )
+        for name in ("air_temperature", "material_temperature")
+    }
+    return {
+        "Date of the test": _date(dataset, None if campaign is None else campaign.zone_of("interferometry")),
+        "Machine": report.machine,
+        "Serial number of the machine": report.machine_serial_number,
+        "Control": report.control,
+        "Location": report.location,
+        "Customer": report.customer,
+        "Operator": report.operator,
+        "Axis": "" if campaign is None else campaign.campaign.axis,
+        "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
+        "Measured travel": f"{np.ptp(position):g} mm, {position.min():g} to {position.max():g} mm",
+        "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
+        "Feed": "" if feed is None else f"{feed:g} mm/min",
+        "Dwell at a target": "" if dwell is None else f"{dwell:g} s",
+        "Warm-up": report.warm_up,
+        "Compensation of the machine": report.machine_compensation,
+        **_instruments(report),
+        "Air temperature before, after": temperatures["air_temperature"],
+        "Material temperature before, after": temperatures["material_temperature"],
+        "Places of the sensors": report.sensor_places,
+        "Expansion coefficient": _coefficient(laser),
+        "Dead path": f"{laser.dead_path_mm:g} mm" if laser and "dead_path_mm" in laser.model_fields_set else "",
+        "Readings": "" if laser is None else compensation[laser.compensation],
+        "Remarks": report.remarks,
+    }
+
+
+def _date(dataset: xr.Dataset, zone: str | None) -> str:
+    """Return from when to when readings were taken, in local time where the zone is stated, else in UTC."""
+    if np.isnat(dataset["time"].values).all():
+        return ""
+    first, last = time_span(dataset)
+    return f"{moment(first, zone)} to {moment(last, zone)}"
+
+
+def _coefficient(laser: InterferometryTable | None) -> str:
+    """Return the expansion coefficient, and whether it is assumed."""
+    if laser is None:
+        return ""
+    stated = "expansion_coefficient_ppm_per_K" in laser.model_fields_set
+    return f"{laser.expansion_coefficient_ppm_per_K:g} ppm/K{'' if stated else ' (assumed)'}"
+
+
+def _instruments(report: ReportTable) -> dict[str, str]:
+    """Return each instrument with serial number and date of its calibration."""
+    if not report.instrument:
+        return {"Instruments": ""}
+    named = {}
+    for k, item in enumerate(report.instrument, start=1):
+        parts = [item.name, f"serial number {item.serial_number or 'not stated'}"]
+        parts.append(f"calibrated {item.calibrated.isoformat()}" if item.calibrated else "calibration not stated")
+        named[f"Instrument {k}"] = ", ".join(
+            [*parts, *([f"certificate {item.certificate}"] if item.certificate else [])]
+        )
+    return named
+
+
+def _pair(
+    before: float | None, after: float | None, dataset: xr.Dataset, environment: xr.Dataset | None, name: str
+) -> str:
+    """Return a temperature at the first and at the last reading: as stated, else as logged, else of the laser's own file."""
+    if before is not None or after is not None:
+        return ", ".join("not stated" if value is None else f"{value:.1f} °C" for value in (before, after))
+    time = dataset["time"].values
+    if environment is not None and name in environment and not np.isnat(time).all():
+        log = environment[[name]].dropna("time")
+        if log.sizes["time"]:
+            known = time[~np.isnat(time)]
+            at = [float(log[name].sel(time=when, method="nearest")) for when in (known.min(), known.max())]
+            return f"{at[0]:.1f} °C, {at[1]:.1f} °C (logged)"
+    if name in dataset and np.isfinite(dataset[name]).any():
+        ends = np.nanmean(np.atleast_2d(dataset[name].values), axis=0)
+        return ", ".join(f"{value:.1f} °C" for value in ends) + " (file of the laser)"
+    return ""
+
+
+# A test by ISO 230-2 from a file of readings, a campaign file or the results of a run, evaluated for its own page.
+
+_STATED_INPUTS = ("device", "alignment", "material_temperature", "expansion_coefficient")
+
+
+@dataclass(frozen=True)
+class StandardTest:
+    """A test as its page and the terminal show it.
+
+    Attributes
+    ----------
+    part : Iso230Part or None
+        Values; None of a test of one cycle, which has no standard deviation.
+    dataset : Dataset
+        Readings, with the group ``settled``.
+    remarks : tuple of str
+        What was left out or assumed when the file was read.
+    """
+
+    title: str
+    part: Iso230Part | None
+    dataset: xr.Dataset
+    remarks: tuple[str, ...]
+
+
+def read_test(path: Path, cycles: str | None) -> StandardTest:
+    """Read and evaluate a test."""
+    if path.is_dir():
+        return _of_results(path, cycles)
+    if path.exists() and not path.is_file():
+        raise CampaignError(f"{path}: is a pipe, a socket or a device; name a file")
+    if path.suffix == ".toml":
+        campaign = load_campaign(path)
+        if campaign.interferometry is None:
+            raise CampaignError(f"{path}: this campaign has no [interferometry]; name one with readings of the axis")
+        laser = read_laser(campaign)
+        read = (laser["deviations"], laser["iso_budget"], cycles, campaign, laser["environment"])
+        return _evaluate(campaign.campaign.title, *read)
+    deviations = read_deviations(path, rotary=True)
+    rotary = deviations["deviation"].attrs["units"] == "arcsec"
+    origin: Origin = "not of a rotary axis" if rotary else "assumed"
+    budget = StatedBudget(SCATTER_ALONE if rotary else Iso230Budget(), dict.fromkeys(_STATED_INPUTS, origin))
+    try:
+        return _evaluate(path.name, deviations, budget, cycles)
+    except InterferometryError as error:
+        raise CampaignError(f"{path}: {error}") from None
+
+
+def _of_results(folder: Path, cycles: str | None) -> StandardTest:
+    """Return the test of a run as its results hold it."""
+    if cycles is not None:
+        raise CampaignError(
+            f'--cycles "{cycles}": {folder} holds the windows of its run; name the campaign file or the file of readings instead'
+        )
+    results = read_results(folder)
+    if results.iso230 is None or results.iso230.settled is None:
+        raise CampaignError(
+            f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
+        )
+    dataset = read_product(folder, "deviations")
+    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset))
+
+
+def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
+    return (*describe_notes(deviations), *(notice.message for notice in left_out_notices(deviations, "left_out")))
+
+
+def _evaluate(
+    title: str,
+    deviations: xr.Dataset,
+    budget: StatedBudget,
+    cycles: str | None,
+    campaign: Campaign | None = None,
+    environment: xr.Dataset | None = None,
+) -> StandardTest:
+    """Evaluate readings; a test of one cycle keeps its readings alone."""
+    window = None if cycles is None else read_window(cycles, deviations)
+    remarks = _remarks(deviations)
+    if deviations.sizes["cycle"] == 1:
+        return StandardTest(title, None, deviations, remarks)
+    timed = not np.isnat(deviations["time"].values).all()
+    drift = estimate_drift(deviations) if timed else None
+    windows, settled, found = evaluate_standard(
+        deviations,
+        budget,
+        drift=None if drift is None else drift["drift"],
+        material_degC=material_by_cycle(deviations, environment),
+        cycles=window,
+    )
+    dataset = joined(deviations, iso=windows, settled=settled, **({} if drift is None else {"drift": drift}))
+
+    if deviations["deviation"].attrs["units"] == "um":
+        found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
+    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks)
+
+
+def read_window(text: str, deviations: xr.Dataset) -> list[int]:
+    """Return the cycle numbers of a window of cycles."""
+    match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", text)
+    if match is None:
+        raise CampaignError(f'--cycles "{text}" is not a window of cycles; write for example 1-5')
+    first, last = int(match.group(1)), int(match.group(2) or match.group(1))
+    cycles = deviations["cycle"].values.tolist()
+    window = [cycle for cycle in cycles if first <= cycle <= last]
+    if first > last:
+        raise CampaignError(f'--cycles "{text}" ends before it begins; write for example {last}-{first}')
+    if len(window) != last - first + 1:
+        raise CampaignError(
+            f'--cycles "{text}" contains cycles that were not measured; there are {cycles[0]} to {cycles[-1]}'
+        )
+    return window

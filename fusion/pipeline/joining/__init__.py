@@ -1,1 +1,0 @@
-"""Two finished runs of one machine, read together."""

@@ -1,0 +1,391 @@
+"""The stage that evaluates the readings, and the alignment of both recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.analysis.alignment.align import AxisGeometry, add_sensor_line, align, align_logs
+from fusion.analysis.consistency.camera import find_gaps, gap_words, in_gaps
+from fusion.analysis.consistency.readings import find_gross_readings
+from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose, undetermined_check
+from fusion.campaign.inputs import LaserInputs, Source
+from fusion.campaign.recompensation import material_by_cycle
+from fusion.pipeline.iso230 import evaluate_standard
+from fusion.report.wording import moment
+from fusion.results.progress import Report, counted, listed, silent
+from fusion.results.results import Notice, Outcome
+from fusion.results.store import group, joined
+from interferometry import neighbours
+from interferometry.anomalies import Anomaly, detect_anomalies
+from interferometry.deviations import OUTLIER
+from interferometry.drift.estimate import estimate_drift, flag_outliers
+from thermography.fields.cycle_fields import cycles_with_field
+
+#: Share of the readings that may lie outside the frames' time before the next test should be filmed otherwise.
+_OUTSIDE_SHARE = 0.05
+
+
+def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> Outcome:
+    """Evaluate the readings conventionally, by the paper's differences, by ISO 230-2 and by the joint estimate."""
+    report("deviations", 0, 1)
+    deviations = source.deviations
+    times = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
+    drift = None if np.isnat(times).all() else estimate_drift(deviations)
+    deviations = deviations if drift is None else flag_outliers(deviations, drift)
+    comparison = neighbours.compare(deviations, drift)
+    windows, settled, standard = evaluate_standard(
+        deviations,
+        source.iso_budget,
+        drift=None if drift is None else drift["drift"],
+        material_degC=material_by_cycle(deviations, source.environment),
+    )
+    groups = {
+        "conventional": neighbours.evaluate_conventional(deviations),
+        "neighbours": neighbours.evaluate_neighbours(deviations),
+        "comparison": comparison,
+        "chart": neighbours.build_chart(deviations),
+    }
+    groups |= {"iso": windows, "settled": settled, **({} if drift is None else {"drift": drift})}
+    dataset = joined(deviations, **groups)
+    zone = source.campaign.zone_of("interferometry")
+    compared = {"conventional_s_um": "conventional", "pair_s_um": "differenced", "ratio": "ratio"}
+    parts: dict[str, Any] = {
+        "iso230": standard,
+        "neighbours": {key: by_direction(comparison[name]) for key, name in compared.items()},
+    }
+    if drift is not None:
+        parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
+        parts["drift"] = _drift_part(deviations, drift)
+    report("deviations", 1, 1)
+    return Outcome(dataset, parts, (*_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
+
+
+def utc(time: np.datetime64) -> str:
+    """Return a time as results.json writes it, ISO 8601 in UTC to the second."""
+    return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
+def _drift_part(deviations: xr.Dataset, drift: xr.Dataset) -> dict[str, Any]:
+    """Return the part ``drift`` of results.json; the range of every target's drift is that of the mean of both approaches, um."""
+    course = drift["drift"].mean("direction")
+    range_u = drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0)
+    return {
+        "profile_um": by_direction(drift["profile"]),
+        "profile_u_um": by_direction(drift["profile_u"]),
+        "scatter_um": by_direction(drift["scatter"]),
+        "position_mm": deviations["position"].values.tolist(),
+        "range_um": (course.max("cycle") - course.min("cycle")).values.tolist(),
+        "range_u_um": range_u.values.tolist(),
+    }
+
+
+def _approach_notices(deviations: xr.Dataset) -> Iterator[Notice]:
+    """Return the notice that a test of one approach has no bidirectional values."""
+    read = deviations["deviation"].notnull().any(("cycle", "target"))
+    sides = [str(name) for name in read["direction"].values[read.values]]
+    if len(sides) == 2:
+        return
+    yield Notice(
+        "one_approach",
+        f"Positions were approached in the {sides[0]} direction only: unidirectional values are given; reversal error, bidirectional "
+        "values and the drift of the reversal need both.",
+        "Approach every position from both sides.",
+    )
+
+
+def _scatter_notices(drift: xr.Dataset | None) -> Iterator[Notice]:
+    """Return the notice that the drift between readings hides their noise."""
+    if drift is None or not drift.attrs["scatter_undetermined"]:
+        return
+    sigma = float(drift["sigma"])
+    yield Notice(
+        "scatter_undetermined",
+        "The drift from one reading to the next is so large that the noise of the readings is negligible against it: the search for the "
+        f"variances ended at its limit. The scatter of {sigma:.2g} µm is that limit, not a measured value, and the true one may be "
+        "far smaller; uncertainties, outliers and positions that stand out rest on it.",
+        "Let the machine come to rest before the test, or read the positions in quicker succession; check whether the readings were "
+        "averaged or smoothed before they were written.",
+    )
+
+
+def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset | None, zone: str | None) -> Iterator[Notice]:
+    """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
+    yield from _approach_notices(deviations)
+    approached = deviations["deviation"].notnull().any(("cycle", "target")).values
+    gaps = np.isnan(deviations["deviation"].values) & approached[:, None]
+    if gaps.any():
+        cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
+        of_all = f"{counted(int(gaps.sum()), 'reading')} of {gaps[:, approached].size} missing"
+        missing = f"{of_all}, in {counted(len(cycles), 'cycle')}: {listed(cycles)}."
+        if drift is None:
+            yield Notice("readings_missing", f"{missing} The values use the remaining readings.", remedy="")
+        else:
+            share = np.sqrt(1.0 - gaps.mean(axis=0))
+            wider = float(np.nanmax(drift["profile_u"].values * (1.0 - share)))
+            effect = f"This widens the profile's standard uncertainty by up to {wider:.3f} µm."
+            remaining = "The joint estimate allows for gaps; conventional values use the remaining readings."
+            yield Notice("readings_missing", f"{missing} {effect} {remaining}", remedy="", effect_um=wider)
+    outliers = (deviations["quality_flag"] & OUTLIER.mask) > 0
+    if outliers.any():
+        named = _names(outliers, deviations, zone)
+        yield Notice(
+            "outliers",
+            f"{counted(len(named), 'outlier')} down-weighted in the joint estimate: {listed(named)}. Conventional values "
+            "contain them.",
+            f"Compare {_file(deviations)} with the logs of machine and laser: {listed(named)}.",
+        )
+
+
+def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
+    """Return an array over direction and target as lists per direction."""
+    return {str(name): np.asarray(values.sel(direction=name), float).tolist() for name in values["direction"].values}
+
+
+def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
+    used, gross = _without_gross(deviations)
+    fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
+    gross_notices = _gross_notices(deviations, gross, source.campaign.zone_of("interferometry"))
+    return fused, [*gross_notices, *_outside_notices(fused), *_gap_notices(fields, deviations)]
+
+
+def align_with_logs(source: LaserInputs, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Give every reading the environment and the drivers at its own time, where there are no frames."""
+    used, gross = _without_gross(deviations)
+    fused = align_logs(used, environment=source.environment, drivers=source.drivers)
+    sensors, plan = source.sensors, source.campaign.plan
+    if sensors is not None and plan is not None and plan.axis is not None:
+        axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
+        fused = add_sensor_line(fused, sensors.temperature, sensors.x_mm, sensors.y_mm, axis, file=sensors.file)
+    gross_notices = _gross_notices(deviations, gross, source.campaign.zone_of("interferometry"))
+    return fused, [*_sensor_notices(fused), *gross_notices]
+
+
+def _sensor_notices(fused: xr.Dataset) -> Iterator[Notice]:
+    """Return the notice that contact sensors replace the camera, with what the line between them misses."""
+    if "interpolation_u" not in fused:
+        return
+    missed, share = float(fused["interpolation_u"]), float(fused["axis_scale_u"])
+    yield Notice(
+        "sensors_for_the_camera",
+        "The rise along the axis comes from contact sensors, on a straight line from one to the next. A sensor is missed by the "
+        f"line through the others by {missed:.2g} K ({share:.0%} of the rise), which enters the uncertainty of every coefficient "
+        "per kelvin; a warm spot between the sensors is not seen.",
+        "Place sensors where the table warms most, evenly along the axis.",
+    )
+
+
+def _without_gross(deviations: xr.Dataset) -> tuple[xr.Dataset, xr.DataArray]:
+    """Return the readings without those that are errors of reading, and which these are."""
+    gross = find_gross_readings(group(deviations, "drift")["standardised"])
+    return deviations.assign(deviation=deviations["deviation"].where(~gross)), gross
+
+
+def _gross_notices(deviations: xr.Dataset, gross: xr.DataArray, zone: str | None) -> Iterator[Notice]:
+    """Return a notice for the readings that are errors of reading."""
+    if not gross.any():
+        return
+    deviation, named = deviations["deviation"], _names(gross, deviations, zone)
+    largest = float(np.abs(deviation.where(gross) - deviation.median("cycle")).max())
+    yield Notice(
+        "gross_readings",
+        f"{counted(int(gross.sum()), 'reading')} more than ten standard deviations of their position off, by up to {largest:.3g} µm: "
+        f"{listed(named)}; left out where drift and field are compared and modelled.",
+        f"Check {listed(named)} (beam, unit, typing error), and correct or remove these readings in {_file(deviations)}.",
+    )
+
+
+def _names(marked: xr.DataArray, deviations: xr.Dataset, zone: str | None) -> list[str]:
+    """Return cycle, position, approach and time of every reading that is marked (cycle, direction, target)."""
+    cycle, direction, target = (marked[name].values for name in marked.dims)
+    time, position = deviations["time"].values, deviations["position"].values
+    return [
+        f"cycle {cycle[c]}, position {target[t]} ({position[t]:g} mm), {direction[d]} approach, {moment(time[c, d, t], zone)}"
+        for c, d, t in np.argwhere(marked.values)
+    ]
+
+
+def _file(deviations: xr.Dataset) -> str:
+    """Return the name of the file of the readings."""
+    return str(deviations.attrs.get("source", "the file of the readings"))
+
+
+def _gap_notices(fields: xr.Dataset, deviations: xr.Dataset) -> Iterator[Notice]:
+    """Return a notice for gaps between the frames in which readings were taken, with the cycles that have no frame."""
+    gaps = find_gaps(fields["time"].values)
+    inside = in_gaps(deviations["time"], gaps)
+    if not inside.any():
+        return
+    empty = fields["cycle"].values[~cycles_with_field(fields["temperature"])]
+    without = f"; cycles without a frame: {listed(str(cycle) for cycle in empty)}" if empty.size else ""
+    yield Notice(
+        "frames_gaps",
+        f"{counted(len(gaps), 'gap')} between the frames: {listed(gap_words(gap) for gap in gaps)}{without}. The field of "
+        f"{counted(int(inside.sum()), 'reading')} in them is interpolated.",
+        "Give all frames of the test.",
+    )
+
+
+def _outside_notices(fused: xr.Dataset) -> Iterator[Notice]:
+    """Return a notice for readings that lie outside the frames' time."""
+    outside = (fused["deviation"].notnull() & ~fused["inside_frames"]).values
+    if not outside.any():
+        return
+    cycles = [str(cycle) for cycle in fused["cycle"].values[outside.any(axis=(1, 2))]]
+    many = outside.sum() > _OUTSIDE_SHARE * fused["deviation"].notnull().values.sum()
+    yield Notice(
+        "readings_outside_frames",
+        f"{counted(int(outside.sum()), 'reading')} outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
+        "evaluated, but not used where drift and field are compared.",
+        "Start the camera before the first cycle and stop it after the last one." if many else "",
+    )
+
+
+# Positions that stand out from what the model explains, and their cause.
+
+#: Largest family-wise p-value of an anomaly for which a cause is named.
+_CAUSE_LEVEL = 0.02
+
+
+@dataclass(frozen=True)
+class DiagnosedPosition:
+    """A position that stands out, and its diagnosis."""
+
+    anomaly: Anomaly
+    diagnosis: Diagnosis
+
+    def as_json(self) -> dict[str, Any]:
+        """One entry of ``anomalies`` in results.json: what was flagged, its cause, and the evidence for and against it."""
+        anomaly, diagnosis = self.anomaly, self.diagnosis
+        return {
+            "target": anomaly.target,
+            "direction": anomaly.direction,
+            "p_value": anomaly.p_value,
+            "p_resolution": anomaly.least_p_value,
+            "scatter_um": anomaly.scatter_um,
+            "cause": diagnosis.cause,
+            "evidence": {
+                "kind": anomaly.kind,
+                "extra_um": anomaly.extra_um,
+                "probability": diagnosis.probability,
+                "for": list(diagnosis.for_it),
+                "against": list(diagnosis.against_it),
+                "check": diagnosis.check,
+                **diagnosis.evidence,
+            },
+        }
+
+
+def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.DataArray) -> list[DiagnosedPosition]:
+    """Detect positions that stand out given the named effects, and diagnose them."""
+    left = (fused["deviation"] - explained).values
+    cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=left))
+    # Scatter that is only unequal, as it naturally is, makes no position an anomaly; one that stands out does.
+    anomalies = [anomaly for anomaly in detect_anomalies(cleaned, estimate_drift(cleaned)) if anomaly.stands_out]
+    diagnoses = diagnose(fused.assign(deviation=fused["deviation"].copy(data=left)), anomalies)
+    return [
+        DiagnosedPosition(anomaly, withhold_doubtful_cause(anomaly, diagnosis))
+        for anomaly, diagnosis in zip(anomalies, diagnoses, strict=True)
+    ]
+
+
+def withhold_doubtful_cause(anomaly: Anomaly, diagnosis: Diagnosis) -> Diagnosis:
+    """Name no cause for a position that is itself flagged only near the limit."""
+    if diagnosis.cause == "undetermined" or anomaly.p_value <= _CAUSE_LEVEL:
+        return diagnosis
+    doubt = f"the position itself is flagged only near the limit (p = {anomaly.p_value:.2g}); before a cause, it needs more cycles"
+    check = undetermined_check(diagnosis.cause)
+    return replace(diagnosis, cause="undetermined", check=check, against_it=(doubt, *diagnosis.against_it))
+
+
+def sites_of(positions: Sequence[DiagnosedPosition], targets: int) -> list[tuple[int, str]]:
+    """Sites that are reported as anomalies, so that the loop does not report them again as a remainder."""
+    anomalies, sides = [position.anomaly for position in positions], {"both": ("positive", "negative")}
+    if 4 * len({anomaly.target for anomaly in anomalies}) > targets:
+        return []
+    return [
+        (anomaly.target, name) for anomaly in anomalies for name in sides.get(anomaly.direction, (anomaly.direction,))
+    ]
+
+
+# How much a campaign must hold for each analysis, and the notice that names what a small one would need.
+
+#: Smallest test whose drift can be modelled and attributed: below, no cycle can be held out and no course be distinguished from chance.
+LEAST_CYCLES, LEAST_TARGETS, LEAST_FRAMES = 12, 3, 12
+#: So many targets take part in the model of the drift at most: they share their drift, and the work grows with the cube of their number.
+MOST_TARGETS = 64
+#: So many values over the cycles are correlated with the field at most: memory and work grow with the square of their number and faster.
+MOST_CYCLES = 500
+
+
+def insufficient_for_model(deviations: xr.Dataset) -> Iterator[Notice]:
+    """Return the notice that a test is too small for positions that stand out and for the closed loop; empty where it is not."""
+    cycles, targets = deviations.sizes["cycle"], deviations.sizes["target"]
+    if cycles >= LEAST_CYCLES and targets >= LEAST_TARGETS:
+        return
+    yield Notice(
+        "too_small_for_model",
+        f"{counted(cycles, 'cycle')} at {counted(targets, 'target')}: ISO 230-2, profile, scatter and drift are evaluated; positions "
+        f"that stand out, causes of drift and closed loop need at least {LEAST_CYCLES} cycles (better 50) at {LEAST_TARGETS} targets.",
+        f"Measure at least {LEAST_CYCLES} cycles, better 50, for the causes of the drift.",
+    )
+
+
+def choose_targets(deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Return the readings that take part in the model of the drift: all, or those at some of very many targets, evenly chosen."""
+    count = deviations.sizes["target"]
+    if count <= MOST_TARGETS:
+        return deviations, []
+    order = np.argsort(deviations["position"].values, kind="stable")
+    chosen = np.sort(order[np.round(np.linspace(0, count - 1, MOST_TARGETS)).astype(int)])
+    notice = Notice(
+        "targets_chosen",
+        f"Positions that stand out and the closed loop use {MOST_TARGETS} of the {count} positions, evenly spread with both ends, "
+        "which know the drift as well; ISO 230-2, profile, scatter and drift use all.",
+        "",
+    )
+    return deviations.isel(target=chosen), [notice]
+
+
+def average_cycles(fused: xr.Dataset, field: xr.DataArray) -> tuple[xr.Dataset, xr.DataArray, list[Notice]]:
+    """Return readings and field as they are correlated: as they are, or means of successive cycles and frames of a very long test."""
+    cycles, frames = fused.sizes["cycle"], field.sizes["time"]
+    together = int(np.ceil(cycles / MOST_CYCLES))
+    if together == 1:
+        return fused, field, []
+    start = field["time"].values[0]
+    present = fused["deviation"].notnull() & fused["time"].notnull()
+    seconds = ((fused["time"] - start) / np.timedelta64(1, "s")).where(present)
+    means = xr.Dataset({"deviation": fused["deviation"].where(present), "seconds": seconds})
+    means = means.coarsen(cycle=together, boundary="trim").mean()
+    milliseconds = (1000.0 * means["seconds"]).round().fillna(0.0)
+    time = (start + milliseconds.astype(np.int64).astype("timedelta64[ms]")).where(means["seconds"].notnull())
+    averaged = means.drop_vars("seconds").assign(time=time.astype("datetime64[ns]"), position=fused["position"])
+    averaged["deviation"].attrs = fused["deviation"].attrs
+    at_once = max(1, frames * together // cycles)
+    of_frames = field if at_once == 1 else field.coarsen(time=at_once, boundary="trim").mean()
+    notice = Notice(
+        "cycles_averaged",
+        f"Field and drift are correlated by means of {together} successive cycles ({averaged.sizes['cycle']} of {cycles}): a part "
+        "that responds within less is seen as one that responds at once.",
+        "",
+    )
+    return averaged.assign_coords(cycle=averaged["cycle"].astype(int)), of_frames, [notice]
+
+
+def insufficient_for_correlation(fields: xr.Dataset) -> Iterator[Notice]:
+    """Return the notice that a test is too small for drift and field to be compared; empty where it is not."""
+    frames = fields.sizes["time"]
+    if frames >= LEAST_FRAMES:
+        return
+    yield Notice(
+        "too_few_frames",
+        f"{counted(frames, 'frame')}: fields and hotspots are evaluated; which part of the field goes with the drift needs at least "
+        f"{LEAST_FRAMES} frames.",
+        "Take a frame in every cycle, or once a minute.",
+    )

@@ -1,0 +1,621 @@
+"""The report of a campaign: the facts that its templates state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.diagnosis.residual import LEVEL as REMAINDER_LEVEL
+from fusion.analysis.drift_model.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
+from fusion.report.charts.model import rate_text
+from fusion.report.conclusions import conclude, describe_anomaly, headline, next_steps
+from fusion.report.wording import (
+    CONTRIBUTORS,
+    ISO230_TERMS,
+    Row,
+    Table,
+    Words,
+    alike,
+    anomaly_cause,
+    anomaly_place,
+    approach_of,
+    assumption,
+    baseline_words,
+    conditional,
+    decimals_of,
+    effect_words,
+    figures_of,
+    gain,
+    in_words,
+    join,
+    measured,
+    number,
+    p_cell,
+    p_words,
+    parameters,
+    print_unit,
+    quantity,
+    randomised_causes,
+    say,
+    small,
+    spaced,
+    table,
+    untouched,
+    upper_first,
+)
+from fusion.results.axis import CorrelationPart, Evidence, Iso230Part, Iso230Window, PlacePart
+from fusion.results.loop import AxisLoop, AxisStep, Coefficient, HoldOutQuestion, Loop, Nothing, RunnerUp, StepPart
+from fusion.results.parts import Figures
+from fusion.results.results import Results
+from fusion.results.store import by_approach, group, has
+from interferometry.deviations import REGISTRY
+from interferometry.plots import time_span
+from thermography.fields.cycle_fields import plan_unit
+
+# Drift and field in the report: the facts that its templates state.
+
+
+def describe_correlation(
+    fused: xr.DataTree, results: Results, joint: Mapping[str, Any] | None
+) -> dict[str, Any] | None:
+    """Return the facts of the section on drift and field; None where it was not tested."""
+    correlation = results.correlation
+    if correlation is None or "correlation" not in fused.children:
+        return None
+    maps = fused.children["correlation"]
+    source = correlation.source
+    attributable = correlation.verdict == "attributable"
+    adding, collinear = _other_modes(correlation) if attributable and source.kind == "mode" else ([], [])
+    # What each number of contact sensors loses against the camera; whether fewer do as well.
+    losses = [np.inf if added.loss_um is None else added.loss_um for added in correlation.sensors.sets]
+    return {
+        "headline": conditional(say("place_sentence", correlation), results.inputs, "attribution"),
+        "attributable": attributable,
+        "causes": randomised_causes(correlation),
+        "joint_causes": None if joint is None else joint["causes"],
+        "adding": adding,
+        "collinear": collinear,
+        "figure": {"mode": f"mode_{source.name}", "cell": "sensitivity"}.get(source.kind, "") if attributable else "",
+        "maps": [_map_facts(maps, name, source.part) for name in ("", "modes") if not name or name in maps.children],
+        "cells": [_strongest_cell(maps.to_dataset(), str(channel)) for channel in maps.to_dataset()["channel"].values],
+        "places": [
+            (kind, [(place, _strongest_part(maps, kind, k)) for k, place in enumerate(listed)])
+            for kind, listed in (("modes", correlation.modes), ("regions", correlation.regions))
+            if listed
+        ],
+        "region": leading_region(maps) if "target_regions" in maps.children else "",
+        "region_targets": _region_targets(maps) if "target_regions" in maps.children else None,
+        "false_alarms": rate_text(float(maps["false_alarm_rate"])),
+        "excitation": maps.attrs["excitation"],
+        "warm_up_share": float(maps["warm_up_share"]),
+        "courses": int(maps.children["clusters"]["cluster"].max()),
+        "condition": float(maps.children["clusters"]["condition"]),
+        "level": LEVEL,
+        "camera": _camera_prediction(maps.children["sensors"].to_dataset()),
+        "sensors": [
+            (added, losses[at] > min(losses[:at], default=np.inf)) for at, added in enumerate(correlation.sensors.sets)
+        ],
+    }
+
+
+def passes(p: float | None) -> bool:
+    """Return whether a family-wise p-value is significant."""
+    return p is not None and p <= LEVEL
+
+
+def _other_modes(correlation: CorrelationPart) -> tuple[list[PlacePart], list[PlacePart]]:
+    """Return the modes that are significant given the leading one, and those that are so only on their own."""
+    others = [mode for mode in correlation.modes if mode.name != f"mode {correlation.source.name}"]
+    adding = [mode for mode in others if any(passes(part.p_given_leading_mode) for part in mode.parts.values())]
+    alone = [mode for mode in others if any(passes(part.p_value) for part in mode.parts.values())]
+    return adding, [mode for mode in alone if mode not in adding]
+
+
+def _map_facts(maps: xr.DataTree, name: str, channel: str) -> dict[str, Any]:
+    """Return what the maps of cells, or of modes, can show: rate of false alarms, unexplained drift (µm in 1 h), limit (µm/K)."""
+    tested = maps.children[name].to_dataset() if name else maps.to_dataset()
+    limit = tested["detectable_sensitivity"].sel(channel=channel)
+    return {
+        "name": name or "cells",
+        "false_alarms": rate_text(float(tested["false_alarm_rate" if name else "cells_false_alarm_rate"])),
+        "unexplained_um": float(maps["unexplained_drift"].sel(channel=channel)),
+        "limit_um_per_K": float(limit.where(np.isfinite(limit)).median()),
+    }
+
+
+def _strongest_cell(maps: xr.Dataset, channel: str) -> dict[str, Any]:
+    """Return the cell that one part of the drift follows most closely."""
+    names = ["p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity"]
+    flat = maps[names].sel(channel=channel).stack(cell=("y", "x"))
+    best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
+    values = {name: float(best[name]) for name in (*names, "x", "y")}
+    return {"channel": channel, "unexplained_um": float(maps["unexplained_drift"].sel(channel=channel)), **values}
+
+
+def _strength(maps: xr.DataTree, kind: str) -> xr.DataArray:
+    """Return the statistic of modes or regions as a multiple of its threshold."""
+    tested = maps.children[kind].to_dataset()
+    return (tested["statistic"] / tested["threshold"]).fillna(0.0)
+
+
+def _strongest_part(maps: xr.DataTree, kind: str, k: int) -> str:
+    """Return the part of the drift that follows a mode or a region most closely."""
+    of_place = _strength(maps, kind).isel({kind.removesuffix("s"): k})
+    return str(of_place["channel"].values[int(of_place.values.argmax())])
+
+
+def leading_region(maps: xr.DataTree) -> str:
+    """Return the region that explains the drift best."""
+    ratio = _strength(maps, "regions").max("channel")
+    return str(ratio["region"].values[int(ratio.values.argmax())])
+
+
+def _region_targets(maps: xr.DataTree) -> list[tuple[str, list[str], int]]:
+    """Return the regions that single targets follow: name, those targets, and the number of targets tested."""
+    p = maps.children["target_regions"].to_dataset()["p_value"]
+    passed = {str(region): p["series"].values[(p.sel(region=region) <= LEVEL).values] for region in p["region"].values}
+    return [(region, [*map(str, names)], p.sizes["series"]) for region, names in passed.items() if names.size]
+
+
+def _camera_prediction(sensors: xr.Dataset) -> dict[str, Any] | None:
+    """Return by how much the camera lowers the error in cycles left out, µm; None where the field did not change enough."""
+    if "sensor" not in sensors.sizes or sensors.sizes["sensor"] == 0:
+        return None
+    return {
+        "gain": float(sensors["camera_gain"]),
+        "at_most": float(sensors["camera_gain_at_most"]),
+        "decided": bool(sensors["camera_decided"]),
+        "within_s": float(sensors["run_length"]),
+    }
+
+
+# The test by ISO 230-2 in the report: values of the axis and of every target, budget, tolerances, conditions, other
+# standards.
+
+#: Columns of the budget, of a test from both sides.
+_BUDGETED = ("A", "R", "E", "M", "B", "mean_reversal")
+#: Values of each direction, in the terms of the standard.
+_ONE_WAY = {
+    "A": "Unidirectional positioning accuracy A",
+    "R": "Unidirectional positioning repeatability R",
+    "E": "Unidirectional systematic positioning error E",
+}
+_ARROWS = {"positive": "↑", "negative": "↓"}
+#: Missing readings that are listed one by one.
+_NAMED = 8
+
+
+def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None, *, unit: str = "µm") -> dict[str, Any]:
+    """Return the tables of the section on ISO 230-2, as page and terminal show them."""
+    shown = part.settled
+    tables: dict[str, Any] = dict.fromkeys(("positions", "budget", "tolerances"))
+    if shown is None:
+        rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
+        axis = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
+        return {**tables, "quoted": part, "axis": axis, "missing": ""}
+    if dataset is not None and has(dataset, "settled"):
+        tables["positions"] = _iso230_positions_table(group(dataset, "settled"), dataset["position"], unit)
+    return {
+        **tables,
+        "quoted": shown,
+        "axis": _values_table(part, shown, unit),
+        "budget": _budget_table(shown, unit),
+        "tolerances": _tolerances_table(part, unit) if part.tolerances else None,
+        "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
+    }
+
+
+def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
+    """Return the values of every target in the order of the axis; decimals by the uncertainty of a mean deviation."""
+    spread = settled["standard_deviation"].values / np.sqrt(np.where(settled["count"] > 0, settled["count"], np.nan))
+    places = decimals_of(float(np.nanmedian(spread)))
+
+    def shown(value: float) -> str:
+        return f"{value:.{places}f}".replace("-", "−") if np.isfinite(value) else "–"
+
+    along = _along(position)
+    of_both = ("mean_bidirectional", "reversal", "repeatability_bidirectional")
+    of_each = ("mean_unidirectional", "standard_deviation", "repeatability")
+    one_way = [by_approach(settled[name], target=along) for name in of_each]
+    values = np.hstack([*one_way, *(settled[name].sel(target=along).values[:, None] for name in of_both)])
+    places_mm, counted = position.sel(target=along).values, by_approach(settled["count"], target=along)
+    rows = [
+        [str(target), f"{place:g}", *(shown(value) for value in row), ", ".join(str(int(count)) for count in counts)]
+        for target, place, row, counts in zip(along, places_mm, values, counted, strict=True)
+    ]
+    titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in _ARROWS.values()]
+    unit_along = str(position.attrs.get("units", "mm"))
+    return table(
+        ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"B_i / {unit}", f"R_i / {unit}", "n↑, n↓"], rows
+    )
+
+
+def _along(position: xr.DataArray) -> np.ndarray:
+    """Return the numbers of the targets in the order of the axis."""
+    return position["target"].values[np.argsort(position.values, kind="stable")]
+
+
+def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
+    """Return which readings of a window are missing, and why."""
+    within = dataset[["deviation", "quality_flag"]].sel(cycle=list(cycles))
+    missing = np.argwhere(np.isnan(within["deviation"].values))
+    if missing.size == 0:
+        return "No reading of the window is missing."
+    named = []
+    for cycle, direction, target in missing[:_NAMED]:
+        bits = int(within["quality_flag"].values[cycle, direction, target])
+        why = join([flag.name.replace("_", " ") for flag in REGISTRY if bits & flag.mask]) or "missing"
+        approach = _ARROWS[str(within["direction"].values[direction])]
+        named.append(
+            f"cycle {within['cycle'].values[cycle]}, target {within['target'].values[target]}{approach} ({why})"
+        )
+    more = len(missing) - len(named)
+    rest = f" and {more} more" if more else ""
+    return f"{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
+
+
+def single_run_table(dataset: xr.Dataset) -> Table:
+    """Return the deviations of a test of one cycle."""
+    unit, place = (print_unit(str(dataset[name].attrs["units"])) for name in ("deviation", "position"))
+    along = _along(dataset["position"])
+    values = by_approach(dataset["deviation"].isel(cycle=0), target=along)
+    rows = []
+    for target, at, readings in zip(along, dataset["position"].sel(target=along).values, values, strict=True):
+        cells = [f"{value:.2f}".replace("-", "−") if np.isfinite(value) else "–" for value in readings]
+        rows.append([str(target), f"{at:g}", *cells])
+    return table(["Target", place, *(f"deviation{arrow} / {unit}" for arrow in _ARROWS.values())], rows)
+
+
+def _tolerances_table(part: Iso230Part, unit: str) -> Table:
+    """Return every quantity that was judged."""
+    rows = []
+    for row in part.tolerances:
+        value = measured(row.value_um, None if row.expanded_u_um is None else row.expanded_u_um / 2)
+        cells = [row.quantity, value, f"{row.limit_um:g}", row.decision]
+        rows.append(Row(cells, marked=row.decision != "pass"))
+    return table([Words("Quantity"), f"Value ± U / {unit}", f"Tolerance / {unit}", Words("Decision")], rows)
+
+
+def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
+    """Return the axis values of the settled window, those of the first one and their range over the windows."""
+    several = part.first is not None and part.first.window != shown.window
+    rows = []
+    for symbol, term in ISO230_TERMS.items():
+        found = part.range_um.get(symbol)
+        first = quantity(getattr(part, f"{symbol}_um"))
+        spread = "–" if found is None else f"{number(found.lowest)} to {number(found.highest)}"
+        values = [quantity(getattr(shown, f"{symbol}_um"))]
+        rows.append(Row([term, *values, *([first, spread] if several else [])], marked=True))
+        for direction, arrow in _ARROWS.items():
+            if symbol not in _ONE_WAY:
+                continue
+            of_shown = quantity(getattr(getattr(shown, direction), f"{symbol}_um"))
+            of_first = quantity(getattr(getattr(part.first, direction), f"{symbol}_um")) if part.first else "–"
+            rows.append(Row([f"{_ONE_WAY[symbol]}{arrow}", of_shown, *([of_first, "–"] if several else [])]))
+    mean = [quantity(shown.mean_reversal_um), *([quantity(part.mean_reversal_um), "–"] if several else [])]
+    rows.append(Row(["Mean reversal error, with its sign", *mean]))
+    columns = [f"{shown.window} / {unit}"]
+    if several:
+        columns += [f"First window, {part.window} / {unit}", f"Range over windows without overlap / {unit}"]
+    return table([Words("Quantity of the axis (± U, k = 2)"), *columns], rows)
+
+
+def _budget_table(shown: Iso230Window, unit: str) -> Table:
+    """Return the budget: every input with its contributions, and the expanded uncertainty without and with the sampling."""
+    side = approach_of(shown)
+    names: tuple[str, ...] = _BUDGETED
+    titles = [name.replace("_", " ") for name in _BUDGETED]
+    if side:
+        names = tuple(f"{symbol}_{side}" for symbol in _ONE_WAY)
+        titles = [f"{symbol}{_ARROWS[side]}" for symbol in _ONE_WAY]
+    rows: list[Row] = []
+    for entry in shown.contributions:
+        u = "–" if entry.u is None else f"{number(entry.u, 2)} {unit if entry.unit == 'um' else entry.unit}"
+        found = (entry.unidirectional_um.get(name) if side else getattr(entry, f"{name}_um") for name in names)
+        cause = CONTRIBUTORS.get(entry.contributor, entry.contributor)
+        rows.append(Row([cause, u, entry.origin, *(number(value, 2) for value in found)]))
+    without = [shown.u_without_sampling_um.get(name) for name in names]
+    values = [getattr(getattr(shown, side), f"{symbol}_um") for symbol in _ONE_WAY] if side else []
+    with_it = [value.u for value in values or (getattr(shown, f"{symbol}_um") for symbol in _BUDGETED)]
+    for name, sums in (("U (k = 2) without the sampling of the cycles", without), ("U (k = 2)", with_it)):
+        expanded = (number(None if u is None else 2 * u, 2) for u in sums)
+        rows.append(Row([name, "", "", *expanded], marked=True))
+    columns = [f"{title} / {unit}" for title in titles]
+    return table([Words("Contribution"), "Standard uncertainty u", Words("u is"), *columns], rows)
+
+
+# Model and anomalies in the report: steps, coefficients, errors, candidates, evidence, for the page and the
+# application alike.
+
+#: What the hold-out is for, and what it is not.
+DECIDED_BEFORE = (
+    "What enters is decided on the training part alone. The hold-out is opened once, to report: an effect that it does not confirm "
+    "stays in the table as not confirmed, and the error after may exceed the error before."
+)
+
+
+def errors_table(loop: Loop) -> Table:
+    """Return the errors on the hold-out with their intervals: of the model before and after, and of plain predictions."""
+    named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
+    plain = [(words, getattr(loop.baselines, name)) for name, words in baseline_words(loop).items()]
+    listed = [*named, *plain]
+    numbers = alike(
+        [getattr(one, name) for _, one in listed for name in ("rmse_um", "low_um", "high_um")], distinct=False
+    )
+    rows = [
+        Row([name, numbers[3 * at], f"{numbers[3 * at + 1]} to {numbers[3 * at + 2]}"], marked=at < len(named))
+        for at, (name, _) in enumerate(listed)
+    ]
+    return table([Words("Prediction of what was held out"), "Error / µm", "95 % interval / µm"], rows)
+
+
+def steps_table(loop: Loop) -> Table:
+    """Return the declared model and every effect that was added, with the errors before and after: held out, and blocks left out."""
+    declared = join([effect_words(name).name for name in loop.declared]) or "nothing"
+    errors = [error for step in loop.steps for error in (step.rmse_before_um, step.rmse_after_um)]
+    numbers = alike([loop.rmse_declared_um, *errors])
+    rows = [Row(["0", f"declared: {declared}", "–", numbers[0], "–", "", ""])]
+    for turn, step in enumerate(loop.steps, start=1):
+        held_out = " -> ".join(numbers[2 * turn - 1 : 2 * turn + 1])
+        rows.append(Row([str(turn), *_step_cells(step, held_out)], marked=True))
+    titles = ("p", "Held out / µm", "Blocks / µm", Words("Confirmed"), Words("Next best effect"))
+    return table(["Step", Words("Effect"), *titles], rows)
+
+
+def _step_cells(step: StepPart, held_out: str) -> list[str]:
+    text = parameters(step.parameters, step.parameter_ranges)
+    return [
+        f"{effect_words(step.effect).name}{f': {text}' if text else ''}",
+        p_cell(step.p_value),
+        held_out,
+        " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
+        f"not confirmed: {step.doubt}" if step.doubt else "yes",
+        _runner_up(step.runner_up),
+    ]
+
+
+def _runner_up(other: RunnerUp | Nothing) -> str:
+    """Return the second best effect of a step and how far behind it is."""
+    if isinstance(other, Nothing) or other.gain_deficit is None:
+        return "none"
+    name, size = effect_words(other.effect).name, number(abs(other.gain_deficit), 2)
+    if other.gain_deficit < 0:
+        return f"{name} (log-likelihood higher by {size}, but not confirmed)"
+    return f"{name} (log-likelihood lower by {size})"
+
+
+def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
+    """Return the model in numbers: coefficients, unexplained drift, simplest prediction, and what was not tried."""
+    rows = [(effect_words(one.effect).name, _coefficient(one)) for one in loop.declared_coefficients]
+    for step in loop.steps:
+        name = effect_words(step.effect).name
+        named = zip(coefficient_names(step), step.coefficients, strict=True)
+        rows += [(f"{name}: {what}" if what else name, _coefficient(coefficient)) for what, coefficient in named]
+    left = loop.residual_drift
+    common, stretch = small(left.common_rms_um), small(left.stretch_rms_um)
+    size = f"{common} µm rms common to all positions, {stretch} µm rms of stretch along the axis"
+    rows.append(("unexplained drift", f"{left.kind}: {size}"))
+    if isinstance(loop.held_out_test, HoldOutQuestion):
+        rows.append(("extra test on the held-out cycles", say("hold_out_question", loop.held_out_test)))
+    return rows + refused_effects(loop)
+
+
+def coefficient_names(step: AxisStep) -> list[str]:
+    """Return what each coefficient of an added effect is the size of, empty for one that stands alone."""
+    count = len(step.coefficients)
+    shape = str(step.parameters.get("shape", ""))
+    stretch = "stretch at the far end"
+    shapes = {"flat": ["shift"], "flat and linear": ["shift", stretch]}.get(shape, [stretch])
+    if step.effect == "unseen_heat_source" and count in (len(shapes), 2 * len(shapes)):
+        start = [f"remainder of the time before the start, {name}" for name in shapes] if count > len(shapes) else []
+        return [f"{name} at full load" for name in shapes] + start
+    if step.effect == "periodic_disturbance" and count == 2:
+        return ["sine part", "cosine part"]
+    if count == len(shapes) and count > 1:
+        return shapes
+    return [""] if count == 1 else [f"coefficient {k}" for k in range(1, count + 1)]
+
+
+def refused_effects(loop: Loop) -> list[tuple[str, str]]:
+    """Return the effects that were not tried or not admitted, with the reason."""
+    titled = (("not tried", loop.not_tried), ("not admitted", loop.not_admitted))
+    rows = [(title, name, reason) for title, reasons in titled for name, reason in reasons.items()]
+    unnamed = {name: f"{p_words(p)}; " for name, p in loop.unconfirmed_effects.items()}
+    return [(f"{title}: {effect_words(name).name}", unnamed.get(name, "") + reason) for title, name, reason in rows]
+
+
+def _coefficient(coefficient: Coefficient) -> str:
+    unit = print_unit(coefficient.unit)
+    text = measured(coefficient.value, coefficient.u, unit)
+    if coefficient.u_scale is not None:
+        fit, scale = number(2 * (coefficient.u_fit or 0.0), 2), number(2 * coefficient.u_scale, 2)
+        text += f", of which the fit ± {fit} and the scale of the rise ± {scale}"
+    if coefficient.prior is not None:
+        text += f" (prior {measured(coefficient.prior, coefficient.prior_u, unit)})"
+    return text
+
+
+def describe_candidates(loop: AxisLoop) -> Table:
+    """Return the best candidate of every effect in every round of the search with its scores."""
+    rows = []
+    for turn, score in ((turn, score) for turn, scores in enumerate(loop.search, start=1) for score in scores):
+        of_search = (gain(score.gain), gain(score.excess_gain), p_cell(score.family_wise_p))
+        held_out = (gain(score.held_out_gain), p_cell(score.held_out_p))
+        rows.append([str(turn), effect_words(score.effect).name, parameters(score.parameters), *of_search, *held_out])
+    titles = ("Gain", "Gain beyond chance", "p (search)", "Held-out gain", "p (held out)")
+    return table(["Round", Words("Effect"), Words("Best parameters"), *titles], rows)
+
+
+def describe_evidence(evidence: Evidence) -> dict[str, Any]:
+    """Return the evidence of an anomaly: size, sentences for and against, what to inspect, and all numbers."""
+    return {
+        "stands_out": say("stands_out", evidence),
+        "support": evidence.support,
+        "against": evidence.against,
+        "check": evidence.check,
+        "numbers": [(spaced(name), in_words(value)) for name, value in evidence.numbers().items()],
+    }
+
+
+#: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
+_SECTIONS = (
+    ("iso230", "iso230", "ISO 230-2"),
+    ("drift", "drift", "Drift"),
+    ("anomalies", "anomalies", "Positions"),
+    ("fields", "hotspots", "Heat"),
+    ("sensors", "sensors", "Contact sensors"),
+    ("cause", "loop", "Cause"),
+    ("place", "correlation", "Place"),
+    ("data", "", "Data"),
+    ("uncertainty", "", "Uncertainty"),
+    # ... then, in the appendix, what it rests on.
+    ("paper", "neighbours", "Neighbour differences"),
+    ("correlation", "correlation", "Drift and field"),
+    ("loop", "loop", "Model"),
+    ("registration", "registration", "Registration"),
+    ("glossary", "", "Glossary"),
+    ("provenance", "", "Provenance"),
+)
+#: Section of the report -> what its figures rest on.
+_RESTS_ON: dict[str, Figures] = {
+    "fields": "field", "drift": "positions", "paper": "positions", "iso230": "positions", "anomalies": "positions",
+    "place": "attribution", "correlation": "attribution", "cause": "causes", "loop": "causes",
+}  # fmt: skip
+_SIGNS = {"positive": "+", "negative": "−"}
+_LEVELS = {
+    "search": SEARCH_LEVEL, "second": SECOND_LEVEL, "entry": ENTRY_LEVEL, "remainder": REMAINDER_LEVEL, "attribution": LEVEL,
+}  # fmt: skip
+#: Actions in the summary; all remedies stand with what was left out.
+MOST_STEPS = 6
+
+
+def describe_campaign(
+    results: Results, provenance: Mapping[str, Any], datasets: Mapping[str, Any], joint: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Return the facts of a campaign that the templates of its report state."""
+    deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
+    figures = figures_of(results)
+    laser = None if deviations is None else _laser(deviations)
+    loop = None
+    if isinstance(results.loop, AxisLoop):
+        # The tables on the model that the application shows too.
+        tables = {
+            "steps": steps_table,
+            "errors": errors_table,
+            "model": describe_model,
+            "candidates": describe_candidates,
+        }
+        loop = {name: describe(results.loop) for name, describe in tables.items()}
+    return {
+        "axis": provenance["parameters"]["campaign"].get("axis", "") if deviations is not None else "",
+        "first": laser["first"] if laser else None,
+        "zone": results.time.zone if results.time else None,
+        "figures": figures,
+        "verdict": results.loop.verdict if results.loop else "",
+        "headline": headline(results),
+        "doubts": results.inputs.doubts if results.inputs else (),
+        "untouched": untouched(results.inputs, figures),
+        "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
+        "answers": conclude(results),
+        "next": next_steps(results)[:MOST_STEPS],
+        "contents": [(at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) is not None],
+        "laser": laser,
+        "camera": None if fields is None else _camera(fields),
+        "seen": "picture" if results.registration is not None and results.registration.is_picture else "table",
+        "field_of": "cycle" if "positions" in figures else "window",
+        "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
+        "comparison": None if deviations is None else _comparison_table(deviations),
+        "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
+        "anomalies": [
+            {
+                "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",
+                "sentence": describe_anomaly(anomaly),
+                **describe_evidence(anomaly.evidence),
+            }
+            for anomaly in results.anomalies or ()
+        ],
+        "correlation": None if fused is None else describe_correlation(fused, results, joint),
+        "joint": joint,
+        "loop": loop,
+        "decided_before": DECIDED_BEFORE,
+        "levels": _LEVELS,
+    }
+
+
+def _laser(deviations: xr.Dataset) -> dict[str, Any]:
+    """What the laser measured; first and last are None where the readings have no times."""
+    read = deviations["deviation"].notnull().any(("cycle", "target"))
+    first, last = time_span(deviations) if has(deviations, "drift") else (None, None)
+    return {
+        "readings": int(np.isfinite(deviations["deviation"]).sum()),
+        "possible": deviations["deviation"].size,
+        "origin": deviations["time"].attrs.get("origin", "recorded"),
+        "positions": deviations.sizes["target"],
+        "travel_mm": float(np.ptp(deviations["position"].values)),
+        "cycles": deviations.sizes["cycle"],
+        "approaches": [str(name) for name in read["direction"].values[read.values]],
+        "first": first,
+        "last": last,
+        "duration_s": None if first is None else float((last - first) / np.timedelta64(1, "s")),
+    }
+
+
+def _camera(fields: xr.Dataset) -> dict[str, Any]:
+    """What the camera measured; rises are those of the last cycle, K."""
+    first, last = fields["time"].values[[0, -1]]
+    rise = fields["temperature_rise"].isel(cycle=-1)
+    names = ("name", "residual", "leave_one_out") if "fiducial" in fields.sizes else ()
+    return {
+        "frames": int(fields["frame_count"].sum()) if "frame_count" in fields else fields.sizes["time"],
+        "fields": fields.sizes["cycle"],
+        "first": first,
+        "last": last,
+        "duration_s": float((last - first) / np.timedelta64(1, "s")),
+        "cells": (fields.sizes["x"], fields.sizes["y"]),
+        "cell_size": float(np.median(np.diff(fields["x"]))),
+        "unit": plan_unit(fields),
+        "visible": float(np.isfinite(rise).mean()),
+        "mean_rise_K": float(rise.mean()),
+        "largest_rise_K": float(rise.max()),
+        "fiducials": list(zip(*(fields[f"fiducial_{name}"].values.tolist() for name in names), strict=True)),
+    }
+
+
+def _positions_table(deviations: xr.Dataset) -> Table:
+    """Return profile, scatter and conventional standard deviation of every position and approach."""
+    drift, conventional = group(deviations, "drift"), group(deviations, "conventional")
+    decimals = {name: decimals_of(float(drift[f"{name}_u"].median())) for name in ("profile", "scatter")}
+    targets = deviations["target"].values
+    laid = {name: by_approach(drift[name], target=targets) for key in decimals for name in (key, f"{key}_u")}
+    s = by_approach(conventional["standard_deviation"], target=targets)
+    rows = []
+    for at, (target, position_mm) in enumerate(zip(targets, deviations["position"].values, strict=True)):
+        row = [str(target), f"{position_mm:g}"]
+        for name, places in decimals.items():
+            both = zip(laid[name][at], laid[f"{name}_u"][at], strict=True)
+            row += [measured(float(value), float(u), decimals=places) for value, u in both]
+        rows.append([*row, *(f"{value:.2f}" for value in s[at])])
+    quantities = ("Profile", "Scatter s", "Conventional s")
+    return table(["Position", "mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows)
+
+
+def _comparison_table(deviations: xr.Dataset) -> Table:
+    """Return conventional, differenced, their ratio and the joint estimate's own standard deviation, per position and approach."""
+    comparison = group(deviations, "comparison")
+    headings = {
+        "conventional": "Conventional s {} / µm",
+        "differenced": "Of differences s {} / µm",
+        "ratio": "Ratio {}",
+        "joint": "Joint estimate s {} / µm",
+    }
+    columns = [name for name in headings if name in comparison]
+    links = comparison["link"].values
+    values = np.stack([by_approach(comparison[name], link=links) for name in columns], axis=-1)
+    rows = [
+        [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
+    ]
+    return table(["Position", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)

@@ -1,0 +1,380 @@
+"""Charts of the closed loop: what the model misses over time, position, direction and period, and what each effect contributes."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from bokeh import palettes
+from bokeh.models import FixedTicker, LinearColorMapper
+from bokeh.plotting import figure
+from scipy import ndimage
+
+from fusion.analysis.attribution.significance import CHECKS, LEVEL
+from fusion.report.charts.plan import Extent, add_cells, extent_of, new_plan
+from fusion.report.charts.style import (
+    BEFORE,
+    CATEGORIES,
+    DIVERGING,
+    Chart,
+    add_colour_bar,
+    add_hold_out,
+    add_series,
+    add_zero_line,
+    fix_range,
+    new_figure,
+    of_direction,
+    of_rank,
+    palette,
+    span_words,
+)
+from fusion.report.wording import CHANNELS, alike, duration, effect_words, number, p_cell, p_words, region_words
+from interferometry.plots import COLOURS, INK, MUTED, hours_since_start
+
+# Maps and charts of the correlation: sensitivity and significance of cells, thermal modes, clusters, regions by
+# target.
+
+#: Upper ends of the steps in which a p-value is shown, their colours, and their names; above the last one a cell is left blank.
+_P_STEPS = (0.01, 0.05, 0.1)
+#: Largest p-value that a map shows.
+LEAST_SHOWN = _P_STEPS[-1]
+_P_COLOURS = ("#3b0f70", "#b63679", "#fbb18b")
+_P_NAMES = {0.5: "≤ 0.01", 1.5: "≤ 0.05", 2.5: "≤ 0.1"}
+#: Colours of groups of cells: light enough for a dark number on each.
+_GROUPS = palettes.Set3[12]
+#: Numbers of groups that are nearer than this would be written over each other.
+_LEAST_MM = 22.0
+
+
+def _add_blank(drawn: figure, extent: Extent, name: str) -> None:
+    """Hatch the plan, which shows wherever no cell is coloured."""
+    left, right, bottom, top = extent
+    drawn.quad(
+        left=left, right=right, bottom=bottom, top=top, fill_color="#ffffff", line_color=None, hatch_pattern="right_diagonal_line",
+        hatch_color="#9aa7ad", hatch_scale=7, hatch_weight=0.6, level="image", legend_label=name,
+    )  # fmt: skip
+
+
+def _cell_columns(maps: xr.Dataset, **layers: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the cells of the plan with values, one row each."""
+    x, y = np.meshgrid(maps["x"].values, maps["y"].values)
+    return {"x / mm": x.ravel(), "y / mm": y.ravel(), **{name: values.ravel() for name, values in layers.items()}}
+
+
+def plot_sensitivity(maps: xr.Dataset, channel: str) -> Chart:
+    """Draw the sensitivity of one part of the drift to every cell; cells whose family-wise p is above 0.05 are hatched."""
+    chosen, extent = maps.sel(channel=channel), extent_of(maps)
+    values, p = chosen["sensitivity"].values, chosen["p_value"].fillna(1.0).values
+    passed = p <= LEVEL
+    limit = float(np.nanmax(np.abs(values[passed]))) if passed.any() else 1.0
+    mapper = LinearColorMapper(palette(DIVERGING), low=-limit, high=limit, nan_color="rgba(0, 0, 0, 0)")
+    drawn = new_plan(extent, title=CHANNELS.get(channel, channel), height=300)
+    _add_blank(drawn, extent, "not significant (p > 0.05)")
+    tips = [("sensitivity", "@own{0.00} µm/K"), ("family-wise p", "@p{0.000}")]
+    add_cells(drawn, np.where(passed, values, np.nan), extent, mapper, tips, own=values, p=p)
+    add_colour_bar(drawn, mapper, "sensitivity / (µm/K)")
+    return Chart(
+        drawn,
+        _where(maps, passed, p, f"sensitivity {span_words(values[passed], 'µm/K')}" if passed.any() else ""),
+        _cell_columns(maps, **{"sensitivity / (µm/K)": values, "family-wise p": p}),
+    )
+
+
+def plot_significance(maps: xr.Dataset, channel: str) -> Chart:
+    """Draw the family-wise p-value of every cell in steps; cells above 0.1 are hatched."""
+    extent, p = extent_of(maps), maps["p_value"].sel(channel=channel).fillna(1.0).values
+    step = np.digitize(p, _P_STEPS, right=True).astype(float)
+    mapper = LinearColorMapper(list(_P_COLOURS), low=0.0, high=float(len(_P_STEPS)), nan_color="rgba(0, 0, 0, 0)")
+    drawn = new_plan(extent, title=CHANNELS.get(channel, channel), height=300)
+    _add_blank(drawn, extent, "p > 0.1")
+    blank = step == len(_P_STEPS)
+    add_cells(drawn, np.where(blank, np.nan, step + 0.5), extent, mapper, [("family-wise p", "@p{0.000}")], p=p)
+    _add_steps(drawn, mapper, "family-wise p", _P_NAMES)
+    return Chart(drawn, _where(maps, p <= LEVEL, p, ""), _cell_columns(maps, **{"family-wise p": p}))
+
+
+def _add_steps(drawn: figure, mapper: LinearColorMapper, label: str, names: dict[float, str]) -> None:
+    """Put a colour bar with names instead of numbers below a map."""
+    add_colour_bar(drawn, mapper, label)
+    (bar,) = (part for part in drawn.below if getattr(part, "color_mapper", None) is mapper)
+    bar.ticker, bar.major_label_overrides = FixedTicker(ticks=list(names)), dict(names)
+
+
+def _where(maps: xr.Dataset, passed: np.ndarray, p: np.ndarray, more: str) -> str:
+    """Say how many cells are significant and where the strongest is."""
+    row, column = np.unravel_index(np.argmin(p), p.shape)
+    place = f"x {float(maps['x'][column]):.0f} mm, y {float(maps['y'][row]):.0f} mm (p {p_cell(float(p.min()))})"
+    if not passed.any():
+        return f"No cell of {p.size} is significant at 0.05; the closest is at {place}."
+    return f"{int(passed.sum())} of {p.size} cells are significant at 0.05{', ' + more if more else ''}; the strongest is at {place}."
+
+
+def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None = None) -> Chart:
+    """Draw the pattern of a thermal mode, relative to the cell marked by a cross, with its p-value and lag in one part of the drift."""
+    one, extent = modes.sel(mode=mode), extent_of(modes)
+    p, lag = (float(one[name].sel(channel=channel)) for name in ("p_value", "lag"))
+    significant = p <= LEVEL
+    title = f"mode {mode}: {'significant, ' if significant else ''}p {p_cell(p, least_p)}, lag {duration(lag)}"
+    drawn = new_plan(extent, title=title, height=250)
+    mapper = LinearColorMapper(palette("PuOr_r"), low=-1.0, high=1.0, nan_color="#e1e5e7")
+    pattern = one["pattern"].values
+    add_cells(drawn, pattern, extent, mapper, [("warming relative to the cross", "@image{0.00}")])
+    x, y = float(one["at_x"]), float(one["at_y"])
+    for colour, width in (("#ffffff", 5), (INK, 2)):
+        drawn.scatter([x], [y], marker="cross", size=14, line_color=colour, line_width=width)
+    add_colour_bar(drawn, mapper, "warming relative to the cross")
+    seen = (
+        f"Thermal mode {mode}, strongest at x {x:.0f} mm, y {y:.0f} mm; it {'correlates' if significant else 'does not correlate'} with "
+        f"the {CHANNELS.get(channel, channel)} ({p_words(p, least_p)})."
+    )
+    return Chart(drawn, seen, _cell_columns(modes, **{"warming relative to the cross": pattern}))
+
+
+def plot_clusters(clusters: xr.Dataset) -> Chart:
+    """Draw groups of cells with one course of temperature; inside a group no analysis of this session can separate places."""
+    group, extent = clusters["cluster"].values, extent_of(clusters)
+    count = int(group.max())
+    colours = [_GROUPS[at % len(_GROUPS)] for at in range(max(count, 1))]
+    mapper = LinearColorMapper(colours, low=0.5, high=max(count, 1) + 0.5, nan_color="#ffffff")
+    drawn = new_plan(extent, height=300)
+    add_cells(drawn, np.where(group == 0, np.nan, group), extent, mapper, [("group", "@image{0}")])
+    places = _label_places(clusters, count)
+    drawn.text(
+        [x for _, x, _ in places], [y for *_, y in places], [str(number) for number, *_ in places], text_align="center",
+        text_baseline="middle", text_color=INK, text_font_size="12px",
+    )  # fmt: skip
+    _add_steps(drawn, mapper, "group", {float(number): str(number) for number in range(1, count + 1)})
+    sizes = np.bincount(group.ravel(), minlength=count + 1)[1:]
+    seen = (
+        f"{count} groups of cells with one temperature curve each; the largest covers "
+        f"{100 * sizes.max(initial=0) / group.size:.0f} % of the table."
+    )
+    return Chart(drawn, seen, _cell_columns(clusters, group=group))
+
+
+def _label_places(clusters: xr.Dataset, count: int) -> list[tuple[int, float, float]]:
+    """Return number and place (mm) of the groups that have room for their number: in their thickest part, none over another."""
+    group, x, y = clusters["cluster"].values, clusters["x"].values, clusters["y"].values
+    found: list[tuple[int, float, float]] = []
+    sizes = np.bincount(group.ravel(), minlength=count + 1)
+    for one in sorted(range(1, count + 1), key=lambda number: -sizes[number]):
+        depth = ndimage.distance_transform_edt(np.pad(group == one, 1))[1:-1, 1:-1]
+        row, column = np.unravel_index(np.argmax(depth), depth.shape)
+        place = (float(x[column]), float(y[row]))
+        if all(np.hypot(place[0] - other[1], place[1] - other[2]) >= _LEAST_MM for other in found):
+            found.append((one, *place))
+    return found
+
+
+def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray) -> Chart:
+    """Draw the sensitivity of every target and direction to one region, each tested singly, with 95 % interval; filled where p <= 0.05."""
+    chosen = targets.sel(region=region)
+    step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
+    drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region))
+    add_zero_line(drawn)
+    place = position.sel(target=chosen["series_target"].values).values.astype(float)
+    value, half = chosen["sensitivity"].values, 2 * chosen["sensitivity_u"].values
+    side, passed = chosen["series_direction"].values, chosen["p_value"].values <= LEVEL
+    for shift, direction in ((-0.1, "positive"), (0.1, "negative")):
+        for rows, words in ((passed, "p ≤ 0.05"), (~passed, "p > 0.05")):
+            here = rows & (side == direction)
+            if not here.any():
+                continue
+            name, looks = f"{direction}, {words}", of_direction(direction)
+            add_series(drawn, place[here] + shift * step, value[here], name=name, line=False, half=half[here], **looks)
+            if words == "p > 0.05":
+                drawn.renderers[-1].glyph.fill_color = "#ffffff"
+    seen = (
+        f"Sensitivity of {value.size} series to {region_words(region)}: {span_words(value, 'µm/K')}; {int(passed.sum())} of them are "
+        "significant by themselves."
+    )
+    columns = {
+        "position / mm": place, "approach": side, "sensitivity / (µm/K)": value, "95 % interval ± / (µm/K)": half,
+        "family-wise p": chosen["p_value"].values,
+    }  # fmt: skip
+    return Chart(drawn, seen, columns)
+
+
+def rate_text(rate: float, checks: int = CHECKS) -> str:
+    """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
+    u = np.sqrt(max(rate, 1.0 / checks) * (1.0 - rate) / checks)
+    return f"{100 * rate:.1f} ± {200 * u:.1f} %"
+
+
+_TIME, _AFTER = "time since first reading / h", COLOURS["positive"]
+
+
+def _stages(loop: xr.Dataset) -> list[tuple[str, str, str, str]]:
+    """Return ending of the variables, colour, dash and name of what to draw: before and after, or one where nothing was added."""
+    before, after = loop["residual_declared"], loop["residual_final"]
+    if np.allclose(before, after, atol=1e-9, equal_nan=True):
+        return [("final", _AFTER, "solid", "declared model, nothing added")]
+    return [("declared", BEFORE, "dashed", "declared model"), ("final", _AFTER, "solid", "with the added effects")]
+
+
+def plot_held_out_positions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw the error of predicting the held-out cycles at every position, both approaches together."""
+    order = np.argsort(deviations["position"].values, kind="stable")
+    place = deviations["position"].values[order].astype(float)
+    drawn = new_figure(x="position / mm", y="error of prediction, rms / µm")
+    columns: dict[str, np.ndarray] = {"position / mm": place}
+    parts = []
+    for (ending, colour, dash, text), marker in zip(_stages(loop), ("square", "circle"), strict=False):
+        error = np.sqrt((loop[f"held_out_error_{ending}"] ** 2).mean(["cycle", "direction"]).values[order])
+        add_series(drawn, place, error, name=text, colour=colour, dash=dash, marker=marker)
+        columns[f"{text} / µm"] = error
+        parts.append(f"{text} {span_words(error, 'µm')}, largest at {place[int(np.nanargmax(error))]:g} mm")
+    fix_range(drawn, 0.0, 1.08 * float(np.nanmax([columns[name] for name in list(columns)[1:]])))
+    return Chart(drawn, f"Error of predicting the held-out cycles by position: {'; '.join(parts)}.", columns)
+
+
+def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw half the difference of the residuals of both approaches over time, before and after the loop."""
+    hours = hours_since_start(deviations).mean(["direction", "target"]).values
+    drawn = new_figure(x=_TIME, y="(positive − negative) / 2 / µm")
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: hours}
+    parts = []
+    for ending, colour, dash, text in _stages(loop):
+        residual = loop[f"residual_{ending}"].mean("target")
+        odd = ((residual.sel(direction="positive") - residual.sel(direction="negative")) / 2).values
+        add_series(drawn, hours, odd, name=text, colour=colour, dash=dash)
+        columns[f"{text} / µm"] = odd
+        parts.append(f"{text} {span_words(odd, 'µm')}")
+    return Chart(drawn, f"Residual that changes sign with the approach, over time: {'; '.join(parts)}.", columns)
+
+
+def plot_residual_spectrum(loop: xr.Dataset) -> Chart:
+    """Draw the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds."""
+    drawn = new_figure(x="period / min", y="power over that of noise", x_type="log")
+    columns: dict[str, np.ndarray] = {"period / min": loop["period"].values}
+    highest, limit, parts = 0.0, float("nan"), []
+    for ending, colour, dash, text in _stages(loop):
+        power = loop[f"periodogram_{ending}"]
+        limit = float(power.attrs["limit"])
+        add_series(drawn, power["period"].values, power.values, name=text, colour=colour, dash=dash)
+        columns[f"{text}, power over that of noise"] = power.values
+        at = int(np.nanargmax(power.values))
+        parts.append(f"{text} {number(float(power[at]), 2)} at {number(float(power['period'][at]), 2)} min")
+        highest = max(highest, float(power[at]))
+    drawn.hspan(limit, line_color=MUTED, line_dash="dashed", line_width=1.5, legend_label="95 % limit of noise")
+    fix_range(drawn, 0.0, 1.08 * max(highest, limit))
+    seen = f"Power of the innovations over period; strongest: {'; '.join(parts)}; noise alone stays below {number(limit, 2)}."
+    return Chart(drawn, seen, columns)
+
+
+def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw the cumulative sum of the innovations: without trend where nothing happens, with a kink at an event."""
+    hours = hours_since_start(deviations).transpose("cycle", "direction", "target").values.ravel()
+    drawn = new_figure(x=_TIME, y="sum of innovations / √n")
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {}
+    parts = []
+    for ending, colour, dash, text in _stages(loop):
+        values = loop[f"innovation_{ending}"].transpose("cycle", "direction", "target").values.ravel()
+        valid = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
+        order = valid[np.argsort(hours[valid], kind="stable")]
+        walk = np.cumsum(values[order]) / np.sqrt(order.size)
+        add_series(drawn, hours[order], walk, name=text, colour=colour, dash=dash)
+        columns = {_TIME: hours[order], **columns, f"{text}, sum of innovations / √n": walk}
+        parts.append(f"{text} {span_words(walk, '').strip()}")
+    return Chart(drawn, f"Running sum of the innovations over time: {'; '.join(parts)}.", columns)
+
+
+def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw what each effect of the final model contributes over time at the far end of the axis, positive approach."""
+    far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
+    place = float(deviations["position"].sel(target=far))
+    hours = hours_since_start(deviations).sel(target=far, direction="positive").values
+    drawn = new_figure(x=_TIME, y="contribution / µm", title=f"at {place:g} mm, positive approach", legend_columns=1)
+    add_zero_line(drawn)
+    columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: hours}
+    parts = []
+    for at, effect in enumerate(str(name) for name in loop["effect"].values):
+        line = loop["contribution"].sel(effect=effect, target=far, direction="positive").values
+        words = effect_words(effect).name
+        add_series(drawn, hours, line, name=words, **of_rank(at))
+        columns[f"{words} / µm"] = line
+        parts.append(f"{words} {span_words(line, 'µm')}")
+    return Chart(drawn, f"Contributions at {place:g} mm over time: {'; '.join(parts)}.", columns)
+
+
+def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw what each prediction missed in the cycles that took no part in any choice: dots for readings, lines for means of a cycle."""
+    hours = hours_since_start(deviations)
+    middle = hours.mean(["direction", "target"]).values
+    held = loop["held_out_error_final"].notnull().any(["direction", "target"]).values
+    raw = deviations["deviation"] - deviations["deviation"].isel(cycle=~held).mean("cycle")
+    first, last = (float(end(hours.values[held])) for end in (np.nanmin, np.nanmax))
+    times = (max(0.0, 2 * first - last), last + 0.02)
+    drawn = new_figure(x=_TIME, y="measured − predicted / µm", height=360, x_range=times)
+    add_zero_line(drawn)
+    add_hold_out(drawn, first, last)
+    columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: middle}
+    series = [
+        (raw, "drift as measured", CATEGORIES[3], "dotted"),
+        (loop["held_out_error_last_value"], "last value repeated", CATEGORIES[2], "dotdash"),
+        (loop["held_out_error_declared"], "declared model", BEFORE, "dashed"),
+    ]
+    if len(_stages(loop)) > 1:
+        series.append((loop["held_out_error_final"], "with the added effects", _AFTER, "solid"))
+    parts = []
+    for values, text, colour, dash in series:
+        mean = values.mean(["direction", "target"]).values
+        add_series(drawn, middle, mean, name=text, colour=colour, dash=dash, width=2.2)
+        columns[f"{text}, mean of the cycle / µm"] = mean
+        if values is raw:
+            continue
+        looks = {"size": 2.5, "color": colour, "alpha": 0.45}
+        drawn.scatter(hours.values.ravel(), values.values.ravel(), legend_label=text, **looks)
+        parts.append(f"{text} {number(float(np.sqrt(np.nanmean(values.values**2))))} µm rms")
+    seen = (
+        f"Errors of predicting the {int(held.sum())} cycles that were held out: {'; '.join(parts)}; the drift as measured moves over "
+        f"{span_words(columns['drift as measured, mean of the cycle / µm'], 'µm')}."
+    )
+    return Chart(drawn, seen, columns)
+
+
+def plot_predicted_measured(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
+    """Draw predicted against measured deviations of the cycles that were held out, with the line on which both are equal."""
+    measured = deviations["deviation"]
+    drawn = new_figure(x="measured deviation / µm", y="predicted deviation / µm", height=360)
+    columns: dict[str, np.ndarray] = {}
+    parts = []
+    for (ending, colour, _, text), marker in zip(_stages(loop), ("x", "circle"), strict=False):
+        error = loop[f"held_out_error_{ending}"]
+        here = error.notnull().values & measured.notnull().values
+        read, predicted = measured.values[here], (measured - error).values[here]
+        add_series(drawn, read, predicted, name=text, colour=colour, line=False, marker=marker, size=4.5)
+        columns |= {"measured deviation / µm": read, f"predicted, {text} / µm": predicted}
+        parts.append(f"{text} {number(float(np.sqrt(np.mean((read - predicted) ** 2))))} µm rms from the line")
+    ends = [float(np.min(columns["measured deviation / µm"])), float(np.max(columns["measured deviation / µm"]))]
+    drawn.line(ends, ends, line_color=MUTED, line_dash="dashed", legend_label="predicted = measured")
+    return Chart(drawn, f"Predicted against measured deviation of the held-out cycles: {'; '.join(parts)}.", columns)
+
+
+# Errors of predicting blocks of a test from the others, before and after an effect was added: what tells of every
+# kind of effect.
+
+
+def plot_block_errors(errors: xr.Dataset, hours: np.ndarray, along: str) -> Chart:
+    """Draw the errors of predicting blocks from the others over time, without an effect and with it."""
+    others = [name for name in errors.dims if name != along]
+    x = "time since first reading / h" if along == "cycle" else "time since start / h"
+    drawn = new_figure(x=x, y="prediction error, rms / µm", height=300)
+    columns: dict[str, np.ndarray] = {along: errors[along].values, x: hours} if along == "cycle" else {x: hours}
+    stages = (("before", "without the effect", BEFORE, "dashed"), ("after", "with it", COLOURS["positive"], "solid"))
+    for name, text, colour, dash in stages:
+        size = np.sqrt((errors[name] ** 2).mean(others).values)
+        marker = "circle" if along == "cycle" else None
+        add_series(drawn, hours, size, name=text, colour=colour, dash=dash, marker=marker)
+        columns[f"{text} / µm"] = size
+    highest = np.nanmax([columns["without the effect / µm"], columns["with it / µm"]])
+    fix_range(drawn, 0.0, 1.05 * float(highest))
+    before, after = alike([float(np.sqrt((errors[name] ** 2).mean())) for name in ("before", "after")])
+    counted = int(np.isfinite(columns["with it / µm"]).sum())
+    unit = "cycles" if along == "cycle" else "blocks of time"
+    seen = (
+        f"Errors in {counted} {unit} that were left out and predicted from the others: {before} µm rms without the effect, {after} µm "
+        "with it."
+    )
+    return Chart(drawn, seen, columns)

@@ -1,0 +1,111 @@
+"""The report of a record: the facts that its templates state, and its charts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.analysis.alignment.sensor_health import describe_fault
+from fusion.analysis.drift_model.record import ENTRY_LEVEL
+from fusion.report.campaign import DECIDED_BEFORE, MOST_STEPS, errors_table, refused_effects, steps_table
+from fusion.report.charts import record as charts
+from fusion.report.charts.model import plot_block_errors
+from fusion.report.charts.style import Chart
+from fusion.report.conclusions import conclude, headline, next_steps
+from fusion.report.wording import duration, join, moment
+from fusion.results.loop import RecordLoop
+from fusion.results.progress import counted
+from fusion.results.results import Results
+
+#: Largest number of channels with charts; all of them are in fusion.nc.
+_MOST_CHANNELS = 6
+#: Sections of the report with their titles in the contents.
+_SECTIONS = (
+    ("record", "Record"), ("loop", "Cause"), ("chained", "Forward chaining"), ("data", "Data"), ("uncertainty", "Uncertainty"),
+    ("glossary", "Glossary"), ("provenance", "Provenance"),
+)  # fmt: skip
+_ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
+
+
+def draw_record(record: xr.Dataset) -> dict[str, Chart]:
+    """Return the charts of a record by name."""
+    drawn = {"temperatures": charts.plot_temperatures(record)}
+    if record.sizes["driver_name"]:
+        drawn["drivers"] = charts.plot_drivers(record)
+    for k, name in enumerate(_shown_channels(record)):
+        drawn[f"prediction_{k}"] = charts.plot_prediction(record, name)
+        drawn[f"residual_{k}"] = charts.plot_residuals(record, name)
+        if record.sizes["effect"]:
+            drawn[f"contribution_{k}"] = charts.plot_contributions(record, name)
+    for step in range(record.sizes.get("step", 0)):
+        errors = xr.Dataset({name: record[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})
+        drawn[f"block_errors_{step}"] = plot_block_errors(errors, charts.hours_of(record), "time")
+    return drawn
+
+
+def _shown_channels(record: xr.Dataset) -> list[str]:
+    """Return the channels that get charts."""
+    return [str(name) for name in record["channel"].values[:_MOST_CHANNELS]]
+
+
+def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
+    """Return the facts of a record that the templates of its report state."""
+    loop = results.loop
+    assert isinstance(loop, RecordLoop)
+    first, last = record["time"].values[[0, -1]]
+    block_s = float(record.attrs["block_s"])
+    span = duration(float((last - first) / np.timedelta64(1, "s")) + block_s)
+    # The times of a record whose campaign file does not state the beginning count from zero.
+    start = first if first >= np.datetime64("1971-01-01") else None
+    channels, drivers = (join([str(name) for name in record[dim].values]) for dim in ("channel", "driver_name"))
+    begun = "start not stated" if start is None else moment(start)
+    return {
+        "axis": "",
+        "first": start,
+        "zone": None,
+        "figures": (),
+        "verdict": loop.verdict,
+        "headline": headline(results),
+        "doubts": (),
+        "untouched": "",
+        "measured": (
+            f"{counted(record.sizes['channel'], 'displacement')} and {counted(record.sizes['sensor'], 'temperature')} over "
+            f"{_measured_time(loop, span)}" + (f", with {drivers} as driver" if drivers else "")
+        ),
+        "answers": conclude(results),
+        "next": next_steps(results)[:MOST_STEPS],
+        "contents": _SECTIONS,
+        "laser": None,
+        "camera": None,
+        "data": [
+            ("Channels", channels),
+            ("Sensors", join([str(name) for name in record["sensor"].values])),
+            ("Time", f"{begun}, {span}; averaged over {record.sizes['time']} blocks of {duration(block_s)}"),
+        ],
+        "shown": list(enumerate(_shown_channels(record))),
+        "omitted": max(0, record.sizes["channel"] - _MOST_CHANNELS),
+        "faults": [(one, describe_fault(one.kind, one.size, one.onset_s, one.onset_u_s)) for one in loop.sensor_faults],
+        "steps": steps_table(loop),
+        "errors": errors_table(loop),
+        "error_keys": _ERRORS,
+        "refused": refused_effects(loop),
+        "chained_means": {name: _mean_chained(loop, name) for name in _ERRORS},
+        "levels": {"entry": ENTRY_LEVEL},
+        "decided_before": DECIDED_BEFORE,
+    }
+
+
+def _mean_chained(loop: RecordLoop, name: str) -> float | None:
+    """Return an error, mean over the forward-chained parts, um."""
+    values = [getattr(part, name) for part in loop.chained if getattr(part, name) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _measured_time(loop: RecordLoop, span: str) -> str:
+    """Return how long was measured; of several runs without the time between them."""
+    hours = [run.duration_h for run in loop.runs if run.duration_h is not None]
+    if not hours or len(hours) < len(loop.runs):
+        return span
+    return f"{duration(3600.0 * sum(hours))} in {counted(len(hours), 'run')}"

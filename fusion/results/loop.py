@@ -1,0 +1,487 @@
+"""Parts of results.json on the closed loop, along an axis and on a record: added effects, search, detection limits, residual."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from fusion.results.parts import Number, ResultPart, Sensitivity
+
+Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
+#: Value of a parameter of an effect: a number in the unit that its name ends with, or a word.
+Parameter = float | int | str
+#: Range of a parameter that fits equally well: its ends (None where the data set none), or the other words.
+Range = tuple[Number, ...] | tuple[str, ...]
+
+
+class Nothing(ResultPart):
+    """An empty object: there is none."""
+
+
+class RunnerUp(ResultPart):
+    """The next best effect of a round of the search."""
+
+    effect: str
+    """Name of the effect."""
+    gain_deficit: Number
+    """Difference of its log-likelihood gain beyond chance to that of the chosen effect, nats."""
+    p_value: Number
+    """Its own p-value, family-wise over the search."""
+
+
+class Coefficient(Sensitivity):
+    """A coefficient of an effect, fitted to all cycles."""
+
+    unit: str
+    """Unit of value and uncertainty."""
+    prior: Number = None
+    """What was expected beforehand; absent where nothing was."""
+    prior_u: Number = None
+    """Standard uncertainty of what was expected."""
+
+
+class DeclaredCoefficient(Coefficient):
+    """A coefficient of a declared effect."""
+
+    effect: str
+    """Name of the effect."""
+    jackknife_u: Number = None
+    """Standard deviation by which it moves when a target or a part of the test is left out; null where it rests on one of them alone."""
+
+
+class ErrorInterval(ResultPart):
+    """A root mean square error on the hold-out with its 95 % interval."""
+
+    rmse_um: Number
+    """Root mean square error, um."""
+    low_um: Number
+    """Lower end of the interval (block bootstrap over the hold-out), um."""
+    high_um: Number
+    """Upper end of the interval, um."""
+
+
+class ModelErrors(ResultPart):
+    """Errors on the hold-out before and after."""
+
+    declared: ErrorInterval
+    """Of the declared model."""
+    final: ErrorInterval
+    """With the effects that the training part alone decided on."""
+
+
+class Baselines(ResultPart):
+    """Errors of plain predictions of the hold-out from the training part."""
+
+    last_value: ErrorInterval
+    """Repeating the last value."""
+    mean: ErrorInterval
+    """The mean of the training part."""
+    least_squares: ErrorInterval
+    """Least squares on everything that was logged."""
+    ridge: ErrorInterval
+    """Ridge regression on the same."""
+    ridge_with_lags: ErrorInterval
+    """Ridge regression on the same and on lagged copies of it."""
+
+
+class StepPart(ResultPart):
+    """An effect that the closed loop added."""
+
+    effect: str
+    """Name of the effect."""
+    event_time: str | None = None
+    """Time of an event, UTC; null for an effect that lasts, and where no time of day is known."""
+    parameters: Mapping[str, Parameter]
+    """Parameters; a name ends with its unit."""
+    parameter_ranges: Mapping[str, Range]
+    """Values of the parameters that fit equally well (profile likelihood, 95 %)."""
+    p_value: Number
+    """p-value that let it in, family-wise over the search."""
+    rmse_before_um: Number
+    """Root mean square error on the hold-out before it entered, um; null for an effect that entered after the hold-out was opened."""
+    rmse_after_um: Number
+    """Root mean square error on the hold-out after it entered, um; larger where the hold-out does not support it."""
+    rmse_without_um: Number
+    """Root mean square error on the hold-out of all other effects without it, um."""
+    cross_rmse_before_um: Number
+    """Error of predicting blocks of the whole test from the others, without it, um; of an event along an axis the block around it."""
+    cross_rmse_after_um: Number
+    """The same with it, um."""
+    rms_um: Number
+    """Root mean square of its contribution, um."""
+    tied: tuple[str, ...]
+    """Effects that these data cannot distinguish from it."""
+    runner_up: RunnerUp | Nothing
+    """The next best effect."""
+    confirmed: bool
+    """Whether readings that were not used to find it support it; false: the effect is not confirmed."""
+    doubt: str
+    """Why it is not confirmed, with both errors; empty where it is."""
+    confirmed_by: str
+    """How it was confirmed before it entered."""
+
+
+class AxisStep(StepPart):
+    """An effect that the closed loop added along an axis."""
+
+    coefficients: tuple[Coefficient, ...]
+    """Coefficients of its columns."""
+    held_out_p: Number
+    """p-value of its gain on readings that its coefficients were not fitted to."""
+    event_cycle: int | None
+    """Cycle in which an event happened; null for an effect that is no event."""
+
+
+class RecordStep(StepPart):
+    """An effect that the closed loop added on a record."""
+
+    rms_by_channel_um: Mapping[str, Number]
+    """Root mean square of its contribution, um, by channel."""
+    chained_rmse_before_um: Number
+    """Error of the forward-chained parts before it, um."""
+    chained_rmse_after_um: Number
+    """Error of the forward-chained parts with it, um."""
+    rejected: Mapping[str, str]
+    """Effects of the same round that were rejected, with the reason."""
+    event_s: Number
+    """Instant of an event, s from the start; null for an effect that is no event."""
+
+
+class Unexplained(ResultPart):
+    """Structure that the final model leaves."""
+
+    shape: str
+    """Description; empty where nothing is left."""
+    rms_um: Number
+    """Its root mean square, um."""
+    p_value: Number
+    """p-value of any structure in the residual, family-wise over the shapes."""
+    closest_effect: str
+    """Effect that comes closest to it; empty where none does."""
+
+
+class AxisUnexplained(Unexplained):
+    """Structure that the final model leaves along an axis."""
+
+    closest_effect_p: Number
+    """p-value of that effect in the search."""
+    closest_effect_share: Number
+    """Share of the structure that this effect explains, 1."""
+
+
+class RecordUnexplained(Unexplained):
+    """Structure that the final model leaves of a record."""
+
+    p_values: Mapping[str, Number]
+    """p-value by shape, each shape by itself."""
+    variance_share: Number
+    """Share of the displacements' variance on the hold-out that is left, mean over the channels, 1."""
+
+
+class ResidualDrift(ResultPart):
+    """Stochastic drift of the model in addition to profile and effects."""
+
+    kind: Literal["random walk", "integrated random walk"]
+    """Stochastic model of this drift."""
+    common_rms_um: Number
+    """Root mean square of the part that all targets share, um."""
+    stretch_rms_um: Number
+    """Root mean square of the stretch at the far end of travel, um."""
+    common_um_per_sqrt_h: Number = None
+    """Process noise of the common part of a random walk, um/sqrt(h)."""
+    stretch_um_per_sqrt_h: Number = None
+    """Process noise of the stretch of a random walk, um/sqrt(h)."""
+    common_um_in_1_h: Number = None
+    """What the common part of an integrated random walk reaches in one hour, um."""
+    stretch_um_in_1_h: Number = None
+    """What the stretch of an integrated random walk reaches in one hour, um."""
+
+
+class HoldOutQuestion(ResultPart):
+    """Hold-out test of the strongest undecided candidate."""
+
+    effect: str
+    """Name of the effect."""
+    parameters: Mapping[str, Parameter]
+    """Parameters; a name ends with its unit."""
+    rmse_before_um: Number
+    """Root mean square error on the hold-out without it, um."""
+    rmse_after_um: Number
+    """Root mean square error on the hold-out with it, um."""
+    p_value: Number
+    """p-value of its gain on the hold-out."""
+    entered: bool
+    """Always false: the hold-out reports, it does not decide."""
+
+
+class CandidateScore(ResultPart):
+    """Best candidate of one effect in one round of the search."""
+
+    effect: str
+    """Name of the effect."""
+    parameters: Mapping[str, Parameter]
+    """Parameters of the best candidate; empty where none is separable from the model."""
+    gain: Number
+    """Gain in log-likelihood, nats."""
+    excess_gain: Number
+    """Gain beyond the mean gain where nothing is missing, nats."""
+    p_value: Number
+    """p-value of the gain for this effect alone."""
+    family_wise_p: Number
+    """p-value of the gain, family-wise over the search."""
+
+
+class AxisScore(CandidateScore):
+    """Best candidate of one effect along an axis."""
+
+    held_out_gain: Number
+    """Gain on readings that its coefficients were not fitted to, nats."""
+    held_out_p: Number
+    """p-value of that gain."""
+    collinear_share: Number
+    """Share of the candidates that are collinear with the model, 1."""
+
+
+class RecordScorePart(CandidateScore):
+    """Best candidate of one effect on a record."""
+
+    chained_rmse_before_um: Number
+    """Error of the forward-chained parts before the round, um."""
+    chained_rmse_after_um: Number
+    """Error of the forward-chained parts with it, um; null where it was not tried."""
+    chosen: bool
+    """Whether it entered the model."""
+    rejected: str
+    """Why it did not enter; empty where it did or was not tried."""
+
+
+class DetectionLimit(ResultPart):
+    """How large an effect must be to be detected with these readings."""
+
+    effect: str
+    """Name of the effect."""
+    detectable_um: Number
+    """Root mean square detected with 80 % power, median over the candidates, um; null where none is separable from the model."""
+    best_um: Number
+    """The same for the candidate that is easiest to detect, um."""
+    worst_um: Number
+    """The same for the candidate that is hardest to detect, um."""
+    visible_share: Number
+    """Share of the effect's root mean square that is not absorbed by profile and declared effects, 1."""
+    confounded_with: tuple[str, ...]
+    """Effects that are collinear with what is visible of it."""
+    note: str
+    """What prevents its detection; empty where nothing does."""
+
+
+class FieldCorrection(ResultPart):
+    """An error of the camera that was corrected in the fields."""
+
+    effect: str
+    """``camera_offset`` or ``reflected_source``."""
+    text: str
+    """What was wrong, in one sentence."""
+    size_K: Number
+    """Largest size of the error, K."""
+    size_u_K: Number
+    """Standard uncertainty of the size, K."""
+    first_cycle: int
+    """First cycle whose field it touches."""
+
+
+class AxisLine(ResultPart):
+    """The declared line on the plan against its best alternative."""
+
+    alternative: str
+    """The alternative in words."""
+    gain: Number
+    """What it gains in log-likelihood, less a penalty for added effects, nats; negative where the declared line is better."""
+    gain_limit: Number
+    """What an alternative gains by chance in two of a thousand tests with the declared line, nats."""
+    expansion_ppm_per_K: Number
+    """Expansion along the alternative, estimated from the readings alone, ppm/K."""
+    expansion_u_ppm_per_K: Number
+    """Its standard uncertainty, ppm/K."""
+    superfluous: tuple[str, ...]
+    """Added effects that are not needed with the alternative."""
+    alternative_ppm_per_K: tuple[Number, Number]
+    """Smallest and largest expansion along lines that explain the readings as well as the declared one, ppm/K."""
+
+
+class ResidualPart(ResultPart):
+    """Tests of the residual of one model."""
+
+    p_values: Mapping[str, Number]
+    """p-value by shape (permutation test), each shape by itself."""
+    drift_common_um: Number
+    """Root mean square of the unexplained drift that all targets share, um."""
+    drift_stretch_um: Number
+    """Root mean square of the unexplained stretch at the far end of travel, um."""
+    event_s: Number
+    """Instant of the strongest shift, s from the first reading."""
+    period_min: Number
+    """Period of the strongest periodic component, min."""
+    period_is_cycle: bool
+    """Whether that period is the cycle's own or a part of it."""
+
+
+class ResidualTestsPart(ResultPart):
+    """Tests of the residual before and after the closed loop."""
+
+    declared: ResidualPart
+    """Residual of the declared model."""
+    final: ResidualPart
+    """Residual of the final model."""
+
+
+class HoldOutErrors(ResultPart):
+    """Root mean square errors on the hold-out, of a record means over the channels; null where nothing is held out."""
+
+    rmse_persistence_um: Number
+    """Of repeating the last value, in a run of a record its zero, um."""
+    rmse_declared_um: Number
+    """Of the declared model, um."""
+    rmse_final_um: Number
+    """Of the final model, with the effects that the training part alone decided on, um."""
+
+
+class Loop(HoldOutErrors):
+    """What the closed loop found, along an axis or on a record."""
+
+    declared: tuple[str, ...]
+    """Declared effects."""
+    held_out: str
+    """What was held out."""
+    noise_floor_um: Number
+    """Standard deviation of a single reading or block mean that no model explains, um."""
+    errors: ModelErrors
+    """The errors before and after with their intervals."""
+    baselines: Baselines
+    """Errors of plain predictions with their intervals."""
+    best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags"]
+    """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
+    steps: tuple[StepPart, ...]
+    """Effects that were added, in turn."""
+    verdict: Verdict
+    """complete: nothing is missing; explained: effects added, nothing is left; partial: something is left; unexplained: something is left
+    and no effect is confirmed; no_skill: the model predicts no better than the last value or the mean, these data cannot tell."""
+    unconfirmed_effects: Mapping[str, Number]
+    """Effects that are significant and were not admitted or not confirmed, with their p-value."""
+    unexplained: Unexplained
+    """What is left."""
+    not_tried: Mapping[str, str]
+    """Effects that were not tried, with the reason."""
+    not_admitted: Mapping[str, str]
+    """Effects that were tried and not admitted, with the reason."""
+
+
+class AxisLoop(Loop):
+    """What the closed loop found along an axis."""
+
+    declared_coefficients: tuple[DeclaredCoefficient, ...]
+    """Coefficients of the declared effects."""
+    steps: tuple[AxisStep, ...]
+    """Effects that were added, in turn."""
+    unexplained: AxisUnexplained
+    """What is left."""
+    residual_drift: ResidualDrift
+    """Drift without a cause in the final model."""
+    held_out_test: HoldOutQuestion | Nothing
+    """Hold-out test of the strongest undecided candidate."""
+    search: tuple[tuple[AxisScore, ...], ...]
+    """Scores of every round of the search."""
+    identifiability: tuple[DetectionLimit, ...]
+    """Detection limits of the effects."""
+    field_corrections: tuple[FieldCorrection, ...]
+    """Errors of the camera that were corrected in the fields."""
+    residual_tests: ResidualTestsPart
+    """Tests of the residual."""
+    axis_line: AxisLine | None = None
+    """Other lines, orders of the targets and signs; null where the expansion of the axis is not declared."""
+
+
+class ChannelErrors(HoldOutErrors):
+    """Errors of one channel of a record on the hold-out."""
+
+    noise_um: Number
+    """Standard deviation of a block mean that no model explains, um."""
+    variance_share: Number
+    """Share of the displacement's variance on the hold-out that is left, 1."""
+
+
+class ChainedPart(HoldOutErrors):
+    """One part of a record, predicted by the whole procedure on the time before it."""
+
+    first_h: Number
+    """Start of the part, h."""
+    last_h: Number
+    """End of the part, h."""
+    in_training: bool
+    """Whether it is before the hold-out, so that it took part in the selection of effects."""
+    effects: tuple[str, ...]
+    """Effects found before it, or in the other runs."""
+    runs: tuple[str, ...] = ()
+    """Names of the runs that it consists of; absent in a record of one run."""
+
+
+class SensorFaultPart(ResultPart):
+    """A temperature sensor that is faulty or suspected."""
+
+    sensor: str
+    """Name of the sensor."""
+    kind: Literal["no signal", "stuck", "jump", "ramp", "noise"]
+    """What it does."""
+    state: Literal["left_out", "suspected"]
+    """Whether it was left out of the whole record, or stays because a machine may do the same."""
+    run: str = ""
+    """Run that shows it; absent in a record of one run."""
+    onset_s: Number
+    """When it began, s from the start, of several runs from the start of that run."""
+    onset_u_s: Number
+    """Standard uncertainty of that, s."""
+    size: Number
+    """Change beyond what the other sensors predict, K; of noise the ratio after to before; null where there is no signal."""
+    ratio: Number
+    """Its largest excursion over the next largest; null where none is compared."""
+    limit: Number
+    """Ratio from which it is named; null as above."""
+    reason: str
+    """Why it is suspected only; empty for one that was left out."""
+    rmse_with_um: Number
+    """Error of the declared model on the hold-out set with it, um; null for a suspected one, and where it has too few readings."""
+    rmse_without_um: Number
+    """The same without all sensors that were left out, um; null for a suspected one."""
+
+
+class RunPart(HoldOutErrors):
+    """One run of a record of several."""
+
+    file: str
+    """Name of its table."""
+    held_out: bool
+    """Whether it is held out."""
+    duration_h: Number
+    """Its length, h."""
+    blocks: int
+    """Number of its blocks."""
+    verdict: Verdict | Literal[""]
+    """Verdict by the errors in this run; empty where it is not held out."""
+
+
+class RecordLoop(Loop):
+    """What the closed loop found on a record; errors are means over the channels."""
+
+    steps: tuple[RecordStep, ...]
+    """Effects that were added, in turn."""
+    unexplained: RecordUnexplained
+    """What is left."""
+    channels: Mapping[str, ChannelErrors]
+    """Errors by channel."""
+    chained: tuple[ChainedPart, ...]
+    """Forward-chained parts."""
+    search: tuple[tuple[RecordScorePart, ...], ...]
+    """Scores of every round of the search."""
+    sensor_faults: tuple[SensorFaultPart, ...] = ()
+    """Sensors that are faulty or suspected, examined before any model."""
+    runs: tuple[RunPart, ...] = ()
+    """Runs of a record of several; absent where there is one."""

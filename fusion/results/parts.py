@@ -1,0 +1,347 @@
+"""What the parts of results.json have in common: their base class, types of values, and quantities with an uncertainty.
+
+The analysis makes the parts. A number that the data do not determine is NaN there, ``null`` in the file and None when it is read; a key
+that does not apply is never set, and absent.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+from zoneinfo import ZoneInfo
+
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+Number = float | None
+
+
+class ResultPart(BaseModel):
+    """Base class of every part: immutable, without unknown keys, each field described by its docstring."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        use_attribute_docstrings=True,
+        serialize_by_alias=True,
+        # A result of the analysis may add arrays to its part, which are not written.
+        arbitrary_types_allowed=True,
+    )
+
+
+class Quantity(ResultPart):
+    """A measured value with its standard uncertainty."""
+
+    value: Number
+    """Estimate, in the unit that the key ends with."""
+    u: Number
+    """Standard uncertainty (k = 1), same unit; null where it is not known."""
+
+
+class Sensitivity(Quantity):
+    """A quantity per kelvin of the rise with both parts of its standard uncertainty, which are absent where it is not per kelvin."""
+
+    u_fit: Number = None
+    """The part of the fit, the rise taken as exact."""
+    u_scale: Number = None
+    """The part of the scale of the rise (emissivity, reflections, air, camera)."""
+
+
+class ByDirection(ResultPart):
+    """One value per target for each direction of approach; a direction that was not measured is absent."""
+
+    positive: tuple[Number, ...] = ()
+    """Values of the approach in positive direction, in the order of the targets."""
+    negative: tuple[Number, ...] = ()
+    """Values of the approach in negative direction, in the order of the targets."""
+
+    def values(self) -> list[float]:
+        """Return the values of both directions that are determined."""
+        return [value for value in (*self.positive, *self.negative) if value is not None]
+
+
+class AreaPart(ResultPart):
+    """A place on the plan as the rectangle around its cells."""
+
+    x_low_mm: float
+    """Smallest x, mm."""
+    x_high_mm: float
+    """Largest x, mm."""
+    y_low_mm: float
+    """Smallest y, mm."""
+    y_high_mm: float
+    """Largest y, mm."""
+
+
+class PixelAreaPart(ResultPart):
+    """A place on a plan that is the picture itself, as the rectangle around its cells, from the upper left corner of the picture."""
+
+    x_low_px: float
+    """Smallest x, px."""
+    x_high_px: float
+    """Largest x, px."""
+    y_low_px: float
+    """Smallest y, px."""
+    y_high_px: float
+    """Largest y, px."""
+
+
+def _of_time(text: str) -> str:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError("not a time by ISO 8601") from None
+    return text
+
+
+def _known_zone(name: str) -> str:
+    try:
+        ZoneInfo(name)
+    # Also a name that is too long for a file, or leads out of the data base.
+    except (LookupError, ValueError, OSError):
+        raise ValueError("not a zone of the IANA database") from None
+    return name
+
+
+TimeText = Annotated[str, AfterValidator(_of_time)]
+
+
+class PluginPart(ResultPart):
+    """An effect that another installed distribution added."""
+
+    name: str
+    """Name of its entry point."""
+    origin: str
+    """Module and object, ``package.module:object``."""
+    distribution: str
+    """Installed distribution that brought it."""
+    version: str
+    """Version of that distribution."""
+
+
+class TimePart(ResultPart):
+    """When the readings were taken."""
+
+    first: TimeText
+    """Time of the first reading, UTC."""
+    last: TimeText
+    """Time of the last reading, UTC."""
+    zone: Annotated[str, AfterValidator(_known_zone)] | None
+    """Zone that the campaign states, by its name in the IANA data base; null where it states none."""
+
+
+# results.json, part ``inputs``: whether instruments, logs and physics agree.
+
+#: What a run concludes, by what it rests on: ``positions`` on the laser alone (deviations, drift, ISO 230-2 values, positions that stand
+#: out), ``field`` on the camera alone, ``attribution`` (which part of the field the drift follows) and ``causes`` (the model) on both.
+Figures = Literal["positions", "field", "attribution", "causes"]
+
+
+class CheckPart(ResultPart):
+    """One consistency check of the inputs."""
+
+    code: str
+    """Short name; under ``[accept] doubts`` of the campaign file it says that the doubt is known."""
+    value: Number
+    """What was found, in the unit that the evidence names."""
+    limit: Number
+    """Limit that the value is held against."""
+    passed: bool
+    """Whether the inputs agree."""
+    evidence: str
+    """One sentence with the numbers."""
+    remedy: str
+    """What to correct; empty where the check is passed."""
+    endangers: str
+    """Results that are wrong if the doubt is justified."""
+    assumption: str
+    """Assumption behind the results that depend on it, as it follows "only if"."""
+    conditional: tuple[Figures, ...]
+    """Results that hold only under that assumption."""
+
+
+class InputsPart(ResultPart):
+    """Whether instruments, logs and physics agree."""
+
+    state: Literal["sound", "doubted", "corrected"]
+    """``doubted``: a check is not passed and not accepted, so that causes hold only if the input is right."""
+    accepted: tuple[str, ...]
+    """Codes of the doubts that the campaign file accepts."""
+    checks: tuple[CheckPart, ...]
+    """Every check, also those that are passed."""
+
+    @property
+    def doubts(self) -> tuple[CheckPart, ...]:
+        """Checks that are not passed and not accepted."""
+        return tuple(check for check in self.checks if not check.passed and check.code not in self.accepted)
+
+    def assumptions(self, *figures: Figures) -> tuple[str, ...]:
+        """Return what has to be right for some figures to hold; nothing where no doubt touches them."""
+        return tuple(dict.fromkeys(check.assumption for check in self.doubts if set(check.conditional) & set(figures)))
+
+
+# Parts of the ISO 230-2 evaluation in results.json that a test sheet shows in addition to the values: tolerances, conditions,
+# other standards.
+
+
+class Iso230Tolerance(ResultPart):
+    """A quantity judged against its tolerance."""
+
+    quantity: str
+    """Symbol of the quantity, with the direction of approach where it is unidirectional."""
+    limit_um: float
+    """Tolerance, um."""
+    value_um: Number
+    """Value in the settled window, um."""
+    expanded_u_um: Number
+    """Its expanded uncertainty (k = 2), um."""
+    decision: Literal["pass", "fail", "not decided within the uncertainty", "not measured"]
+    """By ISO 14253-1."""
+
+
+class Iso230Check(ResultPart):
+    """A condition that ISO 230-2 asks of a test."""
+
+    name: str
+    """The requirement."""
+    met: bool | None
+    """Whether it is met; null where the readings do not show it."""
+    evidence: str
+    """What was found."""
+
+
+class Iso230Condition(ResultPart):
+    """A condition of the test as it was stated or logged."""
+
+    name: str
+    """What it is."""
+    text: str
+    """With its unit; empty where it is not stated."""
+
+
+class OtherEvaluation(ResultPart):
+    """A quantity of the settled window by another standard."""
+
+    standard: str
+    """Which standard."""
+    name: str
+    """Name of the quantity, with its symbol."""
+    value_um: Number
+    """um."""
+    definition: str
+    """How it is calculated."""
+
+
+# results.json, part ``radiometry``: uncertainty of temperatures and rises, and the budget that it comes from.
+
+
+class BudgetEntry(ResultPart):
+    """One input that all frames share, and what it contributes."""
+
+    input: str
+    """Name of the input; ends with its unit where it has one."""
+    value: Number
+    """Value that the frames were calibrated with; null for a property of the camera that has none."""
+    u: Number
+    """Standard uncertainty, in the unit of the value."""
+    source: Literal["stated", "assumed", "measured"]
+    """Whether the campaign file states the uncertainty, a default was assumed, or the frames showed it."""
+    temperature_u_K: Number
+    """Contribution to the standard uncertainty of the mean temperature of the last cycle, K, to first order."""
+    rise_u_percent: Number
+    """Contribution to the standard uncertainty of a rise, in percent of the rise, to first order; null for the camera's zero, which
+    contributes its u to every rise."""
+
+
+class TwoParts(ResultPart):
+    """Standard uncertainty in two parts, means over the cells of the last cycle."""
+
+    noise_K: Number
+    """From pixel noise and registration: it differs from cell to cell and from cycle to cycle, K."""
+    common_K: Number
+    """From what all cells and frames share: emissivity, reflections, air, window, camera, K."""
+    total_K: Number
+    """Both combined, K."""
+
+
+class SurfacePart(ResultPart):
+    """A part of the table with an emissivity of its own."""
+
+    name: str
+    """Name of the region; empty for the rest of the table."""
+    emissivity: Quantity
+    """Emissivity, 1."""
+    source: Literal["stated", "assumed", "two states", "frames"]
+    """Where the emissivity comes from."""
+    cells: int
+    """Cells of the plan."""
+    rise_scale_u: Number
+    """Standard uncertainty of its rises that is the same share of all of them, 1; null where it is not seen."""
+    monte_carlo_ratio: Number
+    """Propagation of distributions over first order, of the rise; applied where it differs from 1 by more than 5 %."""
+
+
+class RadiometryPart(ResultPart):
+    """Uncertainty of temperatures and rises."""
+
+    temperature_u: TwoParts
+    """Of the temperature of a cell."""
+    rise_u: TwoParts
+    """Of the rise of a cell since the first cycle."""
+    rise_scale_u: Number
+    """Standard uncertainty of all rises that is the same share of each, mean over the plan, 1."""
+    budget: tuple[BudgetEntry, ...]
+    """Inputs that all frames share."""
+    surfaces: tuple[SurfacePart, ...]
+    """Surfaces of one emissivity each."""
+    edge_cells: int
+    """Cells that were left empty because they see two surfaces."""
+
+
+class FieldPart(ResultPart):
+    """The temperature fields in short: how many, over which time, and the rise."""
+
+    fields: int
+    """Cycles, or windows of time where no laser gives cycles, that have a field."""
+    frames: int
+    """Thermograms that were used."""
+    duration_s: Number
+    """From the first thermogram to the last, s."""
+    mean_rise_K: Quantity
+    """Rise of the last field since the first, mean over the plan, with what all cells share as its uncertainty, K."""
+    largest_rise_K: Quantity
+    """Largest rise of a cell in any field, K; null where no cell is seen twice."""
+    largest_cycle: int | None
+    """Cycle or window of that rise."""
+    largest_after_s: Number
+    """From the first field to that one, s."""
+    largest_x_mm: Number = None
+    """Place of that cell, x, mm; null where the plan is the picture itself."""
+    largest_y_mm: Number = None
+    """Place of that cell, y, mm; null where the plan is the picture itself."""
+    largest_x_px: Number = None
+    """Place of that cell from the left edge of the picture, px; only where the picture is the plan."""
+    largest_y_px: Number = None
+    """Place of that cell from the upper edge of the picture, px; only where the picture is the plan."""
+
+
+class ContactSensorPart(ResultPart):
+    """A contact sensor on the table."""
+
+    name: str
+    """Name of its column."""
+    file: str
+    """File of its temperatures, as the campaign names it."""
+    x_mm: float
+    """Place on the plan, x, mm."""
+    y_mm: float
+    """Place on the plan, y, mm."""
+    rise_K: Number
+    """Last temperature minus the first of the common time with the camera, of a faulty sensor the last before its fault, K."""
+    camera_rise_K: Number
+    """The camera's rise of the cell at its place over its own common time, K; null without a camera or where the cell is not seen."""
+    used: bool
+    """Whether it takes part in what is calculated; a faulty one does not."""
+    fault: str
+    """What is wrong with it, in words; empty where it is sound."""
+    fault_time: str | None
+    """From when on, UTC; null where it is sound."""

@@ -1,0 +1,138 @@
+"""Plots of what joins both instruments: the correlation of drift and field, and the errors of the closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import xarray as xr
+
+from fusion.common import FusionError
+from fusion.results.loop import AxisLoop, ErrorInterval, RecordLoop
+from fusion.results.parts import Number
+from interferometry.plots import COLOURS, MUTED, new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class LoopErrors(Protocol):
+    """What `close_loop` returns of its errors: those of every prediction of the hold-out set, and the noise, um."""
+
+    @property
+    def hold_out(self) -> Mapping[str, ErrorInterval]:
+        """Errors by prediction, um."""
+
+    @property
+    def noise_floor_um(self) -> Number:
+        """Noise of a reading, um."""
+
+
+#: Predictions of the hold-out set by name -> words.
+_PREDICTIONS = {
+    "declared": "declared model",
+    "final": "with the added effects",
+    "last_value": "last value repeated",
+    "mean": "mean of the training part",
+    "least_squares": "least squares",
+    "ridge": "ridge regression",
+    "ridge_with_lags": "ridge regression with lags",
+}
+
+
+def plot_correlation(maps: xr.DataTree, ax: Axes | None = None, *, channel: str = "common") -> Axes:
+    """Plot how closely a part of the drift follows the temperature of every place of the plan.
+
+    Parameters
+    ----------
+    maps : DataTree
+        What `correlate` returns, or the group ``correlation`` of ``fusion.nc``.
+    ax : Axes, optional
+        Where to plot; a new figure by default.
+    channel : str
+        Part of the drift: ``common``, ``proportional`` or ``reversal``.
+
+    Returns
+    -------
+    Axes
+        Likelihood ratio over its threshold: places above 1, inside the line, pass at a family-wise error of 5 %.
+
+    Raises
+    ------
+    FusionError
+        There is no such channel.
+
+    Notes
+    -----
+    The test and its error rates: docs/method/attribution.md.
+
+    Examples
+    --------
+    >>> from fusion import correlate
+    >>> ax = plot_correlation(correlate(fused, fields))  # doctest: +SKIP
+    """
+    session = maps.to_dataset()
+    channels = [str(name) for name in session["channel"].values if name != "joint"]
+    if channel not in channels:
+        raise FusionError(f"channel={channel!r} is not one of {channels}")
+    ax = new_axes(ax)
+    ratio = (session["statistic"] / session["threshold"]).sel(channel=channel).transpose("y", "x")
+    image = ax.pcolormesh(ratio["x"], ratio["y"], ratio, cmap="cividis", shading="nearest", vmin=0.0)
+    ax.figure.colorbar(image, ax=ax, label="likelihood ratio / threshold", shrink=0.6)
+    if float(ratio.max()) > 1.0:
+        ax.contour(ratio["x"], ratio["y"], ratio, levels=[1.0], colors="white", linewidths=1.2)
+    ax.set(xlabel="x / mm", ylabel="y / mm", title=f"{channel} drift: {maps.attrs['verdict']}", aspect="equal")
+    ax.grid(visible=False)
+    return ax
+
+
+def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) -> Axes:
+    """Plot the errors on the hold-out set: declared model, model with the added effects, and plain predictions, with 95 % intervals.
+
+    Parameters
+    ----------
+    loop : LoopResult, or the part ``loop`` of Results
+        What `close_loop` returns, or ``run_campaign(...).loop``.
+    ax : Axes, optional
+        Where to plot; a new figure by default.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    FusionError
+        Matplotlib is not installed.
+
+    Notes
+    -----
+    Hold-out set and intervals: docs/method/closed-loop.md.
+
+    Examples
+    --------
+    >>> ax = plot_loop(close_loop(fused, ["axis_expansion", "table_offset"]))  # doctest: +SKIP
+    """
+    errors: dict[str, ErrorInterval] = (
+        {**dict(loop.errors), **dict(loop.baselines)}
+        if isinstance(loop, AxisLoop | RecordLoop)
+        else dict(loop.hold_out)
+    )
+    ax = new_axes(ax)
+    size = {name: error.rmse_um for name, error in errors.items() if error.rmse_um is not None}
+    values = np.array(list(size.values()), float)
+    ends = np.array([[errors[name].low_um, errors[name].high_um] for name in size], float)
+    colours = {"declared": COLOURS["negative"], "final": COLOURS["positive"]}
+    ax.barh(
+        [_PREDICTIONS[name] for name in size],
+        values,
+        xerr=np.abs(ends - values[:, None]).T,
+        color=[colours.get(name, MUTED) for name in size],
+        ecolor="black",
+    )
+    if loop.noise_floor_um is not None:
+        ax.axvline(loop.noise_floor_um, color="black", linewidth=0.8, linestyle=":")
+    ax.invert_yaxis()
+    ax.set(xlabel="error on the hold-out set / µm (95 % intervals; dotted: noise)")
+    return ax

@@ -1,0 +1,140 @@
+"""Progress of a long step: bars on a terminal, plain lines elsewhere, nothing in a library."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from fusion.results.results import Notice
+
+
+# What was left out of a file, counted and named.
+
+#: Maximum number of omitted items listed in a message; the products hold all of them.
+_NAMED = 5
+
+
+def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
+    """Return one notice for each file that counts its rejected lines and lists the first of them."""
+    from fusion.results.results import Notice  # loads numpy: progress is shown before
+
+    lines = json.loads(dataset.attrs.get("left_out", "[]"))
+    notices = []
+    for path in dict.fromkeys(item["path"] for item in lines):
+        named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines if item["path"] == path]
+        notices.append(
+            Notice(
+                code,
+                f"{counted(len(named), 'line')} of {path} left out: {listed(named)}.",
+                f"Correct these lines in {path} and run again; the estimates allow for the gaps.",
+            )
+        )
+    return notices
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, plural unless the number is 1."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return the first names, and how many more there are."""
+    names = list(names)
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return "; ".join(names[:_NAMED]) + more
+
+
+#: ``report(label, done, total)``; called first with done = 0 and last with done = total.
+Report = Callable[[str, int, int], None]
+
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+def silent(label: str, done: int, total: int) -> None:
+    """Report nothing."""
+
+
+class Reporter(AbstractContextManager["Reporter"]):
+    """Shows the progress of a run: bars on a terminal, otherwise one line at each start, end and every ten seconds.
+
+    Parameters
+    ----------
+    console : Console
+        Where the progress is shown.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bars: Progress | None = None
+        self._tasks: dict[str, object] = {}
+        self._started: dict[str, float] = {}
+        self._spoken: dict[str, float] = {}
+        self._finished: set[str] = set()
+
+    def __enter__(self) -> Reporter:
+        if self._console.is_terminal:
+            columns = (
+                SpinnerColumn(),
+                TextColumn("{task.description:<34}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(compact=True),
+            )
+            self._bars = Progress(*columns, console=self._console)
+            self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, label: str, done: int, total: int) -> None:
+        """Show that `done` of `total` parts of the step `label` are finished."""
+        if self._bars is None:
+            self._write(label, done, total)
+            return
+        if label not in self._tasks:
+            self._tasks[label] = self._bars.add_task(label, total=max(total, 1))
+        self._bars.update(self._tasks[label], completed=done if total else 1, total=max(total, 1))  # type: ignore[arg-type]
+
+    def _write(self, label: str, done: int, total: int) -> None:
+        if label in self._finished:
+            if done >= total:
+                return
+            self._finished.remove(label)
+            del self._started[label]
+        now = time.monotonic()
+        if label not in self._started:
+            self._started[label] = self._spoken[label] = now
+            if done < total:
+                self._console.print(f"{label} ...", highlight=False)
+                return
+        if done >= total:
+            self._finished.add(label)
+            self._console.print(f"{label}: done in {now - self._started[label]:.1f} s", highlight=False)
+        elif now - self._spoken[label] > _SECONDS_BETWEEN_LINES:
+            self._spoken[label] = now
+            left_s = (now - self._started[label]) / done * (total - done) if done else 0.0
+            left = f", about {left_s:.0f} s left" if left_s else ""
+            self._console.print(f"{label}: {done} of {total}{left}", highlight=False)

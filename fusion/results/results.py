@@ -1,0 +1,348 @@
+"""results.json as typed models: every finding of a run, its unit, and the JSON Schema that is made from them.
+
+The parts are in `fusion.results.parts`, `axis` and `loop`. A number is None (``null`` in the file) where the data do not
+determine it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal
+
+from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError
+
+from fusion.common import FusionError
+from fusion.results.axis import (
+    AlignmentPart,
+    AnomalyPart,
+    CameraPart,
+    CorrelationPart,
+    DriftPart,
+    HotspotPart,
+    Iso230Part,
+    NeighboursPart,
+    RegistrationPart,
+)
+from fusion.results.loop import AxisLoop, RecordLoop
+from fusion.results.parts import (
+    ContactSensorPart,
+    FieldPart,
+    InputsPart,
+    Number,
+    PluginPart,
+    Quantity,
+    RadiometryPart,
+    ResultPart,
+    TimePart,
+)
+from fusion.results.store import Product, plain, require_own
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SCHEMA_VERSION = 3
+#: Keys of schema 2 and earlier that have another name now.
+RENAMED_KEYS = {
+    "as_well_ppm_per_K": "alternative_ppm_per_K",
+    "behind_by": "gain_deficit",
+    "blocked": "not_admitted",
+    "camera_gain_decided": "camera_reduction_significant",
+    "camera_gain_um": "camera_reduction_um",
+    "decided": "significant",
+    "equal_places_mm": "equivalent_places_mm",
+    "least_p": "p_resolution",
+    "looks_like": "confounded_with",
+    "loss_at_most_um": "loss_upper_limit_um",
+    "nearest": "closest_effect",
+    "nearest_p": "closest_effect_p",
+    "nearest_share": "closest_effect_share",
+    "nuisance": "residual_drift",
+    "one_way_um": "unidirectional_um",
+    "p_beside_leader": "p_given_leading_mode",
+    "premise": "assumption",
+    "sealed_question": "held_out_test",
+    "share_not_separable": "collinear_share",
+    "unnamed": "unconfirmed_effects",
+    "within_s": "block_length_s",
+    "would_tell": "recommended_test",
+}
+#: The same for the tests of the residual, the keys of ``p_values``.
+RENAMED_TESTS = {
+    "course in time": "autocorrelation",
+    "direction along the axis": "direction_along_axis",
+    "memory": "autocorrelation",
+    "one place": "single_target",
+    "rhythm": "periodicity",
+    "slow pattern": "slow_pattern",
+}
+#: Objects whose keys are names of a campaign: fiducials and channels.
+_NAMED_BY_THE_CAMPAIGN = ("leave_one_out_mm", "channels", "rms_by_channel_um")
+#: Faults of a file of which the first is named: each one that is written out takes a kilobyte.
+_MOST_FAULTS = 1_000
+#: Characters of the place of a fault: a key may be as long as the file.
+_LONGEST_PLACE = 200
+
+
+class ResultsError(FusionError):
+    """A results.json that this version cannot read; the message names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something left out or doubtful: what it is, by how much it may move the result, and what to do about it."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    code: Annotated[str, Field(description="Short name, for programs.")]
+    message: Annotated[str, Field(description="One sentence with counts and names, for people.")]
+    remedy: Annotated[str, Field(description="What would remove the warning; empty where nothing has to be done.")]
+    effect_um: Annotated[Number, Field(description="Size of the effect on the drift, um; null where not known.")] = None
+
+
+def _loop_tag(loop: Any) -> str:
+    """Return which loop a value is, so that a fault is reported against that one model: only a record has channels."""
+    keys = loop if isinstance(loop, Mapping) else type(loop).model_fields if isinstance(loop, ResultPart) else ()
+    return "record" if "channels" in keys else "axis"
+
+
+class Results(ResultPart):
+    """results.json of a run; a part that a campaign does not have is absent."""
+
+    model_config = ConfigDict(title="thermofuse results")
+
+    schema_version: Literal[3] = Field(alias="schema")
+    """Version of this layout."""
+    campaign: str
+    """Title of the campaign."""
+    warnings: tuple[Notice, ...]
+    """Everything that was left out, is doubtful, or was not possible."""
+    plugins: tuple[PluginPart, ...] = ()
+    """Effects of other distributions that took part in the run."""
+    inputs: InputsPart | None = None
+    """Consistency of the inputs."""
+    time: TimePart | None = None
+    """When the readings were taken; absent where the campaign states no time of day."""
+    registration: RegistrationPart | None = None
+    """Registration of the thermograms to the plan."""
+    camera: CameraPart | None = None
+    """The thermal camera: damaged frames and corrections."""
+    radiometry: RadiometryPart | None = None
+    """Uncertainty of temperatures and rises."""
+    field: FieldPart | None = None
+    """The temperature fields in short."""
+    sensors: tuple[ContactSensorPart, ...] | None = None
+    """Contact sensors on the table."""
+    alignment: AlignmentPart | None = None
+    """Both instruments on one clock."""
+    iso230: Iso230Part | None = None
+    """Axis values by ISO 230-2."""
+    neighbours: NeighboursPart | None = None
+    """Neighbour differences."""
+    drift: DriftPart | None = None
+    """Joint estimate of profile and drift."""
+    anomalies: tuple[AnomalyPart, ...] | None = None
+    """Targets that stand out."""
+    hotspots: tuple[HotspotPart, ...] | None = None
+    """Places that warm more than their surroundings."""
+    correlation: CorrelationPart | None = None
+    """Attribution of the drift to parts of the field."""
+    loop: (
+        Annotated[Annotated[AxisLoop, Tag("axis")] | Annotated[RecordLoop, Tag("record")], Discriminator(_loop_tag)]
+        | None
+    ) = None
+    """Closed loop."""
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {text}" for name, text in self._summary())
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in self._summary())
+        return f"<table>{''.join(rows)}</table>"
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Plot the errors of the closed loop on the hold-out set; see `fusion.results.plots.plot_loop`."""
+        from fusion.results.plots import plot_loop
+
+        if self.loop is None:
+            raise ResultsError(
+                f"{self.campaign}: there is no closed loop to plot; the products beside the results have plots"
+            )
+        return plot_loop(self.loop, ax)
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """Return names and figures of what was found, in short; sentences, conditions and remedies are the report's."""
+        rows = [("campaign", self.campaign)]
+        if self.inputs is not None:
+            doubts = ", ".join(check.code for check in self.inputs.doubts)
+            rows.append(("inputs", f"{self.inputs.state}{f' ({doubts})' if doubts else ''}"))
+        if self.iso230 is not None:
+            values = {name: getattr(self.iso230, f"{name}_um") for name in "ARBEM"}
+            rows.append(
+                ("ISO 230-2 (k = 2)", ", ".join(f"{name} {_expanded(one)}" for name, one in values.items() if one))
+            )
+        if self.anomalies is not None:
+            named = (f"position {one.target}: {one.cause}, p = {one.p_value:.2g}" for one in self.anomalies)
+            rows.append(("anomalies", "; ".join(named) or "none"))
+        if self.loop is not None:
+            final, declared = self.loop.errors.final or self.loop.errors.declared, self.loop.errors.declared
+            rows += [
+                ("verdict", self.loop.verdict.replace("_", " ")),
+                ("added effects", ", ".join(step.effect for step in self.loop.steps) or "none"),
+                ("held-out error", f"{_micrometres(declared.rmse_um)} -> {_micrometres(final.rmse_um)}"),
+            ]
+        return [*rows, ("warnings", str(len(self.warnings)))]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of results.json in JSON's own types; parts and keys that were never set are absent."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+
+def _expanded(value: Quantity) -> str:
+    """A value with its expanded uncertainty, k = 2, in um."""
+    return (
+        _micrometres(value.value)
+        if value.u is None
+        else f"{_micrometres(value.value, '')} ± {_micrometres(2.0 * value.u)}"
+    )
+
+
+def _micrometres(value: Number, unit: str = " µm") -> str:
+    return "undetermined" if value is None else f"{value:.3g}{unit}"
+
+
+def assemble(title: str, parts: Mapping[str, Any], warnings: Sequence[Notice]) -> Results:
+    """Return the results of a run from what the stages found, checked against the models."""
+    notices = [asdict(notice) for notice in warnings]
+    return Results.model_validate(plain({"schema": SCHEMA_VERSION, "campaign": title, "warnings": notices, **parts}))
+
+
+def read_results(folder: str | Path) -> Results:
+    """Read the results of a finished run.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The results folder.
+
+    Returns
+    -------
+    Results
+        The content of its ``results.json``, as `run_campaign` returned it.
+
+    Raises
+    ------
+    ResultsError
+        The folder holds no results, or those of another version.
+
+    Notes
+    -----
+    The products beside them are NetCDF: ``xarray.open_dataset("results/deviations.nc")``.
+
+    Examples
+    --------
+    >>> read_results("results").loop.verdict  # doctest: +SKIP
+    'explained'
+    """
+    folder = Path(folder)
+    path = folder / "results.json"
+    if not path.is_file():
+        raise ResultsError(f"{folder}: there is no results.json in it; name the results folder of a finished run")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        results = Results.model_validate(in_this_schema(content))
+    except ValidationError as error:
+        raise _foreign(path, _first_fault(error)) from None
+    # Also bytes that are no text, numbers of thousands of digits, and brackets without end.
+    except (ValueError, RecursionError) as error:
+        raise _foreign(path, f"not JSON: {error}") from None
+    require_own(folder, [path.name])
+    return results
+
+
+def in_this_schema(content: Any) -> Any:
+    """Return the content of a results.json with the keys of this schema."""
+    if not isinstance(content, dict) or content.get("schema") not in range(1, SCHEMA_VERSION):
+        return content
+    return {**_renamed(content), "schema": SCHEMA_VERSION}
+
+
+def _renamed(part: Any, key: str = "") -> Any:
+    """Return a part of results.json, which stands under a key, with the keys of this schema."""
+    if isinstance(part, list):
+        return [_renamed(one, key) for one in part]
+    if not isinstance(part, dict):
+        return part
+    names = RENAMED_TESTS if key == "p_values" else {} if key in _NAMED_BY_THE_CAMPAIGN else RENAMED_KEYS
+    return {names.get(name, name): _renamed(one, name) for name, one in part.items()}
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _foreign(path: Path, fault: str) -> ResultsError:
+    """Return the error of a file that this version did not write."""
+    return ResultsError(f"{path}: not the results of this version of thermofuse ({fault}); run the campaign again")
+
+
+def _first_fault(error: ValidationError) -> str:
+    """Return the first fault with its place in the file, and how many there are."""
+    if error.error_count() > _MOST_FAULTS:
+        return f"{error.error_count()} values are invalid"
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    # The tag that a loop was distinguished by follows its key and is no place in the file.
+    keys = [key for level, key in enumerate(first["loc"]) if not (level == 1 and first["loc"][0] == "loop")]
+    place = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).removeprefix(".")
+    others = error.error_count() - 1
+    return f"{place[:_LONGEST_PLACE]}: {first['msg']}" + (f", and {others} more" if others else "")
+
+
+def results_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of results.json, made from the models.
+
+    Returns
+    -------
+    dict
+        Every field with its description and unit; a number is null where the data do not determine it.
+
+    Raises
+    ------
+    pydantic.PydanticInvalidForJsonSchema
+        If a model has a type that JSON Schema cannot express: a fault of the models.
+
+    Notes
+    -----
+    Draft 2020-12 of JSON Schema, https://json-schema.org/draft/2020-12.
+
+    Examples
+    --------
+    >>> schema = results_schema()
+    >>> schema["title"], schema["required"]
+    ('thermofuse results', ['schema', 'campaign', 'warnings'])
+    """
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Results.model_json_schema()}
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[Product]):
+    """What a stage found.
+
+    Attributes
+    ----------
+    dataset : Dataset or DataTree
+        Its product.
+    parts : dict
+        Its parts of results.json by key, as in `Results`.
+    notices : tuple of Notice
+        What it left out.
+    """
+
+    dataset: Product
+    parts: dict[str, Any]
+    notices: tuple[Notice, ...] = ()

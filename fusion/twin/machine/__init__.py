@@ -1,1 +1,0 @@
-"""The simulated machine: recipe, schedule, heat, air and effects, with exactly known states."""

@@ -1,8 +1,0 @@
-"""Array types shared by the annotations."""
-
-from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]

@@ -1,0 +1,577 @@
+"""Delimited text and sheets as rows of fields, and tables whose columns are found by their names."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from interferometry.io.faults import BadReading, LaserFormatError, LeftOut, Numerals, raise_if_mostly_invalid
+from interferometry.io.spreadsheets import is_workbook, read_sheets
+
+# Dates and times of a whole file: ISO 8601 and the usual other orders, refused where the file does not settle the
+# order.
+
+#: Attribute ``reference`` of times from a file that gives no zone.
+NO_ZONE = "no zone in the file: taken as UTC"
+#: Years of measurements; others are damage, and the first and last years of the calendar have no UTC.
+_YEARS = (1950, 2199)
+
+_MONTHS = {
+    name: month
+    for month, names in enumerate(
+        (
+            "jan januar january janv janvier ene enero jän jänner",
+            "feb februar february fév févr février fev fevr fevrier febrero",
+            "mar mär märz mrz march mars marzo",
+            "apr april avr avril abr abril",
+            "may mai mayo",
+            "jun juni june juin junio",
+            "jul juli july juil juillet julio",
+            "aug august août aout ago agosto",
+            "sep sept september septembre septiembre",
+            "oct okt october oktober octobre octubre",
+            "nov november novembre noviembre",
+            "dec dez december dezember déc décembre decembre dic diciembre",
+        ),
+        start=1,
+    )
+    for name in names.split()
+}
+_CLOCK = (
+    r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,](?P<fraction>\d{1,9}))?)?"
+    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
+)
+_NUMERIC = re.compile(
+    rf"(?P<a>\d{{1,4}})\s*(?P<mark>[./-])\s*(?P<b>\d{{1,2}})\s*[./-]\s*(?P<c>\d{{1,4}})\.?[,T\s]+{_CLOCK}"
+)
+_NAMED = re.compile(rf"(?P<a>\d{{1,2}}|[^\W\d]+)[.\s-]+(?P<b>\d{{1,2}}|[^\W\d]+)[.,\s-]+(?P<c>\d{{4}})[,T\s]+{_CLOCK}")
+_CHINESE = re.compile(rf"(?P<a>\d{{4}})年(?P<b>\d{{1,2}})月(?P<c>\d{{1,2}})日\s*{_CLOCK}")
+
+
+@dataclass(frozen=True)
+class DateOrder:
+    """Whether the month stands before the day in the dates of a file; None where no date of the file settles it."""
+
+    month_first: bool | None = None
+
+    @classmethod
+    def of(cls, path: Path, lines: Iterable[tuple[int, str]]) -> DateOrder:
+        """Find the order from all dates of a file: one number beyond 12 decides."""
+        decided: dict[bool, tuple[int, str]] = {}
+        open_question: tuple[int, str] | None = None
+        for line, text in lines:
+            match = _NUMERIC.fullmatch(text.strip())
+            if match is None or len(match["a"]) > 2 or match["mark"] == ".":
+                continue
+            first, second = int(match["a"]), int(match["b"])
+            if first > 12 >= second:
+                decided.setdefault(False, (line, text))
+            elif second > 12 >= first:
+                decided.setdefault(True, (line, text))
+            elif first != second:
+                open_question = open_question or (line, text)
+        if len(decided) == 2:
+            (day_line, day), (month_line, month) = decided[False], decided[True]
+            raise LaserFormatError(
+                f"{path}: the date {day!r} on line {day_line} has the day first, {month!r} on line {month_line} the month; "
+                "write all dates as 2026-03-09"
+            )
+        if open_question is not None and not decided:
+            line, text = open_question
+            raise LaserFormatError(
+                f"{path}, line {line}: {text!r} may have the day or the month first, and no date of the file resolves it; "
+                "write the dates as 2026-03-09"
+            )
+        return cls(next(iter(decided), None))
+
+
+def parse_time(text: str, order: DateOrder | None = None) -> tuple[np.datetime64, str]:
+    """Return a time in UTC (without a zone it is taken as UTC) and its zone as +hhmm, "" where the text has none; raises `BadReading`."""
+    stripped = text.strip()
+    try:
+        stamp = datetime.fromisoformat(stripped)
+    except ValueError:
+        stamp = _other_order(text, stripped, order or DateOrder())
+    if not _YEARS[0] <= stamp.year <= _YEARS[1]:
+        raise BadReading(text, f"is outside the years {_YEARS[0]} to {_YEARS[1]}")
+    zone = "" if stamp.tzinfo is None else stamp.strftime("%z")
+    utc = stamp if stamp.tzinfo is None else stamp.astimezone(UTC).replace(tzinfo=None)
+    return np.datetime64(utc, "ns"), zone
+
+
+def _other_order(text: str, stripped: str, order: DateOrder) -> datetime:
+    match = _NUMERIC.fullmatch(stripped) or _CHINESE.fullmatch(stripped) or _NAMED.fullmatch(stripped)
+    wrong = BadReading(text, "is not an ISO 8601 time such as 2026-03-09T06:30:05+00:00")
+    if match is None:
+        raise wrong
+    year, month, day = _date(match, order, wrong, text)
+    hour = int(match["hour"])
+    if match["half"]:
+        if not 1 <= hour <= 12:
+            raise wrong
+        hour = hour % 12 + (12 if match["half"][0] in "Pp" else 0)
+    fraction = (match["fraction"] or "").ljust(6, "0")[:6]
+    clock = f"{hour:02d}:{match['minute']}:{match['second'] or '00'}.{fraction or '000000'}"
+    zone = {"Z": "+00:00", "UTC": "+00:00", "GMT": "+00:00", None: ""}.get(match["zone"], match["zone"])
+    try:
+        return datetime.fromisoformat(f"{year:04d}-{month:02d}-{day:02d}T{clock}{zone}")
+    except ValueError:
+        raise wrong from None
+
+
+def _date(match: re.Match[str], order: DateOrder, wrong: BadReading, text: str) -> tuple[int, int, int]:
+    """Return year, month and day."""
+    a, b, c = match["a"], match["b"], match["c"]
+    named = next((name for name in (a, b) if not name.isdecimal()), None)
+    if named is not None:
+        month = _MONTHS.get(named.casefold())
+        day = b if named == a else a
+        if month is None or not day.isdecimal():
+            raise wrong
+        return int(c), month, int(day)
+    if len(a) == 4:
+        return int(a), int(b), int(c)
+    if match.re is _NAMED:
+        raise wrong
+    if len(c) != 4:
+        raise BadReading(text, "has a year of two digits; write it with four")
+    if match["mark"] == "." or int(a) == int(b):
+        return int(c), int(b), int(a)
+    if order.month_first is None:
+        raise BadReading(text, "may have the day or the month first; write the date as 2026-03-09")
+    return (int(c), int(a), int(b)) if order.month_first else (int(c), int(b), int(a))
+
+
+def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
+    """Return how the times of a file were converted to UTC, in words."""
+    if "" in zones and len(zones) > 1:
+        other = next(zone for zone in zones if zone)
+        raise LaserFormatError(
+            f"{path}: the time on line {zones['']} has no zone, that on line {zones[other]} has {other}; write all of them with a zone"
+        )
+    if "" in zones:
+        return NO_ZONE
+    if set(zones) == {"+0000"}:
+        return "UTC in the file"
+    return "converted to UTC from " + ", ".join(sorted(zones))
+
+
+# Headings of columns: what they name, in five languages, and the unit that they carry.
+
+#: What a column holds -> its usual headings in English, German, French, Spanish and Chinese.
+_TABLE = {
+    "cycle": (
+        "cycle, cycle no, cycle number, zyklus, messzyklus, zyklus nr, cycle de mesure, ciclo, ciclo no, 循环, 循环号, "
+        "循环次数"
+    ),
+    "run": (
+        "run, run no, run number, pass, lauf, messlauf, durchlauf, lauf nr, passe, passage, pasada, corrida, "
+        "recorrido, 测量次数, 次数, 行程"
+    ),
+    "direction": (
+        "direction, approach, direction of approach, approach direction, dir, richtung, anfahrrichtung, "
+        "verfahrrichtung, messrichtung, sens, sens d'approche, sens de déplacement, dirección, sentido, "
+        "sentido de aproximación, 方向, 接近方向, 趋近方向, 运动方向"
+    ),
+    "target": (
+        "target, target no, target number, point, point no, position no, punkt, messpunkt, zielpunkt, punkt nr, "
+        "position nr, point de mesure, cible, punto, punto no, objetivo, 目标, 目标点, 点号, 测点, 序号"
+    ),
+    "position": (
+        "position, target position, nominal, nominal position, commanded position, programmed position, pos, "
+        "sollposition, soll, sollwert, zielposition, nennposition, position cible, position nominale, "
+        "position programmée, posición, posición objetivo, posición nominal, posición programada, 位置, 目标位置, 名义位置, "
+        "理论位置, 指令位置"
+    ),
+    "measured": (
+        "measured, measured position, actual, actual position, laser position, ist, istposition, istwert, "
+        "messwert, position mesurée, mesure, position réelle, posición medida, medida, posición real, 实测位置, 实测值, "
+        "测量值, 实际位置"
+    ),
+    "deviation": (
+        "deviation, error, positioning error, position error, positional error, positional deviation, "
+        "positioning deviation, linear error, deviations, errors, positioning errors, abweichung, "
+        "positionsabweichung, positionierabweichung, fehler, positionierfehler, abweichungen, écart, erreur, "
+        "écart de position, erreur de position, erreur de positionnement, écarts, erreurs, desviación, "
+        "error de posición, error de posicionamiento, desviación de posición, desviaciones, errores, 偏差, 误差, 位置偏差, "
+        "定位误差, 定位偏差, 位置误差"
+    ),
+    "date": "date, datum, fecha, 日期",
+    "time": (
+        "time, timestamp, time stamp, date time, datetime, date and time, time of day, zeit, zeitstempel, uhrzeit, "
+        "datum uhrzeit, datum zeit, heure, horodatage, date heure, date et heure, hora, fecha hora, fecha y hora, "
+        "时间, 日期时间, 测量时间"
+    ),
+    "air_temperature": (
+        "air temperature, temperature of the air, lufttemperatur, temperatur der luft, température de l'air, "
+        "température air, temperatura del aire, temperatura aire, 空气温度, 气温"
+    ),
+    "air_pressure": (
+        "air pressure, pressure, luftdruck, druck, pression, pression atmosphérique, presión, presión atmosférica, "
+        "气压, 大气压, 空气压力"
+    ),
+    "relative_humidity": (
+        "relative humidity, humidity, luftfeuchte, relative feuchte, luftfeuchtigkeit, feuchte, humidité, "
+        "humidité relative, humedad, humedad relativa, 湿度, 相对湿度"
+    ),
+    "material_temperature": (
+        "material temperature, sample temperature, workpiece temperature, scale temperature, materialtemperatur, "
+        "werkstücktemperatur, maschinentemperatur, température matière, température du matériau, "
+        "température de la pièce, temperatura del material, temperatura material, 材料温度, 工件温度, 机床温度"
+    ),
+}
+#: Direction of approach, whether the word names the sign of the travel, and the words. "Forward" only names the first of two runs.
+_DIRECTION_TABLE: tuple[tuple[str, bool, str], ...] = (
+    ("positive", True, "positive, pos, +, +1, p, positiv, positif, positiva, positivo, ↑, 正, 正方向"),
+    ("negative", True, "negative, neg, -, -1, n, negativ, négatif, negativa, negativo, ↓, 负, 负方向"),
+    (
+        "positive",
+        False,
+        "forward, forwards, fwd, fw, outward, vorwärts, vor, hin, hinfahrt, aller, avant, avance, adelante, ida, 正向, 前进, 去程",
+    ),
+    (
+        "negative",
+        False,
+        "reverse, rev, backward, backwards, bwd, bw, return, rückwärts, rück, zurück, rückfahrt, retour, arrière, atrás, vuelta, "
+        "retroceso, 反向, 负向, 后退, 回程",
+    ),
+)
+
+#: Kind of quantity, how its units are written, factor to mm, deg, degC, hPa or percent, and what is added after it.
+_UNIT_TABLE: tuple[tuple[str, str, float, float], ...] = (
+    ("length", "nm", 1e-6, 0.0),
+    ("length", "um, µm, micron, microns, micrometer, micrometre, mikrometer, 微米", 1e-3, 0.0),
+    ("length", "mm, millimeter, millimetre, 毫米", 1.0, 0.0),
+    ("length", "m", 1e3, 0.0),
+    ("length", "inch, inches, in, zoll", 25.4, 0.0),
+    ("length", "mil, thou", 25.4e-3, 0.0),
+    ("length", "uin, µin, microinch", 25.4e-6, 0.0),
+    ("angle", "arcsec, arcsecond, arcseconds, ″, '', \", 角秒, bogensekunden", 1 / 3600, 0.0),
+    ("angle", "deg, degree, degrees, °, grad, 度", 1.0, 0.0),
+    ("temperature", "degc, °c, ℃, c", 1.0, 0.0),
+    ("temperature", "k", 1.0, -273.15),
+    ("temperature", "degf, °f, f", 5 / 9, -160 / 9),
+    ("pressure", "hpa, mbar", 1.0, 0.0),
+    ("pressure", "pa", 1e-2, 0.0),
+    ("pressure", "kpa", 10.0, 0.0),
+    ("pressure", "mmhg, torr", 1013.25 / 760, 0.0),
+    ("pressure", "bar", 1000.0, 0.0),
+    ("humidity", "%, percent, %rh, % rh, %rf, % rf", 1.0, 0.0),
+)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit: its kind of quantity ("length", ...); value * factor + offset is in mm, deg, degC, hPa or percent."""
+
+    kind: str
+    factor: float
+    offset: float
+
+
+#: Unit as it is written, in lower case -> its meaning.
+UNITS = {
+    text.strip(): Unit(kind, factor, offset)
+    for kind, texts, factor, offset in _UNIT_TABLE
+    for text in texts.split(", ")
+}
+
+_IN_BRACKETS = re.compile(r"(.*?)\s*[(\[（【{]\s*([^()\[\]（）【】{}]*?)\s*[)\]）】}]\s*(.*)")
+_AFTER_MARK = re.compile(r"(.*\S)\s*(?:/|,|;|\sin\s|_|\s)\s*(\S+)")
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading as it was understood: its role, None where the words are not known, and its unit, a key of `UNITS`."""
+
+    text: str
+    role: str | None
+    unit: str | None
+
+
+def fold(text: str) -> str:
+    """Return a text for comparison: lower case, without accents, dots, underscores and surplus spaces."""
+    plain = "".join(c for c in unicodedata.normalize("NFKD", text.casefold()) if not unicodedata.combining(c))
+    return re.sub(r"[\s_.:;,/\\#’'–-]+", " ", plain.replace("º", "o").replace("№", "no")).strip()
+
+
+def find_unit(text: str) -> str | None:
+    """Return the key of a unit as it is written, None where it is none."""
+    # Two signs are used for micro: the Greek letter and the micro sign.
+    cleaned = text.strip().casefold().replace("μ", "µ").replace("’’", "''")
+    return cleaned if cleaned in UNITS else None
+
+
+@lru_cache(1 << 16)
+def read_heading(text: str) -> Heading:
+    """Return what a heading such as "Abweichung [µm]" or "Écart / µm" names, and the unit that it carries."""
+    name, unit = split_unit(text)
+    role = _ROLES.get(fold(name).replace(" ", ""))
+    if role == "target" and unit is not None:
+        # "Target [mm]" is the position of a target and not its number.
+        role = "position"
+    return Heading(text, role, unit)
+
+
+def split_unit(text: str) -> tuple[str, str | None]:
+    """Split a heading into name and unit."""
+    match = _IN_BRACKETS.fullmatch(text.strip())
+    if match is not None and (unit := find_unit(match[2])) is not None:
+        return f"{match[1]} {match[3]}".strip(), unit
+    match = _AFTER_MARK.fullmatch(text.strip())
+    if match is not None and (unit := find_unit(match[2])) is not None:
+        return re.sub(r"(\s+in|\s*[/,;])$", "", match[1]), unit
+    return text.strip(), None
+
+
+def find_direction(text: str) -> tuple[str, bool] | None:
+    """Return the direction of approach that a word names."""
+    signs = text.strip().replace("−", "-").replace("–", "-").replace("＋", "+").replace("－", "-")
+    return _DIRECTIONS.get(_key(signs))
+
+
+def _key(word: str) -> str:
+    return word if word in _SIGNS else fold(word)
+
+
+_SIGNS = ("+", "-", "+1", "-1", "↑", "↓")
+_ROLES = {fold(word).replace(" ", ""): role for role, words in _TABLE.items() for word in words.split(", ")}
+_DIRECTIONS = {
+    _key(word): (direction, signed) for direction, signed, words in _DIRECTION_TABLE for word in words.split(", ")
+}
+#: By these, text in the Chinese code page is recognised.
+CHINESE_WORDS = tuple(
+    word for words in _TABLE.values() for word in words.split(", ") if len(word) > 1 and word > "\u4e00"
+)
+
+
+# Bytes of a text file to text: UTF-8, UTF-16, the code page of Western Windows, and that of Chinese Windows.
+
+_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+
+
+def decode_text(path: Path, content: bytes) -> str:
+    """Return the text of a file without byte-order mark, whatever a spreadsheet program of the last thirty years saved it as.
+
+    >>> decode_text(Path("a.csv"), "Abweichung [µm]".encode("cp1252"))
+    'Abweichung [µm]'
+    """
+    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), None) or _unmarked_utf16(content)
+    try:
+        text = content.decode(encoding or "utf-8")
+    except UnicodeDecodeError as fault:
+        if encoding is not None:
+            raise LaserFormatError(
+                f"{path}: byte {fault.start} is not text in {encoding.upper()}, as which the file begins; it is damaged, copy it again"
+            ) from None
+        text = _in_a_code_page(content)
+    place = text.find("\0")
+    if place >= 0:
+        raise LaserFormatError(
+            f"{path}: character {place + 1} is a zero byte, so the file is not text; save the table as CSV in UTF-8 or as XLSX"
+        )
+    return text
+
+
+def _unmarked_utf16(content: bytes) -> str | None:
+    """Return the byte order of UTF-16 without a mark: every other byte of Western text is zero there."""
+    start = content[:400]
+    if len(start) < 16:
+        return None
+    even, odd = start[0::2].count(0), start[1::2].count(0)
+    if odd > 0.4 * len(start) / 2 and even == 0:
+        return "utf-16-le"
+    return "utf-16-be" if even > 0.4 * len(start) / 2 and odd == 0 else None
+
+
+def _in_a_code_page(content: bytes) -> str:
+    try:
+        chinese = content.decode("gb18030")
+    except UnicodeDecodeError:
+        chinese = ""
+    # Every Western text can be read as Chinese too: headings of tables tell them apart.
+    if any(word in chinese for word in CHINESE_WORDS):
+        return chinese
+    try:
+        return content.decode("cp1252")
+    except UnicodeDecodeError:
+        # Five bytes have no meaning in the code page; Latin-1 gives every byte one.
+        return content.decode("latin-1")
+
+
+#: Marks that may stand between fields.
+DELIMITERS = ";\t,|"
+#: Columns of the widest sheet of a spreadsheet; a text with more is no table of readings, and takes long to be found none.
+_MOST_COLUMNS = 16_384
+#: A line with a reading has more characters; a text with more shorter lines than a spreadsheet has rows is damaged, and takes long to
+#: be found so.
+_SHORT_LINE, _MOST_SHORT_LINES = 4, 1_048_576
+#: Longest part of a line of the file that a message repeats, characters.
+_SHOWN = 160
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Rows of fields with their numbers from 1, without empty ones and comments; ``sheet`` is "" for a text file."""
+
+    path: Path
+    sheet: str
+    rows: list[tuple[int, list[str]]]
+
+    @property
+    def place(self) -> str:
+        """File and sheet, as messages name them."""
+        return f"{self.path}, sheet {self.sheet!r}" if self.sheet else str(self.path)
+
+    @cached_property
+    def numerals(self) -> Numerals:
+        """How the numbers of the grid are written."""
+        return Numerals.of(text for _, fields in self.rows for text in fields)
+
+
+@dataclass(frozen=True)
+class DelimitedTable:
+    """A table: its column names, and its rows with the numbers of their lines."""
+
+    path: Path
+    columns: tuple[str, ...]
+    rows: list[tuple[int, list[str]]]
+    numerals: Numerals = field(default_factory=Numerals)
+
+    def records(self) -> Iterator[tuple[int, dict[str, str] | None]]:
+        """Yield line number and fields by column name; None where the number of fields is wrong."""
+        for line, fields in self.rows:
+            yield line, dict(zip(self.columns, fields, strict=True)) if len(fields) == len(self.columns) else None
+
+
+def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
+    """Read a file of text or a spreadsheet as rows of fields."""
+    content = path.read_bytes()
+    if is_workbook(content):
+        sheets = read_sheets(path)
+        if sheet is not None and sheet not in sheets:
+            raise LaserFormatError(
+                f"{path}: there is no sheet {sheet!r}; the sheets are {', '.join(map(repr, sheets))}"
+            )
+        return [Grid(path, name, rows) for name, rows in sheets.items() if sheet in (None, name)]
+    text = decode_text(path, content)
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    short = sum(len(line) < _SHORT_LINE for line in lines) if len(lines) > _MOST_SHORT_LINES else 0
+    if short > _MOST_SHORT_LINES:
+        raise LaserFormatError(
+            f"{path}: {short} lines with nothing or fewer than {_SHORT_LINE} characters, too short for a reading; the file is damaged or "
+            "no table, export it again"
+        )
+    lines = ["" if line.startswith("#") else line for line in lines]
+    present = sorted((mark for mark in DELIMITERS if any(mark in line for line in lines)), key=text.count, reverse=True)
+    grids = [Grid(path, "", split_lines(path, lines, mark)) for mark in present or [","]]
+    if not grids[0].rows:
+        raise LaserFormatError(f"{path}: the file is empty; expected a header line and the measured values below it")
+    return grids
+
+
+def split_lines(path: Path, lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
+    """Split lines of text into fields."""
+    wide = next((number for number, line in enumerate(lines, start=1) if line.count(delimiter) >= _MOST_COLUMNS), None)
+    if wide is not None:
+        raise LaserFormatError(
+            f"{path}, line {wide}: more than {_MOST_COLUMNS} columns, which no spreadsheet has; the file is damaged or not a table, export "
+            "it again with a line for each reading"
+        )
+    reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, [text.strip() for text in fields]) for fields in reader]
+    except csv.Error as fault:
+        raise LaserFormatError(
+            f"{path}, line {reader.line_num}: {fault}; the file is damaged or not a table, export it again"
+        ) from None
+    return [(line, fields) for line, fields in rows if any(fields)]
+
+
+def shown(fields: Iterable[str]) -> str:
+    """Return a row for a message, shortened."""
+    text = ",".join(fields)
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
+
+def read_table(path: Path, required: tuple[str, ...]) -> DelimitedTable:
+    """Read a table from a text file or a spreadsheet and check that it has the required columns."""
+    grids = read_grids(path)
+    for grid in grids:
+        for at, (_, fields) in enumerate(grid.rows):
+            if all(name in fields for name in required):
+                return table_below(grid, at)
+    line, fields = grids[0].rows[0]
+    missing = [name for name in required if name not in fields]
+    raise LaserFormatError(
+        f"{grids[0].place}, line {line}: no column {', '.join(missing)}; the header is {shown(fields)}, "
+        f"expected {','.join(required)!r} (names carry the unit: convert the values and rename the column)"
+    )
+
+
+def table_below(grid: Grid, at: int) -> DelimitedTable:
+    """Return the table whose header is a row of a grid."""
+    line, fields = grid.rows[at]
+    names = tuple(fields[: max(i for i, name in enumerate(fields) if name) + 1])
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
+    if repeated:
+        raise LaserFormatError(
+            f"{grid.place}, line {line}: column {', '.join(map(repr, repeated))} occurs more than once; keep one"
+        )
+    # Spreadsheets give every row the width of the widest one.
+    rows = [(number, row[: len(names)] if not any(row[len(names) :]) else row) for number, row in grid.rows[at + 1 :]]
+    return DelimitedTable(grid.path, names, rows, grid.numerals)
+
+
+def find_header(lines: Iterable[str]) -> tuple[int, str]:
+    """Find the header: the first line that is neither empty nor starts with ``#``."""
+    return next(((i, line) for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), (0, ""))
+
+
+def delimiter_of(header: str) -> str:
+    """Return the delimiter of a header line: comma, semicolon or tab, whichever it contains most often."""
+    return max(",;\t", key=header.count)
+
+
+def read_timed_rows(
+    table: DelimitedTable,
+    variables: Mapping[str, Mapping[str, str]],
+    parse: Callable[[dict[str, str]], list[float]],
+    *,
+    time: str = "time",
+) -> xr.Dataset:
+    """Read the rows of a table that has a column of times into a Dataset."""
+    rows: dict[np.datetime64, list[float]] = {}
+    left_out = LeftOut(table.path)
+    zones: dict[str, int] = {}
+    order = DateOrder.of(table.path, [(line, fields[time]) for line, fields in table.records() if fields is not None])
+    for line, fields in table.records():
+        with left_out.collect(line):
+            if fields is None:
+                raise BadReading("", f"does not have {len(table.columns)} fields")
+            instant, zone = parse_time(fields[time], order)
+            if instant in rows:
+                raise BadReading(fields[time], "occurs on an earlier line too, which is kept")
+            rows[instant] = parse(fields)
+            zones.setdefault(zone, line)
+    raise_if_mostly_invalid(table.path, len(rows), left_out.lines)
+    times = sorted(rows)
+    values = np.array([rows[instant] for instant in times])
+    dataset = xr.Dataset(
+        {name: (("time",), values[:, column], dict(attrs)) for column, (name, attrs) in enumerate(variables.items())},
+        coords={"time": np.array(times, dtype="datetime64[ns]")},
+        attrs={"source": table.path.name, "left_out": left_out.as_json()},
+    )
+    dataset["time"].attrs["reference"] = describe_time_zone(table.path, zones)
+    return dataset

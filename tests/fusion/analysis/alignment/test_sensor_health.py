@@ -1,0 +1,165 @@
+"""Sensors that break, ramp, stick, fall silent or become noisy; and sound ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.alignment.sensor_health import Kind, examine_sensors, excursion_limit, fit_ramp, lay_grid
+from tests.fusion.record_tables import twin_table
+
+SEED = 31
+
+
+@pytest.fixture(scope="module")
+def sound() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A record of the twin of 24 h, a sample per minute: seconds, 10 temperatures, load."""
+    table = twin_table(seed=SEED)
+    seconds = (table["time"].values - table["time"].values[0]) / np.timedelta64(1, "s")
+    return seconds, table["temperature"].values, table["driver"].values
+
+
+def test_the_limit_is_the_ratio_that_a_heavy_tail_exceeds_in_one_of_a_hundred_records():
+    draws = np.abs(np.random.default_rng(3).standard_t(4, (4000, 60)))
+    two = np.sort(draws, axis=1)[:, -2:]
+    # One test alone: 1 % of 4000 is 40; t has not reached its power among 60 values, which at most doubles that (standard deviation 9).
+    assert np.sum(two[:, 1] / two[:, 0] > excursion_limit(1)) <= 80 + 3 * 9
+    assert excursion_limit(81) == pytest.approx(3.0 * excursion_limit(1))
+
+
+def test_sound_sensors_are_left_alone(sound):
+    assert examine_sensors(*sound) == []
+    seconds, temperature, _ = sound
+    assert examine_sensors(seconds, temperature) == []
+    assert examine_sensors(seconds, temperature[:, :1]) == []
+    assert examine_sensors(seconds[:50], temperature[:50]) == []
+
+
+def ramp(seconds: np.ndarray, begin: int, minutes: float) -> np.ndarray:
+    return np.clip((seconds - seconds[begin]) / (60.0 * minutes), 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "spoil"),
+    [
+        (Kind.JUMP, lambda t, s: t + 5.0 * (s >= s[900])),
+        (Kind.RAMP, lambda t, s: t + 28.0 * ramp(s, 900, 15.0)),
+        (Kind.RAMP, lambda t, s: t + 5.0 * ramp(s, 900, 40.0)),
+        (Kind.STUCK, lambda t, s: np.where(s >= s[900], t[900], t)),
+        (Kind.NO_SIGNAL, lambda t, s: np.where(s >= s[900], 850.0, t)),
+        (Kind.NO_SIGNAL, lambda t, s: np.where(s >= s[900], np.nan, t)),
+    ],
+    ids=["jump", "break", "ramp", "stuck", "open circuit", "silent"],
+)
+def test_a_faulty_sensor_is_named_with_its_onset(sound, kind, spoil):
+    sensor = 2
+    seconds, temperature, load = sound
+    spoilt = temperature.copy()
+    spoilt[:, sensor] = spoil(temperature[:, sensor], seconds)
+    (fault,) = examine_sensors(seconds, spoilt, load)
+    assert (fault.sensor, fault.kind, fault.is_clear) == (sensor, kind, True)
+    # Two standard uncertainties and a block of the coarse grid.
+    assert abs(fault.onset_s - seconds[900]) <= 2.0 * fault.onset_u_s + 180.0
+
+
+def test_a_sensor_that_becomes_noisy_is_named(sound):
+    seconds, temperature, load = sound
+    noisy = temperature.copy()
+    noisy[900:, 4] += np.random.default_rng(5).normal(0.0, 0.6, seconds.size - 900)
+    (fault,) = examine_sensors(seconds, noisy, load)
+    assert (fault.sensor, fault.kind, fault.is_clear) == (4, Kind.NOISE, True)
+    assert abs(fault.onset_s - seconds[900]) <= 3600.0
+
+
+def test_heat_beside_one_sensor_that_spreads_to_others_is_no_clear_fault(sound):
+    seconds, temperature, load = sound
+    source = 15.0 * respond((seconds >= seconds[900]).astype(float)[:, None], seconds, time_constant_s=1200.0)[:, 0]
+    spread = respond(source[:, None], seconds, time_constant_s=3600.0)[:, 0]
+    warmed = temperature.copy()
+    warmed[:, 3] += source
+    warmed[:, [2, 4]] += 0.3 * spread[:, None]
+    assert not any(fault.is_clear for fault in examine_sensors(seconds, warmed, load))
+
+
+def test_a_load_that_is_switched_once_explains_what_a_sensor_does_then(sound):
+    seconds, temperature, _ = sound
+    spoilt = temperature.copy()
+    spoilt[:, 2] += 5.0 * ramp(seconds, 900, 40.0)
+    once = (seconds >= seconds[900]).astype(float)[:, None]
+    (fault,) = examine_sensors(seconds, spoilt, once)
+    assert not fault.is_clear
+    assert fault.reason == "a load was switched then, too rarely to compare"
+
+
+def test_two_sensors_that_jump_together_are_suspected_only(sound):
+    seconds, temperature, load = sound
+    spoilt = temperature.copy()
+    spoilt[900:, [2, 6]] += 5.0
+    faults = examine_sensors(seconds, spoilt, load)
+    assert [(fault.sensor, fault.is_clear) for fault in faults] == [(2, False), (6, False)]
+
+
+def test_two_sensors_that_jump_one_after_the_other_are_both_named(sound):
+    seconds, temperature, load = sound
+    spoilt = temperature.copy()
+    spoilt[500:, 2] += 5.0
+    spoilt[1100:, 6] -= 4.0
+    faults = examine_sensors(seconds, spoilt, load)
+    assert [(fault.sensor, fault.is_clear) for fault in faults] == [(2, True), (6, True)]
+
+
+def test_a_logger_that_stands_still_is_no_fault_of_its_sensors(sound):
+    seconds, temperature, load = sound
+    still = temperature.copy()
+    still[700:740] = still[700]
+    assert [fault for fault in examine_sensors(seconds, still, load) if fault.kind is Kind.STUCK] == []
+
+
+# Changes of a sensor beyond its prediction: grids, residuals, excursions and the time of a ramp.
+
+
+def wandering(n: int = 600, sensors: int = 4, seed: int = 1) -> np.ndarray:
+    """Sensors that follow two sources with gains of their own, and noise."""
+    rng = np.random.default_rng(seed)
+    sources = np.cumsum(rng.normal(0.0, 0.05, (n, 2)), axis=0)
+    return 20.0 + sources @ rng.uniform(0.5, 1.5, (2, sensors)) + rng.normal(0.0, 0.01, (n, sensors))
+
+
+def test_grids_are_fine_only_where_there_are_more_samples_than_blocks():
+    assert [grid.is_fine for grid in lay_grid(np.arange(500.0), wandering(500), None)] == [False]
+    fine, coarse = lay_grid(np.arange(5000.0), wandering(5000), None)
+    assert (fine.seconds.size, fine.step_s) == (5000, 1.0)
+    assert coarse.seconds.size <= 600
+    assert fine.durations() == (1, 2)
+    assert coarse.durations() == (1, 2, 4, 8, 16)
+
+
+def test_a_missing_reading_is_interpolated_and_a_pause_left_out():
+    temperature = wandering(600)
+    temperature[100:103, 0] = np.nan
+    seconds = np.r_[np.arange(300.0), 9000.0 + np.arange(300.0)]
+    (grid,) = lay_grid(seconds, temperature, None)
+    assert grid.seconds.size == 600
+    assert np.isfinite(grid.temperature).all()
+    assert not grid.known[100:103, 0].any()
+    assert grid.known[:, 1].all()
+
+
+@pytest.mark.parametrize(("begin", "end"), [(200, 201), (150, 260)])
+def test_a_ramp_is_timed_within_twice_its_uncertainty(begin, end):
+    seconds = 10.0 * np.arange(400)
+    ramp = 3.0 * np.clip((np.arange(400) - begin) / (end - begin), 0.0, 1.0)
+    fitted = fit_ramp(seconds, ramp + np.random.default_rng(2).normal(0.0, 0.05, 400))
+    assert abs(fitted.begin_s - 10.0 * begin) <= 2.0 * fitted.begin_u_s + 10.0
+    assert fitted.size_K == pytest.approx(3.0, abs=0.1)
+    assert fitted.begin_u_s < 100.0
+
+
+def test_switchings_inside_and_outside_a_time_are_told_apart():
+    load = (np.arange(600) // 100 % 2).astype(float)
+    (grid,) = lay_grid(np.arange(600.0), wandering(), load[:, None])
+    assert grid.switchings(195.0, 205.0) == (True, 4)
+    assert grid.switchings(220.0, 240.0) == (False, 5)
+    (unlogged,) = lay_grid(np.arange(600.0), wandering(), None)
+    assert unlogged.switchings(0.0, 600.0) == (False, 0)

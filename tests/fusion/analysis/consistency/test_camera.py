@@ -1,0 +1,442 @@
+"""Consistency checks of the frames of a series: changed settings, implausible parameters, another range."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import ndimage
+
+from fusion.analysis.consistency import camera as registration
+from fusion.analysis.consistency.camera import (
+    check_frames,
+    check_gaps,
+    check_order,
+    check_phase,
+    check_place,
+    check_registration,
+    find_gaps,
+    gap_words,
+)
+from fusion.analysis.consistency.checks import CODES, Check, Severity
+from tests.fusion.analysis.consistency.twin_fields import recorded
+from thermography.io.flir import FrameReference, index_frames
+from thermography.io.frame import CalibratedRange
+
+STATED = {
+    "emissivity",
+    "reflected_temperature_K",
+    "atmospheric_temperature_K",
+    "relative_humidity",
+    "object_distance_m",
+}
+
+
+@pytest.fixture
+def frames(campaign_folder: Path) -> list[FrameReference]:
+    references, _ = index_frames(sorted((campaign_folder / "thermal").iterdir()))
+    return references[:6]
+
+
+def failed(frames: list[FrameReference], overridden: set[str]) -> dict[str, str]:
+    return {check.code: check.evidence for check in check_frames(frames, overridden=overridden) if not check.passed}
+
+
+def test_a_sound_series_passes(frames: list[FrameReference]) -> None:
+    assert failed(frames, STATED) == {} and failed(frames, set()) == {}
+    assert check_frames([], overridden=set()) == []
+
+
+def with_parameters(frame: FrameReference, **changed: float) -> FrameReference:
+    return replace(frame, parameters=replace(frame.parameters, **changed))
+
+
+def with_camera(frame: FrameReference, **changed: str) -> FrameReference:
+    return replace(frame, camera=replace(frame.camera, **changed))
+
+
+def hot(frame: FrameReference) -> FrameReference:
+    limits = CalibratedRange(573.15, 2273.15, frame.limits.raw_minimum, frame.limits.raw_maximum)
+    return replace(frame, limits=limits)
+
+
+@pytest.mark.parametrize(
+    ("change", "first", "overridden", "expected"),
+    [
+        (
+            lambda frame: with_parameters(frame, emissivity=0.7),
+            3,
+            set(),
+            {"camera_settings": "Parameters differ between the frames: emissivity."},
+        ),
+        (lambda frame: with_parameters(frame, emissivity=0.7), 3, STATED, {}),
+        (hot, 3, STATED, {"camera_settings": "The camera's range changes (2 ranges)."}),
+        (
+            hot,
+            0,
+            STATED,
+            {
+                "camera_range": "Up to 100 % of the pixels of a frame lie outside the range in which the camera is calibrated."
+            },
+        ),
+        (
+            lambda frame: with_camera(frame, lens_model="FOL76"),
+            3,
+            STATED,
+            {"camera_settings": "The frames were taken through 2 lenses."},
+        ),
+        (
+            lambda frame: with_camera(frame, serial="other"),
+            3,
+            STATED,
+            {"camera_settings": "The file holds frames of 2 cameras."},
+        ),
+        (
+            lambda frame: with_parameters(frame, reflected_temperature_K=571.15),
+            0,
+            set(),
+            {"camera_parameters": "Reflected temperature 298 degC: probably K stored as degC."},
+        ),
+        (lambda frame: with_parameters(frame, reflected_temperature_K=571.15), 0, STATED, {}),
+    ],
+)
+def test_what_changes_from_a_frame_on_or_is_implausible_is_doubted_unless_it_is_stated(
+    frames: list[FrameReference],
+    change: Callable[[FrameReference], FrameReference],
+    first: int,
+    overridden: set[str],
+    expected: dict[str, str],
+) -> None:
+    found = failed([*frames[:first], *map(change, frames[first:])], overridden)
+    assert {code: found[code] for code in expected} == expected and bool(found) == bool(expected)
+
+
+def test_a_frozen_camera_contradicts_the_test(frames: list[FrameReference]) -> None:
+    held = [replace(frames[0], time=one.time) for one in frames]
+    (check,) = (check for check in check_frames(held, overridden=STATED) if not check.passed)
+    assert (check.code, check.severity) == ("frozen_camera", Severity.CONTRADICTION)
+    assert "hold the same image, count for count: the camera was frozen" in check.evidence
+    # Two frames may be alike by a copied file.
+    assert failed(held[:2], STATED) == {}
+
+
+# Consistency checks of the camera's stamps: order, rate of its clock, place in the motion of the axis.
+
+
+def phase(seconds_late: float = 0.0, *, gain_s_per_h: float = 0.0, keep: slice = slice(None)) -> dict[str, Check]:
+    test = recorded()
+    true = test.fields["time"].values
+    since = (true - true[0]) / np.timedelta64(1, "s")
+    stamps = true + (1e9 * (seconds_late + gain_s_per_h / 3600.0 * since)).astype("m8[ns]")
+    return {check.code: check for check in check_phase(stamps[keep], test.deviations)}
+
+
+def test_frames_at_the_end_of_each_cycle_pass() -> None:
+    found = phase()
+    assert found["camera_rate"].passed and found["camera_rate"].value == pytest.approx(0.0, abs=0.01)
+    assert found["camera_phase"].passed and found["camera_phase"].value == 0.0
+    assert phase(gain_s_per_h=3.0)["camera_rate"].passed
+
+
+@pytest.mark.parametrize("gain", [60.0, 600.0, -60.0])
+def test_a_clock_that_gains_is_doubted_and_its_rate_said(gain: float) -> None:
+    found = phase(gain_s_per_h=gain)
+    assert not found["camera_rate"].passed
+    # Places are counted in cycles of the camera's own clock: 1/6 of a gain of 600 s/h is of second order.
+    assert found["camera_rate"].value == pytest.approx(gain, rel=0.2)
+
+
+@pytest.mark.parametrize("minutes", [20.0, 60.0, -60.0])
+def test_frames_that_are_stamped_in_the_motion_are_doubted(minutes: float) -> None:
+    found = phase(60.0 * minutes)
+    assert found["camera_rate"].passed
+    assert not found["camera_phase"].passed and found["camera_phase"].value > 0.9
+    assert "clock_offset" in found["camera_phase"].remedy
+
+
+def test_missing_frames_change_nothing() -> None:
+    found = phase(keep=slice(0, 40))
+    assert found["camera_rate"].passed and found["camera_phase"].passed
+    assert not phase(gain_s_per_h=60.0, keep=slice(0, 40))["camera_rate"].passed
+
+
+@pytest.mark.parametrize("interval_s", [10.0, 60.0, 190.0, 400.0])
+def test_a_camera_on_its_own_timer_tells_nothing(interval_s: float) -> None:
+    test = recorded()
+    first, last = test.fields["time"].values[[0, -1]]
+    stamps = np.arange(first, last, np.timedelta64(round(interval_s), "s"))
+    found = check_phase(stamps, test.deviations)
+    assert [check.passed for check in found] == [True, True]
+    assert all("cannot be tested" in check.evidence for check in found)
+
+
+def test_few_cycles_tell_nothing() -> None:
+    test = recorded()
+    short = test.deviations.isel(cycle=slice(0, 8))
+    assert all(check.passed for check in check_phase(test.fields["time"].values[:8], short))
+    no_times = test.deviations.assign(time=xr.full_like(test.deviations["time"], np.datetime64("NaT")))
+    assert all(check.passed for check in check_phase(test.fields["time"].values, no_times))
+
+
+def test_a_clock_that_was_set_back_is_doubted(frames: list[FrameReference]) -> None:
+    (sound,) = check_order(frames)
+    assert sound.passed
+    back = [*frames[:3], *(replace(frame, time=frame.time - np.timedelta64(1, "h")) for frame in frames[3:])]
+    (found,) = check_order(sorted(back, key=lambda frame: frame.time))
+    assert not found.passed and found.value == 1.0
+    assert "IR_0004.jpg is 3420 s before IR_0003.jpg" in found.evidence
+    assert check_order([]) == []
+
+
+def test_a_counter_that_starts_anew_is_no_clock_set_back(frames: list[FrameReference]) -> None:
+    folder = frames[0].path.parent
+    names = ("IR_9998.jpg", "IR_9999.jpg", "IR_0001.jpg", "IR_0002.jpg")
+    renamed = [replace(frame, path=folder / name) for frame, name in zip(frames, names, strict=False)]
+    assert check_order(renamed)[0].passed
+
+
+def test_frames_of_one_file_go_by_their_index(frames: list[FrameReference]) -> None:
+    sequence = [replace(frame, path=Path("a.seq"), index=k) for k, frame in enumerate(frames)]
+    assert check_order(sequence)[0].passed
+    swapped = [replace(sequence[0], index=1), replace(sequence[1], index=0), *sequence[2:]]
+    assert not check_order(swapped)[0].passed
+
+
+def numbered(seconds: np.ndarray, like: FrameReference) -> list[FrameReference]:
+    """Frames of consecutively numbered files with these times."""
+    start = np.datetime64("2026-03-09T06:30:00", "ms")
+    return [
+        replace(
+            like,
+            path=Path(f"/test/IR_{number:04d}.jpg"),
+            index=0,
+            time=start + np.timedelta64(round(1e3 * second), "ms"),
+        )
+        for number, second in enumerate(seconds)
+    ]
+
+
+def test_renamed_files_are_no_fault_of_the_clock(campaign_folder: Path) -> None:
+    like = index_frames(sorted((campaign_folder / "thermal").iterdir())[:1])[0][0]
+    seconds = 252.0 * np.arange(40)
+    shuffled = np.random.default_rng(3).permutation(seconds)
+    two_exchanged = seconds.copy()
+    two_exchanged[[7, 32]] = seconds[[32, 7]]
+    for renamed in (shuffled, two_exchanged):
+        (check,) = check_order(numbered(renamed, like))
+        assert check.passed and "the times were taken" in check.evidence
+    set_back = seconds - np.where(np.arange(40) >= 20, 600.0, 0.0)
+    other_year = seconds - np.where(np.arange(40) >= 20, 25 * 365 * 86400.0, 0.0)
+    for wrong in (set_back, other_year, seconds - np.where(np.arange(40) >= 20, 504.0, 0.0)):
+        (check,) = check_order(numbered(wrong, like))
+        assert not check.passed and "goes backwards 1 times" in check.evidence
+
+
+# What the frames show over the series: stretches without a check of the place, frames left out or repeated, parts that jump.
+
+
+START = np.datetime64("2026-03-09T06:30", "ns")
+FRAMES, ROWS, COLUMNS = 40, 9, 35
+
+
+def fields(change_K: np.ndarray | None = None, **remarks: list) -> xr.Dataset:
+    """A table that warms smoothly by 5 K at one end, with a source that is switched at frame 15, and 20 mK of noise."""
+    rng = np.random.default_rng(4)
+    minutes = 4.2 * np.arange(FRAMES)
+    place = np.linspace(0.0, 1.0, COLUMNS)
+    warm = 5.0 * (1.0 - np.exp(-minutes / 60.0))[:, None, None] * place
+    late = np.maximum(minutes - 63.0, 0.0)[:, None, None] / 60.0 * np.exp(-(((place - 0.3) / 0.1) ** 2))
+    stack = 23.0 + warm + late + rng.normal(0.0, 0.02, (FRAMES, ROWS, COLUMNS))
+    lists = ("knocks", "unchecked_stretches", "frames_damaged", "frames_obstructed", "frames_shaken", "frames_repeated")
+    attrs: dict[str, list] = {name: [] for name in lists}
+    return xr.Dataset(
+        {
+            "frame_temperature": (("time", "y", "x"), stack if change_K is None else stack + change_K),
+            "frame_count": ("time", np.ones(FRAMES, int)),
+        },
+        coords={
+            "time": START + np.round(60e9 * minutes).astype("m8[ns]"),
+            "y": 20.0 * np.arange(ROWS),
+            "x": 20.0 * np.arange(COLUMNS),
+        },
+        attrs={name: json.dumps(value) for name, value in (attrs | remarks).items()},
+    )
+
+
+def doubted_places(dataset: xr.Dataset) -> dict[str, Check]:
+    return {check.code: check for check in check_place(dataset) if not check.passed}
+
+
+def test_a_sound_place_passes() -> None:
+    assert doubted_places(fields()) == {}
+    assert len(check_place(fields())) == 4
+    assert check_place(fields().drop_attrs()) == []
+
+
+def test_a_common_step_of_the_camera_is_no_jump_of_a_part() -> None:
+    step = np.where(np.arange(FRAMES) < 20, 0.0, 0.8)[:, None, None]
+    assert doubted_places(fields(step)) == {}
+
+
+def test_a_reflection_on_a_part_of_the_table_is_doubted_with_place_size_and_time() -> None:
+    lit = np.zeros((FRAMES, ROWS, COLUMNS))
+    lit[18:28, 2:6, 10:16] = 1.0
+    check = doubted_places(fields(lit))["scene_change"]
+    assert check.value == pytest.approx(24 / (ROWS * COLUMNS), abs=0.01)
+    assert "around x = 250 mm, y = 70 mm jumps by +1.0 K" in check.evidence
+    assert "at 2026-03-09T07:45:36Z: a reflection, an object on the table or a blurred view" in check.evidence
+    assert check.evidence.endswith("(2 jumps in all).")
+
+
+def test_a_long_stretch_without_a_check_is_doubted_and_named() -> None:
+    stretch = {"first": "a.jpg#0", "last": "b.jpg#0", "frames": 8}
+    check = doubted_places(fields(unchecked_stretches=[stretch]))["camera_place"]
+    assert check.value == pytest.approx(0.2) and "a.jpg#0 to b.jpg#0 (8 frames)" in check.evidence
+    assert doubted_places(fields(unchecked_stretches=[stretch | {"frames": 2}])) == {}
+
+
+def test_many_frames_left_out_or_repeated_are_doubted() -> None:
+    names = [f"{i}.jpg#0" for i in range(30)]
+    left_out = doubted_places(fields(frames_obstructed=names[:20], frames_shaken=names[20:22]))["frames_left_out"]
+    assert left_out.evidence.startswith(
+        "35 % of 62 frames were left out: 20 with something before the table, 2 displaced alone"
+    )
+    repeated = doubted_places(fields(frames_repeated=names[:10]))["frames_repeated"]
+    assert (
+        repeated.evidence
+        == "10 of 40 frames hold the image of the frame before, 0.jpg#0 to 9.jpg#0: the camera was frozen."
+    )
+
+
+def moving(across_mm: np.ndarray, **remarks: list) -> xr.Dataset:
+    """A table that moves, located in every frame to 0.03 mm."""
+    rng = np.random.default_rng(5)
+    across = across_mm + rng.normal(0.0, 0.03, len(across_mm))
+    base = fields(**remarks).drop_vars("frame_temperature")
+    times = START + 10 * np.arange(len(across)) * np.timedelta64(1, "s")
+    return base.assign(table_across=("frame_time", across)).assign_coords(frame_time=times)
+
+
+def test_a_moving_table_is_not_displaced_across_its_axis_nor_lost() -> None:
+    straight = 0.02 * np.sin(np.arange(200) / 7.0)
+    assert doubted_places(moving(straight)) == {}
+    knocked = doubted_places(moving(straight + 0.6 * (np.arange(200) >= 120)))
+    assert set(knocked) == {"camera_place"}
+    assert (
+        "by +0.6" in knocked["camera_place"].evidence
+        and "from 2026-03-09T06:50:00Z on" in knocked["camera_place"].evidence
+    )
+    lost = doubted_places(moving(straight, frames_unplaced=[f"a.seq#{i}" for i in range(60)]))
+    assert "60 in which the moving table is not located" in lost["frames_left_out"].evidence
+    assert doubted_places(moving(straight[:4])) == {}
+
+
+def test_readings_in_a_gap_between_frames_are_counted() -> None:
+    dataset = fields()
+    readings = xr.DataArray(dataset["time"].values[:, None] + np.array([30, 60], "m8[s]"), dims=("cycle", "target"))
+    (sound,) = check_gaps(dataset["time"].values, readings)
+    assert sound.passed and sound.value == 0.0
+    kept = np.delete(dataset["time"].values, np.arange(14, 23))
+    (check,) = check_gaps(kept, readings)
+    # Nine frames are missing, so that ten intervals of 4.2 min lie between the frames about them.
+    assert not check.passed and check.value == 0.25
+    assert "42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z" in check.evidence
+    assert [gap_words(gap) for gap in find_gaps(kept)] == ["42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z"]
+    assert check_gaps(np.delete(kept, np.arange(1, len(kept))), readings)[0].passed
+
+
+def test_a_long_series_is_checked_piece_by_piece_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    lit = np.zeros((FRAMES, ROWS, COLUMNS))
+    lit[18:28, 2:6, 10:16] = 1.0
+    lit[:, 0, :3] = np.nan
+    at_once = [check_place(fields(change_K)) for change_K in (None, lit)]
+    monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 7 * 8 * ROWS * COLUMNS)
+    assert [check_place(fields(change_K)) for change_K in (None, lit)] == at_once
+
+
+# What a registration leaves to doubt.
+
+
+SOUND = {
+    "leave_one_out_mm": {f"F{i}": 0.02 for i in range(1, 13)},
+    "fiducials_listed": 12,
+    "unchecked": [],
+    "contradicted_hints": [],
+    "mirrored": False,
+    "span": 0.66,
+    "area_ratio": 1.004,
+}
+
+
+def doubts(**changed):
+    checks = check_registration({**SOUND, **changed}, file="fiducials.csv")
+    assert all(check.code in CODES for check in checks)
+    assert all(bool(check.remedy) != check.passed for check in checks)
+    return [(check.code, check.evidence) for check in checks if not check.passed]
+
+
+def test_a_sound_registration_is_not_doubted():
+    assert doubts() == []
+    assert doubts(area_ratio=None) == []
+    assert doubts(contradicted_hints=["F1", "F2"], leave_one_out_mm={f"F{i}": 0.0 for i in range(6)}) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "code", "evidence"),
+    [
+        (
+            {"leave_one_out_mm": dict.fromkeys("ABCDE", 0.1)},
+            "fiducials_found",
+            "5 of the 12 fiducials of fiducials.csv",
+        ),
+        ({"unchecked": ["F1", "F3"]}, "fiducials_unchecked", "If F1, F3 were elsewhere than fiducials.csv says"),
+        ({"contradicted_hints": list("ABCDEFG")}, "fiducial_hints", "7 of 12 fiducials lie more than 25 px"),
+        ({"area_ratio": 1.06}, "fiducial_diameters", "1.060 times the area that diameter_mm of fiducials.csv says"),
+        ({"span": 0.24}, "fiducials_span", "The fiducials in use span 24 % of the plan"),
+        ({"mirrored": True}, "plan_mirrored", "appears mirrored"),
+    ],
+)
+def test_each_doubt_is_named(changed, code, evidence):
+    ((named, text),) = doubts(**changed)
+    assert named == code
+    assert evidence in text
+
+
+def shifts(monkeypatch, *pictures):
+    """The check of pictures of temperatures, degC."""
+    monkeypatch.setattr(registration, "calibrate", lambda counts, parameters: counts)
+    frames = [SimpleNamespace(read_counts=lambda picture=picture: picture, parameters=None) for picture in pictures]
+    (check,) = registration.check_picture(frames)
+    return check
+
+
+def test_a_picture_that_stays_is_no_doubt_and_one_that_moves_is(monkeypatch):
+    rng = np.random.default_rng(5)
+    scene = 20.0 + 5.0 * ndimage.gaussian_filter(rng.normal(size=(96, 128)), 3.0)
+    still = [scene + rng.normal(scale=0.02, size=scene.shape) for _ in range(4)]
+    assert shifts(monkeypatch, *still).passed
+    moved = shifts(monkeypatch, *still, np.roll(scene, (3, 4), axis=(0, 1)))
+    # A shift of 5 px; the content that comes in at the edge costs a tenth of it.
+    assert not moved.passed and moved.value == pytest.approx(5.0, abs=0.5)
+    other = shifts(monkeypatch, scene, rng.normal(20.0, 1.0, scene.shape))
+    assert not other.passed and "none of them correlates with it" in other.evidence
+
+
+def test_discs_in_rows_are_not_taken_for_a_shift_by_a_row(monkeypatch):
+    row, column = np.mgrid[:120, :160]
+    scene = np.full((120, 160), 22.0)
+    for y in (15, 100):
+        for x in (20, 140):
+            scene[(row - y) ** 2 + (column - x) ** 2 < 16] -= 3.0
+    # What warms between the discs is unlike the first picture; a shift by 85 px would leave a third of it, with one row on the other.
+    warm = 4.0 * np.exp(-((column - 80) ** 2 + (row - 60) ** 2) / 800.0)
+    rng = np.random.default_rng(5)
+    pictures = [scene + share * warm + rng.normal(scale=0.05, size=scene.shape) for share in np.linspace(0.0, 1.0, 8)]
+    check = shifts(monkeypatch, *pictures)
+    assert check.passed and check.value < 1.0

@@ -1,0 +1,268 @@
+"""Consistency checks of the logs: a log of another day, a log that ends early, a log with a long gap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.analysis.consistency.checks import Check, Severity
+from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.analysis.consistency.logs import (
+    check_contact_sensors,
+    check_log,
+    check_material,
+    check_sensors,
+    compare_sensors,
+)
+from tests.fusion.analysis.consistency.twin_fields import SENSOR_MM, recorded, scaled
+
+START = np.datetime64("2026-03-09T06:30", "ns")
+READINGS = START + np.arange(0, 4 * 3600, 8).astype("m8[s]")
+
+
+def log(first_s: float, last_s: float, step_s: float = 60.0) -> xr.Dataset:
+    seconds = np.arange(first_s, last_s + 1.0, step_s)
+    return xr.Dataset(coords={"time": START + (seconds * 1e9).astype("m8[ns]")})
+
+
+def check(dataset: xr.Dataset) -> Check:
+    (only,) = check_log(dataset, READINGS, name="drivers", file="drivers.csv")
+    return only
+
+
+def test_a_log_of_another_day_is_a_contradiction() -> None:
+    found = check(log(86400.0, 86400.0 + 4 * 3600.0))
+    assert found.severity is Severity.CONTRADICTION and found.value == 0.0
+    assert found.evidence.startswith(
+        "drivers.csv (2026-03-10T06:30:00Z to 2026-03-10T10:30:00Z) covers 0 % of the readings"
+    )
+    assert "Check the date, the clock and the time zone of drivers.csv" in found.remedy
+
+
+@pytest.mark.parametrize(("last_s", "share"), [(4 * 3600.0, 1.0), (2 * 3600.0, 0.5), (3600.0, 0.25)])
+def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
+    found = check(log(-60.0, last_s))
+    assert found.passed is (share == 1.0) and found.severity is Severity.DOUBT
+    # One reading more or less at the end.
+    assert found.value == pytest.approx(share, abs=0.002)
+
+
+@pytest.mark.parametrize(("late_s", "words"), [(10_800.0, "3 h late"), (-9000.0, "2.5 h early")])
+def test_a_log_of_another_time_zone_is_a_contradiction_that_names_the_shift(late_s: float, words: str) -> None:
+    found = check(log(late_s, late_s + 4 * 3600.0))
+    assert found.severity is Severity.CONTRADICTION and found.value < 0.6
+    assert f"nearly all of them if its clock is {words}." in found.evidence and "time_zone" in found.remedy
+
+
+def test_a_log_that_may_have_been_started_late_is_only_doubted() -> None:
+    # Half of the test is covered, and after a shift all of it; but this log goes on for hours after the test.
+    found = check(log(7200.0, 10 * 3600.0))
+    assert found.severity is Severity.DOUBT and "2 h late" in found.evidence
+    # An hour late: three quarters are covered, the shift is named.
+    assert "if its clock is 1 h late" in check(log(3600.0, 5 * 3600.0)).evidence
+
+
+def test_a_log_with_a_long_gap_is_doubted() -> None:
+    whole = log(0.0, 4 * 3600.0)
+    holed = whole.sel(
+        time=(whole["time"] < START + np.timedelta64(3600, "s")) | (whole["time"] > START + np.timedelta64(7200, "s"))
+    )
+    found = check(holed)
+    assert found.value == pytest.approx(0.75, abs=0.01)
+    # Its clock is right, so that nobody is sent to look at it.
+    assert found.evidence.endswith("; the others fall into gaps of the log.")
+    assert found.remedy.startswith("Log without a break") and "clock" not in found.remedy
+
+
+def test_what_was_not_logged_is_not_checked() -> None:
+    assert check_log(None, READINGS, name="drivers", file="") == []
+    nothing = np.full(3, np.datetime64("NaT"))
+    assert check_log(log(0.0, 60.0), nothing, name="drivers", file="") == []
+
+
+def environment(jump_K: float = 0.0) -> xr.Dataset:
+    """Five hours of air and material temperature once a minute, of which the material jumps after three."""
+    rng = np.random.default_rng(8)
+    course = 22.0 + np.cumsum(rng.normal(0.0, 0.01, 300))
+    columns = {"air_temperature": course, "material_temperature": course + jump_K * (np.arange(300) >= 180)}
+    time = START + np.arange(300) * np.timedelta64(60, "s")
+    noisy = {name: ("time", np.round(one + rng.normal(0.0, 0.01, 300), 2)) for name, one in columns.items()}
+    return xr.Dataset(noisy, coords={"time": time})
+
+
+def drivers(jump_K: float) -> xr.Dataset:
+    """A load and the temperature of a screw nut, logged with the environment."""
+    logged = environment(jump_K)
+    load = (np.arange(300) // 20 % 2).astype(float)
+    nut = logged["material_temperature"].values
+    return xr.Dataset(
+        {"speed": ("time", load, {"units": "1/min"}), "nut": ("time", nut, {"units": "degC"})},
+        coords={"time": logged["time"]},
+    )
+
+
+def test_a_contact_sensor_that_jumps_alone_is_doubted_by_name() -> None:
+    (sound,) = check_contact_sensors(environment(), drivers(0.0), file="environment.csv")
+    assert (sound.code, sound.passed, sound.value) == ("contact_sensors", True, 0.0)
+    (doubted,) = check_contact_sensors(environment(2.0), None, file="environment.csv")
+    assert not doubted.passed
+    assert doubted.evidence.startswith("environment.csv: material temperature jumps by 2 K from 2.9")
+    assert check_contact_sensors(None, None, file="environment.csv") == []
+
+
+def test_a_temperature_among_the_drivers_is_examined_and_its_load_is_not() -> None:
+    (doubted,) = check_contact_sensors(environment(), drivers(3.0), file="environment.csv")
+    assert doubted.evidence.startswith("environment.csv: nut jumps by 3 K from 2.9")
+
+
+# Contact sensors on the table: sound by themselves, and as warm as the camera sees their places.
+
+
+MINUTES = START + 60 * np.arange(120) * np.timedelta64(1, "s")
+WARMING = 4.0 * (1.0 - np.exp(-np.arange(120) / 40.0))
+
+
+def logged(*shares: float, seed: int = 3) -> xr.DataArray:
+    """Sensors that show a share of the warming each, with 0.02 K of noise."""
+    noise = np.random.default_rng(seed).normal(0.0, 0.02, (120, len(shares)))
+    values = 20.0 + WARMING[:, None] * np.array(shares) + noise
+    return xr.DataArray(
+        values, {"time": MINUTES, "sensor": [f"t{k + 1}" for k in range(len(shares))]}, ("time", "sensor")
+    )
+
+
+def fields() -> xr.Dataset:
+    """A plan of 5 x 9 cells of 20 mm that warms alike everywhere."""
+    frames = np.broadcast_to(20.0 + WARMING[:, None, None], (120, 5, 9))
+    plan = {"time": MINUTES, "y": 10.0 + 20.0 * np.arange(5), "x": 10.0 + 20.0 * np.arange(9)}
+    rise_u = (("cycle", "y", "x"), np.full((2, 5, 9), 0.05))
+    return xr.Dataset({"frame_temperature": (("time", "y", "x"), frames), "temperature_rise_u": rise_u}, plan)
+
+
+def test_sound_sensors_pass_and_one_that_breaks_is_named() -> None:
+    sound = logged(1.0, 0.8, 0.6, 0.9)
+    assert check_sensors(sound, file="t.csv")[0].passed
+    broken = sound.copy(deep=True)
+    broken.values[60:, 2] += 15.0
+    (check,) = check_sensors(broken, file="t.csv")
+    assert not check.passed and "t3" in check.evidence
+    (check,) = check_sensors(sound, file="t.csv", left_out=["t5 jumps by 15 K"])
+    assert (
+        check.passed and check.evidence.startswith("No other contact sensor") and "left out: t5 jumps" in check.evidence
+    )
+
+
+def test_a_camera_that_reads_the_rise_too_small_is_doubted() -> None:
+    x, y = np.array([30.0, 130.0]), np.array([30.0, 70.0])
+    (agreeing,) = compare_sensors(fields(), logged(1.0, 1.0), x, y, u_K=0.1)
+    assert agreeing.passed and "2 sensors compared" in agreeing.evidence
+    (doubted,) = compare_sensors(fields(), logged(1.0, 1.4), x, y, u_K=0.1)
+    assert not doubted.passed and doubted.evidence.startswith("At t2 the camera shows a rise of ")
+
+
+def test_sensors_of_another_time_are_not_compared() -> None:
+    late = logged(1.0).assign_coords(time=MINUTES + np.timedelta64(1, "D"))
+    assert compare_sensors(fields(), late, np.array([30.0]), np.array([30.0]), u_K=0.1) == []
+
+
+# Consistency checks of camera and environment log: an emissivity is a slope, a reflection an offset; logs of another course.
+
+
+def checks(factor: float = 1.0, *, seed: int = 5, offset_K: float = 0.0, stated: bool = True) -> dict[str, Check]:
+    test = recorded(seed)
+    fields = scaled(test.fields, factor)
+    fields["frame_temperature"] = fields["frame_temperature"] + offset_K
+    return of_log(test.environment, fields, stated=stated)
+
+
+def of_log(environment: xr.Dataset, fields: xr.Dataset, *, stated: bool) -> dict[str, Check]:
+    near = field_at(fields, SENSOR_MM) if stated else thin_fields(fields)
+    found = check_material(near, environment, stated=stated, file="environment.csv")
+    return {check.code: check for check in found}
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_sound_camera_passes(stated: bool) -> None:
+    found = checks(stated=stated)
+    assert found["material_rise"].passed and found["material_level"].passed
+    assert found["material_rise"].value == pytest.approx(0.0, abs=0.02)
+
+
+# The rise grows nearly as the reciprocal of the emissivity: 0.97 over 0.90, over 0.50, and over 1.0.
+@pytest.mark.parametrize("factor", [1.078, 1.94, 0.85])
+def test_a_wrong_emissivity_is_doubted(factor: float) -> None:
+    found = checks(factor)
+    assert not found["material_rise"].passed
+    assert found["material_rise"].value == pytest.approx(factor - 1.0, abs=0.03)
+    assert "emissivity" in found["material_rise"].remedy
+
+
+def test_pictures_in_reverse_order_run_against_the_log() -> None:
+    test = recorded()
+    reverse = test.fields.copy(deep=True)
+    reverse["frame_temperature"] = reverse["frame_temperature"].copy(data=reverse["frame_temperature"].values[::-1])
+    course = of_log(test.environment, reverse, stated=False)["material_course"]
+    assert not course.passed and course.value > 0.9
+    assert "Check the order, the times and the day of the frames and of the rows of environment.csv" in course.remedy
+    assert checks(stated=False)["material_course"].passed
+
+
+def with_material(environment: xr.Dataset, values: np.ndarray) -> xr.Dataset:
+    return environment.assign(material_temperature=environment["material_temperature"].copy(data=values))
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_log_backwards_or_of_another_hour_is_not_followed(stated: bool) -> None:
+    test = recorded()
+    material = test.environment["material_temperature"].values
+    for values in (material[::-1], np.roll(material, -material.size // 3)):
+        course = of_log(with_material(test.environment, values), test.fields, stated=stated)["material_course"]
+        assert not course.passed and course.evidence.startswith(
+            "The material temperature in environment.csv changes by"
+        )
+
+
+def test_a_sensor_that_stands_still_is_doubted_where_the_table_warms() -> None:
+    test = recorded()
+    still = with_material(test.environment, np.full(test.environment.sizes["time"], 25.13))
+    found = of_log(still, test.fields, stated=True)
+    assert [code for code, check in found.items() if not check.passed] == ["material_still"]
+    assert "stays at 25.13 degC to the last digit" in found["material_still"].evidence
+    early = test.fields.isel(time=slice(0, 14))
+    assert of_log(still, early, stated=True)["material_still"].evidence.endswith("cannot be tested.")
+
+
+def test_exchanged_columns_are_named() -> None:
+    test = recorded()
+    log = test.environment
+    air, material = log["air_temperature"].values, log["material_temperature"].values
+    exchanged = with_material(log.assign(air_temperature=log["air_temperature"].copy(data=material)), air)
+    found = of_log(exchanged, test.fields, stated=True)
+    assert not found["environment_columns"].passed and "look exchanged" in found["environment_columns"].evidence
+    # What the exchange explains names it before it blames the camera.
+    others = [check for code, check in found.items() if not check.passed and code != "environment_columns"]
+    assert all(check.remedy.startswith("See environment_columns first") for check in others)
+    assert checks()["environment_columns"].passed
+
+
+def test_a_reflection_changes_the_level_and_not_the_rise() -> None:
+    found = checks(offset_K=-22.0)
+    assert found["material_rise"].passed and not found["material_level"].passed
+    assert "reflected_temperature" in found["material_level"].remedy
+    assert found["material_level"].value < -15.0
+
+
+def test_a_small_change_tells_nothing() -> None:
+    test = recorded()
+    short = test.fields.isel(time=slice(0, 12))
+    found = of_log(test.environment, scaled(short, 1.9), stated=False)
+    assert found["material_rise"].passed and "cannot be tested" in found["material_rise"].evidence
+
+
+def test_without_a_log_or_a_field_there_is_no_check() -> None:
+    test = recorded()
+    assert check_material(None, test.environment, stated=False, file="") == []
+    assert check_material(thin_fields(test.fields), None, stated=False, file="") == []
+    assert of_log(test.environment.drop_vars("material_temperature"), test.fields, stated=False) == {}
+    assert "environment_columns" not in of_log(test.environment.drop_vars("air_temperature"), test.fields, stated=False)

@@ -1,0 +1,259 @@
+"""Consistency checks of the readings: each lie is named, sound readings pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.analysis.consistency.checks import Check, Severity
+from fusion.analysis.consistency.readings import (
+    _equal_shares,
+    check_readings,
+    check_signs,
+    find_gross_readings,
+    random_part_um,
+)
+from interferometry.deviations import build_deviations
+
+CYCLES, TARGETS = 40, 12
+PLAN_MM = 700.0
+
+
+def sound(seed: int = 5, *, noise_um: float = 0.4, reversal_um: float = 1.2) -> xr.Dataset:
+    """A test of 12 targets over 330 mm with a drift of 5 um and a reversal error."""
+    rng = np.random.default_rng(seed)
+    position = 30.0 * np.arange(TARGETS)
+    profile = np.cumsum(rng.normal(0.0, 0.8, TARGETS))
+    drift = 5.0 * (1.0 - np.exp(-np.arange(CYCLES) / 15.0))
+    sign = np.array([0.5, -0.5])
+    deviation = (
+        profile
+        + drift[:, None, None] * (0.3 + position / 330.0)
+        + reversal_um * sign[:, None]
+        + noise_um * rng.standard_normal((CYCLES, 2, TARGETS))
+    )
+    order = np.concatenate([np.arange(TARGETS), TARGETS + np.arange(TARGETS)[::-1]]).reshape(2, TARGETS)
+    time = np.datetime64("2026-03-09T06:30") + (250 * np.arange(CYCLES)[:, None, None] + 8 * order).astype("m8[s]")
+    return build_deviations(range(1, CYCLES + 1), range(1, TARGETS + 1), position, deviation, time)
+
+
+def failed(deviations: xr.Dataset) -> dict[str, Check]:
+    return {check.code: check for check in check_readings(deviations, plan_extent_mm=PLAN_MM) if not check.passed}
+
+
+def with_deviation(test: xr.Dataset, values: np.ndarray) -> xr.Dataset:
+    return test.assign(deviation=test["deviation"].copy(data=values))
+
+
+def test_the_random_part_is_that_of_the_noise() -> None:
+    # 38 x 24 second differences, two of three independent: 3 % standard error; four of them allowed.
+    assert random_part_um(sound()["deviation"].values) == pytest.approx(0.4, rel=0.12)
+    assert np.isnan(random_part_um(np.zeros((2, 2, 3))))
+
+
+def test_deviations_in_nanometres_are_a_contradiction() -> None:
+    test = sound()
+    check = failed(with_deviation(test, 1000.0 * test["deviation"].values))["deviation_magnitude"]
+    assert check.severity is Severity.CONTRADICTION
+    assert check.remedy == "Check the units: deviations are read as µm and positions as mm."
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "code"),
+    [("deviation", 1e-3, "deviation_unit"), ("position", 1e-3, "travel"), ("position", 1.0 / 25.4, "travel")],
+)
+def test_deviations_in_mm_and_positions_in_metres_or_inches_are_doubted(name: str, factor: float, code: str) -> None:
+    test = sound()
+    named = failed(test.assign({name: test[name].copy(data=factor * test[name].values)}))
+    assert code in named and "look like" in named[code].remedy
+
+
+def test_a_cycle_that_was_copied_is_named() -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[20] = values[19]
+    named = failed(with_deviation(test, values))
+    assert set(named) == {"copied_cycles"}
+    assert named["copied_cycles"].evidence == "Cycles 20 and 21 agree digit for digit."
+
+
+def test_coarse_rounding_is_no_copy() -> None:
+    test = sound(noise_um=0.1)
+    assert "copied_cycles" not in failed(with_deviation(test, np.round(test["deviation"].values)))
+
+
+@pytest.mark.parametrize("first", [8, 20, 33])
+def test_exchanged_labels_of_approach_are_named_with_their_cycle(first: int) -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[first:] = values[first:, ::-1]
+    check = failed(with_deviation(test, values))["approach_labels"]
+    assert f"From cycle {first + 1} on" in check.evidence
+
+
+def test_a_reversal_that_drifts_or_steps_to_another_size_is_no_exchange() -> None:
+    test = sound()
+    sign = np.array([0.5, -0.5])[None, :, None]
+    ramp = np.linspace(0.0, -2.4, CYCLES)[:, None, None] * sign
+    step = np.where(np.arange(CYCLES) >= 20, -3.0, 0.0)[:, None, None] * sign
+    for change in (ramp, step):
+        assert "approach_labels" not in failed(with_deviation(test, test["deviation"].values + change))
+
+
+def test_one_approach_alone_and_missing_readings_pass() -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[:, 1] = np.nan
+    values[3, 0, 4] = np.nan
+    assert failed(with_deviation(test, values)) == {}
+
+
+def test_only_what_lies_far_beyond_the_scatter_of_its_own_position_is_an_error_of_reading() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.standard_normal((200, 2, 3))
+    values[:, :, 2] *= 4.0
+    values[5, 0, 0], values[6, 1, 2], values[7, 1, 1], values[8, 0, 1] = 11.5, 30.0, np.inf, np.nan
+    found = find_gross_readings(xr.DataArray(values, dims=("cycle", "direction", "target")))
+    # 30 standard deviations of an ordinary reading are 7.5 of that position.
+    assert np.argwhere(found.values).tolist() == [[5, 0, 0], [7, 1, 1]]
+
+
+@pytest.mark.parametrize(("first", "size_um"), [(4, -20.0), (20, 500.0), (37, -20.0)])
+def test_a_new_datum_is_named_with_its_cycle_and_size(first: int, size_um: float) -> None:
+    deviations = sound()
+    deviations["deviation"][first:] += size_um
+    check = failed(deviations)["datum"]
+    assert check.evidence.startswith(f"From cycle {first + 1} on all targets read {np.sign(size_um):+.0f}"[:-1])
+    assert "two campaigns" in check.remedy and "clamping" in check.remedy
+
+
+def test_cycles_that_have_no_site_in_common_tell_no_jump() -> None:
+    """Two cycles of one half of the targets, two of the other; then one cycle with all, and nothing has jumped either."""
+    deviations = sound()
+    half = (np.arange(CYCLES) // 2 % 2)[:, None] == (np.arange(TARGETS) < TARGETS // 2)
+    for whole in ([], [20]):
+        half[whole] = True
+        values = np.where(half[:, None, :], deviations["deviation"].values, np.nan)
+        assert "datum" not in failed(with_deviation(deviations, values))
+
+
+def test_a_jump_of_some_targets_or_a_small_slip_is_no_new_datum() -> None:
+    some, small = sound(), sound()
+    some["deviation"][20:, :, 6:] += 20.0
+    small["deviation"][20:] += 3.0
+    assert not failed(some) and not failed(small)
+
+
+def test_a_laser_that_is_zeroed_in_every_cycle_is_named() -> None:
+    deviations = sound()
+    zeroed = deviations["deviation"] - deviations["deviation"].isel(direction=0, target=0, drop=True)
+    check = failed(deviations.assign(deviation=zeroed))["zeroed_cycles"]
+    assert "Target 1 in positive approach" in check.evidence
+    # Coarse digits make every reading repeat; that says nothing of the zero.
+    coarse = deviations["deviation"].copy(data=10.0 * np.round(deviations["deviation"].values / 10.0))
+    assert "zeroed_cycles" not in failed(deviations.assign(deviation=coarse))
+
+
+def test_shares_of_equal_readings_are_those_of_every_pair_of_cycles(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.round(rng.normal(size=(30, 6)), 1)
+    values[rng.random(values.shape) < 0.2] = np.nan
+    values[4] = np.nan
+    monkeypatch.setattr("fusion.analysis.consistency.readings._CYCLES_AT_ONCE", 7)
+    told = np.vstack([shares for _, shares in _equal_shares(values)])
+    both = (np.isfinite(values)[:, None] & np.isfinite(values)).sum(axis=2)
+    expected = (values[:, None] == values).sum(axis=2) / np.maximum(both, 1)
+    np.testing.assert_allclose(told, expected, rtol=1e-12)
+    assert [start for start, _ in _equal_shares(values)] == [0, 7, 14, 21, 28]
+
+
+def test_without_any_reading_there_is_nothing_to_check() -> None:
+    values = np.full((4, 2, 4), np.nan)
+    ((start, shares),) = _equal_shares(values.reshape(4, -1))
+    assert start == 0 and not shares.any() and shares.shape == (4, 4)
+    assert np.isnan(random_part_um(values))
+    test = sound()
+    assert (
+        check_readings(with_deviation(test, np.full_like(test["deviation"].values, np.nan)), plan_extent_mm=PLAN_MM)
+        == []
+    )
+
+
+# Order and sign of the readings: exchanged labels and inverted signs are named, sound readings and step cycles pass.
+
+
+def failed_signs(deviations: xr.Dataset) -> dict[str, Check]:
+    return {check.code: check for check in check_signs(deviations) if not check.passed}
+
+
+def sloped(seed: int = 5) -> xr.Dataset:
+    """Sound readings of an axis with a pitch error, which gives them a shape that has a sign."""
+    test = sound(seed)
+    return with_deviation(test, test["deviation"].values + 0.8 * np.arange(TARGETS))
+
+
+def inverted(place: tuple) -> xr.Dataset:
+    test = sloped()
+    values = test["deviation"].values.copy()
+    values[place] *= -1.0
+    return with_deviation(test, values)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("make", [sound, sloped])
+def test_sound_readings_pass_every_check(make: Callable[[int], xr.Dataset], seed: int) -> None:
+    assert failed(make(seed)) == failed_signs(make(seed)) == {}
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (np.s_[20:], "from cycle 21 on"),
+        (np.s_[:, 1], "approach in negative direction against approach in positive direction"),
+        (np.s_[:, :, 9], "target 10"),
+    ],
+)
+def test_inverted_signs_are_named_with_their_place(place: tuple, words: str) -> None:
+    found = failed_signs(inverted(place))
+    assert list(found) == ["mirrored_readings"]
+    assert words in found["mirrored_readings"].evidence
+
+
+def test_targets_of_one_approach_numbered_from_the_other_end_are_named() -> None:
+    test = sloped()
+    values = test["deviation"].values.copy()
+    values[:, 1] = values[:, 1, ::-1]
+    found = failed_signs(with_deviation(test, values))
+    assert list(found) == ["target_order"]
+    assert "with the targets of one approach read from the other end" in found["target_order"].evidence
+    assert "ISO 230-2 values" in found["target_order"].endangers
+
+
+def test_exchanged_labels_contradict_the_travel() -> None:
+    labelled = sloped().assign_coords(direction=["negative", "positive"]).sel(direction=["positive", "negative"])
+    check = failed_signs(labelled)["travel_order"]
+    assert check.value == 1.0
+    assert (
+        "In 40 of 40 cycles, first in cycle 1, the readings labelled positive were taken at falling" in check.evidence
+    )
+
+
+def test_a_step_cycle_and_readings_without_times_are_no_contradiction() -> None:
+    test = sloped()
+    up = test["time"].isel(direction=[0, 0]).values + np.array([0, 4], "m8[s]")[:, None]
+    assert failed_signs(test.assign(time=test["time"].copy(data=up))) == {}
+    nothing = np.full(test["time"].shape, np.datetime64("NaT", "ns"))
+    assert failed_signs(test.assign(time=test["time"].copy(data=nothing))) == {}
+
+
+def test_cycles_that_lack_readings_take_no_part() -> None:
+    test = inverted(np.s_[20:])
+    values = test["deviation"].values.copy()
+    values[5, 0, 3] = np.nan
+    assert "from cycle 21 on" in failed_signs(with_deviation(test, values))["mirrored_readings"].evidence
+    values[:, 0, 3] = np.nan
+    assert failed_signs(with_deviation(test, values)) == {}

@@ -1,0 +1,522 @@
+"""The result of the loop: numbers by hand, and the keys of its part of results.json."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusion.analysis.alignment.readings import Readings, Series
+from fusion.analysis.diagnosis.residual import Remainder
+from fusion.analysis.drift_model.axis import (
+    LoopResult,
+    coefficients_of,
+    cross_errors,
+    declared_coefficients,
+    doubt_of,
+    error_interval,
+    has_skill,
+    plain_errors,
+    report_steps,
+    residual_drift_size,
+    rmse,
+    verdict,
+)
+from fusion.analysis.drift_model.fit import ModelFit, coefficient_spread, fit_model, unexplained_drift
+from fusion.analysis.drift_model.search import (
+    Confirmation,
+    Confirmed,
+    Decision,
+    LoopState,
+    Reason,
+    Round,
+    Score,
+    Step,
+    exceeds_noise,
+    is_confirmed,
+)
+from fusion.analysis.effects.effect import Candidate, Prior
+from fusion.results.loop import AxisLoop, AxisStep, Baselines, DetectionLimit, ErrorInterval, ResidualTestsPart
+from fusion.results.store import plain
+from tests.fusion.small_campaign import RATIOS, campaign, model_of, term
+
+BARE = campaign(cycles=12)
+WAVE = np.sin(BARE.seconds / 100.0)
+LATE = (BARE.seconds >= 655.0).astype(float)
+
+
+def measured() -> Readings:
+    noise = 0.1 * np.random.default_rng(2).standard_normal(BARE.seconds.size)
+    return replace(BARE, response=2.0 * WAVE + 0.5 * LATE + noise)
+
+
+def fitted() -> ModelFit:
+    declared = term(WAVE, "axis_expansion", units=("ppm/K",), prior=Prior(11.7, 2.0))
+    event = term(LATE, "step_event", parameters={"time_s": 655.0}, event_s=655.0)
+    return model_of(measured(), [declared, event])
+
+
+def score(name: str, **changes) -> Score:
+    return Score(name, Candidate(WAVE[:, None], {"minutes": 5.0}, ("um",)), **changes)
+
+
+def state(model: ModelFit, *, confirmed: Confirmed = Confirmed.OTHER_TARGETS) -> LoopState[ModelFit]:
+    confirmation = Confirmation(True, confirmed, 4.0, 0.02)
+    chosen = score("step_event", excess=20.0, gain=21.0, p_value=1e-4, family_wise_p=1e-3, confirmation=confirmation)
+    rival = score("dead_path", excess=18.5, p_value=0.01, family_wise_p=0.1, collinear=0.25)
+    limit = DetectionLimit(
+        effect="dead_path",
+        detectable_um=0.1,
+        best_um=0.05,
+        worst_um=0.2,
+        visible_share=0.9,
+        confounded_with=["air_index"],
+        note="",
+    )
+    first = Round((chosen, rival, Score("constant", None, collinear=1.0)), detection_limits=(limit,))
+    return LoopState(
+        model,
+        steps=(Step(chosen, first, confirmed),),
+        decisions=(
+            Decision("reflected_source", Reason.NOT_AVAILABLE, {"because": "no patch"}),
+            Decision("constant", Reason.COLLINEAR),
+            Decision("step_event", Reason.ENTERED),
+        ),
+        rounds=(first,),
+        errors_um=(0.8, 0.3),
+        errors_without_um=(0.8,),
+    )
+
+
+def remainder(shape: str = "", series: np.ndarray | None = None) -> Remainder:
+    return Remainder(
+        p_value=0.5,
+        p_values={},
+        shape=shape,
+        rms_um=0.2 if shape else 0.0,
+        cycles=np.arange(12),
+        along_time=np.zeros(12),
+        sites=[],
+        along_sites=np.zeros(0),
+        series=np.zeros(BARE.seconds.size) if series is None else series,
+        free=lambda columns: columns,
+    )
+
+
+HOLD_OUT = {
+    name: ErrorInterval(rmse_um=error, low_um=0.9 * error, high_um=1.1 * error)
+    for name, error in {
+        **dict.fromkeys(Baselines.model_fields, 1.2),
+        "declared": 0.8,
+        "final": 0.3,
+        "last_value": 0.9,
+        "ridge": 0.5,
+    }.items()
+}
+UNTESTED = ResidualTestsPart.model_construct()
+
+
+def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
+    model = looped.model
+    return LoopResult(
+        declared=["axis_expansion"],
+        declared_coefficients=declared_coefficients(model, 1),
+        held_out="cycles 11 to 12 held out",
+        noise_floor_um=0.1,
+        rmse_declared_um=0.8,
+        rmse_final_um=0.3,
+        hold_out=HOLD_OUT,
+        hold_out_errors={},
+        skill=True,
+        steps=report_steps(looped, {}),
+        unnamed={},
+        remainder=left,
+        residual_drift=residual_drift_size(model),
+        state=looped,
+        before=model,
+        after=model,
+    )
+
+
+def test_the_rmse_leaves_sites_without_a_prediction_out():
+    assert rmse(np.array([3.0, np.nan, -4.0])) == pytest.approx(np.sqrt(12.5))
+
+
+def test_coefficients_are_told_with_their_prior():
+    model = fitted()
+    place = model.place(model.terms[0]).start
+    assert [one.model_dump(exclude_unset=True) for one in declared_coefficients(model, 1)] == [
+        {
+            "effect": "axis_expansion",
+            "value": model.fit.coefficients[place],
+            "u": model.fit.coefficients_u[place],
+            "unit": "ppm/K",
+            "prior": 11.7,
+            "prior_u": 2.0,
+            "jackknife_u": coefficient_spread(model)[place],
+        }
+    ]
+    two = term(np.column_stack([WAVE, WAVE**2]), "b", units=("um", "um/K"), prior=Prior(1.0, 0.1))
+    told = coefficients_of(model_of(measured(), [two]), two)
+    assert [entry.model_fields_set - {"value", "u", "unit"} for entry in told] == [{"prior", "prior_u"}, set()]
+    assert [entry.unit for entry in told] == ["um", "um/K"]
+    assert [entry.effect for entry in declared_coefficients(fitted(), 2)] == ["axis_expansion", "step_event"]
+
+
+def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
+    model = fitted()
+    (step,) = report_steps(state(model), {})
+    assert step.effect == "step_event" and step.parameters == {"time_s": 655.0}
+    assert (step.rmse_before_um, step.rmse_after_um) == (0.8, 0.3)
+    assert (step.p_value, step.held_out_p) == (1e-3, 0.02)
+    assert step.tied == ("dead_path",)
+    assert step.runner_up.model_dump() == {"effect": "dead_path", "gain_deficit": pytest.approx(1.5), "p_value": 0.1}
+    assert step.confirmed_by == str(Confirmed.OTHER_TARGETS)
+    # The drift has learnt an early step by the time of the hold-out set: the block around it tells.
+    without = fit_model(model.readings, [model.terms[0]])
+    np.testing.assert_array_equal(step.cross_errors_before_um, cross_errors(without, 655.0))
+    np.testing.assert_array_equal(step.cross_errors_after_um, cross_errors(model, 655.0))
+    assert step.cross_rmse_before_um == rmse(step.cross_errors_before_um)
+    assert step.cross_rmse_after_um == rmse(step.cross_errors_after_um) < step.cross_rmse_before_um
+    assert step.confirmed and step.doubt == ""
+    # 655 s lies between the third and the fourth reading of cycle 6.
+    assert step.event_cycle == 6
+    # A coefficient times a column of zeros and ones, about its mean at every site.
+    shares = np.array([LATE[BARE.site == site].mean() for site in range(8)])[BARE.site]
+    height = step.coefficients[0].value
+    assert height == pytest.approx(0.5, abs=0.2)
+    assert step.rms_um == pytest.approx(abs(height) * np.sqrt(np.mean((LATE - shares) ** 2)))
+
+
+@pytest.mark.parametrize(("event_s", "cycle"), [(650.0, 6), (650.1, 6), (720.1, 7), (5000.0, 12)])
+def test_an_event_belongs_to_the_cycle_of_the_next_reading(event_s, cycle):
+    """Cycle 6 is read from 650 to 720 s, cycle 7 from 780 s on; 12 is the last."""
+    model = fitted()
+    later = term(LATE, "step_event", event_s=event_s)
+    changed = replace(model, terms=(model.terms[0], later))
+    assert report_steps(state(changed), {})[0].event_cycle == cycle
+
+
+def test_an_effect_that_lasts_belongs_to_no_cycle():
+    model = model_of(measured(), [term(WAVE), term(LATE, "step_event")])
+    assert report_steps(state(model), {})[0].event_cycle is None
+
+
+@pytest.mark.parametrize(("after", "confirmed"), [(0.3, True), (0.799, False), (0.9, False)])
+def test_what_lasts_is_confirmed_by_the_hold_out_set(after, confirmed):
+    model = model_of(measured(), [term(WAVE), term(LATE, "a")])
+    looped = replace(state(model), errors_um=(0.8, after))
+    (step,) = report_steps(looped, {})
+    assert (step.rmse_after_um, step.rmse_without_um, step.confirmed) == (after, 0.8, confirmed)
+    assert step.doubt == (
+        "" if confirmed else f"the error on the hold-out set is 0.8 µm without it and {after:.3g} µm with it"
+    )
+    found = replace(result(looped, remainder()), steps=[step])
+    assert found.verdict == ("explained" if confirmed else "unexplained")
+
+
+def test_a_pattern_that_all_cycles_contradict_is_not_confirmed():
+    wrong = Decision("step_event", Reason.INCONSISTENT_PATTERN, {"p_value": 1e-5})
+    (step,) = report_steps(state(fitted()), {0: wrong})
+    assert not step.confirmed and step.doubt == wrong.sentence
+
+
+def test_an_effect_that_entered_late_has_no_held_out_error():
+    (step,) = report_steps(state(fitted(), confirmed=Confirmed.SECOND_SEARCH), {})
+    assert np.isnan([step.rmse_before_um, step.rmse_after_um, step.rmse_without_um]).all()
+    assert step.confirmed and step.cross_rmse_after_um < step.cross_rmse_before_um
+
+
+def test_significant_effects_without_a_name_keep_the_verdict_from_being_complete():
+    found = replace(result(state(fitted()), remainder()), steps=[])
+    assert found.verdict == "complete"
+    assert repr(found) == "LoopResult: complete; declared axis_expansion; added nothing; held-out error 0.8 -> 0.3 um"
+    assert replace(found, unnamed={"thermal_lag": 1e-34}).verdict == "unexplained"
+    assert replace(found, skill=False).verdict == "no_skill"
+    assert replace(found, skill=False, unnamed={"thermal_lag": 1e-34}).verdict == "unexplained"
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_size_of_the_unexplained_drift(order):
+    model = model_of(measured(), [term(WAVE)], order=order, ratios=RATIOS if order == 1 else RATIOS / 1e4)
+    told = residual_drift_size(model).model_dump(exclude_unset=True)
+    drift, _ = unexplained_drift(model.fit)
+    assert told["kind"] == ("random walk" if order == 1 else "integrated random walk")
+    assert told["common_rms_um"] == pytest.approx(np.sqrt(np.mean(drift[:, 0] ** 2)))
+    assert told["stretch_rms_um"] == pytest.approx(np.sqrt(np.mean(drift[:, 1] ** 2)))
+    unit = "um_per_sqrt_h" if order == 1 else "um_in_1_h"
+    # Standard deviation of a random walk after an hour, and of an integrated one.
+    after_an_hour = 3600.0 if order == 1 else 3600.0**3 / 3.0
+    for name, ratio in zip(("common", "stretch"), model.fit.system.ratios, strict=True):
+        assert told[f"{name}_{unit}"] == pytest.approx(model.fit.sigma * np.sqrt(ratio * after_an_hour))
+    assert len(told) == 5
+
+
+def test_the_part_of_results_json_is_written():
+    part = result(state(fitted()), remainder()).described(UNTESTED)
+    written = plain(part)
+    assert written.keys() == AxisLoop.model_fields.keys()
+    # The errors of single readings stay in the loop, and the time of day is not known to it.
+    assert written["steps"][0].keys() == AxisStep.model_fields.keys() - {"event_time"}
+    assert part.not_tried == {"reflected_source": "no patch"} and set(part.not_admitted) == {"constant"}
+    assert written["held_out_test"] == {}
+    assert (part.rmse_declared_um, part.rmse_final_um, part.noise_floor_um) == (0.8, 0.3, 0.1)
+    assert written["errors"]["final"] == {"rmse_um": 0.3, "low_um": pytest.approx(0.27), "high_um": pytest.approx(0.33)}
+    assert (part.best_baseline, part.rmse_persistence_um) == ("ridge", 0.9)
+
+
+def test_every_score_of_the_search_is_written():
+    (scored,) = result(state(fitted()), remainder()).described(UNTESTED).search
+    assert scored[0].model_dump() == {
+        "effect": "step_event",
+        "parameters": {"minutes": 5.0},
+        "gain": 21.0,
+        "excess_gain": 20.0,
+        "p_value": 1e-4,
+        "family_wise_p": 1e-3,
+        "held_out_gain": 4.0,
+        "held_out_p": 0.02,
+        "collinear_share": 0.0,
+    }
+    # An effect that was not worth confirming has no evidence from unused readings.
+    assert (scored[1].held_out_gain, scored[1].held_out_p, scored[1].collinear_share) == (0.0, 1.0, 0.25)
+    assert scored[2].parameters == {}
+
+
+def test_the_nearest_effect_to_what_is_left_is_one_that_was_not_added():
+    looped = state(fitted())
+    shaped = remainder("a shape", series=WAVE + 0.1)
+    told = result(looped, shaped).described(UNTESTED).unexplained
+    assert (told.shape, told.rms_um, told.p_value) == ("a shape", 0.2, 0.5)
+    # The step fits as well (its score has the same column) but is in the model; the constant has no candidate.
+    assert (told.closest_effect, told.closest_effect_p) == ("dead_path", 0.1)
+    series = WAVE + 0.1
+    left = series - WAVE * (WAVE @ series) / (WAVE @ WAVE)
+    assert told.closest_effect_share == pytest.approx(1.0 - left @ left / (series @ series))
+    nothing = result(looped, remainder()).described(UNTESTED).unexplained
+    assert (nothing.nearest, nothing.closest_effect_p, nothing.closest_effect_share) == ("", None, None)
+
+
+# Plain predictions and the intervals of their errors.
+
+
+def test_the_interval_of_white_errors_is_that_of_theory():
+    """Errors of 1 um in 400 units of 8: the rmse has a standard error of 1 / sqrt(2 * 3200) = 0.0125 um."""
+    rng = np.random.default_rng(3)
+    found = error_interval(rng.standard_normal(3200), np.arange(3200) // 8, rng)
+    assert found.rmse_um == pytest.approx(1.0, abs=3 * 0.0125)
+    # A thousand resamples know the quantiles to a tenth of the width.
+    assert found.high_um - found.low_um == pytest.approx(2 * 1.96 * 0.0125, rel=0.25)
+    assert found.low_um < found.rmse_um < found.high_um
+
+
+def test_errors_that_follow_one_another_have_a_wider_interval():
+    rng = np.random.default_rng(4)
+    white = rng.standard_normal(400)
+    alike = np.repeat(white[::10], 10)
+    wide, narrow = (error_interval(errors, np.arange(400), np.random.default_rng(1)) for errors in (alike, white))
+    assert wide.high_um - wide.low_um > 2.0 * (narrow.high_um - narrow.low_um)
+
+
+def test_channels_are_averaged_and_gaps_left_out():
+    errors = np.column_stack([np.ones(50), np.full(50, 3.0)])
+    errors[3] = np.nan
+    found = error_interval(errors, np.arange(50), np.random.default_rng(1))
+    assert (found.rmse_um, found.low_um, found.high_um) == pytest.approx((2.0, 2.0, 2.0))
+
+
+def with_series(course, response):
+    """Thirty cycles beside one logged series; the last six are predicted."""
+    bare = campaign(cycles=30)
+    seconds = np.arange(0.0, bare.seconds[-1] + 60.0, 60.0)
+    series = {"load": Series(seconds, course(seconds), "1")}
+    readings = replace(bare, series=series, response=response(bare))
+    return readings, readings.cycle <= 24
+
+
+def test_every_plain_prediction_is_of_its_kind():
+    def course(seconds):
+        return np.sin(seconds / 900.0)
+
+    readings, used = with_series(course, lambda bare: 2.0 * course(bare.seconds) + 5.0 * bare.target)
+    errors = plain_errors(readings, used)
+    assert list(errors) == ["last_value", "mean", "least_squares", "ridge", "ridge_with_lags"]
+    site, response = readings.site, readings.response
+    for number in np.unique(site):
+        own, later = response[used & (site == number)], (site == number)[~used]
+        np.testing.assert_allclose(errors["last_value"][later], response[~used][later] - own[-1])
+        np.testing.assert_allclose(errors["mean"][later], response[~used][later] - own.mean())
+    # The series is interpolated between its samples.
+    assert np.abs(errors["least_squares"]).max() < 1e-2 < 0.5 < np.abs(errors["mean"]).max()
+    assert np.sqrt(np.mean(errors["ridge"] ** 2)) < 0.05
+
+
+def test_a_lagged_copy_predicts_what_follows_late():
+    def course(seconds):
+        return (seconds // 2400.0 % 2.0).astype(float)
+
+    def late(bare):
+        samples = np.arange(0.0, bare.seconds[-1] + 60.0, 60.0)
+        return bare.at(Series(samples, course(samples), "1").lagged(1200.0))
+
+    errors = plain_errors(*with_series(course, late))
+    rms = {name: float(np.sqrt(np.mean(values**2))) for name, values in errors.items()}
+    assert rms["ridge_with_lags"] < 0.5 * rms["ridge"]
+
+
+def test_without_anything_logged_a_regression_is_the_mean():
+    bare = campaign(cycles=30)
+    readings = replace(bare, series={}, response=bare.seconds / 1e4)
+    errors = plain_errors(readings, readings.cycle <= 24)
+    for name in ("least_squares", "ridge", "ridge_with_lags"):
+        np.testing.assert_allclose(errors[name], errors["mean"])
+
+
+def test_a_site_that_was_not_read_before_has_no_prediction():
+    readings, used = with_series(np.sin, lambda bare: bare.seconds / 1e4)
+    used = used & (readings.site != 3)
+    for values in plain_errors(readings, used).values():
+        np.testing.assert_array_equal(np.isnan(values), (readings.site == 3)[~used])
+
+
+# Blocks of cycles predicted from the others: the same by dense algebra, and what it says of a step.
+
+
+LONG = campaign(cycles=20)
+
+
+def predicted(response: np.ndarray, *columns: np.ndarray, prior: Prior | None = None) -> ModelFit:
+    noise = 0.1 * np.random.default_rng(5).standard_normal(LONG.seconds.size)
+    terms = [term(column, f"effect {k}") for k, column in enumerate(columns)]
+    if prior is not None:
+        terms[0] = replace(terms[0], candidate=replace(terms[0].candidate, prior=prior))
+    return model_of(replace(LONG, response=response + noise), terms, ratios=RATIOS)
+
+
+def cross_rmse(model: ModelFit, event_s: float | None = None) -> float:
+    return float(np.sqrt(np.nanmean(cross_errors(model, event_s) ** 2)))
+
+
+def dense_errors(model: ModelFit, block: np.ndarray) -> np.ndarray:
+    """Best linear unbiased prediction from the covariance of drift and noise, with priors as further observations."""
+    readings, fit = model.readings, model.fit
+    since = readings.seconds - readings.seconds[0]
+    walk = np.minimum(since[:, None], since[None, :])
+    drift = sum(
+        ratio * walk * np.outer(one, one) for ratio, one in zip(fit.system.ratios, readings.loadings.T, strict=True)
+    )
+    noise = np.diag(fit.system.variance)
+    x, y, known = fit.design, fit.response, ~block
+    whitening = np.linalg.inv(np.linalg.cholesky((drift + noise)[np.ix_(known, known)]))
+    a, b = whitening @ x[known], whitening @ y[known]
+    for place, prior in model.priors():
+        a = np.vstack([a, np.eye(x.shape[1])[place] * fit.sigma / prior.u])
+        b = np.append(b, fit.sigma * prior.mean / prior.u)
+    beta = np.linalg.lstsq(a, b, rcond=None)[0]
+    gain = drift[np.ix_(block, known)] @ np.linalg.inv((drift + noise)[np.ix_(known, known)])
+    return y[block] - x[block] @ beta - gain @ (y[known] - x[known] @ beta)
+
+
+@pytest.mark.parametrize("prior", [None, Prior(0.5, 0.05)])
+def test_blocks_are_predicted_by_the_best_linear_prediction(prior):
+    wave = np.sin(LONG.seconds / 500.0)
+    model = predicted(wave, wave, prior=prior)
+    block = (LONG.cycle - 1) // 4
+    errors = cross_errors(model)
+    assert np.isnan(errors[block == 0]).all()
+    for number in range(1, 5):
+        np.testing.assert_allclose(errors[block == number], dense_errors(model, block == number), rtol=1e-4, atol=1e-6)
+
+
+def test_of_an_event_only_the_block_around_it_counts():
+    at = float(LONG.seconds[LONG.cycle == 11].min())
+    step = (LONG.seconds >= at).astype(float)
+    model = predicted(2.0 * step, step)
+    block = (LONG.cycle >= 9) & (LONG.cycle < 13)
+    errors = cross_errors(model, at)
+    assert np.isnan(errors[~block]).all()
+    np.testing.assert_allclose(errors[block], dense_errors(model, block), rtol=1e-4, atol=1e-6)
+
+
+def test_the_first_block_is_not_asked_for_what_it_alone_knows():
+    """What the machine still remembers of the time before the log dies away within the first cycles."""
+    start = np.exp(-LONG.seconds / 60.0)
+    model = predicted(5.0 * start, start)
+    assert cross_rmse(model) < 0.2
+
+
+@pytest.mark.parametrize("cycle", [3, 11, 19])
+def test_a_step_is_not_interpolated(cycle):
+    """Between the readings before and after it a drift makes a ramp: the error without the step exceeds that with it by far."""
+    at = float(LONG.seconds[LONG.cycle == cycle].min())
+    step = (LONG.seconds >= at).astype(float)
+    with_it, without = predicted(2.0 * step, step), predicted(2.0 * step)
+    assert cross_rmse(with_it, at) < 0.2 < 0.5 < cross_rmse(without, at)
+
+
+def test_a_site_that_only_one_block_holds_is_left_out():
+    odd = (LONG.site == 3) & (LONG.cycle > 4)
+    readings = replace(LONG.subset(~odd), response=np.zeros((~odd).sum()))
+    noise = 0.1 * np.random.default_rng(5).standard_normal(readings.seconds.size)
+    model = model_of(replace(readings, response=noise), [], ratios=RATIOS)
+    assert 0.09 < cross_rmse(model) < 0.2
+
+
+# What may be said: a name is confirmed by an error that falls by more than chance, and the outcome has one word.
+
+
+@pytest.mark.parametrize(
+    ("with_um", "without_um", "noise_um", "confirmed"),
+    [
+        (0.9, 1.0, 0.0, True),
+        (10.846, 10.855, 0.0, False),  # a thousandth of the error
+        (1.01, 1.0, 0.0, False),
+        (0.402, 0.41, 0.4, True),  # most of what is left beside the noise
+        (0.3, 0.35, 0.4, True),  # an error below the noise is all chance, and smaller all the same
+        (1.0, 1.0, 0.0, False),
+    ],
+)
+def test_an_effect_is_confirmed_by_a_share_of_the_error_beyond_the_noise(with_um, without_um, noise_um, confirmed):
+    assert is_confirmed(with_um, without_um, noise_um) is confirmed
+    assert (doubt_of(with_um, without_um, noise_um, "on the hold-out set") == "") is confirmed
+
+
+@pytest.mark.parametrize(("error_um", "exceeds"), [(0.44, False), (0.45, True)])
+def test_an_error_exceeds_the_noise_by_what_is_left_beside_it(error_um, exceeds):
+    """With half the noise beside it 0.4 um become 0.447 um."""
+    assert exceeds_noise(error_um, 0.4, 0.5) is exceeds
+
+
+@pytest.mark.parametrize(
+    ("error_um", "last_um", "mean_um", "skill"),
+    [(1.0, 2.0, 3.0, True), (1.0, 0.9, 3.0, False), (1.0, 3.0, 0.9, False), (0.42, 0.41, 0.41, True)],
+)
+def test_skill_is_more_than_the_last_value_or_the_mean_or_an_error_of_noise_alone(error_um, last_um, mean_um, skill):
+    assert has_skill(error_um, last_um, mean_um, 0.4, 0.5) is skill
+
+
+SOUND = {"confirmed": False, "doubtful": False, "tested": False, "remains": False, "skill": True}
+
+
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({}, "complete"),
+        ({"confirmed": True}, "explained"),
+        ({"remains": True}, "unexplained"),
+        ({"tested": True}, "unexplained"),
+        ({"doubtful": True}, "unexplained"),
+        ({"confirmed": True, "remains": True}, "partial"),
+        ({"confirmed": True, "tested": True}, "partial"),
+        ({"confirmed": True, "doubtful": True}, "partial"),
+        ({"skill": False}, "no_skill"),
+        ({"skill": False, "confirmed": True}, "no_skill"),
+        ({"skill": False, "remains": True}, "no_skill"),
+        ({"skill": False, "doubtful": True}, "no_skill"),
+        ({"skill": False, "tested": True}, "unexplained"),
+        ({"skill": False, "tested": True, "confirmed": True}, "partial"),
+    ],
+)
+def test_the_outcome_has_one_word(changed, word):
+    assert verdict(**{**SOUND, **changed}) == word

@@ -1,0 +1,246 @@
+"""Campaigns of one machine compared: profiles, scatters, drift per kelvin, and what cannot be compared."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.analysis.comparison import (
+    Change,
+    ComparisonError,
+    ProfileChange,
+    compare_campaigns,
+    compare_profiles,
+    compare_scatters,
+)
+from fusion.results.results import ResultsError
+from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
+from tests.fusion.results_sample import PARTS, RECORD_LOOP
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_results(tmp_path_factory.mktemp("compared") / "before", readings_of(31))
+
+
+def changed(changes: tuple[Change, ...]) -> list[tuple[str, float | None]]:
+    return [(change.quantity, change.position_mm) for change in changes if change.significant and change.machine]
+
+
+def loop_with(**parts: Any) -> dict[str, Any]:
+    return {**copy.deepcopy(PARTS["loop"]), **parts}
+
+
+def test_of_two_sound_campaigns_nothing_changed(before: Path, tmp_path: Path) -> None:
+    (pair,) = compare_campaigns([before, write_results(tmp_path / "after", readings_of(32))])
+    assert changed(pair.changes) == []
+    assert {change.group for change in pair.changes} == {"profile", "scatter", "drift per kelvin", "ISO 230-2"}
+    assert pair.not_compared == ()
+
+
+def test_a_repair_is_found_among_three_campaigns(before: Path, tmp_path: Path) -> None:
+    sound = write_results(tmp_path / "sound", readings_of(32))
+    after = write_results(tmp_path / "after", repaired(readings_of(33), -1.2))
+    first, second = compare_campaigns([before, sound, after])
+    assert changed(first.changes) == []
+    assert changed(second.changes) == [("position", REPAIRED_MM)]
+    assert second.tests == first.tests
+
+
+def test_an_expansion_per_kelvin_is_compared_with_its_uncertainty(before: Path, tmp_path: Path) -> None:
+    coefficient = {**PARTS["loop"]["declared_coefficients"][0], "value": 13.0}
+    other = write_results(tmp_path / "after", readings_of(32), loop=loop_with(declared_coefficients=[coefficient]))
+    (pair,) = compare_campaigns([before, other])
+    change = next(change for change in pair.changes if change.quantity == "axis_expansion")
+    assert change.significant
+    assert change.change.value == pytest.approx(1.4)
+    assert change.change.u == pytest.approx(0.2 * 2**0.5)
+
+
+def test_models_with_other_effects_are_not_compared(before: Path, tmp_path: Path) -> None:
+    other = write_results(tmp_path / "after", readings_of(32), loop=loop_with(steps=[]))
+    (pair,) = compare_campaigns([before, other])
+    assert not [change for change in pair.changes if change.group == "drift per kelvin"]
+    assert "the models hold different effects (step event and nothing more)" in pair.not_compared[0]
+
+
+def test_other_targets_leave_the_standard_out(before: Path, tmp_path: Path) -> None:
+    other = write_results(tmp_path / "after", readings_of(32).isel(target=slice(0, 12)))
+    (pair,) = compare_campaigns([before, other])
+    assert any("different ones" in lack for lack in pair.not_compared)
+    assert "Profile: 4 positions were measured in one of the two campaigns only." in pair.not_compared
+    assert not [change for change in pair.changes if change.group == "ISO 230-2"]
+
+
+def test_another_axis_and_a_record_say_why_nothing_is_compared(before: Path, tmp_path: Path) -> None:
+    other = write_results(tmp_path / "y", readings_of(32), axis="Y")
+    record = write_results(tmp_path / "record", readings_of(32), loop=RECORD_LOOP, iso230=None)
+    (record / "deviations.nc").unlink()
+    along_y, recorded = compare_campaigns([before, other, record])
+    assert along_y.changes == ()
+    assert along_y.not_compared == ("Everything: the axes differ (X and Y): nothing is compared.",)
+    assert [lack.split(":")[0] for lack in recorded.not_compared] == [
+        "Drift per kelvin",
+        "ISO 230-2",
+        "Profile and scatter",
+    ]
+
+
+def test_one_folder_or_no_results_are_refused(before: Path, tmp_path: Path) -> None:
+    with pytest.raises(ComparisonError, match=r"2 results folders are named, 1 of them different"):
+        compare_campaigns([before, before])
+    with pytest.raises(ResultsError, match=r"there is no results.json in it"):
+        compare_campaigns([before, tmp_path])
+
+
+# Profiles of two tests.
+
+
+def estimate(
+    rng: np.random.Generator, *, extra: np.ndarray | float = 0.0, components: tuple[str, ...] = ()
+) -> xr.Dataset:
+    """A profile of eight positions with independent errors of 0.1 um about a bow that is another one in each test."""
+    position = np.linspace(0.0, 350.0, 8)
+    bow = (
+        rng.normal(0.0, 5.0)
+        + rng.normal(0.0, 5.0) * position / 350.0
+        + rng.normal(0.0, 2.0) * position * (350.0 - position) / 350.0**2
+    )
+    named = ("shift", "stretch", *components)
+    sides = np.array([[0.5], [-0.5]]) * np.ones(8)
+    share = np.stack([np.ones((2, 8)), np.ones((2, 8)), *[sides] * len(components)])
+    return xr.Dataset(
+        {
+            "profile": (("direction", "target"), bow + extra + rng.normal(0.0, 0.1, (2, 8))),
+            "covariance": (("direction", "target", "other_direction", "other_target"), 0.01 * np.eye(16).reshape(2, 8, 2, 8)),
+            "scatter_freedom": (("direction", "target"), np.full((2, 8), 50.0)),
+            "drift_share": (("component", "direction", "target"), share),
+            "position": ("target", position),
+        },
+        coords={"direction": ["positive", "negative"], "target": np.arange(1, 9), "component": list(named)},
+    )  # fmt: skip
+
+
+def moved_positions(found: ProfileChange) -> list[tuple[str, float | None]]:
+    """Single positions that count as changed."""
+    return [(shape.shape, shape.position_mm) for shape in found.shapes if shape.position_mm is not None]
+
+
+def test_another_thermal_state_changes_no_position(rng: np.random.Generator) -> None:
+    """Nominal 5 %: of 100 pairs at most 11 (a binomial count exceeds that once in a hundred such tests)."""
+    alarms = sum(bool(moved_positions(compare_profiles(estimate(rng), estimate(rng), level=0.05))) for _ in range(100))
+    assert alarms <= 11
+
+
+def test_positions_that_moved_are_told_from_their_neighbours(rng: np.random.Generator) -> None:
+    moved = np.zeros((2, 8))
+    moved[:, 2], moved[0, 5] = 3.0, 1.5
+    found = compare_profiles(estimate(rng), estimate(rng, extra=moved), level=0.05)
+    assert set(moved_positions(found)) >= {("position", 100.0)}
+    assert {place for _, place in moved_positions(found)} == {100.0, 250.0}
+    size = next(shape for shape in found.shapes if shape.position_mm == 100.0)
+    assert abs(size.change_um - 3.0) < 4 * size.u_um
+    assert all(shape.machine for shape in found.shapes if shape.position_mm is not None)
+
+
+def test_slope_and_bow_are_told_and_are_no_change_of_the_machine(rng: np.random.Generator) -> None:
+    bow = np.linspace(-1.0, 1.0, 8)
+    found = compare_profiles(estimate(rng), estimate(rng, extra=10.0 * (1.0 - bow**2)), level=0.05)
+    shapes = {shape.shape: shape for shape in found.shapes}
+    assert shapes["bow"].p_value < 1e-6
+    assert not shapes["bow"].machine and not shapes["slope"].machine
+
+
+@pytest.mark.parametrize(("components", "machine"), [((), True), (("reversal",), False)])
+def test_a_reversal_that_drifts_in_a_test_is_no_change_between_tests(
+    rng: np.random.Generator, components: tuple[str, ...], machine: bool
+) -> None:
+    more = np.array([[0.5], [-0.5]])
+    found = compare_profiles(estimate(rng, components=components), estimate(rng, extra=more), level=0.05)
+    reversal = next(shape for shape in found.shapes if shape.shape == "mean reversal")
+    assert reversal.machine is machine
+    assert reversal.change_um == pytest.approx(1.0, abs=4 * reversal.u_um)
+
+
+def test_what_remains_has_no_slope_and_its_uncertainty(rng: np.random.Generator) -> None:
+    found = compare_profiles(estimate(rng), estimate(rng), level=0.05)
+    assert np.polyfit(found.position_mm, found.remaining_um, 1) == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert (found.remaining_u_um < 0.1).all()
+
+
+def test_positions_of_one_test_alone_are_counted(rng: np.random.Generator) -> None:
+    other = estimate(rng)
+    other["position"] = other["position"] + xr.where(other["target"] == 8, 3.0, 0.0)
+    assert compare_profiles(estimate(rng), other, level=0.05).left_out == 2
+
+
+def test_other_targets_and_other_approaches_cannot_be_compared(rng: np.random.Generator) -> None:
+    shifted = estimate(rng)
+    shifted["position"] = shifted["position"] + 1.0
+    with pytest.raises(
+        ComparisonError, match=r"0 positions are the same within 0.05 mm; 5 are needed .*measure at the same targets"
+    ):
+        compare_profiles(estimate(rng), shifted, level=0.05)
+    forward, backward = estimate(rng), estimate(rng)
+    forward["profile"] = forward["profile"].where(forward["direction"] == "positive")
+    backward["profile"] = backward["profile"].where(backward["direction"] == "negative")
+    with pytest.raises(ComparisonError, match="no direction of approach was measured in both tests"):
+        compare_profiles(forward, backward, level=0.05)
+
+
+def test_a_repair_is_found_between_two_tests_of_the_twin_and_nothing_else() -> None:
+    before, after = readings_of(31), readings_of(32, duty="constant")
+    assert moved_positions(compare_profiles(drift_of(before), drift_of(after), level=0.05)) == []
+    found = compare_profiles(drift_of(before), drift_of(repaired(after, 1.0)), level=0.05)
+    assert moved_positions(found) == [("position", REPAIRED_MM)]
+    size = next(shape for shape in found.shapes if shape.position_mm == REPAIRED_MM)
+    assert size.change_um == pytest.approx(1.0, abs=4 * size.u_um)
+
+
+# Scatters of two tests.
+
+
+PLACE = np.linspace(0.0, 300.0, 16)
+
+
+def sample(rng: np.random.Generator, freedom: int, sigma: np.ndarray | float = 1.0) -> np.ndarray:
+    """Standard deviations of 16 positions."""
+    return np.asarray(sigma * np.sqrt(rng.chisquare(freedom, 16) / freedom))
+
+
+def least_p(rng: np.random.Generator, freedoms: tuple[int, int], after: np.ndarray | float = 1.0) -> float:
+    one, other = sample(rng, freedoms[0]), sample(rng, freedoms[1], after)
+    found = compare_scatters(PLACE, one, other, *(np.full(16, float(freedom)) for freedom in freedoms))
+    return 16 * min(change.p_value for change in found)
+
+
+def test_equal_scatter_and_a_noisier_day_raise_no_alarm(rng: np.random.Generator) -> None:
+    """Nominal 5 %: of 300 pairs at most 25 (a binomial count exceeds that once in two hundred such tests)."""
+    for freedoms, day in (((60, 60), 1.0), ((30, 120), 2.5), ((8, 8), 1.0)):
+        assert sum(least_p(rng, freedoms, day) <= 0.05 for _ in range(300)) <= 25
+
+
+def test_a_position_that_repeats_worse_is_found(rng: np.random.Generator) -> None:
+    worse = np.ones(16)
+    worse[4] = 2.0
+    one, other, freedom = sample(rng, 100), sample(rng, 100, worse), np.full(16, 100.0)
+    found = compare_scatters(PLACE, one, other, freedom, freedom)
+    assert [change.position_mm for change in found if 16 * change.p_value <= 0.05] == [80.0]
+    assert found[4].after_um == other[4]
+
+
+def test_too_few_positions_are_not_compared() -> None:
+    few = np.ones(4)
+    assert compare_scatters(PLACE[:4], few, few, few * 50, few * 50) == []
+
+
+def test_a_position_without_scatter_is_left_out(rng: np.random.Generator) -> None:
+    one, other = sample(rng, 50), sample(rng, 50)
+    one[0], other[1] = 0.0, np.nan
+    found = compare_scatters(PLACE, one, other, np.full(16, 50.0), np.full(16, 50.0))
+    assert len(found) == 14

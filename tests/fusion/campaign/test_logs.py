@@ -1,0 +1,382 @@
+"""Logged tables: units come from the headings, rows that cannot be used are listed, a record keeps its numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.inputs import pipe_notices, read_record
+from fusion.campaign.logs import ContactSensors, TableError, read_drivers, read_sensors, split_heading
+from fusion.common import FusionError
+from interferometry.io.faults import LaserFormatError
+from tests.fusion.campaign_parts import without
+
+RECORD = """\
+[campaign]
+title = "Spindle"
+
+[record]
+file = "{file}"
+time = "{time}"
+temperatures = ["t*"]
+displacements = ["ch*"]
+drivers = ["spindle*"]
+{more}
+"""
+
+
+def record(folder: Path, content: str, *, time: str = "time [min]", more: str = "") -> Path:
+    (folder / "record.csv").write_text(content, encoding="utf-8")
+    (folder / "campaign.toml").write_text(RECORD.format(file="record.csv", time=time, more=more), encoding="utf-8")
+    return folder / "campaign.toml"
+
+
+def test_headings_carry_name_and_unit() -> None:
+    assert split_heading(Path("x"), "t1 [degC]") == ("t1", "degC")
+    assert split_heading(Path("x"), "t1(°C)") == ("t1", "degC")
+    assert split_heading(Path("x"), "head (deg C)") == ("head", "degC")
+    assert split_heading(Path("x"), "Z [Microns]") == ("Z", "um")
+    assert split_heading(Path("x"), "spindle speed (RPM) ") == ("spindle speed", "RPM")
+    with pytest.raises(
+        TableError, match=r'the column "duty" has no unit; write it in the heading, for example "duty \[1\]"'
+    ):
+        split_heading(Path("drivers.csv"), "duty")
+
+
+def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
+    path = tmp_path / "drivers.csv"
+    path.write_text(
+        "time,duty [1],speed [1/min]\n"
+        "2026-03-09T06:31:00+00:00,0.5,1000\n"
+        "2026-03-09T07:30:00+01:00,0.4,900\n"
+        "2026-03-09T06:32:00+00:00,much,900\n"
+        "2026-03-09T06:31:00+00:00,0.6,1000\n"
+        "2026-03-09T06:33:00+00:00,0.7,1100\n"
+    )
+    drivers = read_drivers(path)
+    np.testing.assert_array_equal(drivers["duty"].values, [0.4, 0.5, 0.7])
+    assert drivers["speed"].attrs["units"] == "1/min"
+    assert str(drivers["time"].values[0]) == "2026-03-09T06:30:00.000000000"
+    assert [(one["line"], one["value"]) for one in json.loads(drivers.attrs["left_out"])] == [
+        (4, "much"), (5, "2026-03-09T06:31:00+00:00"),
+    ]  # fmt: skip
+    path.write_text("time\n2026-03-09T06:31:00+00:00\n")
+    with pytest.raises(TableError, match=r'there is no column apart from time; add one named "name \[unit\]"'):
+        read_drivers(path)
+    path.write_text("time,t [degC],t [K]\n2026-03-09T06:31:00+00:00,1,2\n")
+    with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
+        read_drivers(path)
+
+
+def test_a_record_is_converted_to_the_units_of_the_calculation(tmp_path: Path) -> None:
+    campaign = record(
+        tmp_path, "time [min],t1 [K],t2 [degC],ch1 [mm],spindle [rpm]\n0,293.15,21,0.001,0\n1,294.15,22,0.002,500\n"
+    )
+    data = read_record(load_campaign(campaign))
+    np.testing.assert_allclose(data["temperature"].values, [[20.0, 21.0], [21.0, 22.0]])
+    np.testing.assert_allclose(data["displacement"].values, [[1.0], [2.0]])
+    np.testing.assert_allclose(np.diff(data["time"].values) / np.timedelta64(1, "s"), [60.0])
+    assert data["driver_units"].values.tolist() == ["rpm"]
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "point", "end"), [(",", ".", ""), (";", ",", ""), (";", ".", ""), ("\t", ".", ""), (";", ",", ";")]
+)
+def test_a_record_may_be_written_as_any_spreadsheet_does(tmp_path: Path, delimiter: str, point: str, end: str) -> None:
+    lines = ["time [min]|t1 [degC]|ch1 [um]|spindle [rpm]", "0|20.5|1.25|0", "1|21.5|-2.5|500"]
+    written = [line.replace("|", delimiter) for line in lines[:1]]
+    written += [line.replace(".", point).replace("|", delimiter) + end for line in lines[1:]]
+    data = read_record(load_campaign(record(tmp_path, "# logger 7\n" + "\n".join(written) + "\n")))
+    np.testing.assert_array_equal(data["temperature"].values[:, 0], [20.5, 21.5])
+    np.testing.assert_array_equal(data["displacement"].values[:, 0], [1.25, -2.5])
+
+
+def test_a_number_sign_in_a_heading_is_part_of_it_and_lines_are_counted_in_the_file(tmp_path: Path) -> None:
+    rows = "".join(f"{k},20,1,0\n" for k in range(5))
+    campaign = record(
+        tmp_path, f"# logger 7\ntime [min],t #1 [degC],ch1 [um],spindle [rpm]\n{rows}?,20,1,0\n5,20,1,0,7\n"
+    )
+    data = read_record(load_campaign(campaign))
+    assert data["sensor"].values.tolist() == ["t #1"]
+    assert [(one["line"], one["value"]) for one in json.loads(data.attrs["left_out"])] == [(9, "5 fields"), (8, "?")]
+
+
+def test_lines_of_a_record_that_do_not_fit_its_header_are_listed(tmp_path: Path) -> None:
+    rows = "".join(f"{k},20,1,0\n" for k in range(5))
+    campaign = record(tmp_path, f"time [min],t1 [degC],ch1 [um],spindle [rpm]\n{rows}5,20,1,0,7\n6,20,1,0\n")
+    data = read_record(load_campaign(campaign))
+    assert data.sizes["time"] == 6
+    assert json.loads(data.attrs["left_out"]) == [
+        {"path": "record.csv", "line": 7, "value": "5 fields", "reason": "4 were expected"}
+    ]
+
+
+def test_a_time_of_day_that_is_missing_is_listed(tmp_path: Path) -> None:
+    rows = "".join(f"2026-03-09 06:3{k}:00,20,1,0\n" for k in range(6))
+    data = read_record(
+        load_campaign(record(tmp_path, f"time,t1 [degC],ch1 [um],spindle [rpm]\n,20,1,0\n{rows}", time="time"))
+    )
+    assert data.sizes["time"] == 6
+    assert [(one["line"], one["reason"]) for one in json.loads(data.attrs["left_out"])] == [(2, "is not a time")]
+
+
+@pytest.mark.parametrize(
+    ("content", "time", "message"),
+    [
+        ("time [min],t1 [bar],ch1 [um],spindle [rpm]\n0,1,1,1\n1,1,1,1\n", "time [min]", r'"t1 \[bar\]": "bar" is not a unit'),
+        ("time [min],t1 [degC],ch1 [um],spindle [rpm]\n0,20,1,1,5\n1,21,1,1,5\n", "time [min]", "more fields than the header names"),
+        ("time [min],t1 [degC],ch1,spindle [rpm]\n0,1,1,1\n1,1,1,1\n", "time [min]", 'the column "ch1" has no unit'),
+        ("time [min],t1 [degC],ch1 [um],spindle [rpm]\n0,a,1,1\n1,b,1,1\n", "time [min]", r'the column "t1 \[degC\]" contains no numbers'),
+        ("time [min],t1 [degC],ch1 [um]\n0,1,1\n1,1,1\n", "time [min]", r'no column is named "spindle\*"'),
+        ("time [min],t1 [degC],ch1 [um],spindle [rpm]\n0,1,1,1\n", "clock [s]", r'no column is named "clock \[s\]"'),
+    ],
+)  # fmt: skip
+def test_records_that_cannot_be_used_name_the_column(tmp_path: Path, content: str, time: str, message: str) -> None:
+    campaign = record(tmp_path, content, time=time)
+    with pytest.raises(ValueError, match=message):
+        read_record(load_campaign(campaign))
+
+
+@pytest.mark.real_data
+def test_a_published_record_is_read_whole(tmp_path: Path, real_file: Callable[[str], Path]) -> None:
+    """46.3 h of a spindle test: 16 temperatures, 5 displacements and the speed, every 15 s (11,115 rows)."""
+    path = real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")
+    text = RECORD.format(file=path.as_posix(), time="時間(s)", more="")
+    (tmp_path / "campaign.toml").write_text(text, encoding="utf-8")
+    data = read_record(load_campaign(tmp_path / "campaign.toml"))
+    assert dict(data.sizes) == {"time": 11115, "sensor": 16, "channel": 5, "driver_name": 1}
+    assert (data["time"].values[-1] - data["time"].values[0]) / np.timedelta64(1, "h") == pytest.approx(46.3, abs=0.05)
+    assert data.attrs["left_out"] == "[]"
+
+
+def test_damaged_spreadsheets_are_named_whatever_their_reader_raises(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Flipped bits and cut ends: the reader raises errors of zipfile, zlib, XML and missing keys, which are none of the package's."""
+    pd.DataFrame({"time [s]": [0, 1], "t1 [degC]": [20.0, 20.5], "ch1 [um]": [0.0, 0.1]}).to_excel(
+        tmp_path / "whole.xlsx", index=False
+    )
+    whole = np.frombuffer((tmp_path / "whole.xlsx").read_bytes(), np.uint8)
+    (tmp_path / "campaign.toml").write_text(
+        RECORD.format(file="damaged.xlsx", time="time [s]", more="").replace('drivers = ["spindle*"]', "")
+    )
+    refused = 0
+    for number in range(20):
+        damaged = whole.copy()
+        damaged[rng.integers(0, whole.size, 6)] ^= 1 << rng.integers(0, 8, 6, dtype=np.uint8)
+        (tmp_path / "damaged.xlsx").write_bytes(damaged[: None if number % 2 else rng.integers(whole.size)].tobytes())
+        campaign = load_campaign(tmp_path / "campaign.toml")
+        try:
+            read_record(campaign)
+        except (FusionError, LaserFormatError) as error:
+            assert "damaged.xlsx" in str(error)
+            refused += 1
+    assert refused > 10
+    monkeypatch.setattr("interferometry.io.spreadsheets.MOST_BYTES", 1000)
+    (tmp_path / "damaged.xlsx").write_bytes(whole.tobytes())
+    with pytest.raises(LaserFormatError, match=r"damaged\.xlsx: cannot be read as a spreadsheet"):
+        read_record(load_campaign(tmp_path / "campaign.toml"))
+
+
+def test_one_mark_for_no_reading_costs_one_reading(tmp_path: Path) -> None:
+    """A column with such a mark is text; its decimal commas and typographic minus signs are numbers all the same."""
+    rows = ["Zeit [s];T1 [°C];Z [µm]", "0;20,5;1,5", "30;21;---", "60;22,5;\u22122,5", "90;n/a;3"]
+    path = tmp_path / "campaign.toml"
+    path.write_text(
+        '[campaign]\ntitle = "Record"\n[record]\nfile = "log.csv"\ntime = "Zeit [s]"\ntemperatures = ["T1 [°C]"]\n'
+        'displacements = ["Z [µm]"]\n',
+        encoding="utf-8",
+    )
+    for encoding in ("utf-8", "utf-16"):
+        (tmp_path / "log.csv").write_text("\n".join(rows) + "\n", encoding=encoding)
+        table = read_record(load_campaign(path))
+        np.testing.assert_array_equal(table["temperature"].values.ravel(), [20.5, 21.0, 22.5, np.nan])
+        np.testing.assert_array_equal(table["displacement"].values.ravel(), [1.5, np.nan, -2.5, 3.0])
+    (tmp_path / "log.csv").write_text("\n".join(rows).replace("\u2212", "-") + "\n", encoding="cp1252")
+    assert read_record(load_campaign(path))["temperature"].values[2, 0] == 22.5
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("oil in/out", "a name that no product can store; begin it with a letter, leave / out"),
+        ("=HYPERLINK", "a name that no product can store"),
+        ("x" * 101, "a name that no product can store"),
+        ("deviation", 'the name of a result; rename it, for example "logged deviation"'),
+        ("duty_series", "the name of a result"),
+    ],
+)
+def test_names_that_the_products_cannot_keep_are_refused(tmp_path: Path, name: str, message: str) -> None:
+    path = tmp_path / "drivers.csv"
+    path.write_text(f"time,{name} [1]\n2026-03-09T06:00:00Z,1\n2026-03-09T06:01:00Z,2\n")
+    with pytest.raises(TableError, match=message):
+        read_drivers(path)
+
+
+# Contact sensors of a campaign file: read in degC, each with its place on the plan.
+
+
+SENSORS = '\n[sensors]\nfile = "sensors.csv"\nplaces = "places.csv"\n'
+LOG = "time,t1 [degC],t2 [K]\n2026-03-09T08:00:00Z,20.0,293.15\n2026-03-09T08:01:00Z,20.5,293.35\n"
+PLACES = "name,x_mm,y_mm\nt1,500,90\nt2,200,90\n"
+
+
+def read(folder: Path, log: str = LOG, places: str = PLACES) -> ContactSensors | None:
+    (folder / "sensors.csv").write_text(log, encoding="utf-8")
+    (folder / "places.csv").write_text(places, encoding="utf-8")
+    return read_sensors(load_campaign(without(folder / "campaign.toml", "thermography", added=SENSORS)))
+
+
+def test_temperatures_are_read_with_their_places(copied: Path) -> None:
+    sensors = read(copied)
+    assert sensors is not None and sensors.names == ["t1", "t2"]
+    assert sensors.temperature.values[-1].tolist() == pytest.approx([20.5, 20.2])
+    assert sensors.x_mm.tolist() == [500.0, 200.0] and sensors.u_K == 0.2
+
+
+@pytest.mark.parametrize(
+    ("log", "places", "fault"),
+    [
+        (LOG.replace("[K]", "[bar]"), PLACES, 'the column "t2"'),
+        (LOG, PLACES.replace("t2,", "t3,"), r"t2, t3 is in only one of the two files"),
+        (LOG, PLACES.replace("200,90", "900,90"), r"line 3: x 900 mm, y 90 mm is outside the plan of 700 x 180 mm"),
+        (LOG, PLACES.replace("200,90", "left,90"), "line 3: .*write the place in mm"),
+    ],
+)
+def test_what_does_not_fit_is_named(copied: Path, log: str, places: str, fault: str) -> None:
+    with pytest.raises(TableError, match=fault):
+        read(copied, log, places)
+
+
+def long_log(*, broken: bool) -> str:
+    """Two hours of three sensors, of which the second may jump by 15 K half way."""
+    minutes = np.arange(120)
+    warm = 20.0 + 4.0 * (1.0 - np.exp(-minutes / 40.0))[:, None] * np.array([1.0, 0.8, 0.9])
+    warm += np.random.default_rng(2).normal(0.0, 0.02, warm.shape)
+    warm[60:, 1] += 15.0 if broken else 0.0
+    stamps = np.datetime64("2026-03-09T08:00:00") + 60 * minutes
+    rows = [f"{stamp}Z,{a:.3f},{b:.3f},{c:.3f}" for stamp, (a, b, c) in zip(stamps, warm, strict=True)]
+    return "\n".join(["time,t1 [degC],t2 [degC],t3 [degC]", *rows]) + "\n"
+
+
+def test_a_sensor_that_breaks_is_left_out_and_named(copied: Path) -> None:
+    places = PLACES + "t3,350,90\n"
+    whole = read(copied, long_log(broken=False), places)
+    assert whole is not None and whole.faults == () and whole.names == ["t1", "t2", "t3"]
+    sensors = read(copied, long_log(broken=True), places)
+    assert sensors is not None and sensors.names == ["t1", "t3"] and sensors.x_mm.tolist() == [500.0, 350.0]
+    (fault,) = sensors.faults
+    assert fault.sensor == 1 and "jumps by 15 K" in fault.words and fault.onset_s == pytest.approx(3600.0, abs=120.0)
+    # The others keep every sample.
+    assert sensors.temperature.shape == (120, 2) and sensors.logged.shape == (120, 3)
+
+
+def test_a_campaign_without_sensors_has_none(copied: Path) -> None:
+    assert read_sensors(load_campaign(copied / "campaign.toml")) is None
+
+
+# Runs of a record: read in the order of their times, held to the same columns, and refused where they cannot be one test.
+
+
+HEADING = "time,t1 [degC],ch1 [um],speed [rpm]"
+CAMPAIGN = """\
+[campaign]
+title = "Runs"
+
+[record]
+{runs}
+time = "{time}"
+temperatures = ["t*"]
+displacements = ["ch*"]
+drivers = ["speed*"]
+"""
+
+
+def write_runs(folder: Path, runs: str, *, time: str = "time", **tables: str) -> Path:
+    """A campaign file and the tables of its runs, by name."""
+    for name, content in tables.items():
+        (folder / f"{name}.csv").write_text(content, encoding="utf-8")
+    (folder / "campaign.toml").write_text(CAMPAIGN.format(runs=runs, time=time), encoding="utf-8")
+    return folder / "campaign.toml"
+
+
+def stamped(day: int, *, heading: str = HEADING, hours: int = 3) -> str:
+    """Rows from six o'clock on, one an hour."""
+    rows = [f"2026-01-{day:02d}T{6 + hour:02d}:00:00Z,{20 + hour},{day},{hour}" for hour in range(hours)]
+    return "\n".join([heading, *rows]) + "\n"
+
+
+def elapsed(first: float = 0.0) -> str:
+    """Three rows, one a minute."""
+    return "\n".join([HEADING.replace("time", "time [s]"), *(f"{first + 60 * k},20,{k},{k}" for k in range(3))]) + "\n"
+
+
+def test_runs_are_joined_in_the_order_of_their_times(tmp_path: Path) -> None:
+    campaign = write_runs(tmp_path, 'files = "r*.csv"', r1=stamped(9), r2=stamped(7), r3=stamped(8))
+    data = read_record(load_campaign(campaign))
+    assert json.loads(data.attrs["runs"]) == ["r2.csv", "r3.csv", "r1.csv"]
+    assert data["displacement"].values[:, 0].tolist() == [7.0] * 3 + [8.0] * 3 + [9.0] * 3
+    assert data["run"].values.tolist() == [0] * 3 + [1] * 3 + [2] * 3
+    assert json.loads(data.attrs["test"]) == [2]
+    assert (np.diff(data["time"].values) > np.timedelta64(0)).all()
+
+
+def test_a_pipe_among_the_runs_is_left_out_and_named(tmp_path: Path) -> None:
+    campaign = load_campaign(write_runs(tmp_path, 'files = "r*.csv"', r1=stamped(9), r2=stamped(7)))
+    assert pipe_notices(campaign) == []
+    os.mkfifo(tmp_path / "r3.csv")
+    assert json.loads(read_record(campaign).attrs["runs"]) == ["r2.csv", "r1.csv"]
+    (notice,) = pipe_notices(campaign)
+    assert notice.message == "record.files also matches 1 pipe, socket or device, which is left out: r3.csv."
+
+
+def test_runs_that_count_from_their_own_zero_follow_the_order_of_the_files(tmp_path: Path) -> None:
+    runs = 'files = ["b.csv", "a.csv"]\ntest = "b.csv"'
+    campaign = write_runs(tmp_path, runs, time="time [s]", a=elapsed(), b=elapsed(1.0))
+    data = read_record(load_campaign(campaign))
+    assert json.loads(data.attrs["runs"]) == ["b.csv", "a.csv"]
+    assert json.loads(data.attrs["test"]) == [0]
+    assert (np.diff(data["time"].values) > np.timedelta64(0)).all()
+    assert [str(path) for path in load_campaign(campaign).files_of("record")] == ["b.csv", "a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ('files = ["q*.csv"]', "matches no file"),
+        ('file = "a.csv"\nfiles = ["a.csv", "b.csv"]', "write either file"),
+        ("", "write either file"),
+        ('file = "a.csv"\ntest = ["a.csv"]', "test names runs among files"),
+        (
+            'files = ["a.csv", "b.csv"]\ntest = ["c.csv"]',
+            "test names c.csv, which files does not; the runs are a.csv, b.csv",
+        ),
+        ('files = ["a.csv", "b.csv"]\ntest = ["*.csv"]', "test names c.csv"),
+        ('files = ["a.csv", "b.csv"]\ntest = ["a.csv", "b.csv"]', "test names all 2 runs"),
+    ],
+)
+def test_runs_that_are_named_wrongly_are_refused(tmp_path: Path, runs: str, message: str) -> None:
+    campaign = write_runs(tmp_path, runs, a=stamped(1), b=stamped(2), c=stamped(3))
+    with pytest.raises(CampaignError, match=message):
+        load_campaign(campaign)
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (stamped(2, heading="time,t1 [degC],ch2 [um],speed [rpm]"), "ch1, ch2 is not in both"),
+        (stamped(2, heading="time,t1 [degC],ch1 [um],speed [1/s]"), 'the driver "speed" is in 1/s, in a.csv in'),
+        (stamped(1, hours=9), "begins at 2026-01-01T06:00:00, before .* has ended"),
+    ],
+)
+def test_runs_that_cannot_be_one_record_are_refused(tmp_path: Path, other: str, message: str) -> None:
+    campaign = write_runs(tmp_path, 'files = ["a.csv", "b.csv"]', a=stamped(1), b=other)
+    with pytest.raises(TableError, match=message):
+        read_record(load_campaign(campaign))

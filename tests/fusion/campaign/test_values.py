@@ -1,0 +1,121 @@
+"""Values that carry their unit: the number arrives in the canonical unit, anything else is refused with an example."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter
+
+from fusion.campaign import values as value_types
+from fusion.campaign.values import QuantityError, conversion, read_option, read_quantity, unit_name
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "value"),
+    [
+        ("1.2 m", "mm", 1200.0),
+        ("1 in", "um", 25400.0),
+        ("-5e1 \u00b5m", "mm", -0.05),
+        ("68 \u00b0F", "degC", 20.0),
+        ("293.15 kelvin", "degC", 20.0),
+        ("1.5 hours", "s", 5400.0),
+        ("11.7e-6 1/K", "ppm/K", 11.7),
+        ("0.5 m/min", "mm/min", 500.0),
+    ],
+)
+def test_numbers_arrive_in_the_canonical_unit(text: str, target: str, value: float) -> None:
+    assert read_quantity(text, target) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (5, 'a length needs its unit in the value; write for example "5 mm"'),
+        (True, 'a length needs its unit in the value; write for example "5 mm"'),
+        ("five mm", 'this is not a length with a unit; write for example "5 mm"'),
+        ("5 s", '"s" is not a unit of a length; use one of nm, um, mm, cm, m, in'),
+        ("1e999 mm", 'the number is not finite; write for example "5 mm"'),
+    ],
+)
+def test_anything_else_is_refused_with_an_example(value: object, message: str) -> None:
+    with pytest.raises(QuantityError) as error:
+        read_quantity(value, "mm")
+    assert str(error.value) == message
+
+
+def test_a_temperature_has_an_offset() -> None:
+    assert conversion("K", "degC") == (1.0, -273.15)
+    assert unit_name(" \u2103 ") == "degC" and unit_name("furlong") == "furlong"
+
+
+def test_an_option_is_named_with_what_was_written() -> None:
+    assert read_option("--spacing", "2 cm", "mm") == 20.0
+    with pytest.raises(QuantityError, match=r'^--spacing "0": a length needs its unit in the value; write for example'):
+        read_option("--spacing", "0", "mm")
+
+
+# Tests of the types of values: what is written, the number in the unit of the name, and the sentence about what cannot be.
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "value"),
+    [
+        ("Millimetres", "2 cm", 20.0),
+        ("Metres", "1.2 m", 1.2),
+        ("Celsius", "295.15 K", 22.0),
+        ("PositiveSeconds", "5 min", 300.0),
+        ("PartsPerMillion", "11.7 ppm/K", 11.7),
+        ("Fraction", "45 %", 0.45),
+        ("KelvinU", "20 mK", 0.02),
+        ("TimeZone", "Europe/Vienna", "Europe/Vienna"),
+        ("PixelPatch", [8, 8, 24, 16], (8, 8, 24, 16)),
+    ],
+)
+def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: Any) -> None:
+    read = TypeAdapter(getattr(value_types, name)).validate_python(written)
+    assert read == (pytest.approx(value) if isinstance(value, float) else value)
+
+
+@pytest.mark.parametrize("pattern", ["/**/*", "/**/*.jpg", "/*/**/*.jpg", "../" * 20 + "**/*.seq"])
+def test_a_pattern_does_not_search_the_whole_disk(tmp_path: Path, pattern: str) -> None:
+    with pytest.raises(
+        ValueError,
+        match=r"any depth \(\*\*\) below /, the root of a disk; name the folder of the files before the first",
+    ):
+        value_types.check_pattern(tmp_path, pattern)
+
+
+def test_a_relative_pattern_names_files_where_they_are(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "1.jpg").touch()
+    (tmp_path / "here").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "2.jpg").symlink_to("1.jpg")
+    (tmp_path / "disk" / "3.jpg").symlink_to("gone.jpg")
+    real = tmp_path.resolve()
+    assert sorted(value_types.matching_files(tmp_path, "here/*.jpg")) == [
+        real / "disk" / "1.jpg",
+        real / "disk" / "1.jpg",
+        tmp_path / "here" / "3.jpg",
+    ]
+
+
+def test_pipes_and_sockets_that_a_pattern_matches_are_told_apart_from_files(tmp_path: Path) -> None:
+    (tmp_path / "1.jpg").touch()
+    (tmp_path / "2.jpg").symlink_to("gone.jpg")
+    (tmp_path / "folder.jpg").mkdir()
+    os.mkfifo(tmp_path / "3.jpg")
+    (tmp_path / "4.jpg").symlink_to("/dev/null")
+    assert sorted(value_types.matching_pipes(tmp_path, "*.jpg")) == [tmp_path / "3.jpg", tmp_path / "4.jpg"]
+    assert sorted(value_types.matching_files(tmp_path, "*.jpg")) == [tmp_path / "1.jpg", tmp_path / "2.jpg"]
+    assert value_types.matching_pipes(tmp_path, f"{'x' * 300}*") == []
+
+
+def test_what_is_no_file_is_told(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "laser.csv")
+    assert value_types.not_a_file(tmp_path) == f"{tmp_path} is a folder; name a file in it"
+    assert value_types.not_a_file(tmp_path / "laser.csv").endswith("is a pipe, a socket or a device; name a file")
+    (tmp_path / "file.csv").touch()
+    assert not value_types.not_a_file(tmp_path / "file.csv") and not value_types.not_a_file(tmp_path / "absent.csv")

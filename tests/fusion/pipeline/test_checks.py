@@ -1,0 +1,196 @@
+"""The check finds what a run would refuse, all of it at once where it can, and leaves nothing behind."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.analysis.alignment.align import AlignmentError
+from fusion.analysis.consistency.checks import CODES, ContradictionError
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.inputs import read_source
+from fusion.pipeline.check import check_campaign
+from fusion.pipeline.checks import check_source
+from fusion.pipeline.run import run_campaign
+from fusion.report.terminal import summary_rows
+from fusion.results.results import read_results
+from tests.fusion.analysis.consistency import lies
+from tests.fusion.campaign_parts import without
+
+
+def change(campaign: Path, old: str, new: str) -> Path:
+    file = campaign / "campaign.toml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    return file
+
+
+def test_a_sound_campaign_is_ready(campaign_folder):
+    before = sorted(campaign_folder.rglob("*"))
+    checked = check_campaign(campaign_folder / "campaign.toml")
+    lines = checked.lines()
+    assert checked.faults == () and lines[-1].startswith("ready to run: ")
+    assert "  readings: 24 cycles, 6 targets from 0 to 250 mm, 288 of 288" in lines
+    assert {recording.name for recording in checked.recordings} == {"frames", "readings", "environment", "drivers"}
+    assert any(line.startswith("  readings     █") for line in lines)
+    assert sorted(campaign_folder.rglob("*")) == before
+    told = json.loads(json.dumps(checked.as_json()))
+    assert told["ready"] is True and told["recordings"][0]["stretches"][0][0].endswith("Z")
+
+
+def test_an_axis_beyond_the_plan_is_found_before_the_frames_are_reduced(copied):
+    file = change(copied, 'origin = ["', 'origin = ["1')
+    (fault,) = check_campaign(file).faults
+    assert fault.startswith(f"{file}: plan.axis: the measured line leaves the plan: axis position")
+    with pytest.raises(AlignmentError, match=r"check \[plan.axis\] origin and direction"):
+        read_source(load_campaign(file))
+
+
+def test_every_broken_file_is_named(copied):
+    (copied / "fiducials.csv").write_text("name\nF1\n")
+    (copied / "environment.csv").write_text("time\n")
+    (copied / "laser.csv").write_text("cycle,direction\n1,positive\n")
+    checked = check_campaign(copied / "campaign.toml")
+    assert len(checked.faults) == 3
+    for name in ("laser.csv", "environment.csv", "fiducials.csv"):
+        assert sum(name in fault for fault in checked.faults) == 1
+    assert checked.lines()[-1] == "not ready: 3 faults"
+
+
+def test_quiet_leaves_faults_and_doubts(copied):
+    assert check_campaign(copied / "campaign.toml").lines(quiet=True) == []
+    absent = check_campaign(copied / "absent.toml")
+    assert absent.lines(quiet=True) == [
+        f"fault: {copied / 'absent.toml'}: no such campaign file; check the name or give its full path"
+    ]
+
+
+def test_a_doubt_is_named_and_does_not_refuse(copied):
+    """Readings of the last three cycles copied from the cycles before."""
+    lines = (copied / "laser.csv").read_text().splitlines()
+    fields = [line.split(",") for line in lines]
+    name = fields[0].index("deviation_um")
+    last = {tuple(row[:3]): row for row in fields[1:]}
+    for (cycle, direction, target), row in last.items():
+        if int(cycle) > 21:
+            row[name] = last[(str(int(cycle) - 3), direction, target)][name]
+    (copied / "laser.csv").write_text("\n".join(",".join(row) for row in fields) + "\n")
+    checked = check_campaign(copied / "campaign.toml")
+    assert checked.faults == () and [one.code for one in checked.doubts] == ["copied_cycles"]
+    assert checked.lines()[-1].endswith(", 1 doubt")
+    accepted = change(copied, "[model]", '[accept]\ndoubts = ["copied_cycles"]\n\n[model]')
+    assert check_campaign(accepted).doubts == []
+
+
+def test_a_record_is_checked(tmp_path):
+    seconds = np.arange(0, 36_000, 60)
+    rng = np.random.default_rng(5)
+    warm = 20 + 5 * (1 - np.exp(-seconds / 9000))
+    rows = [f"{s},{t:.3f},{3 * (t - 20) + 0.1 * rng.standard_normal():.3f}" for s, t in zip(seconds, warm, strict=True)]
+    (tmp_path / "a.csv").write_text("time [s],t1 [degC],ch1 [um]\n" + "\n".join(rows) + "\n")
+    file = tmp_path / "campaign.toml"
+    file.write_text(
+        '[campaign]\ntitle = "R"\n[record]\nfile = "a.csv"\ntime = "time [s]"\ntemperatures = ["t*"]\ndisplacements = ["ch*"]\n'
+    )
+    checked = check_campaign(file)
+    assert checked.faults == () and checked.content == ("record: 1 run, 1 temperature, 1 displacement, 600 rows",)
+    file.write_text(file.read_text().replace('["ch*"]', '["z*"]'))
+    assert 'no column is named "z*"' in check_campaign(file).faults[0]
+
+
+def test_a_campaign_of_one_instrument_is_checked_for_what_it_has(copied):
+    campaign = copied / "campaign.toml"
+    laser = check_campaign(without(campaign, "thermography", "plan", "model", name="checked_laser.toml"))
+    camera = check_campaign(without(campaign, "interferometry", "model", name="checked_camera.toml"))
+    assert laser.faults == () and camera.faults == ()
+    assert [bar.name for bar in laser.recordings] == ["readings", "environment", "drivers"]
+    assert [bar.name for bar in camera.recordings] == ["frames", "drivers"]
+    assert laser.content[0].startswith("readings: 24 cycles") and camera.content[0].startswith("frames: ")
+
+
+def test_a_sound_campaign_passes_every_check(results_folder):
+    inputs = read_results(results_folder).inputs
+    assert inputs.state == "sound"
+    assert {check.code for check in inputs.checks} <= set(CODES)
+    assert all(check.passed for check in inputs.checks)
+
+
+@pytest.mark.parametrize(
+    ("lie", "message"),
+    [
+        (lies.deviations_in_nm, "Check the units: deviations are read as µm and positions as mm"),
+        (lies.drivers_of_another_day, "drivers.csv .* covers 0 % of the readings"),
+    ],
+)
+def test_a_contradiction_is_refused_before_a_folder_is_made(copied, tmp_path, lie, message):
+    lie(copied)
+    with pytest.raises(ContradictionError, match=message):
+        run_campaign(copied / "campaign.toml", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("lie", "code"),
+    [
+        (lies.deviations_in_mm, "deviation_unit"),
+        (lies.positions_in_inch, "travel"),
+        (lies.copied_cycle, "copied_cycles"),
+        (lies.new_datum, "datum"),
+        (lies.drivers_end_early, "drivers_coverage"),
+    ],
+)
+def test_a_doubt_is_found_before_anything_is_calculated(copied, lie, code):
+    lie(copied)
+    checks = check_source(read_source(load_campaign(copied / "campaign.toml")))
+    assert code in [check.code for check in checks if not check.passed]
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(
+    ("lie", "code"), [(lies.inverted_signs, "axis_line"), (lies.emissivity_of_half, "material_rise")]
+)
+def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, tmp_path, lie, code):
+    lie(copied)
+    results = run_campaign(copied / "campaign.toml", tmp_path / "out")
+    assert results.inputs.state == "doubted"
+    assert code in [check.code for check in results.inputs.doubts]
+    assert results.warnings[0].code.startswith("doubt_")
+    name, text = summary_rows(results)[0]
+    assert name == "inputs" and text.startswith("doubted: ")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Doubted input." in page and "Only if " in page
+    conditional = {figure for check in results.inputs.doubts for figure in check.conditional}
+    assert "causes" in conditional
+    sizes = dict(summary_rows(results))["how much"]
+    assert ("only if" in sizes.lower()) is ("positions" in conditional)
+
+
+@pytest.mark.chain
+def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied, tmp_path):
+    lies.copied_cycle(copied)
+    # Nine cycles about the copy are too few for a model, and take the least time.
+    head, *lines = (copied / "laser.csv").read_text().splitlines()
+    kept = [line for line in lines if 6 <= int(line.split(",")[0]) <= 14]
+    (copied / "laser.csv").write_text("\n".join([head, *kept]) + "\n")
+    path = without(
+        copied / "campaign.toml", "thermography", "plan", "model", added='[accept]\ndoubts = ["copied_cycles"]\n'
+    )
+    inputs = run_campaign(path, tmp_path / "out").inputs
+    assert (inputs.state, inputs.accepted) == ("sound", ("copied_cycles",))
+    path.write_text(path.read_text().replace("copied_cycles", "weather"), encoding="utf-8")
+    with pytest.raises(CampaignError, match=r"accept\.doubts = 'weather': no such check; there are"):
+        run_campaign(path, tmp_path / "other")
+
+
+def test_one_error_of_reading_changes_neither_the_verdict_on_the_field_nor_the_causes(copied, tmp_path, results_folder):
+    lies.one_gross_reading(copied)
+    sound, spoilt = read_results(results_folder), run_campaign(copied / "campaign.toml", tmp_path / "out")
+    assert spoilt.correlation.verdict == sound.correlation.verdict
+    # One reading of 288 less; the p-values have a standard error of 0.016 from their 499 draws.
+    assert spoilt.correlation.source.p_value == pytest.approx(sound.correlation.source.p_value, abs=0.06)
+    assert [step.effect for step in spoilt.loop.steps] == [step.effect for step in sound.loop.steps]
+    assert spoilt.loop.rmse_final_um == pytest.approx(sound.loop.rmse_final_um, rel=0.02)
+    (notice,) = (warning for warning in spoilt.warnings if warning.code == "gross_readings")
+    assert "cycle 9, position 5 (200 mm), positive approach" in notice.message and "left out" in notice.message

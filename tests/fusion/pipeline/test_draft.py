@@ -1,0 +1,230 @@
+"""Campaign files for folders: what the files tell, what is asked, and a check that says what is missing."""
+
+import os
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import load_campaign
+from fusion.campaign.values import QuantityError
+from fusion.pipeline.check import check_campaign
+from fusion.pipeline.draft import Asker, DraftError, draft_lines, unused_files, write_campaign
+from fusion.pipeline.inspect import scan_folder
+from thermography.io.flir import index_frames
+from thermography.radiometry.planck import calibrate
+
+ANSWERS = {
+    "Title of the report": 'The "small" one',
+    "Plan point under the spindle at axis position 0, x": "500 mm",
+    "Plan point under the spindle at axis position 0, y": "90 mm",
+    "How that point moves over the plan as the axis position grows (right, left, down, up)": "left",
+    "Size of a cell of the field; it divides both sides": "20 mm",
+}
+
+
+def answering(question: str, default: str) -> str:
+    return ANSWERS.get(question, default)
+
+
+def test_answers_make_a_campaign_that_is_ready(copied):
+    original = load_campaign(copied / "campaign.toml")
+    (copied / "campaign.toml").unlink()
+    path, missing = write_campaign(copied, Asker(answering))
+    assert missing == [] and check_campaign(path).faults == ()
+    written = load_campaign(path)
+    assert written.campaign.title == 'The "small" one'
+    assert written.plan == original.plan
+    assert written.input_files() == original.input_files()
+
+
+def test_without_answers_the_missing_lines_are_marked_and_the_check_names_them(copied):
+    (copied / "campaign.toml").unlink()
+    path, missing = write_campaign(copied, Asker(None))
+    assert [line.split(": ")[1].split(" = ")[0] for line in missing] == ["origin", "direction"]
+    faults = check_campaign(path).faults
+    numbers = {line.split(":")[0].removeprefix("line ") for line in missing}
+    assert {fault.split(", line ")[1].split(":")[0] for fault in faults} == numbers
+
+
+def test_a_folder_of_frames_alone_is_ready_with_the_picture_as_its_plan(copied):
+    path, missing = write_campaign(copied / "thermal", Asker(None))
+    campaign = load_campaign(path)
+    assert missing == [] and campaign.plan.in_pixels and campaign.campaign.axis == ""
+    checked = check_campaign(path)
+    assert checked.faults == () and any("plan: the picture of " in line for line in checked.content)
+    path.unlink()
+    in_mm = Asker(lambda question, default: "fiducials" if question.startswith("No table of fiducials") else default)
+    _, missing = write_campaign(copied / "thermal", in_mm)
+    assert [line.split(" = ")[0].split(": ")[1] for line in missing] == ["size", "fiducials"]
+
+
+def test_an_existing_file_is_never_replaced(copied):
+    before = (copied / "campaign.toml").read_text()
+    with pytest.raises(DraftError, match=r"campaign.toml exists already and is not replaced"):
+        write_campaign(copied, Asker(None))
+    assert (copied / "campaign.toml").read_text() == before
+
+
+def test_times_without_a_zone_are_asked_for(copied):
+    (copied / "campaign.toml").unlink()
+    laser = copied / "laser.csv"
+    text = laser.read_text()
+    laser.write_text(text.replace("+00:00", ""))
+    asked = []
+
+    def vienna(question, default):
+        asked.append(question)
+        return (
+            "Europe/Vienna"
+            if question.startswith("Time zone of the times in laser.csv")
+            else answering(question, default)
+        )
+
+    path, _ = write_campaign(copied, Asker(vienna))
+    assert load_campaign(path).campaign.time_zone == "Europe/Vienna"
+    path.unlink()
+    write_campaign(copied, Asker(None))
+    assert 'time_zone = "UTC"   # taken, as the file gives none: check it' in path.read_text()
+    path.unlink()
+    laser.write_text(text)
+    asked.clear()
+    write_campaign(copied, Asker(vienna))
+    assert not any("zone" in question for question in asked)
+
+
+def test_a_file_of_readings_with_a_fault_is_written_down_and_left_to_the_check(copied):
+    (copied / "campaign.toml").unlink()
+    (copied / "laser.csv").write_text("cycle,direction,target,position_mm,time,deviation_um\nx,y,z,a,b,c\n")
+    path, _ = write_campaign(copied, Asker(answering))
+    assert any("laser.csv" in fault for fault in check_campaign(path).faults)
+
+
+def test_a_folder_without_measurements_is_refused(tmp_path):
+    with pytest.raises(DraftError, match="neither thermal frames nor deviations nor a record"):
+        write_campaign(tmp_path, Asker(None))
+    (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DraftError, match=r"in it \(notes.csv: "):
+        write_campaign(tmp_path, Asker(None))
+    assert not (tmp_path / "campaign.toml").exists()
+    (tmp_path / "notes.csv").write_text("\ufeff0,20.1,4.41E-05\n1,20.2,4.3E-05\n", encoding="utf-8")
+    with pytest.raises(DraftError, match=r"notes.csv: a table of numbers without headings; write a first line"):
+        write_campaign(tmp_path, Asker(None))
+    with pytest.raises(DraftError, match="no such folder"):
+        write_campaign(tmp_path / "absent", Asker(None))
+
+
+def test_runs_of_a_record_are_one_campaign(tmp_path):
+    seconds = np.arange(0, 36_000, 60)
+    warm = 20 + 5 * (1 - np.exp(-seconds / 9000))
+    rows = "".join(f"{s},{t:.3f},{3 * (t - 20):.3f},{s % 7}\n" for s, t in zip(seconds, warm, strict=True))
+    for name in ("run_1.csv", "run_2.csv"):
+        (tmp_path / name).write_text(f"time [s],t1 [degC],ch1 [um],speed [1/min]\n{rows}")
+    (tmp_path / "other.csv").write_text(f"time [s],t1 [degC],ch9 [um],speed [1/min]\n{rows}")
+    path, missing = write_campaign(tmp_path, Asker(None))
+    record = load_campaign(path).record
+    assert missing == []
+    # The first file decides, and the one with other columns is named beside it.
+    assert record.file == "other.csv" and '# file = "run_1.csv"   # also found' in path.read_text()
+    (tmp_path / "other.csv").unlink()
+    path.unlink()
+    write_campaign(tmp_path, Asker(None))
+    record = load_campaign(path).record
+    assert record.files == ("run_1.csv", "run_2.csv")
+    assert (record.temperatures, record.displacements, record.drivers) == (
+        ("t1 [degC]",),
+        ("ch1 [um]",),
+        ("speed [1/min]",),
+    )
+    assert check_campaign(path).faults == ()
+
+
+def test_names_from_files_stay_text(tmp_path):
+    """A file name with a quote and a line break, in a folder of the same kind, makes no key of its own."""
+    folder = tmp_path / 'a"\n[accept]'
+    folder.mkdir()
+    (folder / "x.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n")
+    (folder / "y\nz.txt").write_text("nothing\n")
+    lines = "\n".join(draft_lines(scan_folder(folder), Asker(None)))
+    assert "\n[accept]" not in lines and "#   y z.txt: " in lines
+
+
+@pytest.mark.real_data
+def test_the_public_spindle_record_is_ready_at_once(real_file, tmp_path):
+    (tmp_path / "data.xlsx").write_bytes(real_file("CAIVIAC__FL_THERMAL/data/data.xlsx").read_bytes())
+    path, missing = write_campaign(tmp_path, Asker(None))
+    record = load_campaign(path).record
+    assert missing == []
+    assert (len(record.temperatures), len(record.displacements), record.drivers) == (16, 5, ("spindle(RPM)",))
+    assert check_campaign(path).faults == ()
+
+
+def test_frames_of_another_camera_are_ready_with_their_times_from_the_names(copied):
+    frames, _ = index_frames(sorted((copied / "thermal").iterdir()))
+    for frame in frames:
+        stamp = str(frame.time.astype("datetime64[s]")).replace("-", "").replace(":", "").replace("T", "_")
+        np.save(copied / "thermal" / f"IR_{stamp}.npy", calibrate(frame.read_counts(), frame.parameters))
+        frame.path.unlink()
+    (copied / "campaign.toml").unlink()
+    path, missing = write_campaign(copied, Asker(answering))
+    checked = check_campaign(path)
+    assert missing == [] and checked.faults == ()
+    # The emissivity that nobody stated is a notice, not an implausible stored value of 1.
+    assert "stack_emissivity_unknown" in {notice.code for notice in checked.notices}
+    assert "camera_parameters" not in {doubt.code for doubt in checked.doubts}
+    written = load_campaign(path).thermography
+    assert (written.frames, written.stack.unit) == (("thermal/*.npy",), "degC")
+    assert written.stack.time_in_name == "%Y%m%d_%H%M%S"
+
+
+def test_what_frames_of_another_camera_do_not_tell_is_marked(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((2, 8, 9), 7329, np.uint16))
+    text = "\n".join(draft_lines(scan_folder(tmp_path), Asker(None)))
+    for line in ('frames = ["*.npy"]', 'scale = "FILL IN"', 'unit = "K"', 'start = "FILL IN"', 'interval = "FILL IN"'):
+        assert f"\n{line}" in text
+
+
+def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path):
+    heading = "cycle,direction,target,position_mm,time,deviation_um\n"
+    for name in ("run_1.csv", "run_2.csv"):
+        (tmp_path / name).write_text(f"{heading}1,+,1,0,2026-03-09T06:30:00Z,0.1\n1,+,2,50,2026-03-09T06:31:00Z,0.2\n")
+    (tmp_path / "places.csv").write_text("name,x_mm,y_mm\nT1,50,50\nT2,150,50\n")
+    (tmp_path / "notes.md").write_text("# Notes\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    told = unused_files(path)
+    assert sorted(line.split(":")[0] for line in told) == ["notes.md", "places.csv", "run_2.csv"]
+    assert "run_2.csv: deviations; one campaign takes one file of deviations: join the tables of one test" in told
+    assert load_campaign(path).interferometry is not None
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of files are bytes on POSIX systems only")
+def test_a_name_that_is_no_text_is_refused(tmp_path):
+    name = os.fsdecode(b"\xff.csv")
+    (tmp_path / name).write_text(
+        "cycle,direction,target,position_mm,deviation_um\n1,positive,1,0,1\n1,positive,2,9,1\n"
+    )
+    with pytest.raises(DraftError, match=r"is not UTF-8 .*\\udcff.*another name"):
+        write_campaign(tmp_path, Asker(None, print))
+    assert not (tmp_path / "campaign.toml").exists()
+
+
+def test_a_folder_of_results_gets_no_campaign_file(tmp_path):
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(DraftError, match="holds the results of a run; name the folder that holds the files"):
+        write_campaign(tmp_path, Asker(None, print))
+    assert [path.name for path in tmp_path.iterdir()] == ["results.json"]
+
+
+def test_nothing_is_asked_without_a_terminal_and_a_useless_answer_is_asked_again():
+    silent = Asker(None)
+    assert silent.text("Title", "A") == "A"
+    assert silent.quantity("Width", "mm", "5 mm") == '"5 mm"'
+    assert silent.quantity("Width", "mm") == '"FILL IN"'
+    assert silent.choice("Which", ("a", "b")) == "a"
+    with pytest.raises(QuantityError):
+        silent.quantity("Width", "mm", "5")
+    answers, told = iter(["5", "5 K", "5 mm", "c", "b"]), []
+    asker = Asker(lambda question, default: next(answers), told.append)
+    assert asker.quantity("Width", "mm") == '"5 mm"'
+    assert asker.choice("Which", ("a", "b")) == "b"
+    assert len(told) == 3 and "needs its unit" in told[0] and told[2] == '"c" is not one of the choices'
+    assert Asker(lambda question, default: "").quantity("Width", "mm") == '"FILL IN"'

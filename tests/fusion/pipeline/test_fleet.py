@@ -1,0 +1,260 @@
+"""A fleet: campaigns found and named apart, one that fails stops no other, and a summary that runs nothing that a file holds."""
+
+import csv
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import psutil
+import pytest
+from rich.console import Console
+
+from fusion.pipeline.fleet import (
+    SUMMARY,
+    FleetError,
+    Row,
+    as_csv,
+    as_json,
+    cells,
+    count_line,
+    find_members,
+    has_room,
+    read_rows,
+    render_fleet,
+    run_fleet,
+    summary_table,
+    with_findings,
+)
+from fusion.results.results import read_results
+from fusion.results.store import OutputError, write_json
+from tests.fusion.campaign_parts import without
+
+
+def touch(folder, *names):
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+
+
+def test_campaigns_are_named_after_their_folders_or_their_own_names(tmp_path):
+    touch(tmp_path, "hall/m2/X/campaign.toml", "hall/m1/X/campaign.toml", "hall/m1/Y/campaign.toml", "hall/notes.toml")
+    assert [member.name for member in find_members([tmp_path / "hall"])] == ["m1/X", "m1/Y", "m2/X"]
+    # A file that is named twice is one campaign; one alone has the name of its folder.
+    twice = [tmp_path / "hall/m1/X", tmp_path / "hall/m1/X/campaign.toml"]
+    assert [member.name for member in find_members(twice)] == ["X"]
+    touch(tmp_path, "a/x.toml", "a/y.toml", "b/campaign.toml")
+    paths = [tmp_path / "a/x.toml", tmp_path / "a/y.toml", tmp_path / "b"]
+    assert [member.name for member in find_members(paths)] == ["a/x", "a/y", "b"]
+
+
+def test_what_is_no_fleet_is_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FleetError, match=r"empty: holds no campaign.toml; name the campaign files"):
+        find_members([tmp_path / "empty"])
+    with pytest.raises(FleetError, match=r"gone: is not there"):
+        find_members([tmp_path / "gone"])
+    touch(tmp_path, "n/m1/campaign.toml", "n/m1/old/campaign.toml", "n/m2/campaign.toml")
+    with pytest.raises(
+        FleetError, match=r"old/campaign.toml: is in the folder of .*m1/campaign.toml, so their results would too"
+    ):
+        find_members([tmp_path / "n"])
+
+
+@pytest.mark.parametrize("name", ["logs", "Logs", "fleet.html"])
+def test_a_campaign_does_not_take_a_name_of_the_fleet(tmp_path, name):
+    for folder in (name, "x"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "campaign.toml").write_text("")
+    held = rf"{name}.campaign\.toml: its results would be written to the folder {name}, .*; rename the folder"
+    with pytest.raises(FleetError, match=held):
+        find_members([tmp_path])
+
+
+@pytest.fixture(scope="module")
+def hall(campaign_folder, tmp_path_factory):
+    """Two machines measured by the laser alone, and one whose readings are not there."""
+    folder = tmp_path_factory.mktemp("fleet") / "hall"
+    part = without(
+        campaign_folder / "campaign.toml", "thermography", "plan", "plan.axis", "model", name="laser_only.toml"
+    )
+    text = part.read_text()
+    part.unlink()
+    for name in ("a", "b", "c"):
+        shutil.copytree(campaign_folder, folder / name, ignore=shutil.ignore_patterns("thermal"))
+        (folder / name / "campaign.toml").write_text(text + "\n[model]\ndeclared = []\n")
+    # Five cycles are enough to evaluate, and take the least time.
+    for name in ("a", "c"):
+        lines = (folder / name / "laser.csv").read_text().splitlines()
+        kept = [line for line in lines if not line[0].isdigit() or int(line.split(",")[0]) <= 5]
+        (folder / name / "laser.csv").write_text("\n".join(kept) + "\n")
+    (folder / "b" / "laser.csv").unlink()
+    return folder
+
+
+@pytest.mark.chain
+def test_one_that_fails_stops_no_other_and_the_next_fleet_keeps_what_is_finished(hall, tmp_path):
+    out, ended, told = tmp_path / "out", [], []
+    members = find_members([hall])
+    how = {"report": lambda label, done, total: told.append((done, total))}
+    rows = run_fleet(members, out, jobs=2, say=lambda row: ended.append(row.name), **how)
+    assert [(row.name, row.state, row.exit_code) for row in rows] == [
+        ("a", "finished", 0),
+        ("b", "failed", 2),
+        ("c", "finished", 0),
+    ]
+    assert sorted(ended) == ["a", "b", "c"]
+    assert told[0] == (0, 3) and told[-1] == (3, 3)
+    assert "laser.csv" in rows[1].message
+    assert rows[0].peak_MB > 50 and rows[0].seconds > 0
+    for row in rows:
+        assert (out / row.log).is_file()
+    assert (out / rows[0].report).is_file() and not rows[1].report
+    assert {"fleet.json", "fleet.csv", "fleet.html", "manifest.json"} <= {path.name for path in out.iterdir()}
+    with pytest.raises(OutputError, match="is not empty; add --resume"):
+        run_fleet(members, out)
+    # Only what failed is run again.
+    shutil.copy(hall / "a" / "laser.csv", hall / "b" / "laser.csv")
+    ended.clear()
+    again = run_fleet(members, out, resume=True, say=lambda row: ended.append(row.name))
+    assert ended == ["b"]
+    assert [row.state for row in again] == ["kept", "finished", "kept"]
+    assert again[0].drift_um == rows[0].drift_um
+    # A reading that differs in one digit, under the size and time of before, and a report that is gone are both seen.
+    readings = hall / "a" / "laser.csv"
+    before, content = readings.stat(), readings.read_text()
+    readings.write_text(f"{content[:-2]}{(int(content[-2]) + 1) % 10}\n")
+    os.utime(readings, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert readings.stat().st_size == before.st_size
+    (out / again[2].report).unlink()
+    third = run_fleet(members, out, resume=True)
+    assert [row.state for row in third] == ["finished", "kept", "finished"]
+    assert (out / third[2].report).is_file()
+
+
+@pytest.mark.chain
+def test_campaigns_whose_names_differ_by_a_slash_have_logs_of_their_own(hall, tmp_path):
+    nested = tmp_path / "halls"
+    shutil.copytree(hall / "b", nested / "m" / "X")
+    shutil.copytree(hall / "b", nested / "m_X")
+    (nested / "m_X" / "campaign.toml").write_text("")
+    rows = run_fleet(find_members([nested]), tmp_path / "out", jobs=2)
+    assert [row.name for row in rows] == ["m/X", "m_X"]
+    assert len({row.log for row in rows}) == 2 and all((tmp_path / "out" / row.log).is_file() for row in rows)
+    assert "there is no instrument" in rows[1].message and "there is no instrument" not in rows[0].message
+
+
+@pytest.mark.chain
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT that is sent to one process")
+def test_a_fleet_that_is_stopped_ends_cleanly_with_what_was_kept(hall, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "fusion.cli", "fleet", str(hall), "--out", str(out), "--jobs", "1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fleet:
+        deadline = time.monotonic() + 60
+        while not (runs := psutil.Process(fleet.pid).children()) and time.monotonic() < deadline:
+            time.sleep(0.002)
+        [run] = runs
+        os.kill(fleet.pid, signal.SIGINT)
+        _, said = fleet.communicate(timeout=30)
+    assert fleet.returncode == 130
+    assert "stopped by SIGINT; " in said
+    assert "3 campaigns: 1 stopped, 2 not started; start the same command with --resume to go on" in said
+    rows = json.loads((out / "fleet.json").read_text())["campaigns"]
+    assert [row["state"] for row in rows] == ["stopped", "waiting", "waiting"]
+    assert (out / "fleet.html").is_file()
+    assert not psutil.pid_exists(run.pid) or run.wait(10) is not None
+
+
+def test_runs_wait_for_memory_and_processors(monkeypatch):
+    assert has_room([], 1, 1e9)
+    running = [SimpleNamespace(measure=lambda: 0.4e9)]
+    # The run that is going on may still take 0.6 GB, another one 1 GB.
+    for free, room in ((1.5e9, False), (1.7e9, True)):
+        memory = SimpleNamespace(available=free)
+        monkeypatch.setattr(psutil, "virtual_memory", lambda memory=memory: memory)
+        assert has_room(running, 4, 1e9) is room
+    assert not has_room(running, 1, 1e9)
+
+
+FAILED = Row("b", state="failed", exit_code=2, message='=HYPERLINK("x")', seconds=1.5, log="logs/b.log")
+
+
+@pytest.fixture(scope="module")
+def whole(results_folder):
+    return with_findings(Row("a", state="finished", exit_code=0, seconds=61.2, peak_MB=412.0), results_folder)
+
+
+def test_a_row_says_what_the_results_say(whole, results_folder):
+    results = read_results(results_folder)
+    assert whole.title == results.campaign
+    assert whole.verdict == results.loop.verdict
+    assert whole.drift_um == max(results.drift.range_um)
+    assert whole.drift_u_um in results.drift.range_u_um
+    assert (whole.anomalies, whole.warnings) == (len(results.anomalies), len(results.warnings))
+    assert whole.report == "a/report.html"
+    shown = cells(whole)
+    assert shown[0] == "a"
+    assert shown[2].endswith(" µm") and "±" in shown[2]
+    assert shown[6:] == ["0", "61.2", "412"]
+    assert cells(FAILED)[1:4] == ["failed", "–", "–"]
+
+
+def test_results_that_cannot_be_read_are_a_failure(tmp_path):
+    row = with_findings(Row("a", state="finished", exit_code=0), tmp_path)
+    assert row.state == "failed"
+    assert "there is no results.json" in row.message
+
+
+def test_the_summary_is_read_back(whole, tmp_path):
+    write_json(tmp_path / SUMMARY, as_json([whole, FAILED], started="2026-11-22T01:00:00+00:00", finished="later"))
+    assert read_rows(tmp_path) == {"a": whole, "b": FAILED}
+    assert json.loads((tmp_path / SUMMARY).read_text())["campaigns"][0]["report"] == "a/report.html"
+    (tmp_path / SUMMARY).write_text('{"campaigns": [{"name": 1}]}')
+    assert read_rows(tmp_path) == {}
+
+
+def test_no_text_is_a_formula_for_a_spreadsheet_or_a_style_for_the_terminal(whole):
+    lines = list(csv.DictReader(io.StringIO(as_csv([replace(whole, title="+1"), FAILED]))))
+    assert [line["title"] for line in lines] == ["'+1", ""]
+    assert lines[1]["message"] == '\'=HYPERLINK("x")'
+    assert float(lines[0]["drift_um"]) == whole.drift_um
+    assert "key" not in lines[0]
+    told = io.StringIO()
+    Console(file=told, width=160).print(summary_table([replace(whole, name="[red]a[/red]"), FAILED], "2 [b]campaigns"))
+    assert "[red]a[/red]" in told.getvalue()
+    assert "2 [b]campaigns" in told.getvalue()
+
+
+def test_endings_are_counted(whole):
+    rows = [whole, replace(whole, state="kept"), FAILED, replace(FAILED, state="stopped"), Row("c")]
+    assert count_line(rows) == (
+        "5 campaigns: 1 finished, 1 kept from before, unchanged, 1 failed, 1 stopped, 1 not started"
+    )
+
+
+STARTED = "2026-11-22T01:30:00+00:00"
+WHOLE = Row(
+    "hall 1/<X>", "finished", 0, "<script>alert(1)</script>", "partial", drift_um=12.3, drift_u_um=0.4, anomalies=2,
+    warnings=3, inputs="doubted",
+)  # fmt: skip
+BROKEN = Row("m/Y", "failed", 2, message="laser.csv, line 3: <img src=x>", log="logs/m_Y.log")
+
+
+def test_the_page_escapes_what_files_hold_and_shows_failures_first():
+    page = render_fleet([WHOLE, BROKEN], started=STARTED)
+    assert "<script>alert" not in page and "<img" not in page
+    assert "&lt;script&gt;alert(1)" in page
+    assert 'href="hall%201/%3CX%3E/report.html"' in page
+    page = render_fleet([WHOLE, BROKEN], started=STARTED)
+    assert page.index("laser.csv, line 3") < page.index("<h2>Campaigns</h2>")
+    assert 'href="logs/m_Y.log"' in page
+    assert "2 campaigns: 1 finished, 1 failed. Started 2026-11-22 01:30 UTC." in page
+    assert "12.30 ± 0.80 µm" in page
+    assert "What failed" not in render_fleet([WHOLE], started=STARTED)

@@ -1,0 +1,186 @@
+"""ISO 230-2 in the pipeline: settled and first window, budgets, the sheet with tolerances and conditions, and a test from a file alone."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.campaign.config import Campaign, CampaignError
+from fusion.campaign.recompensation import StatedBudget
+from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test, read_window
+from fusion.report.wording import moment
+from fusion.results.axis import Iso230Part
+from fusion.results.results import ResultsError
+from fusion.results.store import joined, plain
+from interferometry.deviations import build_deviations
+from interferometry.drift.estimate import estimate_drift
+from interferometry.io.readings import read_deviations
+from interferometry.iso230 import Iso230Budget, evaluate_iso230
+from tests.interferometry.simulated_campaigns import simulate
+
+ASSUMED = StatedBudget(
+    Iso230Budget(), dict.fromkeys(("device", "alignment", "material_temperature", "expansion_coefficient"), "assumed")
+)
+
+
+def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
+    deviations, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
+    drift = estimate_drift(deviations)["drift"]
+    windows, settled, found = evaluate_standard(deviations, ASSUMED, drift=drift, material_degC=None)
+    part = Iso230Part.model_validate(found)
+    assert (part.window, part.first.window) == ("cycles 1 to 5", "cycles 1 to 5")
+    assert part.A_um == part.first.A_um
+    assert min(part.settled.cycles) > 20 and len(part.settled.cycles) == 5
+    assert part.settled.R_um.value < part.first.R_um.value
+    assert part.range_um["R"].highest == float(windows["R"][:-1].max())
+    assert "least drift" in part.settled_rule
+    assert float(settled["A"]) == part.settled.A_um.value
+    for window in (part.first, part.settled):
+        for name in (*"AREMB", "mean_reversal"):
+            squares = sum(getattr(entry, f"{name}_um") ** 2 for entry in window.contributions)
+            total = window.mean_reversal_um if name == "mean_reversal" else getattr(window, f"{name}_um")
+            assert np.sqrt(squares) == pytest.approx(total.u)
+            assert window.u_without_sampling_um[name] < total.u
+    origins = {entry.contributor: entry.origin for entry in part.settled.contributions}
+    assert origins["expansion_coefficient"] == "assumed; material at an assumed 3 K from 20 \u00b0C"
+
+
+def test_without_times_no_environmental_variation_is_claimed():
+    deviations, _ = simulate(np.random.default_rng(2), cycles=4)
+    _, _, found = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
+    part = Iso230Part.model_validate({**found, "settled": None, "first": None})
+    assert part.settled_rule == "the only window of the test"
+    entry = next(row for row in found["settled"]["contributions"] if row["contributor"] == "environmental_variation")
+    assert np.isnan(entry["u"]) and entry["origin"] == "not known, not contained"
+
+
+STATED = {
+    "campaign": {"title": "A", "axis": "X"},
+    "interferometry": {"deviations": "laser.csv", "feed": "2 m/min"},
+    "acceptance": {"A": "1000 um", "R": "1 nm", "E_unidirectional": "1000 um"},
+    "report": {"machine": "Mill", "instrument": [{"name": "laser"}], "air_temperature_before": "21.5 degC"},
+}
+
+
+def sheet(campaign: Campaign | None, environment: xr.Dataset | None = None) -> Iso230Part:
+    deviations, _ = simulate(np.random.default_rng(3), cycles=12)
+    _, settled, part = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
+    dataset = joined(deviations, settled=settled)
+    return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=campaign, environment=environment)))
+
+
+def test_what_is_stated_is_judged_and_shown():
+    part = sheet(Campaign.model_validate({**STATED, "path": Path("campaign.toml")}))
+    judged = {row.quantity: row.decision for row in part.tolerances}
+    assert judged == {"A": "pass", "R": "fail", "E\u2191": "pass", "E\u2193": "pass"}
+    conditions = {row.name: row.text for row in part.conditions}
+    assert conditions["Machine"] == "Mill" and conditions["Axis"] == "X" and conditions["Feed"] == "2000 mm/min"
+    assert conditions["Instrument 1"] == "laser, serial number not stated, calibration not stated"
+    assert conditions["Air temperature before, after"] == "21.5 \u00b0C, not stated"
+    assert conditions["Operator"] == "" and conditions["Dead path"] == ""
+    assert conditions["Expansion coefficient"] == "11.7 ppm/K (assumed)"
+
+
+def test_logged_temperatures_stand_where_none_is_stated():
+    deviations, _ = simulate(np.random.default_rng(3), cycles=12)
+    time = deviations["time"].values
+    log = xr.Dataset(
+        {"air_temperature": ("time", [20.0, 24.0]), "material_temperature": ("time", [21.0, np.nan])},
+        coords={"time": [time.min(), time.max()]},
+    )
+    conditions = {row.name: row.text for row in sheet(None, log).conditions}
+    assert conditions["Air temperature before, after"] == "20.0 \u00b0C, 24.0 \u00b0C (logged)"
+    assert conditions["Material temperature before, after"] == "21.0 \u00b0C, 21.0 \u00b0C (logged)"
+
+
+def test_a_bare_file_has_conditions_checked_and_nothing_judged():
+    part = sheet(None)
+    assert part.tolerances == () and len(part.checks) == 6 and len(part.other_standards) == 9
+    assert all(row.text == "" for row in part.conditions if row.name not in ("Date of the test", "Measured travel"))
+
+
+def test_the_date_of_the_test_is_that_of_its_readings():
+    stated = {**STATED, "campaign": {**STATED["campaign"], "time_zone": "Asia/Tokyo"}}
+    time = simulate(np.random.default_rng(3), cycles=12)[0]["time"].values
+    for campaign, zone in ((None, None), (Campaign.model_validate({**stated, "path": Path("a.toml")}), "Asia/Tokyo")):
+        (date,) = (row.text for row in sheet(campaign).conditions if row.name == "Date of the test")
+        assert date == f"{moment(time.min(), zone)} to {moment(time.max(), zone)}"
+        assert date.endswith("UTC" if zone is None else "JST")
+
+
+LASER = """cycle,direction,target,position_mm,time,deviation_um
+{rows}
+"""
+
+
+def laser_file(path: Path, cycles: int) -> Path:
+    """A table of readings at five targets."""
+    rng = np.random.default_rng(4)
+    rows, minute = [], 0
+    for cycle in range(1, cycles + 1):
+        for direction in ("positive", "negative"):
+            for target in range(1, 6):
+                minute += 1
+                time = np.datetime64("2026-03-09T06:30:00") + np.timedelta64(minute, "m")
+                rows.append(f"{cycle},{direction},{target},{37.0 * target},{time}+00:00,{rng.normal(target, 0.5):.4f}")
+    path.write_text(LASER.format(rows="\n".join(rows)))
+    return path
+
+
+def test_a_file_of_readings(tmp_path):
+    file = laser_file(tmp_path / "laser.csv", 6)
+    found = read_test(file, "2-6")
+    assert found.part.settled.cycles == (2, 3, 4, 5, 6) and found.part.settled_rule == ""
+    axis = evaluate_iso230(read_deviations(file), cycles=[2, 3, 4, 5, 6])
+    for symbol in "AREMB":
+        assert getattr(found.part.settled, f"{symbol}_um").value == pytest.approx(float(axis[symbol]))
+    assert {entry.origin for entry in found.part.settled.contributions[:3]} == {"assumed"}
+
+
+def test_a_single_run_keeps_its_deviations(tmp_path):
+    found = read_test(laser_file(tmp_path / "laser.csv", 1), None)
+    assert found.part is None and found.dataset.sizes["cycle"] == 1
+
+
+def test_a_campaign_of_the_laser_alone_brings_its_budget_and_tolerances(tmp_path):
+    laser_file(tmp_path / "laser.csv", 6)
+    campaign = tmp_path / "campaign.toml"
+    campaign.write_text(
+        '[campaign]\ntitle = "T"\n[interferometry]\ndeviations = "laser.csv"\n'
+        '[interferometry.uncertainty]\ndevice = "2 ppm"\n[acceptance]\nA = "1 m"\n'
+    )
+    found = read_test(campaign, None)
+    assert found.title == "T"
+    assert found.part.settled.contributions[0].origin == "stated"
+    assert [row.decision for row in found.part.tolerances] == ["pass"]
+
+
+def test_the_results_of_a_run_hold_their_own_window(results_folder):
+    found = read_test(results_folder, None)
+    assert float(found.dataset["settled_A"]) == pytest.approx(found.part.settled.A_um.value)
+    with pytest.raises(CampaignError, match="holds the windows of its run"):
+        read_test(results_folder, "1-5")
+    with pytest.raises(ResultsError, match=r"there is no results\.json"):
+        read_test(results_folder / "maps", None)
+
+
+def test_a_window_of_cycles_is_read():
+    x, time = np.zeros((8, 2, 2)), np.full((8, 2, 2), np.datetime64("NaT", "ns"))
+    deviations = build_deviations(range(1, 9), [1, 2], np.array([0.0, 1.0]), x, time)
+    assert read_window(" 2 - 4 ", deviations) == [2, 3, 4]
+    assert read_window("8", deviations) == [8]
+    with pytest.raises(CampaignError, match="ends before it begins; write for example 2-4"):
+        read_window("4-2", deviations)
+    with pytest.raises(CampaignError, match="were not measured; there are 1 to 8"):
+        read_window("7-9", deviations)
+    with pytest.raises(CampaignError, match=r'--cycles "1-1000000000000000000000000000000" contains cycles that were'):
+        read_window(f"1-{10**30}", deviations)
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    pipe = tmp_path / "laser.csv"
+    os.mkfifo(pipe)
+    with pytest.raises(CampaignError, match=r"laser\.csv: is a pipe, a socket or a device; name a file"):
+        read_test(pipe, None)

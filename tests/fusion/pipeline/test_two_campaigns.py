@@ -1,0 +1,130 @@
+"""Two finished runs of one machine told together: in joint.json and in both reports."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.analysis.attribution.two_sessions import SessionComparisonError
+from fusion.campaign.config import CampaignError
+from fusion.pipeline import two_campaigns as records
+from fusion.pipeline.run import run_campaign
+from fusion.pipeline.two_campaigns import compare_runs
+from fusion.results.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
+from tests.fusion.campaign_parts import without
+
+
+@pytest.fixture
+def folders(results_folder, tmp_path):
+    """The same results twice, the second one under another title."""
+    pair = [Path(shutil.copytree(results_folder, tmp_path / name)) for name in ("monday", "tuesday")]
+    path = pair[1] / "results.json"
+    path.write_text(path.read_text().replace("Small campaign", "Second campaign"))
+    as_if_run(pair[1], "results.json")
+    return pair
+
+
+def as_if_run(folder: Path, name: str) -> None:
+    """Enter a product into the provenance as its run would have, had it written it so."""
+    provenance = json.loads((folder / "provenance.json").read_text())
+    provenance["products"][name] |= {"sha256": file_sha256(folder / name)}
+    write_json(folder / "provenance.json", provenance)
+
+
+def test_both_reports_tell_what_the_sessions_agree_on(folders, tmp_path):
+    rows = compare_runs(folders, tmp_path)
+    document = json.loads((tmp_path / "joint.json").read_text())
+    assert document["campaigns"] == ["Small campaign", "Second campaign"]
+    assert len(document["sources"]) == 4
+    assert len(rows) == len(document["agreement"]) + 2
+    assert rows[0][0] == "together" and rows[-1] == ("report", str((tmp_path / "joint.html").resolve()))
+    page = (tmp_path / "joint.html").read_text(encoding="utf-8")
+    assert "A (Small campaign)" in page and "B (Second campaign)" in page and 'href="tuesday/report.html"' in page
+    # A session agrees with itself on whatever it shows.
+    assert all(one["agrees"] and one["shown_by"] == [0, 1] for one in document["agreement"])
+    assert read_dataset(tmp_path / "joint.nc")["p_value"].dims == ("channel", "y", "x")
+    first, second = ((folder / "report.html").read_text() for folder in folders)
+    assert "Together with B (Second campaign)" in first
+    assert "Together with A (Small campaign)" in second
+
+
+def test_other_grids_are_refused(folders, tmp_path):
+    fusion = read_tree(folders[1] / "fusion.nc")
+    for group in fusion["correlation"].subtree:
+        if "x" in group.to_dataset(inherit=False).coords:
+            group.coords["x"] = group["x"] + 7.0
+    write_dataset(folders[1] / "fusion.nc", fusion)
+    as_if_run(folders[1], "fusion.nc")
+    with pytest.raises(SessionComparisonError, match="the plan grids differ along x"):
+        compare_runs(folders, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["results.json", "fusion.nc"])
+def test_products_that_no_run_wrote_are_refused(folders, tmp_path, name):
+    with (folders[0] / name).open("ab") as file:
+        file.write(b" ")
+    with pytest.raises(DamagedProductError, match=f"{name}: is not the file that this run wrote"):
+        compare_runs(folders, tmp_path)
+    assert not (tmp_path / "joint.json").exists()
+
+
+CAMPAIGN = """\
+[campaign]
+title = "{title}"
+
+[record]
+file = "{title}.csv"
+time = "time [s]"
+temperatures = ["t*"]
+displacements = ["ch*"]
+"""
+
+
+def write_record(folder: Path, title: str) -> Path:
+    """A channel that follows one sensor, an hour long."""
+    rng = np.random.default_rng(5)
+    temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.1, 60))
+    noise = rng.normal(0.0, 0.05, 60)
+    rows = [f"{60 * k},{t:.3f},{2.0 * t + noise[k]:.3f}" for k, t in enumerate(temperature)]
+    (folder / f"{title}.csv").write_text("time [s],t1 [degC],ch1 [um]\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    path = folder / f"{title}.toml"
+    path.write_text(CAMPAIGN.format(title=title), encoding="utf-8")
+    return path
+
+
+@pytest.mark.chain
+def test_two_records_are_told_together(tmp_path):
+    paths = [write_record(tmp_path, title) for title in ("Monday", "Tuesday")]
+    assert records.are_records(paths)
+    folders = [tmp_path / "results" / path.stem for path in paths]
+    for path, folder in zip(paths, folders, strict=True):
+        run_campaign(path, folder)
+    rows = records.compare_records(folders, tmp_path)
+    document = json.loads((tmp_path / "joint.json").read_text())
+    assert document["campaigns"] == [name for name, _ in rows[:2]] == ["Monday", "Tuesday"]
+    assert document["records"][0]["rmse_final_um"] == document["records"][1]["rmse_final_um"]
+    assert all(one["agrees"] for one in document["agreement"])
+    assert "held-out error" in rows[0][1]
+
+
+def test_a_record_beside_both_instruments_is_refused(tmp_path, monkeypatch):
+    class Loaded:
+        def __init__(self, path):
+            self.record = path.stem if path.stem == "record" else None
+
+    monkeypatch.setattr(records, "load_campaign", Loaded)
+    with pytest.raises(CampaignError, match=r"record\.toml holds a \[record\], axis\.toml instruments"):
+        records.are_records([Path("axis.toml"), Path("record.toml")])
+
+
+def test_two_campaigns_without_both_instruments_are_refused_before_any_is_run(copied):
+    whole = copied / "campaign.toml"
+    laser = without(whole, "thermography", "plan", "model", name="laser.toml")
+    camera = without(whole, "interferometry", "model", name="camera.toml")
+    assert records.are_records([whole, whole]) is False
+    with pytest.raises(CampaignError, match=r"laser\.toml has no \[thermography\]; two campaigns are compared by the"):
+        records.are_records([whole, laser])
+    with pytest.raises(CampaignError, match=r"camera\.toml has no \[interferometry\]"):
+        records.are_records([camera, whole])

@@ -1,0 +1,214 @@
+"""The sheet of a test and its section: every number equals plain arithmetic on the readings, names are escaped, nothing is replaced."""
+
+import csv
+import io
+import math
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.campaign.recompensation import StatedBudget
+from fusion.pipeline.iso230 import complete_sheet, evaluate_standard
+from fusion.report.campaign import describe_iso230
+from fusion.report.page import Iso230PageError, iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
+from fusion.report.wording import say
+from fusion.results.axis import Iso230Part
+from fusion.results.store import joined, plain
+from interferometry.drift.estimate import estimate_drift
+from interferometry.iso230.uncertainty import SCATTER_ALONE
+from tests.fusion.pipeline.test_iso230 import ASSUMED
+from tests.fusion.report.page_tables import tables_of
+from tests.interferometry.iso230.made_tests import by_hand, test_made
+from tests.interferometry.simulated_campaigns import simulate
+
+X = np.random.default_rng(21).normal(0, 0.6, (5, 2, 7)) + np.array([[1.1], [-0.4]]) + 1.7 * np.arange(7.0)
+VERSIONS = {"thermofuse": "0"}
+
+
+@pytest.fixture(scope="module")
+def test_sheet():
+    return evaluated(X)
+
+
+def evaluated(x: np.ndarray) -> tuple[Iso230Part, xr.Dataset]:
+    """A sheet with its readings."""
+    deviations = test_made(x)
+    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
+    dataset = joined(deviations, iso=windows, settled=settled)
+    return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=None, environment=None))), dataset
+
+
+def cells_of(page: str) -> list[list[str]]:
+    """Texts of the cells of every row of every table of a page."""
+    return [row for rows in tables_of(page).values() for row in rows]
+
+
+def as_number(text: str) -> float:
+    return float(text.replace("\u2212", "-"))
+
+
+def test_the_values_of_the_axis_are_those_of_the_definitions(test_sheet):
+    page = render_iso230("A", *test_sheet, remarks=(), versions=VERSIONS)
+    mean, s, seen = X.mean(axis=0), X.std(axis=0, ddof=1), 0
+    true = {**by_hand(X), "sign": (mean[0] - mean[1]).mean()}
+    for m, q, arrow in zip(mean, s, "\u2191\u2193", strict=True):
+        true |= {f"A{arrow}": (m + 2 * q).max() - (m - 2 * q).min(), f"R{arrow}": 4 * q.max(), f"E{arrow}": np.ptp(m)}
+    for cells in cells_of(page):
+        match = (
+            re.fullmatch(r".*(?:accuracy|repeatability|error) ([AREMB][\u2191\u2193]?)|.*with its (sign)", cells[0])
+            if cells
+            else None
+        )
+        if match is None or len(cells) != 2:
+            continue
+        value, _, expanded = cells[1].partition(" \u00b1 ")
+        # Half of the last printed digit.
+        last = 0.5 * 10.0 ** -len(expanded.partition(".")[2])
+        assert as_number(value) == pytest.approx(true[match.group(1) or match.group(2)], abs=1.001 * last), cells
+        seen += 1
+    assert seen == len(true) == 12
+
+
+def test_the_values_of_the_targets_are_those_of_the_readings(test_sheet):
+    page = render_iso230("A", *test_sheet, remarks=(), versions=VERSIONS)
+    rows = [cells for cells in cells_of(page) if len(cells) == 12 and cells[0].isdigit()]
+    assert len(rows) == 7
+    mean, s = X.mean(axis=0), X.std(axis=0, ddof=1)
+    wide = np.max([2 * s[0] + 2 * s[1] + np.abs(mean[0] - mean[1]), 4 * s[0], 4 * s[1]], axis=0)
+    values = np.array([*mean, *s, *(4 * s), mean.mean(axis=0), mean[0] - mean[1], wide])
+    for i, cells in enumerate(rows):
+        assert [as_number(cell) for cell in cells[:2]] == [i + 1, 10.0 * i]
+        assert [as_number(cell) for cell in cells[2:11]] == pytest.approx(values[:, i], abs=0.00501)
+        assert cells[11] == "5, 5"
+
+
+def test_the_sums_of_the_budget_are_those_of_its_rows(test_sheet):
+    rows = describe_iso230(*test_sheet)["budget"].rows
+    for column in range(3, 9):
+        contributions = [as_number(row.cells[column]) for row in rows[:5] if row.cells[column] != "\u2013"]
+        sampling = [as_number(row.cells[column]) for row in rows[5:7]]
+        without, whole = (as_number(row.cells[column]) for row in rows[7:])
+        # Two significant digits are printed: 5 % of the smallest.
+        assert without == pytest.approx(2 * math.hypot(*contributions), rel=0.06, abs=1e-3)
+        assert whole == pytest.approx(2 * math.hypot(*contributions, *sampling), rel=0.06)
+
+
+def test_json_and_csv_hold_full_precision(test_sheet):
+    told = iso230_json(*test_sheet)
+    assert told["settled"]["A_um"]["value"] == pytest.approx(by_hand(X)["A"], rel=1e-12)
+    rows = list(csv.DictReader(io.StringIO(iso230_csv(*test_sheet))))
+    assert [float(row["mean_positive_um"]) for row in rows] == pytest.approx(X[:, 0].mean(axis=0))
+    assert [float(row["B_i_um"]) for row in rows] == pytest.approx(X[:, 0].mean(axis=0) - X[:, 1].mean(axis=0))
+    assert told["targets"][0]["readings_negative"] == 5
+
+
+def test_missing_readings_are_named_under_the_table():
+    x = X.copy()
+    x[3, 1, 2] = np.nan
+    page = render_iso230("A", *evaluated(x), remarks=(), versions=VERSIONS)
+    assert "1 of 70 readings of the window are missing: cycle 4, target 3\u2193 (missing)." in page
+
+
+def test_a_single_run_shows_deviations_and_says_what_is_not_possible():
+    dataset = test_made(X[:1])
+    page = render_iso230("A", None, dataset, remarks=("1 line left out",), versions=VERSIONS)
+    assert "a standard deviation s is not possible" in page and "<li>1 line left out</li>" in page
+    rows = [cells for cells in cells_of(page) if cells and cells[0].isdigit()]
+    assert [as_number(cells[3]) for cells in rows] == pytest.approx(X[0, 1], abs=0.0051)
+    assert list(csv.DictReader(io.StringIO(iso230_csv(None, dataset))))[6]["deviation_positive_um"] == str(X[0, 0, 6])
+    assert len(iso230_tables(None, dataset, title="A")) == 1
+
+
+def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_path):
+    page = render_iso230("<i>A</i>", *test_sheet, remarks=("<script>",), versions=VERSIONS)
+    assert "<i>A</i>" not in page and "<li>&lt;script&gt;</li>" in page
+    with pytest.raises(Iso230PageError, match=r"page\.docx: the sheet is written as \.html or \.pdf"):
+        write_iso230(tmp_path / "page.docx", page)
+    write_iso230(tmp_path / "page.html", page)
+    with pytest.raises(Iso230PageError, match="exists already"):
+        write_iso230(tmp_path / "page.html", page)
+    assert iso230_tables(*test_sheet, title="A")[0].title == "A, cycles 1 to 5"
+
+
+def test_a_rotary_axis_has_tables_and_csv_alone():
+    deviations = test_made(X)
+    deviations["deviation"].attrs["units"], deviations["position"].attrs["units"] = "arcsec", "deg"
+    budget = StatedBudget(SCATTER_ALONE, dict.fromkeys(ASSUMED.origins, "not of a rotary axis"))
+    windows, settled, part = evaluate_standard(deviations, budget, drift=None, material_degC=None)
+    dataset = joined(deviations, iso=windows, settled=settled)
+    found = Iso230Part.model_validate(plain(part))
+    tables = iso230_tables(found, dataset, title="A")
+    assert tables[0].columns[1].header == "cycles 1 to 5 / arcsec" and tables[1].columns[1].header == "Position / deg"
+    assert iso230_csv(found, dataset).startswith("target,position_deg,mean_positive_arcsec")
+    for write in (
+        lambda: iso230_json(found, dataset),
+        lambda: render_iso230("A", found, dataset, remarks=(), versions=VERSIONS),
+    ):
+        with pytest.raises(Iso230PageError, match="a rotary one"):
+            write()
+
+
+def test_the_budget_of_one_approach_has_its_own_quantities():
+    x = X.copy()
+    x[:, 0] = np.nan
+    found, dataset = evaluated(x)
+    budget = describe_iso230(found, dataset)["budget"]
+    assert budget.titles[3:] == ("A\u2193 / \u00b5m", "R\u2193 / \u00b5m", "E\u2193 / \u00b5m")
+    for column, symbol in enumerate("ARE", start=3):
+        shares = [as_number(row.cells[column]) for row in budget.rows[:7]]
+        without, whole = (as_number(row.cells[column]) for row in budget.rows[7:])
+        assert without == pytest.approx(2 * math.hypot(*shares[:5]), rel=0.06, abs=1e-3)
+        assert whole == pytest.approx(2 * math.hypot(*shares), rel=0.06)
+        assert whole == pytest.approx(2 * getattr(found.settled.negative, f"{symbol}_um").u, rel=0.06)
+    assert iso230_tables(found, dataset, title="A")[2].columns[3].header == "A\u2193 / \u00b5m"
+
+
+@pytest.fixture(scope="module")
+def part():
+    deviations, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
+    drift = estimate_drift(deviations)["drift"]
+    return Iso230Part.model_validate(plain(evaluate_standard(deviations, ASSUMED, drift=drift, material_degC=None)[2]))
+
+
+def test_the_settled_window_stands_with_the_first_one(part):
+    told = describe_iso230(part)
+    titles = told["axis"].titles
+    assert titles[1].startswith(part.settled.window)
+    assert titles[2].startswith("First window, cycles 1 to 5")
+    assert titles[3].startswith("Range over windows without overlap")
+    ranges = [row.cells[3] for row in told["axis"].rows]
+    assert " to " in ranges[0] and ranges[1] == ranges[2] == ranges[-1] == "\u2013"
+    terms = [row.cells[0] for row in told["axis"].rows]
+    assert terms[:3] == [
+        "Bidirectional positioning accuracy A",
+        "Unidirectional positioning accuracy A\u2191",
+        "Unidirectional positioning accuracy A\u2193",
+    ]
+    assert terms[-1] == "Mean reversal error, with its sign"
+
+
+def test_the_budget_ends_with_both_sums(part):
+    rows = describe_iso230(part)["budget"].rows
+    assert [row.cells[0] for row in rows[-2:]] == ["U (k = 2) without the sampling of the cycles", "U (k = 2)"]
+    assert float(rows[-1].cells[3]) == pytest.approx(2 * part.settled.A_um.u, rel=0.06)
+
+
+def test_what_is_assumed_and_what_is_missing_is_said(part):
+    sentence = say("iso230_uncertainty", part.settled)
+    assert "laser with its air compensation 0.25 ppm (assumed)" in sentence
+    assert "can be stated under [interferometry.uncertainty]" in sentence
+    assert "does not contain the environmental variation" not in sentence
+    unknown = [
+        entry.model_copy(update={"u": None}) if entry.contributor == "environmental_variation" else entry
+        for entry in part.settled.contributions
+    ]
+    sentence = say("iso230_uncertainty", part.settled.model_copy(update={"contributions": tuple(unknown)}))
+    assert "It does not contain the environmental variation" in sentence
+
+
+def test_results_of_an_older_run_show_their_only_window(part):
+    told = describe_iso230(part.model_copy(update={"settled": None}))
+    assert told["budget"] is None and told["quoted"].window == "cycles 1 to 5"
+    assert len(told["axis"].rows) == 5

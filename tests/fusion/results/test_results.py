@@ -1,0 +1,183 @@
+"""results.json: the models accept what a run writes and nothing else, and give it back value for value."""
+
+from __future__ import annotations
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from fusion.results.loop import AxisLoop, Coefficient, RecordLoop
+from fusion.results.results import Notice, Results, ResultsError, assemble, read_results, results_schema
+from fusion.results.store import plain
+from tests.fusion.results_sample import PARTS, RECORD_LOOP
+
+
+def validator() -> jsonschema.Draft202012Validator:
+    jsonschema.Draft202012Validator.check_schema(results_schema())
+    return jsonschema.Draft202012Validator(results_schema())
+
+
+def test_a_full_document_keeps_the_schema_and_the_order_of_the_design() -> None:
+    document = assemble("A", PARTS, [Notice("clock", "the clocks disagree", "set clock_offset")]).as_json()
+    validator().validate(document)
+    assert list(document) == ["schema", "campaign", "warnings", *PARTS]
+    assert document["warnings"] == [
+        {"code": "clock", "message": "the clocks disagree", "remedy": "set clock_offset", "effect_um": None}
+    ]
+
+
+@pytest.mark.parametrize("parts", [PARTS, {"loop": RECORD_LOOP}], ids=["instruments", "record"])
+def test_every_value_comes_back(parts: dict[str, Any]) -> None:
+    document = {"schema": 3, "campaign": "A", "warnings": [], **parts}
+    assert assemble("A", parts, []).as_json() == document
+    assert isinstance(assemble("A", parts, []).loop, AxisLoop if "drift" in parts else RecordLoop)
+    validator().validate(document)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("loop", "verdict"), "perfect"),
+        (("anomalies", 0, "cause"), "magic"),
+        (("anomalies", 0, "target"), 0),
+        (("anomalies", 0, "direction"), "up"),
+        (("iso230", "B_um"), 1.0),
+        (("drift", "profile_um"), [1.0]),
+        (("schema",), 2),
+        (("hotspots", 0, "colour"), "red"),
+    ],
+)
+def test_the_schema_refuses_what_the_design_does_not_know(path: tuple[Any, ...], value: object) -> None:
+    document = deepcopy(assemble("A", PARTS, []).as_json())
+    place: Any = document
+    for part in path[:-1]:
+        place = place[part]
+    place[path[-1]] = value
+    assert not validator().is_valid(document)
+    with pytest.raises(ValidationError):
+        Results.model_validate(document)
+
+
+def test_every_field_is_described() -> None:
+    schema = results_schema()
+    tables = {"results": schema, **schema["$defs"]}
+    bare = [
+        f"{name}.{key}"
+        for name, part in tables.items()
+        for key, field in part.get("properties", {}).items()
+        if not field.get("description")
+    ]
+    assert bare == []
+
+
+def test_results_are_read_back_from_a_folder(tmp_path: Path) -> None:
+    written = assemble("A", PARTS, [])
+    text = json.dumps(written.as_json())
+    (tmp_path / "results.json").write_text(text.replace("0.35", "NaN"))
+    with pytest.raises(ResultsError, match="NaN is no number of JSON"):
+        read_results(tmp_path)
+    (tmp_path / "results.json").write_text(text)
+    read = read_results(tmp_path)
+    assert read == written
+    assert read.anomalies is not None and read.anomalies[0].evidence.support == ("a",)
+    assert "probability_local_temperature" not in read.anomalies[0].evidence.numbers()
+
+
+def test_results_print_themselves_as_the_command_does() -> None:
+    results = assemble("A & B", PARTS, [Notice("clock", "the clocks disagree", "set clock_offset")])
+    lines = str(results).splitlines()
+    assert (lines[0], lines[-1]) == ("campaign: A & B", "warning: the clocks disagree")
+    assert repr(results) == str(results)
+    assert "<th>campaign</th><td>A &amp; B</td>" in results._repr_html_()
+
+
+@pytest.mark.parametrize(("value", "written"), [(float("nan"), None), (0.5, 0.5)])
+def test_a_number_that_is_not_determined_is_null_and_a_key_that_does_not_apply_absent(value, written) -> None:
+    assert plain({"a": Coefficient(value=value, u=np.float64(0.1), unit="um")}) == {
+        "a": {"value": written, "u": 0.1, "unit": "um"}
+    }
+
+
+def test_results_that_cannot_be_read_name_file_and_remedy(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match=r"no results.json in it; name the results folder of a finished run"):
+        read_results(tmp_path)
+    (tmp_path / "results.json").write_text('{"schema": 3, "campaign": "A", "warnings": [], "colour": "red"}')
+    with pytest.raises(ResultsError, match=r"results.json: not the results of this version .*; run the campaign again"):
+        read_results(tmp_path)
+
+
+@pytest.mark.parametrize(("loop", "kind"), [(PARTS["loop"], "axis"), (RECORD_LOOP, "record")])
+def test_one_wrong_value_is_one_fault_with_its_place(tmp_path: Path, loop: dict[str, Any], kind: str) -> None:
+    document = {"schema": 3, "campaign": "A", "warnings": [], "loop": {**loop, "verdict": "perfect"}}
+    with pytest.raises(ValidationError) as caught:
+        Results.model_validate(document)
+    assert [fault["loc"] for fault in caught.value.errors()] == [("loop", kind, "verdict")]
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    with pytest.raises(ResultsError, match=r"thermofuse \(loop.verdict: Input should be 'complete'.*'no_skill'\); run"):
+        read_results(tmp_path)
+
+
+def test_several_faults_are_counted_after_the_first(tmp_path: Path) -> None:
+    document = deepcopy(assemble("A", PARTS, []).as_json())
+    document["anomalies"][0]["cause"] = "magic"
+    document["hotspots"][0]["colour"] = "red"
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    with pytest.raises(ResultsError, match=r"\(anomalies\[0\].cause: Input should be .*, and 1 more\)"):
+        read_results(tmp_path)
+
+
+def test_very_many_faults_are_counted_alone_and_long_places_are_cut(tmp_path: Path) -> None:
+    """Written out, each of a million faults would take a kilobyte."""
+    document = {"schema": 3, "campaign": "A", "warnings": [1] * 2_000}
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    with pytest.raises(ResultsError, match=r"\(2000 values are invalid\); run the campaign again"):
+        read_results(tmp_path)
+    (tmp_path / "results.json").write_text(json.dumps({**document, "warnings": [], "k" * 5_000: 1}))
+    with pytest.raises(ResultsError, match=r"\(k{200}: Extra inputs") as caught:
+        read_results(tmp_path)
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("zone", "x"), ("zone", "../../etc/passwd"), ("zone", "x" * 5_000), ("first", "today"), ("last", "99999-99-99")],
+)
+def test_times_and_zones_that_are_none_are_refused(tmp_path: Path, key: str, value: str) -> None:
+    """The report writes times of day in that zone."""
+    time = {"first": "2026-03-09T06:30:00Z", "last": "2026-03-09T16:30:00Z", "zone": "Europe/Berlin"}
+    document = {"schema": 3, "campaign": "A", "warnings": [], "time": time}
+    assert Results.model_validate(document).time is not None
+    (tmp_path / "results.json").write_text(json.dumps({**document, "time": {**time, key: value}}))
+    with pytest.raises(ResultsError, match=rf"\(time\.{key}: "):
+        read_results(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["axis", "record"])
+@pytest.mark.parametrize("schema", [1, 2])
+def test_an_older_schema_is_read_under_the_names_of_this_one(tmp_path: Path, kind: str, schema: int) -> None:
+    """The samples hold every renamed key; a fiducial and a channel that are named like one keep their name."""
+    document = json.loads(Path(__file__).with_name(f"schema_2_{kind}.json").read_text(encoding="utf-8"))
+    (tmp_path / "results.json").write_text(json.dumps({**document, "schema": schema}))
+    results = read_results(tmp_path)
+    validator().validate(results.as_json())
+    assert results.schema_version == 3 and results.loop is not None
+    if isinstance(results.loop, RecordLoop):
+        assert set(results.loop.channels) == {"nuisance"}
+        assert set(results.loop.unexplained.p_values) == {"autocorrelation", "periodicity", "switching"}
+        return
+    assert results.registration is not None and set(results.registration.leave_one_out_mm) == {"nearest"}
+    assert "single_target" in results.loop.residual_tests.final.p_values
+    assert set(results.loop.unconfirmed_effects) == set(results.loop.not_admitted) == {"dead_path"}
+    assert results.correlation is not None and results.correlation.sensors.block_length_s == 3717.0
+
+
+def test_a_schema_of_the_future_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_text(json.dumps({"schema": 4, "campaign": "A", "warnings": []}))
+    with pytest.raises(ResultsError, match="schema: Input should be 3"):
+        read_results(tmp_path)

@@ -1,0 +1,431 @@
+"""Frames of temperatures of any camera: TIFF, NumPy, NetCDF, Zarr and text; their scale, times, and what they lack."""
+
+import importlib.metadata
+import pickle
+import threading
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from tests.thermography.plan_scene import SC660
+from thermography.common import ThermographyError
+from thermography.inspection import describe_stack
+from thermography.io import flir
+from thermography.io import other_cameras as frame_readers
+from thermography.io.flir import FlirReader, read_frame
+from thermography.io.flir_writer import write_jpeg
+from thermography.io.frame import FrameReference, RejectedFrame
+from thermography.io.other_cameras import (
+    FrameReaderError,
+    NetcdfReader,
+    NumpyReader,
+    StackContents,
+    StackError,
+    StackOptions,
+    TemperatureReader,
+    TextReader,
+    TiffReader,
+    encode,
+    find_reader,
+    index_recordings,
+    plug_ins,
+    readers,
+)
+from thermography.radiometry.planck import calibrate, counts_from_temperature, override
+
+STACK = (20.0 + np.arange(3 * 10 * 12).reshape(3, 10, 12) / 50.0).astype(np.float32)
+TIMES = np.array(["2026-03-09T06:30:00", "2026-03-09T06:30:10", "2026-03-09T06:30:20"], "datetime64[ns]")
+EVERY_10_S = StackOptions(unit="degC", start=TIMES[0], interval_s=10.0)
+
+
+def store(folder: Path, kind: str, *, units: str = "degC") -> Path:
+    path = folder / f"stack.{kind}"
+    if kind == "npy":
+        np.save(path, STACK)
+    elif kind == "tif":
+        tifffile.imwrite(path, STACK, photometric="minisblack")
+    else:
+        attrs = {"units": units, "units_metadata": "temperature: on_scale"}
+        dataset = xr.Dataset({"surface": (("time", "row", "column"), STACK, attrs)}, coords={"time": TIMES})
+        if kind == "nc":
+            dataset.to_netcdf(path, engine="h5netcdf")
+        else:
+            dataset.to_zarr(path, consolidated=False, zarr_format=3)
+            path = path / "zarr.json"
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npy", "tif", "nc", "zarr"])
+def test_every_frame_comes_back_with_its_time(tmp_path, kind):
+    path = store(tmp_path, kind)
+    frames, rejected = index_recordings([path], EVERY_10_S if kind in ("npy", "tif") else StackOptions())
+    assert rejected == []
+    assert [frame.time for frame in frames] == TIMES.astype("datetime64[ms]").tolist()
+    for frame, image in zip(frames, STACK, strict=True):
+        assert frame.shape == (10, 12)
+        assert pickle.loads(pickle.dumps(frame)).read_temperature() == pytest.approx(image, abs=1e-5)
+
+
+def test_kelvin_a_folder_of_zarr_and_the_time_tag_of_a_tiff_are_read(tmp_path):
+    frames, _ = index_recordings([store(tmp_path, "nc", units="K")])
+    assert frames[0].read_temperature()[0, 0] == pytest.approx(20.0 - 273.15)
+    folder = store(tmp_path, "zarr").parent
+    assert len(index_recordings([folder])[0]) == 3
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, STACK[0], datetime="2026:03:09 07:30:00")
+    (frame,), _ = index_recordings([path], StackOptions(unit="degC", time_zone="Europe/Vienna"))
+    assert frame.time == TIMES[0]
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({}, r"holds the variables none over three dimensions; write variable = "),
+        (
+            {"a": (("time", "row", "column"), STACK), "b": (("time", "row", "column"), STACK)},
+            "holds the variables a, b over",
+        ),
+    ],
+)
+def test_the_variable_must_be_known(tmp_path, variables, message):
+    path = tmp_path / "a.nc"
+    xr.Dataset(variables).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(StackError, match=message):
+        index_recordings([path])
+    if variables:
+        options = StackOptions(unit="degC", variable="b", start=TIMES[0], interval_s=1.0)
+        assert len(index_recordings([path], options)[0]) == 3
+
+
+def test_what_is_no_stack_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    with pytest.raises(ThermographyError, match=r"an array of shape \(3,\) and type float64; save numbers as"):
+        NumpyReader().contents(tmp_path / "a.npy", EVERY_10_S)
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 8, 3), np.uint8), photometric="rgb")
+    with pytest.raises(ThermographyError, match="a colour image contains no temperatures; export the"):
+        TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
+    (tmp_path / "a.nc").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(ThermographyError, match=r"cannot be opened .* write it again"):
+        NetcdfReader().contents(tmp_path / "a.nc", EVERY_10_S)
+
+
+def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_taken(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, STACK[0], photometric="minisblack")
+    with tifffile.TiffFile(path) as file:
+        at = file.pages[0].tags["ImageLength"].valueoffset
+    content = bytearray(path.read_bytes())
+    content[at : at + 2] = (60_000).to_bytes(2, "little")
+    path.write_bytes(content)
+    with pytest.raises(ThermographyError, match=r"a\.tif: page 0 is damaged \(.*contradict one another\); export"):
+        TiffReader().read_values(path, 0, EVERY_10_S)
+
+
+@pytest.mark.parametrize("kind", ["complex64", "bool"])
+def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path, kind):
+    tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(kind), photometric="minisblack")
+    message = rf"a\.tif: values of type {kind} are not temperatures; export floating-point or whole numbers"
+    with pytest.raises(ThermographyError, match=message):
+        TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
+
+
+@pytest.mark.parametrize(
+    "kind", [np.dtype([("a", "f4"), ("b", "i4")]), np.dtype("V8"), np.dtype("c16"), h5py.string_dtype()]
+)
+def test_a_variable_of_no_numbers_is_refused(tmp_path, kind):
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file.create_dataset("temperature", (3, 4, 5), kind)
+    with pytest.raises(ThermographyError, match="are not temperatures; write floating-point or whole numbers"):
+        describe_stack(tmp_path / "a.nc")
+
+
+def test_of_many_variables_a_message_names_some(tmp_path):
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        for number in range(300):
+            file.create_dataset(f"v{number}", (3, 4, 5), "f4")
+    with pytest.raises(StackError, match=r"the variables v0, v1, .*v\d+, \[\.\.\.\] over three dimensions"):
+        describe_stack(tmp_path / "a.nc")
+
+
+def test_what_a_library_says_of_a_long_attribute_is_cut(tmp_path):
+    time = xr.DataArray(np.arange(3), dims="time", attrs={"units": "days since 2026-01-01", "calendar": "x" * 50_000})
+    values = xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), coords={"time": time})
+    values.to_dataset(name="temperature").to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(ThermographyError, match=r"cannot be opened \(.*\); write it again") as error:
+        describe_stack(tmp_path / "a.nc")
+    assert len(str(error.value)) < 1_000
+
+
+def test_a_zarr_store_of_very_many_arrays_is_not_opened(tmp_path):
+    xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), name="temperature").to_dataset().to_zarr(
+        tmp_path / "a", consolidated=False, zarr_format=3
+    )
+    describe_stack(tmp_path / "a" / "zarr.json")
+    for number in range(1_000):
+        (tmp_path / "a" / f"v{number}").mkdir()
+    with pytest.raises(ThermographyError, match="it holds more than 1000 arrays and groups"):
+        describe_stack(tmp_path / "a" / "zarr.json")
+
+
+IMAGE = np.round(20.0 + np.arange(10 * 12).reshape(10, 12) / 7.0, 2)
+READER = TextReader()
+
+
+def rows(delimiter: str, *, decimal: str = ".", end: str = "") -> str:
+    return (
+        "\n".join(delimiter.join(f"{value:.2f}".replace(".", decimal) for value in row) + end for row in IMAGE) + "\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        rows(","),
+        rows(";", decimal=","),
+        rows("\t", decimal=","),
+        rows(" "),
+        rows(";", end=";"),
+        "Camera: X\nEmissivity;0,95\n[Data]\n" + rows(";", decimal=",") + "\nMean;26\n",
+        ";".join(f"x{i}" for i in range(12)) + "\n" + rows(";"),
+    ],
+)
+def test_a_frame_is_the_longest_block_of_numbers(tmp_path, text):
+    path = tmp_path / "frame.csv"
+    for encoding in ("utf-8", "utf-16"):
+        path.write_text(text, encoding=encoding)
+        assert READER.recognises(path, path.read_bytes()[:512])
+        assert READER.contents(path, StackOptions()).shape == IMAGE.shape
+        assert READER.read_values(path, 0, StackOptions()).tolist() == IMAGE.tolist()
+
+
+def test_pixels_without_a_number_are_missing_and_tables_are_no_frames(tmp_path):
+    path = tmp_path / "frame.csv"
+    path.write_text(rows(";").replace("20.14", "---", 1))
+    values = READER.read_values(path, 0, StackOptions())
+    assert np.isnan(values[0, 1])
+    assert np.isfinite(values).sum() == values.size - 1
+    path = tmp_path / "report.md"
+    path.write_text("\n".join(f"word | 1 | 2 | {row} | 3 | word | 4 | word" for row in range(9)).replace("|", ";"))
+    assert not TextReader().holds_a_frame(path)
+    path = tmp_path / "laser.csv"
+    path.write_text("time,a,b\n1,2,3\n" * 20)
+    assert not READER.holds_a_frame(path)
+    path.write_text("\t".join(["1.5"] * 9) + "\n" + ("\t".join(["2.5"] * 9) + "\n") * 500)
+    assert not READER.holds_a_frame(path)
+    with pytest.raises(ThermographyError, match="no block of at least 8 x 8 numbers in the proportions of a"):
+        READER.contents(path, StackOptions())
+
+
+@pytest.mark.real_data
+def test_an_export_of_the_vendors_program_is_its_picture(real_file):
+    folder = "gpereyrairujo__IRimage/Windows/IRimage/test"
+    values = READER.read_values(real_file(f"{folder}/csv/test_image.csv"), 0, StackOptions())
+    frame = read_frame(real_file(f"{folder}/test_image.jpg"))
+    # The program prints three decimals, and calculates in single precision.
+    assert values == pytest.approx(calibrate(frame.counts, frame.parameters), abs=5e-3)
+
+
+@pytest.mark.parametrize("text", ["1," * 20_000, ";" * 20_000, "\n" * 200_000], ids=["numbers", "marks", "lines"])
+def test_a_line_or_a_table_longer_than_a_frame_is_passed_over(tmp_path, text):
+    path = tmp_path / "a.csv"
+    path.write_text(text + "\n" + "1,2,3,4,5,6,7,8\n" * 8)
+    if text.startswith("\n"):
+        assert not TextReader().holds_a_frame(path)
+    else:
+        assert TextReader().read_values(path, 0, StackOptions()).shape == (8, 8)
+
+
+START = np.datetime64("2026-03-09T06:30:00", "ns")
+
+
+def test_the_scale_is_the_inverse_of_the_calibration():
+    temperature = np.linspace(-40.0, 159.0, 2000)
+    parameters = StackOptions().parameters
+    back = calibrate(encode(temperature, parameters), parameters)
+    # Half a step: 17 mK at -40, 2.4 mK at 20 degC and 1.1 mK at 100 degC.
+    step = 0.5 / np.gradient(counts_from_temperature(temperature, parameters), temperature)
+    assert (np.abs(back - temperature) <= step + 1e-4).all()
+    near = (temperature > 15) & (temperature < 40)
+    assert np.std(back[near] - temperature[near]) < 1.6e-3
+
+
+def test_emissivities_and_pixels_without_temperature_are_calculated_as_for_counts():
+    for parameters in (StackOptions().parameters, StackOptions(emissivity=0.9).parameters):
+        counts = encode(np.array([np.nan, -300.0, 400.0, np.inf]), parameters)
+        assert counts.tolist() == [0, 0, 65535, 65535]
+        assert np.isnan(calibrate(counts[:1], parameters)).all()
+    options = StackOptions(emissivity=0.95, reflected_temperature_K=295.15)
+    given = options.parameters
+    truth = np.array([25.0, 30.0, 35.0])
+    wrong = calibrate(np.rint(counts_from_temperature(truth, override(given, emissivity=0.9))).astype(np.uint16), given)
+    right = calibrate(encode(wrong, given), override(given, emissivity=0.9))
+    assert right == pytest.approx(truth, abs=6e-3)
+
+
+def frames(folder: Path, options: StackOptions, *, name: str = "IR_20260309_063000.npy", count: int = 1) -> list[str]:
+    np.save(folder / name, np.full((count, 4, 5), 20.0) + np.arange(count)[:, None, None])
+    found, rejected = index_recordings([folder / name], options)
+    assert rejected == []
+    return [str(frame.time) for frame in found]
+
+
+def test_times_from_the_name_a_table_or_a_start(tmp_path):
+    options = StackOptions(unit="degC", time_in_name="%Y%m%d_%H%M%S", time_zone="Europe/Vienna", interval_s=0.5)
+    assert frames(tmp_path, options) == ["2026-03-09T05:30:00.000"]
+    assert frames(tmp_path, options, count=2) == ["2026-03-09T05:30:00.000", "2026-03-09T05:30:00.500"]
+    with pytest.raises(StackError, match=r"the name 'b.npy' holds no time of the form '%Y%m%d_%H%M%S'"):
+        frames(tmp_path, options, name="b.npy")
+    with pytest.raises(StackError, match=r"20261025_023000.npy: .* occurs twice or not at all in Europe/Vienna"):
+        frames(tmp_path, options, name="20261025_023000.npy")
+    listed = {("IR_20260309_063000.npy", 1): START}
+    assert frames(tmp_path, StackOptions(unit="degC", times=listed), count=2) == ["2026-03-09T06:30:00.000", "NaT"]
+    with pytest.raises(StackError, match=r"the table of times has no line for c.npy; add one per frame"):
+        frames(tmp_path, StackOptions(unit="degC", times=listed), name="c.npy")
+    with pytest.raises(StackError, match='2 frames and one time; write interval = "10 s"'):
+        frames(tmp_path, StackOptions(unit="degC", start=START), count=2)
+
+
+def test_scale_offset_and_kelvin(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((4, 5), 7329, np.uint16))
+    options = StackOptions(unit="K", scale=0.04, start=START)
+    (frame,), _ = index_recordings([tmp_path / "a.npy"], options)
+    assert frame.read_temperature() == pytest.approx(np.full((4, 5), 20.01))
+    with pytest.raises(StackError, match=r"whole numbers of 16 bits; write the scale of a count .* scale = 0.04"):
+        index_recordings([tmp_path / "a.npy"], StackOptions(unit="K", start=START))
+
+
+SMALL_IMAGE = 20.0 + np.arange(12 * 16).reshape(12, 16) / 10.0
+OPTIONS = StackOptions(unit="degC", start=np.datetime64("2026-03-09T06:30", "ns"), interval_s=10.0)
+
+
+def test_the_content_and_not_the_name_decides(tmp_path):
+    write_jpeg(tmp_path / "a.txt", np.full((8, 8), 18000, np.uint16), SC660, "2026-03-09T06:33:47")
+    tifffile.imwrite(tmp_path / "b.jpg", SMALL_IMAGE.astype(np.float32))
+    assert isinstance(find_reader(tmp_path / "a.txt"), FlirReader)
+    frames, rejected = index_recordings([tmp_path / "a.txt", tmp_path / "b.jpg"], OPTIONS)
+    assert [frame.path.name for frame in frames] == ["b.jpg", "a.txt"]
+    assert rejected == []
+
+
+def test_files_of_no_known_kind_are_rejected_with_the_reason(tmp_path):
+    (tmp_path / "a.bin").write_bytes(bytes(range(256)))
+    frames, rejected = index_recordings([tmp_path / "a.bin", tmp_path / "none.tif"], OPTIONS)
+    assert frames == []
+    assert "a.bin: no thermal file that is read; docs/formats.md lists them" in rejected[0].reason
+    assert "No such file" in rejected[1].reason
+
+
+class ReaderOfOnes(TemperatureReader):
+    """A plug-in: files that begin with ONES hold ten frames of one degree."""
+
+    name = "ones"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        return start.startswith(b"ONES")
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        return StackContents(10, (4, 5), "degC")
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> np.ndarray:
+        return np.ones((4, 5))
+
+
+class Unusable:
+    """A plug-in without the methods of a reader."""
+
+
+@pytest.fixture
+def plug_in(monkeypatch):
+    for cached in (readers, plug_ins):
+        cached.cache_clear()
+    yield monkeypatch
+    for cached in (readers, plug_ins):
+        cached.cache_clear()
+
+
+def named(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    entry = importlib.metadata.EntryPoint("mine", f"{__name__}:{name}", frame_readers.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(entry.__class__, "load", lambda self: globals()[name])
+    monkeypatch.setattr(frame_readers, "entry_points", lambda group: [entry])
+
+
+def test_a_plug_in_is_found_by_its_entry_point(tmp_path, plug_in):
+    named(plug_in, "ReaderOfOnes")
+    (tmp_path / "a.one").write_bytes(b"ONES")
+    frames, rejected = index_recordings([tmp_path / "a.one"], OPTIONS)
+    assert (len(frames), rejected) == (10, [])
+    assert frames[3].time == np.datetime64("2026-03-09T06:30:30")
+    # The scale of counts resolves 5 mK.
+    assert frames[3].read_temperature() == pytest.approx(np.ones((4, 5)))
+
+
+def test_plug_ins_are_loaded_once_before_the_threads(tmp_path, plug_in):
+    loaded = []
+
+    def load(self):
+        loaded.append(threading.current_thread())
+        time.sleep(0.05)  # long enough that other threads would begin to load meanwhile
+        return ReaderOfOnes
+
+    named(plug_in, "ReaderOfOnes")
+    plug_in.setattr(importlib.metadata.EntryPoint, "load", load)
+    plug_in.setattr(flir, "opening_threads", lambda files: 8)
+    paths = [tmp_path / f"{number}.one" for number in range(8)]
+    for path in paths:
+        path.write_bytes(b"ONES")
+    index_recordings(paths, OPTIONS)
+    assert loaded == [threading.current_thread()]
+
+
+def test_a_plug_in_that_cannot_be_used_is_no_fault_of_the_files(tmp_path, plug_in):
+    named(plug_in, "Unusable")
+    np.save(tmp_path / "a.npy", SMALL_IMAGE)
+    with pytest.raises(FrameReaderError, match=r"the plug-in mine = .* lacks name, recognises or index"):
+        index_recordings([tmp_path / "a.npy"], OPTIONS)
+
+
+def test_every_reader_keeps_the_protocol():
+    assert all(isinstance(reader, frame_readers.FrameReader) for reader in readers())
+
+
+def test_damaged_files_raise_no_foreign_error(tmp_path):
+    np.save(tmp_path / "a.npy", SMALL_IMAGE)
+    tifffile.imwrite(
+        tmp_path / "b.tif",
+        np.stack([SMALL_IMAGE, SMALL_IMAGE]).astype(np.float32),
+        photometric="minisblack",
+    )
+    np.savetxt(tmp_path / "c.csv", SMALL_IMAGE, delimiter=";", fmt="%.2f")
+    rng = np.random.default_rng(7)
+    outcomes = {"read": 0, "refused": 0}
+    for i in range(240):
+        original = sorted(tmp_path.glob("[abc].*"))[i % 3]
+        content = bytearray(original.read_bytes())
+        for _ in range(int(rng.integers(1, 4))):
+            at = int(rng.integers(0, len(content)))
+            content[at : at + int(rng.integers(0, 9))] = rng.bytes(int(rng.integers(0, 9)))
+        path = tmp_path / f"damaged{original.suffix}"
+        path.write_bytes(bytes(content[: int(rng.integers(1, len(content) + 1))] if i % 5 == 0 else content))
+        try:
+            frames, rejected = index_recordings([path], OPTIONS)
+            for frame in frames:
+                assert isinstance(frame, FrameReference)
+                frame.read_counts()
+            assert all(isinstance(one, RejectedFrame) for one in rejected)
+            outcomes["read" if frames else "refused"] += 1
+        except (ThermographyError, OSError):
+            outcomes["refused"] += 1
+    assert min(outcomes.values()) > 20
+
+
+def test_what_the_options_must_say_is_asked_for(tmp_path):
+    np.save(tmp_path / "a.npy", SMALL_IMAGE)
+    with pytest.raises(StackError, match='nothing says whether its values are degC or K; write unit = "degC"'):
+        index_recordings([tmp_path / "a.npy"])
+    with pytest.raises(StackError, match=r"the file holds no times; write time_in_name = .* times = .* or start = "):
+        index_recordings([tmp_path / "a.npy"], StackOptions(unit="K"))

@@ -1,0 +1,149 @@
+"""thermofuse: thermal drift of a machine-tool axis from thermograms and laser-interferometer deviations.
+
+The names that a user needs, in the order of the work, from the three packages that define them::
+
+    import thermofuse as tf
+
+    results = tf.run_campaign("campaign.toml", "results")
+    drift = tf.estimate_drift(tf.read_deviations("laser.csv"))
+
+``python -m thermofuse`` is the command. Further functions: :mod:`thermography`, :mod:`interferometry`, :mod:`fusion`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fusion import (
+        AxisGeometry,
+        Candidate,
+        Effect,
+        FusionError,
+        LoopResult,
+        Readings,
+        Results,
+        align,
+        close_loop,
+        correlate,
+        cycle_bounds,
+        diagnose,
+        export_results,
+        fetch_sample,
+        load_campaign,
+        plot_correlation,
+        plot_loop,
+        read_drivers,
+        read_results,
+        run_campaign,
+        simulate_campaign,
+    )
+    from interferometry import (
+        InterferometryError,
+        Iso230Budget,
+        build_deviations,
+        compensate,
+        detect_anomalies,
+        estimate_drift,
+        evaluate_iso230,
+        evaluate_neighbours,
+        plan_cycles,
+        plot_deviations,
+        plot_differences,
+        plot_drift,
+        plot_position,
+        plot_profile,
+        plot_reference_chart,
+        plot_scatter,
+        read_deviations,
+        read_environment,
+    )
+    from thermography import (
+        CameraParameters,
+        PlanGrid,
+        ThermographyError,
+        calibrate,
+        detect_hotspots,
+        index_frames,
+        index_recordings,
+        inspect_file,
+        plot_field,
+        read_fiducials,
+        read_frame,
+        reduce_frames,
+        reduce_moving_frames,
+        register,
+    )
+
+__version__ = metadata.version("thermofuse")
+
+__all__ = [  # noqa: RUF022 - in the order of the work
+    "simulate_campaign",
+    "fetch_sample",
+    "load_campaign",
+    "run_campaign",
+    "read_results",
+    "export_results",
+    "Results",
+    "read_deviations",
+    "build_deviations",
+    "read_environment",
+    "read_drivers",
+    "compensate",
+    "estimate_drift",
+    "evaluate_iso230",
+    "Iso230Budget",
+    "evaluate_neighbours",
+    "detect_anomalies",
+    "plan_cycles",
+    "read_frame",
+    "index_frames",
+    "index_recordings",
+    "inspect_file",
+    "CameraParameters",
+    "calibrate",
+    "PlanGrid",
+    "read_fiducials",
+    "register",
+    "cycle_bounds",
+    "reduce_frames",
+    "reduce_moving_frames",
+    "detect_hotspots",
+    "AxisGeometry",
+    "align",
+    "correlate",
+    "diagnose",
+    "close_loop",
+    "LoopResult",
+    "Effect",
+    "Candidate",
+    "Readings",
+    "plot_deviations",
+    "plot_position",
+    "plot_profile",
+    "plot_drift",
+    "plot_scatter",
+    "plot_differences",
+    "plot_reference_chart",
+    "plot_field",
+    "plot_correlation",
+    "plot_loop",
+    "ThermographyError",
+    "InterferometryError",
+    "FusionError",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that ``import thermofuse`` is quick."""
+    if name in __all__:
+        for package in map(import_module, ("thermography", "interferometry", "fusion")):
+            if name in package.__all__:
+                return getattr(package, name)
+    raise AttributeError(f"module 'thermofuse' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Names of the module, public ones included."""
+    return sorted({*globals(), *__all__})

@@ -1,9 +1,0 @@
-"""Types that annotations share."""
-
-from __future__ import annotations
-
-from typing import Any
-
-from numpy.typing import NDArray
-
-Array = NDArray[Any]

@@ -1,0 +1,710 @@
+"""Frames of temperatures from any camera: what is stated about them outside the file, and how they enter calculations that work on counts.
+
+All further steps work on counts of 16 bits and camera parameters, because averaging counts is fast and exact. Temperatures are therefore
+written as counts of a black-body scale: Planck's law with the constant of a long-wave camera (B = 1500 K), from absolute zero to 160 degC
+in 65,000 steps, 5 mK apart at 20 degC (1.4 mK standard deviation of rounding). With the emissivity and the reflected temperature that the
+camera's program used, another emissivity can be calculated exactly as for counts of such a camera.
+"""
+
+from __future__ import annotations
+
+import codecs
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from math import prod
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+from thermography.common import ThermographyError
+from thermography.io.flir import FlirReader, index_files
+from thermography.io.frame import CalibratedRange, CameraParameters, FrameReference, RejectedFrame
+from thermography.io.hdf5 import MOST_OBJECTS, hdf5_fault
+from thermography.io.sequence import FrameList, FrameTable
+
+_ZERO_CELSIUS_K = 273.15
+#: Planck's constant B of a camera for 7.5 to 13 um, K.
+_PLANCK_B = 1500.0
+#: Highest temperature of the scale, degC, and its count.
+_HIGHEST_DEGC, _HIGHEST_COUNT = 160.0, 65_000.0
+_PLANCK_R1 = _HIGHEST_COUNT * (np.exp(_PLANCK_B / (_HIGHEST_DEGC + _ZERO_CELSIUS_K)) - 1.0)
+#: Parts of a time in the name of a file: directive of strptime -> digits.
+_DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "M": 2, "S": 2, "j": 3}
+#: Most pixels of a frame; a damaged header may claim more.
+_MOST_PIXELS = 1 << 24
+#: Nine hours at 30 Hz.
+_MOST_FRAMES = 1_000_000
+
+
+class StackError(ThermographyError):
+    """What is said of files of temperatures does not suffice; the message names file, key and remedy."""
+
+
+@dataclass(frozen=True)
+class StackOptions:
+    """What files of temperatures do not hold themselves.
+
+    Attributes
+    ----------
+    unit : {"", "degC", "K"}
+        Of the values after `scale` and `offset`; "" where the file says it.
+    scale, offset : float
+        value * scale + offset is the temperature. A camera that stores 0.04 K per count has the scale 0.04 and the unit "K".
+    variable : str or None
+        Name of the variable of a NetCDF or Zarr file; None for the only one with three dimensions.
+    time_in_name : str or None
+        Pattern of the time in the names of the files, with the directives %Y %m %d %H %M %S %f %j of strptime.
+    times : mapping of (str, int) to datetime64, or None
+        UTC by name of the file and index of the frame in it, from 0.
+    start : datetime64 or None
+        UTC of the first frame of every file; with `interval_s`.
+    interval_s : float or None
+        From one frame of a file to the next, s.
+    time_zone : str
+        IANA name of the zone of times in names and in files that give none.
+    emissivity : float
+        With which the camera's program calculated the temperatures; 1 where it is not known.
+    reflected_temperature_K : float
+        Likewise, K.
+
+    Notes
+    -----
+    docs/formats.md lists the kinds of files, and the same keys of the campaign file.
+
+    Examples
+    --------
+    >>> StackOptions(unit="K", scale=0.04, time_in_name="%Y%m%d_%H%M%S").emissivity
+    1.0
+    """
+
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    variable: str | None = None
+    time_in_name: str | None = None
+    times: Mapping[tuple[str, int], np.datetime64] | None = None
+    start: np.datetime64 | None = None
+    interval_s: float | None = None
+    time_zone: str = "UTC"
+    emissivity: float = 1.0
+    reflected_temperature_K: float = 293.15
+
+    @property
+    def parameters(self) -> CameraParameters:
+        """Camera parameters of the scale of counts."""
+        # A stored transmission of 1: the camera's program has corrected the path already.
+        return CameraParameters(
+            emissivity=self.emissivity, object_distance_m=1.0, reflected_temperature_K=self.reflected_temperature_K,
+            atmospheric_temperature_K=293.15, window_temperature_K=293.15, window_transmission=1.0, stored_transmission=1.0,
+            relative_humidity=0.5, planck_r1=float(_PLANCK_R1), planck_b=_PLANCK_B, planck_f=1.0, planck_o=0.0, planck_r2=1.0,
+            atmosphere_alpha1=0.006569, atmosphere_alpha2=0.01262, atmosphere_beta1=-0.002276, atmosphere_beta2=-0.00667,
+            atmosphere_x=1.9,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StackContents:
+    """What a file of temperatures holds.
+
+    Attributes
+    ----------
+    unit : str
+        "degC" or "K" where the file says it, else "".
+    times : sequence of datetime64, or None
+        UTC or, without `zoned`, in the zone that `StackOptions` names; None where the file holds none.
+    """
+
+    frames: int
+    shape: tuple[int, int]
+    unit: str = ""
+    times: tuple[np.datetime64, ...] | None = None
+    zoned: bool = False
+
+
+class TemperatureReader(ABC):
+    """Base of readers of files that hold temperatures: `contents` and `read_values` are left to each kind of file."""
+
+    name: str
+
+    @abstractmethod
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is of this kind, by its content."""
+
+    @abstractmethod
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds, without reading its pixels where that is possible."""
+
+    @abstractmethod
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a frame as stored, (row, column)."""
+
+    def frame_contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds, see `contents`, where it can be frames: what a few bytes state may be any number."""
+        contents = self.contents(path, options)
+        if contents.shape[0] * contents.shape[1] > _MOST_PIXELS or 0 in contents.shape:
+            raise ThermographyError(f"{path}: {contents.shape[1]} x {contents.shape[0]} pixels are not a thermal frame")
+        if not 0 < contents.frames <= _MOST_FRAMES:
+            raise ThermographyError(
+                f"{path}: {contents.frames:,} frames, 1 to {_MOST_FRAMES:,} in a file can be read; export them in parts"
+            )
+        return contents
+
+    def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | RejectedFrame]:
+        """Yield the frames of a file in its order."""
+        contents = self.frame_contents(path, options)
+        unit = options.unit or contents.unit
+        if unit not in ("degC", "K"):
+            raise StackError(
+                f'{path}: nothing says whether its values are degC or K; write unit = "degC" or unit = "K"'
+            )
+        for index, time in enumerate(_times(path, contents, options)):
+            yield TemperatureFrame(
+                parameters=options.parameters,
+                time=time.astype("datetime64[ms]"),
+                limits=CalibratedRange(raw_minimum=1, raw_maximum=65_534),
+                path=path,
+                index=index,
+                size=contents.shape,
+                unit=unit,
+                reader=self,
+                options=options,
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemperatureFrame(FrameReference):
+    """A frame of temperatures, degC or K, of (rows, columns) in a file; further attributes are those of `FrameReference`."""
+
+    size: tuple[int, int]
+    unit: str
+    reader: TemperatureReader
+    options: StackOptions = field(repr=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns."""
+        return self.size
+
+    def read_temperature(self) -> NDArray[np.float64]:
+        """Read the temperatures, (row, column) degC; raise a ThermographyError where the frame has another size than the first."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = np.asarray(self.reader.read_values(self.path, self.index, self.options), np.float64)
+        if values.shape != self.size:
+            raise ThermographyError(
+                f"{self.path}: frame {self.index} has {values.shape[::-1]} pixels and not {self.size[::-1]}; the file is damaged"
+            )
+        # A damaged value may be beyond any temperature, or none; its counts say so.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return values * self.options.scale + self.options.offset - (_ZERO_CELSIUS_K if self.unit == "K" else 0.0)
+
+    def read_counts(self) -> NDArray[np.uint16]:
+        """Read the temperatures as counts of the black-body scale, (row, column) uint16; 0 where there is none."""
+        return encode(self.read_temperature(), self.parameters)
+
+
+def encode(temperature_degC: NDArray[np.floating], parameters: CameraParameters) -> NDArray[np.uint16]:
+    """Write temperatures, degC (NaN: none), as counts of a black-body scale: the inverse of `thermography.radiometry.planck.calibrate`.
+
+    Rounded; 0 for NaN and below the scale, 65535 above it.
+    """
+    p = parameters
+
+    def signal(kelvin: NDArray[np.floating] | float) -> NDArray[np.floating]:
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            return p.planck_r1 / np.expm1(p.planck_b / np.asarray(kelvin, np.float64))
+
+    kelvin = np.asarray(temperature_degC, np.float64) + _ZERO_CELSIUS_K
+    counts = p.emissivity * signal(kelvin) + (1.0 - p.emissivity) * signal(p.reflected_temperature_K)
+    counts = np.where(kelvin > 0.0, np.nan_to_num(counts, nan=0.0), 0.0)
+    return np.clip(np.rint(counts), 0, 65_535).astype(np.uint16)
+
+
+def _times(path: Path, contents: StackContents, options: StackOptions) -> list[np.datetime64]:
+    """Return the time of every frame of a file, UTC, from what is stated; else from the file itself."""
+    count = contents.frames
+    if options.times is not None:
+        times = [options.times.get((path.name, index), np.datetime64("NaT", "ns")) for index in range(count)]
+        if all(np.isnat(time) for time in times):
+            raise StackError(
+                f"{path}: the table of times has no line for {path.name}; add one per frame: file,frame,time"
+            )
+        return times
+    if options.time_in_name is not None:
+        first = _time_in_name(path, options)
+        return [first] if count == 1 else _spaced(path, first, count, options)
+    if options.start is not None:
+        return [options.start] if count == 1 else _spaced(path, options.start, count, options)
+    if contents.times is not None:
+        zone = "UTC" if contents.zoned else options.time_zone
+        return [
+            time if np.isnat(time) else to_utc(path, time.astype("datetime64[us]").item(), zone)
+            for time in contents.times
+        ]
+    raise StackError(
+        f'{path}: the file holds no times; write time_in_name = "..." (as "%Y%m%d_%H%M%S" in the name of the file), times = "times.csv" '
+        '(file,frame,time), or start = "2026-03-09T06:30:00Z" and interval = "10 s"'
+    )
+
+
+def _spaced(path: Path, first: np.datetime64, count: int, options: StackOptions) -> list[np.datetime64]:
+    if options.interval_s is None:
+        raise StackError(
+            f'{path}: {count} frames and one time; write interval = "10 s", the time from one frame to the next'
+        )
+    return [first + np.timedelta64(round(index * options.interval_s * 1e9), "ns") for index in range(count)]
+
+
+def _time_in_name(path: Path, options: StackOptions) -> np.datetime64:
+    pattern = options.time_in_name or ""
+    expression = re.sub(
+        r"%(.)|([^%])",
+        lambda part: (
+            re.escape(part[2]) if part[2] else r"\d{1,6}" if part[1] == "f" else rf"\d{{{_DIGITS.get(part[1], 1)}}}"
+        ),
+        pattern,
+    )
+    found = re.search(expression, path.name)
+    try:
+        if found is None:
+            raise ValueError
+        stamp = datetime.strptime(found[0], pattern)
+    except ValueError:
+        raise StackError(
+            f"{path}: the name {path.name!r} holds no time of the form {pattern!r}; correct time_in_name, for example "
+            '"%Y%m%d_%H%M%S" for IR_20260309_063000.csv'
+        ) from None
+    return to_utc(path, stamp, options.time_zone)
+
+
+def to_utc(path: Path, stamp: datetime, zone: str) -> np.datetime64:
+    """Return a time of a zone as UTC."""
+    placed = stamp.replace(tzinfo=ZoneInfo(zone))
+    if placed.utcoffset() != placed.replace(fold=1).utcoffset():
+        raise StackError(
+            f"{path}: {stamp} occurs twice or not at all in {zone}, where clocks are changed for summer; give the times in UTC"
+        )
+    return np.datetime64(placed.astimezone(UTC).replace(tzinfo=None), "ns")
+
+
+# Frames of temperatures as arrays: TIFF, NumPy, NetCDF and Zarr.
+
+#: Units of temperature as CF and common programs write them.
+_UNITS = {
+    **dict.fromkeys(("degC", "deg_C", "celsius", "Celsius", "degree_Celsius", "degrees_Celsius", "degrees_C", "°C", "C"), "degC"),
+    **dict.fromkeys(("K", "kelvin", "Kelvin", "degK"), "K"),
+}  # fmt: skip
+#: Kinds of NumPy's types that can be temperatures: floating point and whole numbers.
+_NUMBERS = "fiu"
+#: Most characters that a message repeats of a store, whose attributes and names may be of any length.
+_MOST_LETTERS = 500
+#: Files that a Zarr store of version 3 or 2 begins with; each stands for the whole store.
+_ZARR_METADATA = ("zarr.json", ".zgroup")
+
+
+class TiffReader(TemperatureReader):
+    """Reader of TIFF with one grey value per pixel and one page per frame: float temperatures, or 16 bits with a stated scale."""
+
+    name = "TIFF of temperatures"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is a TIFF, or a BigTIFF."""
+        return start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds."""
+        try:
+            import tifffile
+
+            with tifffile.TiffFile(path) as file:
+                first: Any = file.pages[0]
+                shape, kind = first.shape, first.dtype
+                count = len(file.pages)
+                stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
+        except Exception as error:
+            raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
+        if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
+            raise ThermographyError(
+                f"{path}: pixels of shape {shape}: a colour image contains no temperatures; export the radiometric TIFF"
+            )
+        if kind is None or kind.kind not in _NUMBERS:
+            stored = "an unknown type" if kind is None else f"type {kind}"
+            raise ThermographyError(
+                f"{path}: values of {stored} are not temperatures; export floating-point or whole numbers"
+            )
+        _require_scale(path, kind, options)
+        return StackContents(count, (shape[0], shape[1]), times=_stamp(stamp) if count == 1 else None)
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a page, (row, column)."""
+        try:
+            import tifffile
+
+            with tifffile.TiffFile(path) as file:
+                page: Any = file.pages[index]
+                # Read as they are, a million strips that the file does not hold take the memory of a million strips.
+                if page.dtype is None or page.dtype.kind not in _NUMBERS or prod(page.chunked) != len(page.dataoffsets):
+                    raise ValueError("its size, its kind of values and its list of strips contradict one another")
+                return np.asarray(page.asarray())
+        except Exception as error:
+            raise ThermographyError(f"{path}: page {index} is damaged ({error}); export it again") from None
+
+
+class NumpyReader(TemperatureReader):
+    """Reader of .npy: one frame (row, column), or frames (frame, row, column)."""
+
+    name = "NumPy array"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is a NumPy array."""
+        return start[:6] == b"\x93NUMPY"
+
+    def _open(self, path: Path) -> NDArray[np.floating]:
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        # The header is text that NumPy parses as Python: a damaged one raises errors of many kinds.
+        except Exception as error:
+            raise ThermographyError(f"{path}: damaged NumPy file ({error}); save it again with numpy.save") from None
+        if array.ndim not in (2, 3) or array.dtype.kind not in _NUMBERS:
+            raise ThermographyError(
+                f"{path}: an array of shape {array.shape} and type {array.dtype}; save numbers as (row, column) or (frame, row, column)"
+            )
+        return array if array.ndim == 3 else array[np.newaxis]
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds."""
+        array = self._open(path)
+        _require_scale(path, array.dtype, options)
+        return StackContents(array.shape[0], (array.shape[1], array.shape[2]))
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a frame, (row, column)."""
+        return np.array(self._open(path)[index])
+
+
+class NetcdfReader(TemperatureReader):
+    """Reader of a variable (time, row, column) of a NetCDF 4 or Zarr store; its units and times are those of the CF conventions."""
+
+    name = "NetCDF or Zarr"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is HDF5, or a folder of Zarr or its metadata."""
+        zarr = path.name in _ZARR_METADATA or (path.is_dir() and any((path / name).exists() for name in _ZARR_METADATA))
+        return zarr or start[:4] == b"\x89HDF"
+
+    @contextmanager
+    def _variable(self, path: Path, options: StackOptions) -> Iterator[xr.DataArray]:
+        """Open the store for as long as its variable is read."""
+        import xarray as xr  # the libraries of other files load with the first of them: a FLIR file is read without
+
+        try:
+            store = path.parent if path.name in _ZARR_METADATA else path
+            zarr = store.is_dir()
+            if zarr and not find_spec("zarr"):
+                raise ThermographyError(f"{path}: a Zarr store needs the package zarr: pip install thermofuse[zarr]")
+            # Each array of a store costs the library milliseconds whenever it is opened.
+            if zarr and sum(entry.is_dir() for entry in store.iterdir()) > MOST_OBJECTS:
+                raise ValueError(f"it holds more than {MOST_OBJECTS} arrays and groups")
+            if not zarr and (fault := hdf5_fault(store)):
+                raise ValueError(fault)
+            dataset = (
+                xr.open_zarr(store, consolidated=False, chunks=None)
+                if zarr
+                else xr.open_dataset(store, engine="h5netcdf", phony_dims="access")
+            )
+        except ThermographyError:
+            raise
+        except Exception as error:
+            raise ThermographyError(
+                f"{path}: cannot be opened ({shorten(str(error), _MOST_LETTERS)}); write it again"
+            ) from None
+        with dataset:
+            stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
+            name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
+            if name not in dataset.data_vars or dataset[name].ndim != 3:
+                names = shorten(", ".join(map(str, stacks)) or "none", _MOST_LETTERS)
+                raise StackError(
+                    f'{path}: holds the variables {names} over three dimensions; write variable = "..." '
+                    "for the one with the temperatures (time, row, column)"
+                )
+            kind = dataset[name].dtype
+            if kind.kind not in _NUMBERS:
+                raise ThermographyError(
+                    f"{path}: values of type {kind} are not temperatures; write floating-point or whole numbers"
+                )
+            yield dataset[name]
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a store holds."""
+        with self._variable(path, options) as values:
+            first = values.dims[0]
+            stamps = values[first].values if first in values.coords else np.empty(0)
+            times = tuple(stamps.astype("datetime64[ns]")) if stamps.dtype.kind == "M" else None
+            unit = _UNITS.get(str(values.attrs.get("units", "")), "")
+            return StackContents(values.shape[0], (values.shape[1], values.shape[2]), unit, times, zoned=True)
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a time, (row, column)."""
+        with self._variable(path, options) as values:
+            try:
+                return np.asarray(values[index].values)
+            except Exception as error:
+                raise ThermographyError(
+                    f"{path}: frame {index} is damaged ({shorten(str(error), _MOST_LETTERS)}); write it again"
+                ) from None
+
+
+def _require_scale(path: Path, kind: np.dtype[Any], options: StackOptions) -> None:
+    if kind.kind in "iu" and options.scale == 1.0 and options.offset == 0.0:
+        raise StackError(
+            f"{path}: its values are whole numbers of {kind.itemsize * 8} bits; write the scale of a count and the offset, for example "
+            'scale = 0.04 and unit = "K" (scale = 0.1, offset = -273.15, unit = "degC")'
+        )
+
+
+def _stamp(text: str) -> tuple[np.datetime64, ...] | None:
+    """Return the time of the tag DateTime of a TIFF, None where it holds none."""
+    try:
+        return (np.datetime64(datetime.strptime(text, "%Y:%m:%d %H:%M:%S"), "ns"),)
+    except ValueError:
+        return None
+
+
+# Frames of temperatures as text: one number per pixel, one line per row, as the programs of most cameras export them.
+
+_DELIMITERS = (";", "\t", ",", " ")
+#: Fewest rows and columns of a frame: a table with a few columns is none.
+_FEWEST = 8
+#: Largest share of the pixels of a frame that hold no number: with more it is a table with words.
+_MOST_MISSING = 0.25
+#: Largest ratio of the sides of a frame: a log of a few columns over many lines is none.
+_LONGEST = 4
+#: A text frame of a large camera has about 10 MB.
+_MOST_BYTES = 1 << 28
+#: No sensor has more columns, or with the lines around its numbers more lines: a longer table is no frame, and is not read to see that.
+_MOST_COLUMNS, _MOST_LINES = 16_384, 131_072
+
+
+class TextReader(TemperatureReader):
+    """Reader of one frame per file as CSV or TSV: the longest block of lines with equally many numbers; lines around it are passed over."""
+
+    name = "text with one temperature per pixel"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is text."""
+        marked = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        return bool(start) and (marked or not set(start) & (set(range(32)) - {9, 10, 12, 13, 27}))
+
+    def holds_a_frame(self, path: Path) -> bool:
+        """Return whether a text file holds a block of numbers."""
+        try:
+            self.contents(path, StackOptions())
+        except ThermographyError:
+            return False
+        return True
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds."""
+        values = self.read_values(path, 0, options)
+        return StackContents(1, (values.shape[0], values.shape[1]))
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the numbers of a file, (row, column); NaN where a field is no number."""
+        if path.stat().st_size > _MOST_BYTES:
+            raise ThermographyError(
+                f"{path}: {path.stat().st_size} bytes of text are more than one frame; export every frame to a file of its own"
+            )
+        content = path.read_bytes()
+        utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
+        for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
+            block = _longest_block(lines, delimiter)
+            if _is_a_frame(block):
+                return np.array(block)
+        raise ThermographyError(
+            f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; "
+            "export the temperatures of the frame as CSV, one line per row"
+        )
+
+
+def _is_a_frame(block: list[list[float]]) -> bool:
+    rows, columns = len(block), len(block[0]) if block else 0
+    if min(rows, columns) < _FEWEST or max(rows, columns) > _LONGEST * min(rows, columns):
+        return False
+    return bool(np.isnan(block).mean() <= _MOST_MISSING)
+
+
+def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:
+    """Return the longest run of lines that hold the same number of numbers."""
+    best: list[list[float]] = []
+    block: list[list[float]] = []
+    for line in lines:
+        row = _numbers(line, delimiter)
+        if block and (row is None or len(row) != len(block[0])):
+            best, block = max(best, block, key=len), []
+        if row is not None:
+            block.append(row)
+    return max(best, block, key=len)
+
+
+def _numbers(line: str, delimiter: str) -> list[float] | None:
+    """Return the numbers of a line, NaN for a field that is empty or a word for none; None where the line is no row of a frame."""
+    fields = line.split() if delimiter == " " else line.rstrip().removesuffix(delimiter).split(delimiter)
+    if not _FEWEST <= len(fields) <= _MOST_COLUMNS:
+        return None
+    if delimiter != ",":
+        fields = [field.replace(",", ".") for field in fields]
+    try:
+        return [float(field) for field in fields]
+    except ValueError:
+        values = [_number(field) for field in fields]
+        # A row may lack single pixels; a heading lacks most.
+        return values if 2 * np.isnan(values).sum() < len(values) else None
+
+
+def _number(field: str) -> float:
+    try:
+        return float(field) if "_" not in field else np.nan
+    except ValueError:
+        return float("nan")
+
+
+# Readers of thermal files of any camera: the protocol that each keeps, plug-ins by entry point, and the frames of
+# many files.
+
+ENTRY_POINT_GROUP = "thermofuse.frame_readers"
+#: A reader sees this number of bytes when it is asked whether it recognises a file.
+START_BYTES = 512
+
+
+@runtime_checkable
+class FrameReader(Protocol):
+    """What a reader of thermal files does.
+
+    One object reads all files of its kind, and up to eight threads call its methods at once, each for another file: what a call needs stays
+    in the call or is guarded by a lock.
+
+    Attributes
+    ----------
+    name : str
+        Kind of file, for messages.
+    """
+
+    name: str
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is of this kind, by its content; `start` holds its first 512 bytes, none of a folder."""
+        ...
+
+    def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
+        """Yield the frames of a file in its order without reading pixels, damaged ones as `RejectedFrame`.
+
+        Frames of a long file may be yielded together as a `FrameTable`, which makes their references on access.
+
+        Raise a ThermographyError or OSError where nothing in the file can be used.
+        """
+        ...
+
+
+class FrameReaderError(ThermographyError):
+    """A plug-in that cannot be used; the message names it and the remedy."""
+
+
+@cache
+def plug_ins() -> tuple[FrameReader, ...]:
+    """Return the readers that other installed distributions add."""
+    found: list[FrameReader] = []
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        try:
+            reader = entry.load()()
+        except Exception as error:
+            raise FrameReaderError(
+                f"the plug-in {entry.name} = {entry.value} cannot be loaded ({error}); update its package or remove it"
+            ) from error
+        if not isinstance(reader, FrameReader):
+            raise FrameReaderError(
+                f"the plug-in {entry.name} = {entry.value} lacks name, recognises or index; it must keep FrameReader"
+            )
+        found.append(reader)
+    return tuple(found)
+
+
+@cache
+def readers() -> tuple[FrameReader, ...]:
+    """Return all readers, plug-ins first."""
+    return (*plug_ins(), FlirReader(), TiffReader(), NumpyReader(), NetcdfReader(), TextReader())
+
+
+def find_reader(path: Path) -> FrameReader | None:
+    """Return the reader of an existing file or folder of Zarr, None where no reader recognises it."""
+    start = b""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            start = file.read(START_BYTES)
+    return next((reader for reader in readers() if reader.recognises(path, start)), None)
+
+
+def index_recordings(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], options: StackOptions | None = None
+) -> tuple[FrameList, list[RejectedFrame]]:
+    """List all frames of many thermal files of one camera without reading a pixel.
+
+    Parameters
+    ----------
+    paths : str, path-like or iterable of them
+        Files that some reader recognises, in any order; or one such file.
+    options : StackOptions, optional
+        What files of temperatures do not hold themselves; FLIR files need none.
+
+    Returns
+    -------
+    frames : FrameList
+        Sequence of `FrameReference`, sorted by time (UTC), frames without a time last; no time occurs twice.
+    rejected : list of RejectedFrame
+        Everything that is not in `frames`, with the reason.
+
+    Raises
+    ------
+    StackError
+        Temperatures without a unit, or frames without any time, of a whole file: `options` must say more.
+    FrameReaderError
+        A plug-in cannot be used.
+
+    See Also
+    --------
+    thermography.io.flir.index_frames : The same for FLIR files alone.
+
+    Notes
+    -----
+    docs/formats.md lists the kinds of files.
+
+    Examples
+    --------
+    >>> index_recordings(["does_not_exist.tif"])[1][0].reason
+    "[Errno 2] No such file or directory: 'does_not_exist.tif'"
+    """
+    options = options or StackOptions()
+    readers()  # Loaded here once: threads that ask first would each load the plug-ins.
+
+    def walk(path: Path) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
+        reader = find_reader(path)
+        if reader is None:
+            raise ThermographyError(f"{path}: not a known thermal file; docs/formats.md lists them")
+        yield from reader.index(path, options)
+
+    files = [paths] if isinstance(paths, str | os.PathLike) else paths
+    return index_files(files, walk, fatal=(StackError,))

@@ -1,0 +1,546 @@
+"""Reads the headers of a long sequence by the hundred, compiled, and keeps what differs from frame to frame as columns.
+
+The first frame of a run is read field by field (`thermography.io.flir`). As long as the following ones are laid out as it is, their headers
+stand at predicted places. Every one of them is read and checked as the first one was before its frame is listed: magic, version,
+directory, byte orders, lengths and places of the records, size and packing of the samples, that the frame is not truncated, and
+that a header or the end of the file follows. Camera, lens, calibrated range, time zone and names of sensors are compared with those of
+the first frame. The first frame that differs in any of these ends the run and is read field by field, which also finds what is wrong.
+What was found of a long run is kept for the next time (`thermography.io.sequence`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import sys
+from abc import abstractmethod
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermography.common import Array, usable_processors
+from thermography.io.fff_record import (
+    FffSource,
+    damaged_records,
+    read_counts,
+    read_directory,
+)
+from thermography.io.frame import (
+    CameraParameters,
+    Frame,
+    FrameHeader,
+    FrameReference,
+    PlainSamples,
+    RejectedFrame,
+    SampleLocation,
+    Segments,
+    StoredPixels,
+)
+
+# Reads a window of the sensor from many frames: from the page cache of the system if the file is there, else directly
+# from disk.
+
+#: Offsets, lengths and buffers of direct disk reads must be multiples of this, bytes.
+_PAGE = mmap.PAGESIZE
+#: Windows of consecutive frames are read from a disk in one piece if no more than this stands between them, bytes.
+_GAP = 1 << 16
+#: Bit of the result of mincore(2) that is set for a page in memory.
+_IN_MEMORY = 1
+
+
+class WindowReader:
+    """Context manager that reads a window of the sensor from many frames.
+
+    Of plain samples only the rows of the window are read; packed samples are decoded as whole frames. A file in the page cache of the
+    system is copied from there. Any other file is read directly from disk (O_DIRECT), which is half as fast again as through the cache
+    and does not evict the data of other programs, neighbouring windows in one piece; where the system has no direct reads, the cache is
+    used.
+
+    Parameters
+    ----------
+    window : tuple of slice
+        Rows and columns of the sensor, both with start and stop.
+    """
+
+    def __init__(self, window: tuple[slice, slice]) -> None:
+        self.window = window
+        self._file: _File | None = None
+        self._ahead: ThreadPoolExecutor | None = None
+
+    def __enter__(self) -> WindowReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._ahead is not None:
+            self._ahead.shutdown()
+        if self._file is not None:
+            self._file.close()
+
+    def read(self, frames: Sequence[StoredPixels], counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Read the window of every frame into a buffer."""
+        rows, columns = self.window
+        counts = counts[: len(frames)]
+        checked = None
+        for number, (target, frame) in enumerate(zip(counts, frames, strict=True)):
+            samples = frame.plain_samples
+            if samples is None:
+                target[...] = frame.read_counts()[self.window]
+                continue
+            width = frame.shape[1]
+            place = samples.offset + rows.start * width * 2
+            whole = width == target.shape[1]
+            rows_read = target.reshape(-1) if whole else np.empty(target.shape[0] * width, np.uint16)
+            file = self._open(frame.path)
+            if file is not checked:
+                # Once per call: the few frames of a call are neighbours in the file and are cached or evicted together.
+                file.check(place, rows_read.nbytes)
+                if not file.in_memory:
+                    file.read_together(place, self._end_of_neighbours(frames[number:], rows_read.nbytes))
+                checked = file
+            if file.read(place, rows_read.view(np.uint8)) < rows_read.nbytes:
+                raise OSError(
+                    f"{frame.path}: frame {frame.index} ends early; the file has become shorter since it was indexed"
+                )
+            if samples.little_endian != (sys.byteorder == "little"):
+                rows_read.byteswap(inplace=True)
+            if not whole:
+                target[...] = rows_read.reshape(-1, width)[:, columns]
+        return counts
+
+    def read_in_chunks(self, frames: Sequence[StoredPixels], size: int) -> Iterator[NDArray[np.uint16]]:
+        """Read the window of every frame, some frames at a time; from a disk, the next ones while the caller uses these."""
+        shape = (min(size, len(frames)), *(side.stop - side.start for side in self.window))
+        # Two buffers for all chunks: allocating memory for each costs more than reading into it.
+        buffers = [np.empty(shape, np.uint16)]
+        ahead: Future[NDArray[np.uint16]] | None = None
+        for start in range(0, len(frames), size):
+            counts = self.read(frames[start : start + size], buffers[0]) if ahead is None else ahead.result()
+            ahead, following = None, frames[start + size : start + 2 * size]
+            if len(following) and self._file is not None and not self._file.in_memory:
+                if self._ahead is None:
+                    self._ahead = ThreadPoolExecutor(1, "read ahead")
+                if len(buffers) == 1:
+                    buffers.append(np.empty(shape, np.uint16))
+                buffers.reverse()
+                ahead = self._ahead.submit(self.read, following, buffers[0])
+            yield counts
+
+    def _end_of_neighbours(self, frames: Sequence[StoredPixels], length: int) -> int:
+        """Where the windows of the first frames end that follow one another closely in one file, bytes."""
+        end = 0
+        for frame in frames:
+            samples = frame.plain_samples
+            if samples is None or frame.path != frames[0].path:
+                break
+            place = samples.offset + self.window[0].start * frame.shape[1] * 2
+            if end and not 0 <= place - end <= _GAP:
+                break
+            end = place + length
+        return end
+
+    def _open(self, path: Path) -> _File:
+        if self._file is None or self._file.path != path:
+            if self._file is not None:
+                self._file.close()
+            self._file = _File(path)
+        return self._file
+
+
+class _File:
+    """An open file that is read through the page cache or directly."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.cached: BinaryIO = path.open("rb", buffering=0)
+        self.direct: BinaryIO | None = None
+        self.buffer = mmap.mmap(-1, _PAGE)
+        # First and last byte of the file that the buffer holds.
+        self.held = (0, 0)
+        self.pages: mmap.mmap | None
+        # Never accessed: the mapping only serves to ask which pages are in memory. Empty files cannot be mapped,
+        # nor those of some network shares.
+        try:
+            self.pages = mmap.mmap(self.cached.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError):
+            self.pages = None
+        self.in_memory = True
+
+    def check(self, place: int, length: int) -> None:
+        """Determine whether these bytes are in the page cache, and open the file for direct reads if they are not."""
+        self.in_memory = self.pages is None or _resident(self.pages, place, length)
+        self.held = (0, 0)
+        if self.in_memory or self.direct is not None or not hasattr(os, "O_DIRECT"):
+            return
+        try:
+            self.direct = os.fdopen(os.open(self.path, os.O_RDONLY | os.O_DIRECT), "rb", buffering=0)
+        except OSError:
+            # Some file systems have no direct reads; `read` uses the cache then.
+            self.direct = None
+
+    def read_together(self, place: int, end: int) -> None:
+        """Read bytes directly in one piece, from which `read` takes them; nothing where there are no direct reads."""
+        if self.direct is None:
+            return
+        first = place // _PAGE * _PAGE
+        length = -(-(end - first) // _PAGE) * _PAGE
+        if len(self.buffer) < length:
+            self.buffer.close()
+            self.buffer = mmap.mmap(-1, length)
+        self.direct.seek(first)
+        with memoryview(self.buffer) as pages:
+            self.held = (first, first + self.direct.readinto(pages[:length]))  # type: ignore[attr-defined]
+
+    def read(self, place: int, target: NDArray[np.uint8]) -> int:
+        """Read bytes from `place` on into `target`; return their number, which is smaller at the end of the file."""
+        if self.in_memory or self.direct is None:
+            self.cached.seek(place)
+            return self.cached.readinto(target)  # type: ignore[attr-defined]
+        first, end = self.held
+        if not first <= place <= place + target.size <= end:
+            self.read_together(place, place + target.size)
+            first, end = self.held
+        available = max(min(end - place, target.size), 0)
+        with memoryview(self.buffer) as pages:
+            target[:available] = np.frombuffer(pages, np.uint8, available, place - first)
+        return int(available)
+
+    def close(self) -> None:
+        """Close the file and release its buffers."""
+        for resource in (self.cached, self.direct, self.buffer, self.pages):
+            if resource is not None:
+                resource.close()
+
+
+def in_memory(path: Path) -> bool:
+    """Return whether the start of a file is in the page cache of the system; True where the system cannot tell, or there is none."""
+    try:
+        file = _File(path)
+    except OSError:
+        return True
+    resident = file.pages is None or _resident(file.pages, 0, 1)
+    file.close()
+    return resident
+
+
+def _resident(pages: mmap.mmap, place: int, length: int) -> bool:
+    """Return whether all of these bytes of a mapped file are in memory; True where the system cannot tell."""
+    try:
+        mincore = ctypes.CDLL(None).mincore
+    except (AttributeError, OSError, TypeError):
+        return True
+    first = place // _PAGE
+    count = -(-(place + length) // _PAGE) - first
+    state = (ctypes.c_ubyte * count)()
+    address = np.frombuffer(pages, np.uint8).ctypes.data + first * _PAGE
+    failed = mincore(ctypes.c_void_p(address), ctypes.c_size_t(count * _PAGE), state)
+    return bool(failed) or all(page & _IN_MEMORY for page in state)
+
+
+# The same call for many files or frames by threads, results in order.
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: Most threads that compute. Reading, decoding and sums release the interpreter lock; a thread costs up to 12 MB.
+MOST_THREADS = 8
+#: Threads that open files: they wait for the disk or the network, whatever the number of cores.
+_OPENING_THREADS = 8
+#: Most calls that a thread takes at a time: handing over each alone costs half as much as reading the headers of a file.
+_BATCH = 16
+
+
+def usable_threads() -> int:
+    """Return the number of threads that compute: the cores that this process may use, up to `MOST_THREADS`."""
+    return min(usable_processors(), MOST_THREADS)
+
+
+def opening_threads(paths: Sequence[Path]) -> int:
+    """Return the number of threads that open files: one where the first file is in memory, because they would wait for each other."""
+    return 1 if len(paths) < 2 or in_memory(paths[0]) else _OPENING_THREADS
+
+
+def call_by_threads(function: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
+    """Yield the results of a function for every item in order, by threads where there are many items; the first error ends the calls."""
+    if threads == 1 or len(items) < 2:
+        yield from map(function, items)
+        return
+    size = min(max(len(items) // (4 * threads), 1), _BATCH)
+    with ThreadPoolExecutor(threads, "files") as executor:
+        waiting: deque[Future[list[Result]]] = deque()
+        try:
+            for start in range(0, len(items), size):
+                batch = items[start : start + size]
+                waiting.append(executor.submit(lambda some: [function(each) for each in some], batch))
+                if len(waiting) > 2 * threads:
+                    yield from waiting.popleft().result()
+            while waiting:
+                yield from waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+# A frame in a FLIR file, without its pixels.
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlirFrameReference(FrameReference):
+    """A frame in a FLIR file: segments of its FFF record in the file, and places of camera information and samples in the record, bytes."""
+
+    segments: Segments
+    camera_info_place: tuple[int, int]
+    samples: SampleLocation
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns."""
+        return self.samples.shape
+
+    @property
+    def plain_samples(self) -> PlainSamples | None:
+        """Place of the pixels; None where they are packed, or parted into the segments of a JPEG."""
+        if self.samples.encoding != "raw" or len(self.segments) != 1:
+            return None
+        return PlainSamples(self.segments[0][0] + self.samples.offset, self.samples.little_endian)
+
+    def read(self) -> Frame:
+        """Read the frame with its pixels and camera information; raise FlirFormatError where they are damaged."""
+        with self.path.open("rb", buffering=0) as file:
+            return self.read_from(file)
+
+    def read_from(self, file: BinaryIO) -> Frame:
+        """As `read`, from the open file."""
+        source = FffSource(file, self.path, self.segments)
+        info = source.take(*self.camera_info_place, "camera information")
+        counts = read_counts(source, self.samples)
+        header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
+        return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
+
+    def damaged_records(self) -> list[int]:
+        """Return the types of all records that differ from their checksums; reading compares that of the pixels only."""
+        with self.path.open("rb", buffering=0) as file:
+            source = FffSource(file, self.path, self.segments)
+            return damaged_records(source, read_directory(source))
+
+    def read_counts(self) -> NDArray[np.uint16]:
+        """Read the pixels only, (row, column) uint16; raise FlirFormatError where they are damaged."""
+        with self.path.open("rb", buffering=0) as file:
+            return read_counts(FffSource(file, self.path, self.segments), self.samples)
+
+
+# The frames of many files in the order of time, as one sequence whose references may be made on access.
+
+
+class _Frames(Sequence[FrameReference]):
+    """Sequence of frames whose references are made on access; a slice is a list."""
+
+    @abstractmethod
+    def reference(self, place: int) -> FrameReference:
+        """Make the reference of a frame, 0 to n - 1."""
+
+    def __getitem__(self, place: Any) -> Any:
+        """Return a frame, or those of a slice as a list."""
+        chosen = range(len(self))[place]
+        return self.reference(chosen) if isinstance(chosen, int) else [self.reference(each) for each in chosen]
+
+    def __iter__(self) -> Iterator[FrameReference]:
+        """Make the references one after the other."""
+        return map(self.reference, range(len(self)))
+
+
+class FrameTable(_Frames):
+    """Consecutive frames of one file that share size, camera and layout; a reference is made when its frame is asked for.
+
+    Attributes
+    ----------
+    path : Path
+        Of the file.
+    first_index : int
+        Index of the first frame in the file.
+    shape : tuple of int
+        Number of rows and columns.
+    times : (n,) ndarray of datetime64[ms]
+        UTC; NaT where the file stores none.
+    parameter_sets : list of CameraParameters
+        Those that occur.
+    parameter_set : (n,) ndarray of int
+        Which of them every frame has.
+    """
+
+    path: Path
+    first_index: int
+    shape: tuple[int, int]
+    times: Array
+    parameter_sets: list[CameraParameters]
+    parameter_set: NDArray[np.integer[Any]]
+
+    @abstractmethod
+    def temperatures(self) -> dict[str, Array]:
+        """Temperatures inside the camera by sensor, (n,) K; NaN where a frame has none."""
+
+    @abstractmethod
+    def noted(self) -> list[int]:
+        """Places of the frames that carry notes."""
+
+
+class FrameList(_Frames):
+    """Frames in the order of time.
+
+    A frame of a long sequence costs some hundred bytes instead of the two kilobytes of its reference.
+
+    Parameters
+    ----------
+    parts : sequence of FrameTable and of lists of FrameReference
+        In any order.
+    order : (n,) ndarray of int, optional
+        Places in the concatenated parts; their own order by default.
+    """
+
+    def __init__(
+        self, parts: Sequence[FrameTable | list[FrameReference]], order: NDArray[np.integer[Any]] | None = None
+    ) -> None:
+        self._parts = [part for part in parts if len(part)]
+        self._starts = [0, *accumulate(len(part) for part in self._parts)]
+        self._order = order
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return self._starts[-1] if self._order is None else len(self._order)
+
+    def reference(self, place: int) -> FrameReference:
+        """Return a frame, 0 to n - 1."""
+        stored = place if self._order is None else int(self._order[place])
+        part = bisect_right(self._starts, stored) - 1
+        return self._parts[part][stored - self._starts[part]]
+
+    def __eq__(self, other: object) -> bool:
+        """Compare with any sequence, frame by frame."""
+        if not isinstance(other, Sequence):
+            return NotImplemented
+        return len(self) == len(other) and all(a == b for a, b in zip(self, other, strict=True))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        """Return the representation of a list of the frames; of many, their number."""
+        return repr(list(self)) if len(self) <= 3 else f"<{len(self)} frames, the first {self[0]!r}>"
+
+    @cached_property
+    def times(self) -> Array:
+        """Times (UTC), (n,) datetime64[ms]."""
+        return self.column(lambda table: table.times, lambda frame: frame.time, "datetime64[ms]")
+
+    def column(
+        self, of_table: Callable[[FrameTable], Array], of_frame: Callable[[FrameReference], Any], kind: str | type
+    ) -> Array:
+        """One value per frame."""
+        values = np.empty(self._starts[-1], kind)
+        for part, start in zip(self._parts, self._starts, strict=False):
+            of_part = of_table(part) if isinstance(part, FrameTable) else list(map(of_frame, part))
+            for_all = values[start : start + len(part)]
+            for_all[...] = of_part if isinstance(of_part, np.ndarray) else np.array(of_part, kind)
+        return values if self._order is None else values[self._order]
+
+    def files(self) -> Array:
+        """Names of the files, (n,) of str objects."""
+        return self.column(
+            lambda table: np.full(len(table), str(table.path), object), lambda frame: str(frame.path), "object"
+        )
+
+    def numbers(self) -> NDArray[np.int64]:
+        """Indices of the frames in their files, (n,)."""
+        return self.column(lambda table: table.first_index + np.arange(len(table)), lambda frame: frame.index, "int64")
+
+    def shapes(self) -> NDArray[np.int64]:
+        """Rows and columns of the frames, (n, 2)."""
+        rows = self.column(lambda table: np.full(len(table), table.shape[0]), lambda frame: frame.shape[0], "int64")
+        columns = self.column(lambda table: np.full(len(table), table.shape[1]), lambda frame: frame.shape[1], "int64")
+        return np.stack([rows, columns], axis=-1)
+
+    def parameter_sets(self) -> tuple[list[CameraParameters], NDArray[np.int64]]:
+        """Return the camera parameters that occur, and which of them every frame has, (n,)."""
+        known: dict[CameraParameters, int] = {}
+
+        def number(parameters: CameraParameters) -> int:
+            return known.setdefault(parameters, len(known))
+
+        which = self.column(
+            lambda table: np.array([number(each) for each in table.parameter_sets])[table.parameter_set],
+            lambda frame: number(frame.parameters),
+            "int64",
+        )
+        return list(known), which
+
+    def temperatures(self) -> dict[str, Array]:
+        """Temperatures inside the camera by sensor, (n,) K; NaN where a frame has none."""
+        found: dict[str, Array] = {}
+        for part, start in zip(self._parts, self._starts, strict=False):
+            if isinstance(part, FrameTable):
+                readings = part.temperatures()
+            else:
+                names = dict.fromkeys(name for frame in part for name in frame.housekeeping)
+                readings = {name: np.array([f.housekeeping.get(name, np.nan) for f in part]) for name in names}
+            for name, values in readings.items():
+                every = found.setdefault(name, np.full(self._starts[-1], np.nan))
+                every[start : start + len(part)] = values
+        return found if self._order is None else {name: values[self._order] for name, values in found.items()}
+
+    def noted(self) -> list[FrameReference]:
+        """Frames that carry notes, in order."""
+        noted = self.column(
+            lambda table: np.isin(np.arange(len(table)), table.noted()), lambda frame: bool(frame.notes), "bool"
+        )
+        return [self[int(i)] for i in np.flatnonzero(noted)]
+
+    def choose(self, chosen: Array) -> FrameList:
+        """Return the frames where `chosen`, (n,) of bool, is True."""
+        return FrameList(self._parts, np.flatnonzero(chosen) if self._order is None else self._order[chosen])
+
+
+def order_by_time(found: Iterable[FrameReference | FrameTable]) -> tuple[FrameList, list[RejectedFrame]]:
+    """Sort frames by time, and take out those whose time occurs twice."""
+    parts: list[FrameTable | list[FrameReference]] = []
+    for each in found:
+        if isinstance(each, FrameTable):
+            parts.append(each)
+        elif parts and isinstance(parts[-1], list):
+            parts[-1].append(each)
+        else:
+            parts.append([each])
+    stored = FrameList(parts)
+    times = stored.times
+    if not np.isnat(times).any() and (np.diff(times) > np.timedelta64(0)).all():
+        return stored, []
+    by_name = np.unique(stored.files().astype(str), return_inverse=True)[1]
+    order = np.lexsort((stored.numbers(), by_name, times))
+    second = np.concatenate([[False], times[order][1:] == times[order][:-1]])
+    kept = FrameList(parts, order[~second])
+    earlier = np.cumsum(~second) - 1
+    return kept, [_repeated(stored[int(order[i])], kept[int(earlier[i])]) for i in np.flatnonzero(second)]
+
+
+def _repeated(frame: FrameReference, kept: FrameReference) -> RejectedFrame:
+    reason = f"{frame.path}: frame {frame.index} has the same time {frame.time} as frame {kept.index} of {kept.path}"
+    return RejectedFrame(frame.path, frame.index, reason)
+
+
+def frame_times(frames: Sequence[FrameReference]) -> Array:
+    """Return the times (UTC) of frames, (n,) datetime64[ns]; NaT where a file stores none."""
+    if isinstance(frames, FrameList):
+        return frames.times.astype("datetime64[ns]")
+    return np.array([frame.time for frame in frames], "datetime64[ns]")
+
+
+def frame_shapes(frames: Sequence[FrameReference]) -> NDArray[np.int64]:
+    """Return rows and columns of frames, (n, 2)."""
+    return frames.shapes() if isinstance(frames, FrameList) else np.array([frame.shape for frame in frames], np.int64)

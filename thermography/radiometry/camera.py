@@ -1,0 +1,399 @@
+"""Correction of the camera's zero: flat-field steps and drift with the temperature of its housing, estimated from the frames.
+
+The surroundings change with the room, slowly; what the camera adds to it changes suddenly (a flat-field correction, FFC) or
+with the temperatures inside the camera. The level of the background is divided into these parts by generalised least squares on its
+changes from frame to frame. What none of them explains may be the room or the camera: it is not corrected but enters the uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, ndimage, optimize, special
+
+from thermography.common import MAD_TO_SIGMA, Array
+
+# Detects artefacts of the camera in a series of frames: repeated frames, frozen output and bad pixels.
+
+Cause = Literal["repeated_frame", "frozen_frames"]
+#: More repeats in a row than this mean that the camera output was frozen, not that a frame was written twice.
+_MAX_REPEATS = 2
+
+#: Flags of `find_bad_pixels`.
+DEAD, OFFSET, NOISY = 1, 2, 4
+#: Place of the 90th percentile among the 24 pixels that surround a pixel.
+_RING_RANK = 21
+
+
+@dataclass(frozen=True)
+class CameraFlag:
+    """A camera artefact, the first frame that shows it with its time, UTC, and a description without a full stop."""
+
+    cause: Cause
+    index: int
+    time: np.datetime64
+    message: str
+
+
+def find_repeats(repeated: NDArray[np.bool_], time: NDArray[np.datetime64]) -> list[CameraFlag]:
+    """Find frames that were written twice and intervals in which the camera output was frozen."""
+    flags = []
+    labels, count = ndimage.label(repeated)
+    for (run,) in ndimage.find_objects(labels)[:count]:
+        length = run.stop - run.start
+        frozen = length > _MAX_REPEATS
+        text = f"{length} {'frame repeats' if length == 1 else 'frames repeat'} the counts of frame {run.start - 1}"
+        text += ": the camera output was frozen" if frozen else ""
+        cause: Cause = "frozen_frames" if frozen else "repeated_frame"
+        flags.append(CameraFlag(cause, run.start, time[run.start], text))
+    return flags
+
+
+def find_bad_pixels(counts: NDArray[np.uint16], *, threshold: float = 8.0) -> NDArray[np.uint8]:
+    """Find pixels whose mean or noise differs from that of their neighbours."""
+    stack = counts.astype(np.float32)
+    mean, noise = stack.mean(axis=0), stack.std(axis=0)
+    flags = np.where(_outliers(mean, threshold), OFFSET, 0).astype(np.uint8)
+    if len(stack) >= 8:
+        flags |= np.where((noise == 0) & (np.median(noise) > 0), DEAD, 0).astype(np.uint8)
+        flags |= np.where(_outliers(noise, threshold) & (noise > np.median(noise)), NOISY, 0).astype(np.uint8)
+    return flags
+
+
+def _outliers(image: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+    """Return which pixels deviate from their neighbours much further than the pixels of their surroundings do."""
+    rows, columns = image.shape
+    padded = np.pad(image, 1, mode="reflect")
+    shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
+    differences = [np.abs(image - padded[row : row + rows, column : column + columns]) for row, column in shifts]
+    deviation = np.partition(differences, 2, axis=0)[2]
+    typical = max(np.median(deviation), np.float32(1.0))
+    # Few pixels deviate further than those of the whole picture do: of these alone the surroundings are looked at.
+    outlying = deviation > threshold * typical
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(deviation, 2, mode="symmetric"), (5, 5))[outlying]
+    rings = np.delete(windows.reshape(-1, 25), 12, axis=1)
+    outlying[outlying] = deviation[outlying] > threshold * np.partition(rings, _RING_RANK, axis=1)[:, _RING_RANK]
+    return outlying
+
+
+#: Probability that a sound camera is corrected for a step (family-wise), and for a drift.
+_SIGNIFICANCE = 1e-3
+#: Smallest step that is corrected, K: less moves no field by more than its noise.
+_LEAST_STEP_K = 0.02
+#: The table must follow a step of the background within this share of it, or within this multiple of its own scatter.
+_SHARED, _SHARED_SIGMAS = 0.5, 4.0
+#: Largest drift of a camera, K per K of its housing: what changes by more does not follow the housing but the room, as the housing does.
+_LARGEST_DRIFT = 0.5
+#: Changes on either side of a step by which the rate of the table is judged.
+_NEIGHBOURS = 3
+#: Principal components with less than this share of the first one's amplitude would only fit noise.
+_LEAST_COMPONENT = 0.01
+#: Largest number of frames in the fit; of more, frames at even distances represent the series.
+_FITTED_FRAMES = 1000
+#: Changes beyond this multiple of their robust standard deviation are taken for steps before the first fit.
+_OUTLYING = 4.0
+#: With more steps than this share of the changes there is no ordinary change to hold them against.
+_MOST_STEPS = 0.4
+#: Fewest frames beyond the unknown values.
+_LEAST_FRAMES = 6
+#: Time constants with which thin and thick walls follow the air, s.
+ROOM_LAGS_S = (600.0, 3600.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSeries:
+    """Levels of n frames, and what was logged with them.
+
+    Attributes
+    ----------
+    background, table : (n,) ndarray, degC
+        Level of the surroundings of the table, and of the table, which has to share every step of the camera.
+    housing : (n, k) ndarray, K
+        Temperatures inside the camera; k may be 0.
+    room : (n, m) ndarray, degC
+        Temperatures that the background follows: of the air, and of it through first-order lags; m is 0 where none was logged.
+    """
+
+    seconds: Array
+    background: Array
+    table: Array
+    housing: Array
+    room: Array
+
+    def thinned(self, kept: NDArray[np.intp]) -> LevelSeries:
+        """The series of some frames."""
+        return LevelSeries(
+            self.seconds[kept], self.background[kept], self.table[kept], self.housing[kept], self.room[kept]
+        )
+
+
+@dataclass(frozen=True)
+class CameraStep:
+    """A step of the camera's zero: the first frame after it, its size and standard uncertainty, K."""
+
+    index: int
+    value_K: float
+    u_K: float
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCorrection:
+    """Correction of the camera's zero in n frames, relative to the first one.
+
+    Attributes
+    ----------
+    correction_K : (n,) ndarray, K
+        To be added to the temperature of every frame; 0 throughout where nothing is significant.
+    u_K : (n,) ndarray, K
+        Standard uncertainty of the camera's zero after the correction, common to the whole frame; 0 for the first.
+    steps : tuple of CameraStep
+        Steps that were corrected.
+    drift_K : (n,) ndarray, K
+        Drift with the temperature of the housing that was corrected; 0 where it is not significant.
+    unexplained_K : (n,) ndarray, K
+        Slow change of the background that neither room nor camera explains.
+    """
+
+    correction_K: Array
+    u_K: Array
+    steps: tuple[CameraStep, ...]
+    drift_K: Array
+    unexplained_K: Array
+
+    @property
+    def corrects(self) -> bool:
+        """Whether anything is corrected."""
+        return bool(self.correction_K.any())
+
+
+def estimate_correction(series: LevelSeries) -> CameraCorrection:
+    """Estimate steps and drift of the camera's zero."""
+    n = len(series.seconds)
+    kept = np.unique(np.linspace(0, n - 1, min(n, _FITTED_FRAMES)).round().astype(np.intp))
+    thin = series.thinned(kept)
+    room = _components(thin.room)
+    housing = _beyond(_components(thin.housing), room)
+    unknowns = room.shape[1] + housing.shape[1]
+    if len(kept) < unknowns + _LEAST_FRAMES:
+        change = series.background - series.background[0]
+        return CameraCorrection(np.zeros(n), np.asarray(np.abs(change) / np.sqrt(3.0)), (), np.zeros(n), change)
+    regressors = np.diff(np.column_stack([room, housing]), axis=0)
+    places, fit = _find_steps(np.diff(thin.background), regressors, np.diff(thin.seconds))
+    sizes, sizes_u = fit.values[unknowns:], np.sqrt(np.diag(fit.covariance)[unknowns:])
+    shared = _shared_by_table(thin, places, sizes)
+    of_housing = slice(room.shape[1], unknowns)
+    of_room = slice(0, room.shape[1])
+    drift = housing @ fit.values[of_housing]
+    drifts = (
+        _significant(fit, of_room)
+        and _significant(fit, of_housing)
+        and np.ptp(drift) <= _LARGEST_DRIFT * np.ptp(np.nanmean(thin.housing, axis=1))
+    )
+    # What camera and rest have added since the first frame, per unknown value.
+    response = np.zeros((len(kept), len(fit.values)))
+    response[:, :unknowns] = np.column_stack([room, housing]) - np.concatenate([room[0], housing[0]])
+    response[:, unknowns:] = np.arange(len(kept))[:, None] > np.array(places, int)
+    of_camera = np.zeros(len(fit.values), bool)
+    of_camera[of_housing] = True
+    of_camera[unknowns:] = shared
+    variance = np.einsum("ij,jk,ik->i", response * of_camera, fit.covariance, response * of_camera)
+    variance += _missed_variance(sizes[shared], sizes_u[shared], fit.limit) * np.linspace(0.0, 1.0, len(kept))
+    corrected = of_camera.copy()
+    corrected[of_housing] = drifts
+    explained = np.ones(len(fit.values), bool)
+    explained[of_housing] = drifts
+    unexplained = thin.background - thin.background[0] - response @ np.where(explained, fit.values, 0.0)
+    drift = (drift - drift[0]) * drifts
+
+    def full(values: Array) -> Array:
+        return np.asarray(np.interp(series.seconds, thin.seconds, values))
+
+    steps = tuple(
+        CameraStep(_first_after(series, kept, place), float(size), float(u))
+        for place, size, u, camera in zip(places, sizes, sizes_u, shared, strict=True)
+        if camera
+    )
+    correction = -full(drift)
+    for step in steps:
+        correction[step.index :] -= step.value_K
+    u_K = full(np.sqrt(np.maximum(variance, 0.0) + unexplained**2 / 3.0))
+    return CameraCorrection(correction + 0.0, u_K, steps, full(drift), full(unexplained))
+
+
+def hold_constant(level: Array) -> CameraCorrection:
+    """Correct the camera so that a surface of constant temperature stays constant."""
+    n, change = len(level), level - level[0]
+    nothing = np.zeros(n)
+    if n < _LEAST_FRAMES or not change.any():
+        return CameraCorrection(nothing, nothing, (), nothing, change)
+    ratio = float(np.mean(np.diff(level) ** 2) / 2.0 / np.var(level, ddof=1))
+    limit = 1.0 + special.ndtri(_SIGNIFICANCE) * np.sqrt((n - 2) / (n**2 - 1))
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(level))))
+    u_K = np.where(np.arange(n) == 0, 0.0, scatter)
+    if ratio >= limit:
+        return CameraCorrection(nothing, nothing, (), nothing, nothing)
+    return CameraCorrection(-change, u_K, (), change, nothing)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Generalised least squares on the changes of the level.
+
+    Attributes
+    ----------
+    shocks : (n - 1,) ndarray
+        Ratio of every change to its standard deviation, given all other changes.
+    limit : float
+        Ratio from which one of the shocks is a step.
+    """
+
+    values: Array
+    covariance: Array
+    shocks: Array
+    freedom: int
+    limit: float
+
+
+def _components(temperatures: Array) -> Array:
+    """Leading principal components, (n, q), of n temperatures of q or more sensors."""
+    complete = temperatures[:, np.isfinite(temperatures).all(axis=0)]
+    if not complete.size:
+        return np.zeros((len(temperatures), 0))
+    scores, sizes, _ = np.linalg.svd(complete - complete.mean(axis=0), full_matrices=False)
+    kept = sizes > max(_LEAST_COMPONENT * sizes[0], 1e-9)
+    return (scores * sizes)[:, kept]
+
+
+def _beyond(components: Array, known: Array) -> Array:
+    """Components, (n, q), that are not nearly linear combinations of known ones."""
+    centred = known - known.mean(axis=0)
+    rest = components - centred @ np.linalg.lstsq(centred, components, rcond=None)[0] if known.size else components
+    return components[:, np.linalg.norm(rest, axis=0) > _LEAST_COMPONENT * np.linalg.norm(components, axis=0)]
+
+
+def _find_steps(change: Array, regressors: Array, seconds: Array) -> tuple[list[int], _Fit]:
+    """Places of the steps among the changes, and the fit with them: one is added or dropped at a time until none is left to."""
+    # Residual of the least absolute deviations, which steps do not bend, by iteratively reweighted least squares.
+    residual = change
+    for _ in range(50):
+        weight = 1.0 / np.sqrt(np.maximum(np.abs(residual), 1e-5))
+        values = np.linalg.lstsq(regressors * weight[:, None], change * weight, rcond=None)[0]
+        residual = change - regressors @ values
+    outlying = np.abs(residual) > _OUTLYING * MAD_TO_SIGMA * np.median(np.abs(residual))
+    most = int(_MOST_STEPS * (len(change) - regressors.shape[1]))
+    places = np.flatnonzero(outlying).tolist() if np.count_nonzero(outlying) <= most else []
+    fit = _fit(change, _with_steps(regressors, places), seconds)
+    for _ in range(2 * len(change)):
+        limit = fit.limit
+        first = regressors.shape[1]
+        ratios = np.abs(fit.values[first:]) / np.sqrt(np.diag(fit.covariance)[first:])
+        shocks = np.abs(fit.shocks)
+        shocks[places] = 0.0
+        if places and ratios.min() < limit:
+            del places[int(ratios.argmin())]
+        elif shocks.max() > limit and len(places) < most:
+            places = sorted([*places, int(shocks.argmax())])
+        else:
+            break
+        fit = _fit(change, _with_steps(regressors, places), seconds)
+    return places, fit
+
+
+def _with_steps(regressors: Array, places: list[int]) -> Array:
+    """Regressors with a column for every step."""
+    columns = np.zeros((len(regressors), len(places)))
+    columns[places, np.arange(len(places))] = 1.0
+    return np.column_stack([regressors, columns])
+
+
+def _fit(change: Array, design: Array, seconds: Array) -> _Fit:
+    """Fit with the share of the white noise by restricted maximum likelihood."""
+    freedom = len(change) - design.shape[1]
+
+    def whiten(logit: float) -> tuple[Array, Array, Array, Array, float]:
+        white = 1.0 / (1.0 + np.exp(-logit))
+        bands = np.zeros((2, len(change)))
+        bands[0] = (1.0 - white) * seconds / seconds.mean() + 2.0 * white
+        bands[1, :-1] = -white
+        factor = linalg.cholesky_banded(bands, lower=True)
+        solved = linalg.cho_solve_banded((factor, True), np.column_stack([change, design]))
+        information = design.T @ solved[:, 1:]
+        values = np.linalg.solve(information, design.T @ solved[:, 0])
+        squares = max(float(change @ solved[:, 0] - values @ (design.T @ solved[:, 0])), np.finfo(float).tiny)
+        return factor, solved[:, 0] - solved[:, 1:] @ values, values, information, squares
+
+    def deviance(logit: float) -> float:
+        factor, _, _, information, squares = whiten(logit)
+        return float(2.0 * np.log(factor[0]).sum() + np.linalg.slogdet(information)[1] + freedom * np.log(squares))
+
+    best = optimize.minimize_scalar(deviance, bounds=(-8.0, 8.0), method="bounded", options={"xatol": 0.05}).x
+    factor, weighted, values, information, squares = whiten(float(best))
+    scale = squares / freedom
+    unit = np.linalg.inv(information)
+    projected = linalg.cho_solve_banded((factor, True), design)
+    precision = np.diag(linalg.cho_solve_banded((factor, True), np.eye(len(change))))
+    precision = precision - np.einsum("ij,jk,ik->i", projected, unit, projected)
+    shocks = weighted / np.sqrt(np.maximum(precision, 1e-12) * scale)
+    limit = float(-special.stdtrit(freedom, _SIGNIFICANCE / (2 * len(change))))
+    return _Fit(values, unit * scale, shocks, freedom, limit)
+
+
+def _shared_by_table(series: LevelSeries, places: list[int], sizes: Array) -> NDArray[np.bool_]:
+    """Whether the table changes by each step of the background beyond its own rate, so that it is one of the camera."""
+    seconds, change = np.diff(series.seconds), np.diff(series.table)
+    ordinary = np.ones(len(change), bool)
+    ordinary[places] = False
+
+    def beyond_rate(place: int) -> float:
+        near = np.arange(max(place - _NEIGHBOURS, 0), min(place + _NEIGHBOURS + 1, len(change)))
+        near = near[ordinary[near] & (near != place)]
+        rate = float(np.median(change[near] / seconds[near])) if near.size else 0.0
+        return float(change[place]) - rate * float(seconds[place])
+
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs([beyond_rate(place) for place in np.flatnonzero(ordinary)])))
+    off = np.array([abs(beyond_rate(place) - size) for place, size in zip(places, sizes, strict=True)])
+    shared: NDArray[np.bool_] = off <= np.maximum(_SHARED * np.abs(sizes), _SHARED_SIGMAS * scatter)
+    return shared & (np.abs(sizes) >= _LEAST_STEP_K)
+
+
+def _missed_variance(sizes: Array, sizes_u: Array, limit: float) -> float:
+    """Variance of the sum of the steps that are too small to be found, K2, if all steps have normal sizes."""
+    if not sizes.size:
+        return 0.0
+    smallest = max(_LEAST_STEP_K, limit * float(np.median(sizes_u)))
+    below = 2.0 * float(special.ndtr(smallest / np.sqrt(np.mean(sizes**2)))) - 1.0
+    return float(sizes.size * below / (1.0 - below) * smallest**2 / 3.0)
+
+
+def _significant(fit: _Fit, chosen: slice) -> bool:
+    """Whether some of the fitted values differ from zero, by an F test."""
+    values, covariance = fit.values[chosen], fit.covariance[chosen, chosen]
+    if not values.size:
+        return False
+    ratio = float(values @ np.linalg.solve(covariance, values)) / values.size
+    return bool(special.fdtrc(values.size, fit.freedom, ratio) < _SIGNIFICANCE)
+
+
+def _first_after(series: LevelSeries, kept: NDArray[np.intp], place: int) -> int:
+    """First frame after a step between two frames of the thinned series: the largest change between them."""
+    first, last = int(kept[place]), int(kept[place + 1])
+    return first + 1 + int(np.abs(np.diff(series.background[first : last + 1])).argmax())
+
+
+def room_temperatures(seconds: Array, logged_seconds: Array, air_degC: Array) -> Array:
+    """Temperatures that surfaces of a room follow: that of the air, and it through first-order lags."""
+    known = np.isfinite(air_degC)
+    logged_seconds, air_degC = logged_seconds[known], air_degC[known]
+    if len(air_degC) < 2:
+        return np.zeros((len(seconds), 0))
+    followed = [air_degC]
+    for lag_s in ROOM_LAGS_S:
+        kept = np.exp(-np.diff(logged_seconds) / lag_s)
+        body = air_degC.astype(float)
+        for k, share in enumerate(kept):
+            body[k + 1] = share * body[k] + (1.0 - share) * air_degC[k]
+        followed.append(body)
+    return np.column_stack([np.interp(seconds, logged_seconds, values) for values in followed])
