@@ -605,7 +605,7 @@ def report(
         str | None, typer.Option(help="With --pdf: the browser that prints; left out: one is looked for.")
     ] = None,
 ) -> None:
-    """Make the report of a finished run anew, or print it to PDF."""
+    """Make the report of a finished run again, or print it to PDF."""
     from fusion.report.page import print_pdf, report_of
     from fusion.results.folder import claim_file
     from fusion.results.store import write_text

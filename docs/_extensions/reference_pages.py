@@ -234,7 +234,7 @@ def measured_table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def measured_page(text: str, rows: Sequence[Mapping[str, str]]) -> str:
-    """Return the text of `measured.md` with the table of each section made anew from the rows of `measured.csv`."""
+    """Return the text of `measured.md` with the table of each section made again from the rows of `measured.csv`."""
     parts = re.split(r"^(?=## )", text, flags=re.M)
     for number, part in enumerate(parts):
         title = part.partition("\n")[0].removeprefix("## ")

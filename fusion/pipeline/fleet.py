@@ -325,6 +325,7 @@ def run_fleet(
         write_json(out / SUMMARY, as_json([*rows.values()], started=started, finished=_now()))
         report("campaigns", sum(row.state not in ("waiting", "stopped") for row in rows.values()), len(rows))
 
+    others = psutil.Process().children()
     with open_folder(out, resume=resume):
         claim(out, SUMMARY, _TABLE, _PAGE)
         for name, row in read_rows(out).items() if resume else ():
@@ -353,7 +354,7 @@ def run_fleet(
                         say(rows[name])
                 time.sleep(_POLL_S)
         finally:
-            _stop()
+            _stop(others)
             for name, one in running.items():
                 rows[name] = replace(rows[name], seconds=round(time.monotonic() - one.begun, 1))
             write_summary()
@@ -407,9 +408,9 @@ def _ended(row: Row, one: _Running, member: Member, out: Path) -> Row:
     return replace(row, state="failed", message=message or f"ended with exit code {exit_code}; see {row.log}")
 
 
-def _stop() -> None:
-    """Tell runs that are left to stop, as when the fleet is, also one that was being started; they keep their finished stages."""
-    left = psutil.Process().children()
+def _stop(others: Sequence[psutil.Process]) -> None:
+    """Tell runs that are left to stop, also one that was being started; they keep their finished stages. Other children stay."""
+    left = [process for process in psutil.Process().children() if process not in others]
     for process in left:
         with suppress(psutil.Error):
             process.terminate()

@@ -82,9 +82,6 @@ class Recognised:
 
 def recognise(path: Path) -> Recognised:
     """Tell the kind of a file by its content."""
-    from interferometry.io.readings import is_environment_log, read_deviations
-    from interferometry.io.tables import read_table
-
     if path.is_symlink() and not path.exists():
         return Recognised(path, Kind.UNREADABLE, f"a link to {path.readlink()}, where there is no file")
     if path.exists() and not path.is_file():
@@ -103,6 +100,10 @@ def recognise(path: Path) -> Recognised:
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
+    # Not before: frames are looked into without xarray.
+    from interferometry.io.readings import is_environment_log, read_deviations
+    from interferometry.io.tables import read_table
+
     try:
         headings = _headings(text) if text is not None else _sheet_headings(path)
         kind = _by_headings(headings)

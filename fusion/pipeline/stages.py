@@ -91,7 +91,7 @@ def kept_results(campaign: Campaign, folder: Path) -> Results | None:
 
 
 def forget_run(stamps: StageStamps) -> None:
-    """Take the stamp of a whole run away, before its products are written anew."""
+    """Take the stamp of a whole run away, before its products are written again."""
     stamps.forget(_REPORT)
 
 

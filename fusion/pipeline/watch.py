@@ -240,7 +240,7 @@ Rows = list[tuple[int, list[str]]]
 _CONTEXT_CYCLES = 2
 #: Beginnings of files that have no lines of bytes: spreadsheets, UTF-16.
 _NO_LINES = (b"PK", b"\xd0\xcf", b"\xff\xfe", b"\xfe\xff")
-#: End of what was read, by which a file that was begun anew is recognised, bytes.
+#: End of what was read, by which a file that was restarted is recognised, bytes.
 _COMPARED_BYTES = 4096
 #: A file that can only be read as a whole is read during at most this share of the time.
 _READING_SHARE = 0.1
@@ -315,7 +315,7 @@ class ArrivingReadings:
             file.seek(self._offset - len(self._before))
             before, content = file.read(len(self._before)), file.read()
         if before != self._before:
-            fault = f"{self.path}: lines that were read stand there no more, it was begun anew; watch the test anew"
+            fault = f"{self.path}: lines that were read earlier are gone, so the file was restarted; restart the watch"
             return Arrived(faults=self._new([fault]))
         self._go_on()
         end = len(content) if final else content.rfind(b"\n") + 1
@@ -421,7 +421,7 @@ class ArrivingReadings:
         return Arrived()
 
     def _go_on(self) -> None:
-        """Note that the file goes on from what was read of it: should it become shorter or begin anew after that, it is reported again."""
+        """Note that the file goes on from what was read of it: should it become shorter or be restarted after that, it is reported again."""
         self._shorter = False
         self._reported -= {f"{self.path}: {_SHORTER}", f"{self.path}: {_ANEW}"}
 

@@ -142,7 +142,7 @@ def render_report(
 
 
 def report_of(folder: Path) -> str:
-    """Return the report of a finished run, made anew from its products."""
+    """Return the report of a finished run, made again from its products."""
     results = read_results(folder)
     origin = folder / "provenance.json"
     again = "run the campaign again, with --resume to keep what is finished"

@@ -259,7 +259,7 @@ class StageStamps:
         return self._stamps[stage]["note"]
 
     def forget(self, stage: str) -> None:
-        """Remove the stamp of `stage`, where there is one, before its files are written anew."""
+        """Remove the stamp of `stage`, where there is one, before its files are written again."""
         if self._stamps.pop(stage, None) is not None:
             write_json(self._path, self._stamps)
 

@@ -376,7 +376,7 @@ class Displacements:
         return None
 
     def span_after(self, knock: Knock) -> RegistrationSpan:
-        """Register the plan again on the mean of the frames after a knock; the baseline starts anew."""
+        """Register the plan again on the mean of the frames after a knock; the baseline restarts."""
         old, grid = self.registrations.spans[knock.span].registration, self.registrations.grid
         if knock.by_image:
             registration = shift_registration(old, knock.displacement_px[:2])

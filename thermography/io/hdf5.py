@@ -19,7 +19,7 @@ def hdf5_fault(path: Path) -> str:
     most_bytes, objects = max(_LARGE_BYTES, _MOST_PACKED * path.stat().st_size), []
 
     def of_link(name: str, found: Any) -> str | None:
-        return f"{name} stands in another file" if isinstance(found, h5py.ExternalLink) else None
+        return f"{name} is in another file" if isinstance(found, h5py.ExternalLink) else None
 
     def of_object(name: str, found: Any) -> str | None:
         objects.append(name)
@@ -28,7 +28,7 @@ def hdf5_fault(path: Path) -> str:
         if not isinstance(found, h5py.Dataset):
             return None
         if found.external or found.is_virtual:
-            return f"the values of {name} stand in another file"
+            return f"the values of {name} are in another file"
         return (
             f"{name} states {found.nbytes / 1e9:.3g} GB, more than the file holds"
             if found.nbytes > most_bytes

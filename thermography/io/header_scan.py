@@ -49,7 +49,7 @@ from thermography.io.sequence import FlirFrameReference, FrameTable
 
 #: Names a folder that keeps what can be made again; left out, that of the user's cache.
 CACHE_VARIABLE = "THERMOFUSE_CACHE"
-#: Runs of fewer frames are scanned anew: from a disk, that takes three seconds.
+#: Runs of fewer frames are scanned again: from a disk, that takes three seconds.
 FEWEST_KEPT = 20_000
 #: Kept files beyond this size together are removed, the oldest first, bytes.
 _MOST_KEPT = 1 << 30

@@ -1,7 +1,7 @@
 """Opens FLIR files with xarray: ``xarray.open_dataset(path_or_list, engine="flir")``, lazily and one frame at a time.
 
 ``temperature`` is calibrated from ``counts`` when it is accessed, with the parameters that the variables of the Dataset hold: those of the
-file, or those given as ``emissivity=0.95`` and so on. ``ds.flir.temperature(emissivity=0.9)`` calibrates an open Dataset anew.
+file, or those given as ``emissivity=0.95`` and so on. ``ds.flir.temperature(emissivity=0.9)`` calibrates an open Dataset again.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class FlirAccessor:
         self._dataset = dataset
 
     def temperature(self, **overrides: float | None) -> xr.DataArray:
-        """Calibrate the counts anew.
+        """Calibrate the counts again.
 
         Parameters
         ----------

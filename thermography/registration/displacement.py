@@ -7,7 +7,7 @@ is the root mean square displacement of the fiducials. It is measured in four wa
 
 * `FiducialMonitor`: centroids of the fiducials from linear sums of raw counts, for every frame;
 * `fiducial_displacement`: fiducials located near their registered places in the calibrated frame, for frames that the monitor suspects;
-* `search_displacement`: the plan registered anew anywhere in the frame;
+* `search_displacement`: the plan registered again anywhere in the frame;
 * `image_displacement`: the image of the whole table, where the fiducials have no contrast; a shift only.
 
 After a knock, `register_after_knock` registers the table again; without contrast of the fiducials, `shift_registration` moves the
@@ -259,7 +259,7 @@ def _displacement_u(located: Iterable[LocatedDisc]) -> float:
 
 
 def search_displacement(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Displacement of the table by any distance: the plan is registered anew, near where the image as a whole has moved to."""
+    """Displacement of the table by any distance: the plan is registered again, near where the image as a whole has moved to."""
     start = np.array([*_coarse_shift(reference, temperature), 0.0, 0.0])
     try:
         found = register(temperature, _moved_hints(registration, start), grid=grid)

@@ -2,7 +2,7 @@
 
 Plan cells, localised thermal modes and regions are tested against the drift channels (common, proportional to position, reversal; on
 request every target and direction). Each temperature passes through a bank of first-order lags. The drift that the field does not explain
-is a random walk or an integrated random walk whose size is estimated anew under every hypothesis, and the statistic is the profile
+is a random walk or an integrated random walk whose size is estimated again under every hypothesis, and the statistic is the profile
 likelihood ratio. The family-wise p-value compares it with the maxima over all cells, modes, regions, lags and channels in series that are
 simulated under the fitted null hypothesis: one error probability for everything that can become a finding.
 

@@ -144,7 +144,7 @@ def duty_responses(seconds: Array, courses: Array) -> Array:
 def randomisation_test(
     fused_readings: xr.Dataset, duty: xr.DataArray, law: DutyLaw, *, draws: int = 499, seed: int = 0
 ) -> xr.Dataset:
-    """Test which switched source moves the axis, against schedules drawn anew from the same law."""
+    """Test which switched source moves the axis, against schedules drawn again from the same law."""
     seconds, grid_time, courses = _hold(duty)
     names = [str(name) for name in duty["source"].values]
     channels = reduce_channels(clock_readings(fused_readings, grid_time))

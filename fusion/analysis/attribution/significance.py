@@ -29,7 +29,7 @@ from fusion.common import Array
 from interferometry.drift.kalman import DriftSystem, Order, drift_system
 from thermography.fields.large_arrays import empty_array, give_back
 
-# Profile likelihood ratios of many regressors against one drift series, with the drift variance estimated anew under
+# Profile likelihood ratios of many regressors against one drift series, with the drift variance estimated again under
 # each.
 
 Array32 = NDArray[np.float32]

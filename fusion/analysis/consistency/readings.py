@@ -237,8 +237,8 @@ def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
         multiple,
         _DATUM_RANGES,
         f"From cycle {first} on all targets read {size:+.3g} µm in both approaches, {multiple:.2g} times the drift on either side: the "
-        "datum of the laser changed (beam broken, zeroed or set up anew), or a mount slipped.",
-        f"If the laser was zeroed or set up anew before cycle {first}, evaluate the two parts as two campaigns; if not, check the "
+        "datum of the laser changed (beam broken, zeroed or set up again), or a mount slipped.",
+        f"If the laser was zeroed or set up again before cycle {first}, evaluate the two parts as two campaigns; if not, check the "
         "clamping of optics and laser head.",
     )
 

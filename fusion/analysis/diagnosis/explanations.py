@@ -302,7 +302,7 @@ def fit_random_walk(residual: Residual) -> RandomWalkFit:
 
 
 def fit_profile(residual: Residual, columns: Array, rng: np.random.Generator) -> ProfileFit:
-    """Fit the best of several candidate regressors to both directions, the random walk estimated anew under each."""
+    """Fit the best of several candidate regressors to both directions, the random walk estimated again under each."""
     parts = residual.parts
     bank = fit_null(parts.grid, parts.mean)
     regressors = np.ascontiguousarray(columns[parts.rows], np.float32)

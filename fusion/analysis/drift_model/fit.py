@@ -271,7 +271,7 @@ def size_camera_errors(model: ModelFit, effects: Mapping[str, Effect]) -> ModelF
 def recompute_term(
     term: Term, readings: Readings, coefficients: Mapping[str, float], effects: Mapping[str, Effect]
 ) -> Term:
-    """Compute a term's columns anew for the same parameters."""
+    """Compute a term's columns again for the same parameters."""
     near = term.candidate if term.candidate.parameters else None
     offered = effects[term.effect].candidates(readings, coefficients, near)
     same = (candidate for candidate in offered if _same_parameters(candidate.parameters, term.candidate.parameters))

@@ -1259,8 +1259,8 @@ def withdraw_unreplicated(
         before = float(known_mean(np.array([part.rmse_declared_um for part in tried])))
         after = float(known_mean(np.array([part.rmse_final_um for part in tried])))
         if after >= MAX_ERROR_RATIO_TO_ENTER * before:
-            evidence = {"parts": len(tried), "without_um": before, "with_um": after}
-            evidence |= dict.fromkeys(("p_value", "search_p"), step.score.family_wise_p)
+            p = step.score.family_wise_p
+            evidence = {"parts": len(tried), "without_um": before, "with_um": after, "p_value": p, "search_p": p}
             decision = Decision(step.effect, Reason.NOT_REPEATED, evidence)
             return withdraw_unreplicated(problem, withdraw(problem, state, [place], [decision]), chained)
     return state

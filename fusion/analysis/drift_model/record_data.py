@@ -130,7 +130,7 @@ class Record:
         return np.asarray(zero[self.run] + elapsed)
 
     def series(self, values: Array, units: str) -> Series:
-        """Values on the blocks as a series that begins anew with every run."""
+        """Values on the blocks as a series that restarts with every run."""
         return Series(self.seconds, values, units, self.first)
 
     def switched(self) -> NDArray[np.bool_]:

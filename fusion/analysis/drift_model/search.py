@@ -579,10 +579,12 @@ def choose(
             beside = conditional_p_value(problem, state.model, score, unconfirmed)
             # A lasting effect may predict in place of another even where both are significant together; an event happens at its instant.
             if beside > limit or not score.is_event:
-                decision = Decision(
-                    score.name, Reason.WEAKER_THAN_UNCONFIRMED, {"stronger": unconfirmed.name, "beside_p": beside}
-                )
-                state = state.decide(decision.on_evidence(p_value=score.family_wise_p))
+                evidence: dict[str, float | str] = {
+                    "stronger": unconfirmed.name,
+                    "beside_p": beside,
+                    "p_value": score.family_wise_p,
+                }
+                state = state.decide(Decision(score.name, Reason.WEAKER_THAN_UNCONFIRMED, evidence))
                 continue
         score = problem.confirm(score, state)
         state = state.rescored(score)

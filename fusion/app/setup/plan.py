@@ -243,15 +243,17 @@ class FrameView:
             for key, label in (_POSITIONS | _PLACES).items()
         }
         self._adds = pn.widgets.Toggle(label="Add by click", value=False)
-        find, add, remove = (pn.widgets.Button(label=name) for name in ("Find automatically", "Add one", "Remove it"))
-        find.on_click(lambda event: self._take(find(self._frame, self.placed.fiducials, self._grid)))
+        search, add, remove = (pn.widgets.Button(label=name) for name in ("Find automatically", "Add one", "Remove it"))
+        search.on_click(lambda event: self._take(find(self._frame, self.placed.fiducials, self._grid)))
         add.on_click(lambda event: self._add(self._frame.shape[1] / 2, self._frame.shape[0] / 2))
         remove.on_click(self._remove)
         self._chosen.param.watch(lambda event: self._fill(), "value")
         for key, entry in self._numbers.items():
             entry.param.watch(lambda event, key=key: self._type(key, event.new), "value")
         title = heading("Fiducials in the first thermogram", level=3)
-        controls = column(pn.FlexBox(find, self._adds, add), pn.FlexBox(self._chosen, *self._numbers.values(), remove))
+        controls = column(
+            pn.FlexBox(search, self._adds, add), pn.FlexBox(self._chosen, *self._numbers.values(), remove)
+        )
         self.view = column(title, self._message, self._picture, controls, self._table)
 
     def show(self, frame: NDArray[np.float64], placed: Placed, grid: PlanGrid | None) -> None:

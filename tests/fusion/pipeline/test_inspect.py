@@ -90,7 +90,7 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
 def test_a_folder_without_files_is_told(tmp_path):
     (tmp_path / ".hidden").touch()
     (found,) = inspect_paths([tmp_path])
-    assert found.fails and found.fault.startswith("holds no file to look into")
+    assert found.fails and found.fault.startswith("contains no file to inspect")
 
 
 ENVIRONMENT = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC"

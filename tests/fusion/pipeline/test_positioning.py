@@ -216,7 +216,7 @@ def test_what_the_model_explains_is_taken_out_before_positions_are_judged(monkey
         assert drift == "drift of what is left"
         return [anomaly(1, p_value=0.04), anomaly(2, stands_out=False), anomaly(3)]
 
-    def diagnose(anomalies, cleaned):
+    def diagnose(cleaned, anomalies):
         judged.append(cleaned["deviation"])
         return [diagnosis() for _ in anomalies]
 

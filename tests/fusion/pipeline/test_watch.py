@@ -394,7 +394,7 @@ def test_readings_of_a_test_begun_anew_are_not_mixed_with_those_before(laser, cy
     write(laser.path, lines(range(12), zero=0.5))
     arrived += [laser.poll(), laser.poll(final=True)]
     assert all(one.cycles is None for one in arrived)
-    assert "was begun anew" in "".join(fault for one in arrived for fault in one.faults)
+    assert "was restarted" in "".join(fault for one in arrived for fault in one.faults)
 
 
 def write_runs(path: Path, count: int, *, targets: int = 3, zero: float = 1.0) -> None:
@@ -437,7 +437,7 @@ def test_a_file_caught_while_it_is_rewritten_is_waited_for(laser, runs, targets)
         write_runs(laser.path, whole)
         assert given([laser.poll()]) == [whole - 2, whole - 1]
     write_runs(laser.path, 3, zero=2.0)
-    assert "was begun anew; watch the test anew" in laser.poll().faults[0]
+    assert "restart the watch" in laser.poll().faults[0]
 
 
 def test_a_file_that_is_short_when_the_test_is_over_is_told_at_once(laser):

@@ -176,7 +176,9 @@ def test_the_model_and_its_errors_are_told_in_numbers():
         ["last cycle simply repeated", "0.90", "0.80 to 1.00"],
     ]
     assert len(rows) == 7
-    refused = LOOP.model_copy(update={"blocked": {"thermal_lag": "noise"}, "unnamed": {"thermal_lag": 9e-35}})
+    refused = LOOP.model_copy(
+        update={"not_admitted": {"thermal_lag": "noise"}, "unconfirmed_effects": {"thermal_lag": 9e-35}}
+    )
     (reason,) = (text for name, text in model_section.refused_effects(refused) if name.startswith("not admitted"))
     assert reason == "p < 0.001; noise"
     rows = dict(model_section.describe_model(LOOP))

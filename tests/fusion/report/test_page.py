@@ -245,7 +245,7 @@ def test_a_neighbouring_place_is_told_apart_and_reconciled():
     first, second = describe_sources(both, SESSIONS)
     assert (first.name, second.name) == ("place 1", "place 2")
     assert first.verdict.startswith(
-        "shown by A (Monday <1>) alone; B (Tuesday) shows something there too, but not the same: 3.8 and 7.8"
+        "shown by A (Monday <1>) only; B (Tuesday) also shows a source there, but a different one: 3.8 and 7.8"
     )
     assert "75 mm both agree (place 2)" in first.verdict
     assert second.verdict.startswith("both sessions agree here, but it is not a separate source")
@@ -253,7 +253,7 @@ def test_a_neighbouring_place_is_told_apart_and_reconciled():
     assert told[0] == "The two sessions show no cause in common."
     assert (
         told[1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
-        and told[2] == "A (Monday <1>) alone shows place 1."
+        and told[2] == "Only A (Monday <1>) shows place 1."
     )
 
 

@@ -92,7 +92,7 @@ def test_results_are_read_back_from_a_folder(tmp_path: Path) -> None:
 def test_results_print_themselves_as_the_command_does() -> None:
     results = assemble("A & B", PARTS, [Notice("clock", "the clocks disagree", "set clock_offset")])
     lines = str(results).splitlines()
-    assert (lines[0], lines[-1]) == ("campaign: A & B", "warning: the clocks disagree")
+    assert (lines[0], lines[-1]) == ("campaign: A & B", "warnings: 1")
     assert repr(results) == str(results)
     assert "<th>campaign</th><td>A &amp; B</td>" in results._repr_html_()
 

@@ -219,7 +219,7 @@ def test_environment_is_sorted_and_its_faults_are_listed(tmp_path):
     reasons = {one["line"]: one["reason"] for one in left_out(environment)}
     assert "is outside 500 .. 1200, the range of air_pressure_hPa in its unit" in str(reasons[4])
     assert "occurs on an earlier line too" in str(reasons[5])
-    assert "lies outside -9 .. 80" in str(reasons[6])
+    assert "is outside -9 .. 80" in str(reasons[6])
 
 
 def test_environment_in_another_unit_or_as_a_fraction_is_refused(tmp_path):

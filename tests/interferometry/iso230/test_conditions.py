@@ -35,7 +35,7 @@ def test_a_test_as_the_standard_asks_for_it():
 
 def test_too_few_targets_and_equal_spacings_are_told():
     checks = found(at_positions(list(np.linspace(0.0, 2500.0, 7) + 3.0 * np.arange(7) ** 2)))
-    assert checks["targets"].met is False and "asked for: 14" in checks["targets"].evidence
+    assert checks["targets"].met is False and "required: 14" in checks["targets"].evidence
     assert checks["travel"].met is False and "targets about 250 mm apart" in checks["travel"].evidence
     assert checks["settled"].met is None
     equal = at_positions([0.0, 25.0, 50.0, 75.0, 100.0])

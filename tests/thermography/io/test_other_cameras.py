@@ -316,7 +316,7 @@ def test_files_of_no_known_kind_are_rejected_with_the_reason(tmp_path):
     (tmp_path / "a.bin").write_bytes(bytes(range(256)))
     frames, rejected = index_recordings([tmp_path / "a.bin", tmp_path / "none.tif"], OPTIONS)
     assert frames == []
-    assert "a.bin: no thermal file that is read; docs/formats.md lists them" in rejected[0].reason
+    assert "a.bin: not a known thermal file; docs/formats.md lists them" in rejected[0].reason
     assert "No such file" in rejected[1].reason
 
 

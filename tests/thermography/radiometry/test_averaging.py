@@ -38,8 +38,6 @@ def test_sums_hold_1000_frames():
     counts[0] = 0
     statistics = _accumulate(counts)
     assert (statistics.squares == 999 * 2047**2).all()
-    with pytest.raises(ValueError, match="counts: 1001 frames, but the sums hold 1000; merge the statistics of"):
-        _accumulate(np.zeros((1001, 2, 2), np.uint16))
 
 
 @pytest.mark.parametrize(("first", "others"), [(0, 65535), (65535, 0)])

@@ -111,7 +111,7 @@ def test_missing_duplicate_and_misplaced_fiducials_are_reported(rng):
     )
     assert set(registration.located) == {d.name for d in DISCS} - {"F3", "F8"}
     assert "listed twice" in registration.left_out["F1 (second)"]
-    assert "beside F2" in registration.left_out["F13"]
+    assert "also as F2" in registration.left_out["F13"]
     assert "F3" in registration.left_out
     assert "check its x_mm, y_mm" in registration.left_out["F8"]
     assert scene.registration_rms_mm(registration) < 0.05

@@ -97,7 +97,7 @@ def test_the_course_of_a_patch_without_noise_is_exact():
 
 def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
     monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 256 * 8 * 10 * 20)
-    frames = np.random.default_rng(4).standard_normal((3000, 10, 20)).astype(np.float32)
+    frames = np.random.default_rng(4).standard_normal((6000, 10, 20)).astype(np.float32)
     tracemalloc.start()
     try:
         find_switching_patch(frames)

@@ -82,7 +82,7 @@ def hot(frame: FrameReference) -> FrameReference:
             0,
             STATED,
             {
-                "camera_range": "Up to 100 % of the pixels of a frame lie outside the range in which the camera is calibrated."
+                "camera_range": "Up to 100 % of the pixels of a frame are outside the range in which the camera is calibrated."
             },
         ),
         (
@@ -305,7 +305,7 @@ def test_many_frames_left_out_or_repeated_are_doubted() -> None:
     names = [f"{i}.jpg#0" for i in range(30)]
     left_out = doubted_places(fields(frames_obstructed=names[:20], frames_shaken=names[20:22]))["frames_left_out"]
     assert left_out.evidence.startswith(
-        "35 % of 62 frames were left out: 20 with something before the table, 2 displaced alone"
+        "35 % of 62 frames were left out: 20 with an object in front of the table, 2 displaced singly"
     )
     repeated = doubted_places(fields(frames_repeated=names[:10]))["frames_repeated"]
     assert (

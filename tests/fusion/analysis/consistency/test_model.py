@@ -252,7 +252,7 @@ def test_a_line_that_does_away_with_a_named_cause_needs_less(
     }
     check = by_code({"axis_line": line})["axis_line"]
     assert check.passed is passed
-    assert by_code({"axis_line": line, "unnamed": {"pitch_error": 1e-17}})["axis_line"].passed
-    assert ("ask for 11.2 to 12.6 ppm/K" in check.evidence) is passed
+    assert by_code({"axis_line": line, "unconfirmed_effects": {"pitch_error": 1e-17}})["axis_line"].passed
+    assert ("indicate 11.2 to 12.6 ppm/K" in check.evidence) is passed
     assert (f"(log-likelihood {gain:+.1f}" in check.evidence) is (gain > 0.0)
     assert ("without angular growth" in check.evidence) is (bool(superfluous) and not passed)

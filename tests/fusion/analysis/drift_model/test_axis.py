@@ -245,13 +245,12 @@ def test_the_strongest_effect_that_is_undecided_is_asked_for(monkeypatch):
 
 def test_an_event_has_two_cycles_before_it_and_one_after():
     """Of ten used cycles of 130 s: from the start of the third to that of the ninth."""
-    problem = problem_of()
-    model = problem.start([]).model
     instants = (259.0, 260.0, 1040.0, 1041.0)
     offered = [term(LATE, event_s=instant).candidate for instant in instants]
-    assert [one.event_s for one in problem._inside(offered, model)] == [260.0, 1040.0]
     lasting = term(WAVE).candidate
-    assert problem._inside([lasting], model) == [lasting]
+    problem = problem_of(effects={"all": Effect("all", "", "", lambda *_: iter([*offered, lasting]))})
+    found = problem.offer("all", problem.start([]).model, None)
+    assert [one.event_s for one in found] == [260.0, 1040.0, None]
 
 
 # Errors of the camera that the loop finds are taken out of the fields, and the model is fitted again.

@@ -295,7 +295,7 @@ def test_the_nearest_effect_to_what_is_left_is_one_that_was_not_added():
     left = series - WAVE * (WAVE @ series) / (WAVE @ WAVE)
     assert told.closest_effect_share == pytest.approx(1.0 - left @ left / (series @ series))
     nothing = result(looped, remainder()).described(UNTESTED).unexplained
-    assert (nothing.nearest, nothing.closest_effect_p, nothing.closest_effect_share) == ("", None, None)
+    assert (nothing.closest_effect, nothing.closest_effect_p, nothing.closest_effect_share) == ("", None, None)
 
 
 # Plain predictions and the intervals of their errors.

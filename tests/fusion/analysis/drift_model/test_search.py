@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import FrozenInstanceError, dataclass, field, replace
 from pathlib import Path
 from string import Formatter
@@ -287,26 +287,17 @@ def test_an_effect_that_does_not_predict_later_parts_is_told_with_both_errors():
 # Decisions: every reason has a sentence whose fields are given wherever it is decided, and a place in the procedure.
 
 
-def decided(tree: ast.Module) -> list[tuple[Reason, set[str]]]:
-    """Reasons and names of the evidence of every ``Decision(effect, Reason.X, evidence)`` in a module."""
-    decisions = []
+def decided(tree: ast.Module) -> Iterator[tuple[Reason, set[str]]]:
+    """Reasons of every ``Decision(effect, Reason.X, evidence)`` in a module, with the names given anywhere in its function."""
     for function in ast.walk(tree):
         if not isinstance(function, ast.FunctionDef):
             continue
-        literals: dict[str, ast.Dict] = {}
-        for node in ast.walk(function):
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-            if isinstance(node, ast.Assign | ast.AnnAssign) and isinstance(node.value, ast.Dict):
-                literals |= {target.id: node.value for target in targets if isinstance(target, ast.Name)}
-        for node in ast.walk(function):
-            if not (isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Decision"):
-                continue
-            evidence = node.args[2] if len(node.args) > 2 else ast.Dict([], [])
-            given = literals[evidence.id] if isinstance(evidence, ast.Name) else evidence
-            assert isinstance(given, ast.Dict), ast.unparse(node)
-            names = {key.value for key in given.keys if isinstance(key, ast.Constant)}
-            decisions.append((Reason[node.args[1].attr], names))
-    return decisions
+        nodes = list(ast.walk(function))
+        names = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+        names |= {node.arg for node in nodes if isinstance(node, ast.keyword) and node.arg}
+        for node in nodes:
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Decision":
+                yield Reason[node.args[1].attr], names
 
 
 def test_every_reason_is_decided_with_the_fields_of_its_sentence():

@@ -146,11 +146,12 @@ def test_a_card_says_why_shows_the_field_and_chooses_the_position(marked):
 
 
 def test_positions_that_do_not_stand_out_or_were_not_examined_are_told_apart(marked, tmp_path):
-    marked.results = marked.results.model_copy(update={"anomalies": ()})
+    seen = marked.results
+    marked.results = seen.model_copy(update={"anomalies": ()})
     assert "No position stands out" in texts(anomaly_cards(marked, Selection()))
-    marked.results = marked.results.model_copy(update={"anomalies": None})
+    marked.results = seen.model_copy(update={"anomalies": None})
     assert "was not examined" in texts(anomaly_cards(marked, Selection()))
-    marked.fields = None
+    marked.results, marked.fields = seen, None
     assert "The camera did not see this position." in texts(anomaly_cards(marked, Selection()))
 
 
