@@ -47,7 +47,7 @@ default_role = "literal"
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!thermofuse|thermography|interferometry|fusion).*"),
     (r"py:.*", r".*\._\w+"),
-    (r"py:obj", r".*\.(M|Product)"),
+    (r"py:obj", r".*\.(M|Product|Item)"),
 ]
 
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_inline"]
