@@ -16,7 +16,7 @@ from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_sourc
 from fusion.campaign.logs import read_drivers
 from fusion.common import FusionError
 from fusion.pipeline import record as record_stage
-from fusion.pipeline.checks import check_source
+from fusion.pipeline.consistency import check_source
 from fusion.pipeline.inspect import Recording, time_bars
 from fusion.results.progress import counted
 from fusion.results.results import Notice

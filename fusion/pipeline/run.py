@@ -22,7 +22,7 @@ from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, thermal
 from fusion.pipeline import positioning as interferometry
 from fusion.pipeline import record as record_stage
-from fusion.pipeline.checks import check_fields, check_fields_alone, check_loop, check_plan, check_source
+from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
 from fusion.pipeline.remote import fetched_campaign, is_address, require_outside_cache

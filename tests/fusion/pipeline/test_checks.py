@@ -11,7 +11,7 @@ from fusion.analysis.consistency.checks import CODES, ContradictionError
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_source
 from fusion.pipeline.check import check_campaign
-from fusion.pipeline.checks import check_source
+from fusion.pipeline.consistency import check_source
 from fusion.pipeline.run import run_campaign
 from fusion.report.terminal import summary_rows
 from fusion.results.results import read_results
@@ -151,6 +151,7 @@ def test_a_doubt_is_found_before_anything_is_calculated(copied, lie, code):
 @pytest.mark.parametrize(
     ("lie", "code"), [(lies.inverted_signs, "axis_line"), (lies.emissivity_of_half, "material_rise")]
 )
+@pytest.mark.usefixtures("no_charts")
 def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, tmp_path, lie, code):
     lie(copied)
     results = run_campaign(copied / "campaign.toml", tmp_path / "out")

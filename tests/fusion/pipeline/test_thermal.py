@@ -14,7 +14,7 @@ from compliance_checker.runner import CheckSuite
 
 from fusion.campaign.config import ThermographyTable, load_campaign
 from fusion.campaign.inputs import SourceError, read_source
-from fusion.pipeline.checks import check_plan
+from fusion.pipeline.consistency import check_plan
 from fusion.pipeline.thermal import (
     camera_corrected,
     clock_notices,
