@@ -421,7 +421,7 @@ class ArrivingReadings:
         return Arrived()
 
     def _go_on(self) -> None:
-        """Note that the file goes on from what was read of it: should it become shorter or be restarted after that, it is reported again."""
+        """The file goes on from what was read of it: if it becomes shorter or is restarted later, that is reported again."""
         self._shorter = False
         self._reported -= {f"{self.path}: {_SHORTER}", f"{self.path}: {_ANEW}"}
 
