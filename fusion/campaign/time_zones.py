@@ -13,6 +13,11 @@ from fusion.campaign.config import CampaignError
 from interferometry.io.tables import NO_ZONE
 
 
+def utc(time: np.datetime64) -> str:
+    """Return a time as results.json writes it, ISO 8601 in UTC to the second."""
+    return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
 def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Dataset:
     """Bring times that a file gives without a zone to UTC.
 

@@ -171,6 +171,8 @@ def test_a_window_of_cycles_is_read():
     deviations = build_deviations(range(1, 9), [1, 2], np.array([0.0, 1.0]), x, time)
     assert read_window(" 2 - 4 ", deviations) == [2, 3, 4]
     assert read_window("8", deviations) == [8]
+    with pytest.raises(CampaignError, match='--cycles "a" is not a window of cycles; write for example 1-5'):
+        read_window("a", deviations)
     with pytest.raises(CampaignError, match="ends before it begins; write for example 2-4"):
         read_window("4-2", deviations)
     with pytest.raises(CampaignError, match="were not measured; there are 1 to 8"):
