@@ -405,10 +405,9 @@ def reproduce(
     Exit code 0 where they are, 1 where inputs or results differ.
     """
     from fusion.pipeline.reproduce import reproduce as compute_again
-    from fusion.results.progress import Reporter
 
     with _answering():
-        with Reporter(console) as report:
+        with _progress(quiet=False) as report:
             found = compute_again(results, campaign=None if campaign is None else _place(campaign), report=report)
         _print_lines(found.lines)
         if not found.equal:
@@ -426,10 +425,9 @@ def simulate(
 
     Writes the files that the instruments would write; the truth is kept next to the folder.
     """
-    from fusion.results.progress import Reporter
     from fusion.twin.instruments import simulate_campaign
 
-    with _answering(), Reporter(console) as report:
+    with _answering(), _progress(quiet=False) as report:
         simulate_campaign(recipe, out, progress=lambda done, total, what: report(what, done, total))
         console.print(f"campaign: {(out / 'campaign.toml').resolve()}", soft_wrap=True)
 

@@ -156,21 +156,7 @@ def cycles_of_readings(deviations: xr.Dataset) -> Cycles:
 
 
 def cycles_of_frames(times: NDArray[np.datetime64], window_s: float) -> Cycles:
-    """Return consecutive windows of equal length that serve as cycles, from the first frame on; windows without a frame are left out.
-
-    Parameters
-    ----------
-    times : (frames,) ndarray of datetime64
-        Times of the frames, sorted.
-    window_s : float, s
-        Length of a window.
-
-    Examples
-    --------
-    >>> minutes = np.datetime64("2026-03-09T08:00", "ns") + 60 * np.arange(12) * np.timedelta64(1, "s")
-    >>> cycles_of_frames(minutes, 300.0).number.tolist()
-    [1, 2, 3]
-    """
+    """Return consecutive windows of equal length, s, that serve as cycles, from the first of the sorted frames on, without empty ones."""
     length = np.timedelta64(round(window_s * 1e9), "ns")
     start = times.astype("datetime64[ns]")[0]
     number = np.unique((times.astype("datetime64[ns]") - start) // length).astype(np.int64)

@@ -25,6 +25,7 @@ from urllib.parse import quote, unquote, urljoin, urlsplit
 import filelock
 import pooch
 
+from fusion.campaign.values import FILE_KEYS
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.results.progress import Report, silent
 from fusion.results.store import write_json
@@ -35,15 +36,6 @@ from thermography.io.files import write_atomically
 #: Names a folder that keeps what is fetched; left out, that of the user's cache.
 CACHE_VARIABLE = "THERMOFUSE_CACHE"
 _STAMPS = ".origin.json"
-#: Keys of a campaign file that name files, by table; a list holds patterns.
-FILE_KEYS: Mapping[str, tuple[str, ...]] = {
-    "thermography": ("frames", "lens", "stack.times"),
-    "plan": ("fiducials", "regions"),
-    "interferometry": ("deviations", "environment"),
-    "sensors": ("file", "places"),
-    "drivers": ("file",),
-    "record": ("file", "files", "test"),
-}
 #: A file whose connection is lost is asked for so many times, with a pause that doubles, s.
 _TRIALS, _PAUSE_S = 4, 0.5
 #: Files that are fetched at a time: many small ones wait for the answer, not for the line.

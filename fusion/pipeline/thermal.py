@@ -709,9 +709,7 @@ def _registration_part(registration: Registration, source: CameraInputs) -> dict
         "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
         "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
         "unchecked": list(registration.unchecked),
-        "contradicted_hints": registration.contradicted_hints,
-        "mirrored": registration.mirrored,
-        "area_ratio": registration.area_ratio,
+        **{name: getattr(registration, name) for name in ("contradicted_hints", "mirrored", "area_ratio")},
         "span": float(cv2.contourArea(hull)) / (source.grid.width_mm * source.grid.height_mm),
         "leave_one_out_mm": registration.leave_one_out_mm,
     }

@@ -19,6 +19,7 @@ from typer.testing import CliRunner, Result
 
 from fusion import cli
 from fusion.results.results import results_schema
+from tests.fusion.campaign_parts import change, record_of_rows
 
 
 def invoke(*arguments: str | Path) -> Result:
@@ -94,7 +95,7 @@ def test_bad_input_is_one_paragraph_without_a_traceback(
     campaign_folder: Path, results_folder: Path, tmp_path: Path
 ) -> None:
     broken = shutil.copytree(campaign_folder, tmp_path / "campaign") / "campaign.toml"
-    broken.write_text(broken.read_text().replace('"20 mm"', "20"))
+    change(broken, '"20 mm"', "20")
     result = invoke("run", broken, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert result.stderr.startswith(f"thermofuse: {broken}, line 17: ")
@@ -237,17 +238,12 @@ def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
     assert "it lacks a heat source that no sensor sees" in page
     with xr.open_dataset(tmp_path / "out" / "fusion.nc", engine="h5netcdf") as product:
         assert {"displacement", "predicted_final", "contribution", "sealed"} <= set(product.data_vars)
-    again = invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out", "--resume")
-    assert again.exit_code == 0
+    assert invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out", "--resume").exit_code == 0
     assert json.loads((tmp_path / "out" / "results.json").read_text())["loop"] == written["loop"]
 
 
 def test_a_record_too_short_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    (tmp_path / "record.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n1,20,0\n")
-    (tmp_path / "record.toml").write_text(
-        '[campaign]\ntitle = "R"\n[record]\nfile = "record.csv"\ntime = "time [s]"\ntemperatures = ["t*"]\ndisplacements = ["ch*"]\n'
-    )
-    result = invoke("run", tmp_path / "record.toml", "--out", tmp_path / "out")
+    result = invoke("run", record_of_rows(tmp_path, "0,20,0", "1,20,0"), "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "record.csv: 2 samples are too few to hold a part out; a record needs at least 40" in result.stderr
     assert not (tmp_path / "out").exists()
@@ -313,8 +309,7 @@ def test_what_cannot_be_watched_is_refused(campaign_folder: Path, tmp_path: Path
 
 def test_results_that_were_edited_are_not_reported(results_folder: Path, tmp_path: Path) -> None:
     edited = shutil.copytree(results_folder, tmp_path / "edited")
-    text = (edited / "results.json").read_text(encoding="utf-8")
-    (edited / "results.json").write_text(text.replace("Small campaign", "Another campaign"), encoding="utf-8")
+    change(edited / "results.json", "Small campaign", "Another campaign")
     commands = [("report", edited), ("export", edited, "--format", "csv"), ("iso230", edited)]
     for arguments in (*commands, ("compare", results_folder, edited)):
         told = invoke(*arguments)

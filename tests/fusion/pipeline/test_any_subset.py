@@ -15,7 +15,7 @@ from fusion.report.terminal import summary_rows
 from fusion.results.folder import claim, read_manifest
 from fusion.results.results import read_results
 from fusion.results.store import read_dataset, read_tree
-from tests.fusion.campaign_parts import change, keep_cycles, without
+from tests.fusion.campaign_parts import BOTH, change, keep_cycles, without, write_laser
 
 pytestmark = pytest.mark.chain
 
@@ -135,31 +135,6 @@ def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_pat
     assert {"fields", "drift", "iso230"} <= sections(out)
     assert not {"anomalies", "correlation", "loop"} & sections(out)
     assert "mean_rise" in read_tree(out / "fusion.nc").to_dataset()
-
-
-def write_laser(folder: Path, cycles: int, targets: int, directions: tuple[str, ...]) -> Path:
-    """A campaign of the laser alone, made by hand: a profile, a drift that grows along the axis, noise of 0.25 um."""
-    rng = np.random.default_rng(1)
-    profile, seconds, rows = rng.normal(0.0, 0.6, targets), 0.0, []
-    for cycle in range(1, cycles + 1):
-        for direction in directions:
-            order = range(targets) if direction == "positive" else range(targets - 1, -1, -1)
-            for k in order:
-                seconds += 4.0
-                share = k / (targets - 1)
-                value = profile[k] + (2.0 + 6.0 * share) * (1.0 - np.exp(-seconds / 5400.0)) + rng.normal(0.0, 0.25)
-                time = np.datetime64("2026-03-09T06:30:00.000") + np.timedelta64(round(1000 * seconds), "ms")
-                rows.append(f"{cycle},{direction},{k + 1},{20.0 * k:.1f},{time}Z,{value:.3f}")
-            seconds += 20.0
-    folder.mkdir()
-    heading = "cycle,direction,target,position_mm,time,deviation_um"
-    (folder / "laser.csv").write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
-    path = folder / "campaign.toml"
-    path.write_text('[campaign]\ntitle = "Size"\n\n[interferometry]\ndeviations = "laser.csv"\n', encoding="utf-8")
-    return path
-
-
-BOTH = ("positive", "negative")
 
 
 @pytest.mark.parametrize(

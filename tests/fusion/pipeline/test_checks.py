@@ -15,7 +15,7 @@ from fusion.pipeline.run import run_campaign
 from fusion.report.terminal import summary_rows
 from fusion.results.results import read_results
 from tests.fusion.analysis.consistency import lies
-from tests.fusion.campaign_parts import change, keep_cycles, without
+from tests.fusion.campaign_parts import change, keep_cycles, record_of_rows, without
 
 
 def test_a_sound_campaign_is_ready(campaign_folder):
@@ -71,11 +71,7 @@ def test_a_record_is_checked(tmp_path):
     rng = np.random.default_rng(5)
     warm = 20 + 5 * (1 - np.exp(-seconds / 9000))
     rows = [f"{s},{t:.3f},{3 * (t - 20) + 0.1 * rng.standard_normal():.3f}" for s, t in zip(seconds, warm, strict=True)]
-    (tmp_path / "a.csv").write_text("time [s],t1 [degC],ch1 [um]\n" + "\n".join(rows) + "\n")
-    file = tmp_path / "campaign.toml"
-    file.write_text(
-        '[campaign]\ntitle = "R"\n[record]\nfile = "a.csv"\ntime = "time [s]"\ntemperatures = ["t*"]\ndisplacements = ["ch*"]\n'
-    )
+    file = record_of_rows(tmp_path, *rows)
     checked = check_campaign(file)
     assert checked.faults == () and checked.content == ("record: 1 run, 1 temperature, 1 displacement, 600 rows",)
     assert 'no column is named "z*"' in check_campaign(change(file, '["ch*"]', '["z*"]')).faults[0]

@@ -34,7 +34,7 @@ from fusion.pipeline.fleet import (
 )
 from fusion.results.results import read_results
 from fusion.results.store import OutputError, write_json
-from tests.fusion.campaign_parts import keep_cycles, without
+from tests.fusion.campaign_parts import write_laser
 
 
 def touch(folder, *names):
@@ -77,19 +77,11 @@ def test_a_campaign_does_not_take_a_name_of_the_fleet(tmp_path, name):
 
 
 @pytest.fixture(scope="module")
-def hall(campaign_folder, tmp_path_factory):
-    """Two machines measured by the laser alone, and one whose readings are not there."""
+def hall(tmp_path_factory):
+    """Two machines measured by the laser alone, in as few cycles as can be evaluated, and one whose readings are not there."""
     folder = tmp_path_factory.mktemp("fleet") / "hall"
-    part = without(
-        campaign_folder / "campaign.toml", "thermography", "plan", "plan.axis", "model", name="laser_only.toml"
-    )
-    text = part.read_text()
-    part.unlink()
     for name in ("a", "b", "c"):
-        shutil.copytree(campaign_folder, folder / name, ignore=shutil.ignore_patterns("thermal"))
-        (folder / name / "campaign.toml").write_text(text + "\n[model]\ndeclared = []\n")
-    for name in ("a", "c"):
-        keep_cycles(folder / name / "laser.csv", *range(1, 6))
+        write_laser(folder / name, 5, 6)
     (folder / "b" / "laser.csv").unlink()
     return folder
 

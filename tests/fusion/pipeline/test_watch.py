@@ -29,7 +29,7 @@ from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.planning import plan_cycles
 from interferometry.io.readings import read_deviations
 from interferometry.iso230 import evaluate_iso230
-from tests.fusion.campaign_parts import change, without
+from tests.fusion.campaign_parts import change, record_of_rows, without
 from tests.fusion.laboratory import Laboratory, append, begin, copy_frames
 from tests.thermography.flir_mutations import PARAMETERS
 from thermography.io.flir import index_frames
@@ -137,13 +137,8 @@ def test_the_laser_alone_is_followed_and_a_line_that_cannot_be_used_told_once(co
 
 
 def test_a_record_cannot_be_followed(tmp_path):
-    (tmp_path / "record.csv").write_text("time [s],a [degC],x [um]\n0,20,0\n")
-    (tmp_path / "campaign.toml").write_text(
-        '[campaign]\ntitle = "R"\naxis = "X"\n[record]\nfile = "record.csv"\ntime = "time [s]"\n'
-        'temperatures = ["a [degC]"]\ndisplacements = ["x [um]"]\n[model]\ndeclared = []\n'
-    )
     with pytest.raises(CampaignError, match="cannot be followed; run it when it is finished"):
-        next(follow(load_campaign(tmp_path / "campaign.toml")))
+        next(follow(load_campaign(record_of_rows(tmp_path, "0,20,0"))))
 
 
 NAT = np.datetime64("NaT", "ns")
