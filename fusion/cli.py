@@ -315,17 +315,14 @@ def init(
     from fusion.pipeline.check import check_campaign
     from fusion.pipeline.draft import Asker, DraftError, unused_files, write_campaign
 
+    def ask(question: str, default: str) -> str:
+        shown = printable(f"{question} [{default}]" if default else question)
+        return str(typer.prompt(shown, default=default, show_default=False))
+
     with _answering():
         if not yes and not sys.stdin.isatty():
             raise DraftError("there is no terminal to ask at; add --yes, which leaves marked lines to fill in")
-        ask = (
-            None
-            if yes
-            else lambda question, default: typer.prompt(
-                printable(f"{question} [{default}]" if default else question), default=default, show_default=False
-            )
-        )
-        path, missing = write_campaign(folder, Asker(ask, lambda text: errors.print(text)))
+        path, missing = write_campaign(folder, Asker(None if yes else ask, errors.print))
         console.print(f"campaign: {path.resolve()}", soft_wrap=True)
         lines = [f"not used: {line}" for line in unused_files(path)]
         lines += [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()

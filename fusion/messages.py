@@ -316,26 +316,9 @@ _LONGEST_NAME = 255
 
 @contextmanager
 def naming(file: Path, *, readings: Path | None = None) -> Iterator[None]:
-    """Put the file in front of the message of an error that is raised within by what does not know the file.
+    """Put the file in front of the message of an error that is raised within by what does not know it; a path is left as it is.
 
-    Parameters
-    ----------
-    file : Path
-        The campaign file, or what else was asked for.
-    readings : Path or None
-        File of the readings, which errors of the package `interferometry` are about; None where they are about `file` too.
-
-    Raises
-    ------
-    FusionError, InterferometryError, ThermographyError
-        The same error; a message that begins with a path is left as it is.
-
-    Examples
-    --------
-    >>> with naming(Path("x/campaign.toml")):
-    ...     raise FusionError("the plan grids differ")
-    Traceback (most recent call last):
-    fusion.common.FusionError: x/campaign.toml: the plan grids differ
+    Errors of the package `interferometry` are about `readings`, the file of the readings, where that is given.
     """
     try:
         yield

@@ -1,6 +1,5 @@
 """What the command makes of drift and field: regions, hotspots, randomised duty, and the words for them."""
 
-import json
 import shutil
 
 import jsonschema
@@ -16,7 +15,7 @@ from fusion.pipeline.positioning import align_recordings
 from fusion.report.campaign import describe_correlation
 from fusion.results.progress import silent
 from fusion.results.results import assemble, results_schema
-from fusion.results.store import read_dataset
+from fusion.results.store import plain, read_dataset
 from fusion.twin.machine import duty_levels
 from fusion.twin.recipe import Duty
 from tests.fusion.campaign_parts import change
@@ -50,7 +49,7 @@ def outcome(campaign, results_folder):
 
 def test_the_part_of_the_results_keeps_the_schema(outcome):
     _, parts, _ = outcome
-    document = {"schema": 3, "campaign": "x", "warnings": [], **json.loads(json.dumps(parts))}
+    document = {"schema": 3, "campaign": "x", "warnings": [], **plain(parts)}
     jsonschema.Draft202012Validator(results_schema()).validate(document)
 
 
