@@ -263,11 +263,14 @@ def _describe_deviations(found: Recognised) -> list[str]:
 
 
 def _describe_log(found: Recognised) -> list[str]:
-    from fusion.campaign.logs import read_drivers
-    from interferometry.io.readings import read_environment
+    if found.kind is Kind.DRIVERS:
+        from fusion.campaign.logs import read_drivers
 
-    of_drivers = found.kind is Kind.DRIVERS
-    name, log = ("drivers", read_drivers(found.path)) if of_drivers else ("environment", read_environment(found.path))
+        name, log = "drivers", read_drivers(found.path)
+    else:
+        from interferometry.io.readings import read_environment
+
+        name, log = "environment", read_environment(found.path)
     first, last = log["time"].values[0], log["time"].values[-1]
     lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}{_zone(log)}"]
     for variable, values in log.data_vars.items():

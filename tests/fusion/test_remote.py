@@ -24,7 +24,7 @@ from fusion.pipeline import remote
 from fusion.pipeline.remote import RemoteError, fetch_campaign, fetch_file, is_address
 from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
-from tests.fusion.campaign_parts import keep_cycles, without
+from tests.fusion.campaign_parts import change, keep_cycles, without
 
 pytest.importorskip("aiohttp", reason="needs thermofuse[remote]")
 
@@ -177,8 +177,7 @@ def test_a_run_check_and_reproduction_name_the_address(shelf, cache, tmp_path):
 
 def test_a_fault_of_a_remote_file_names_its_address(shelf, cache, tmp_path):
     server, day = shelf
-    text = (day / "laser.toml").read_text().replace('"laser.csv"', '"absent.csv"')
-    (day / "broken.toml").write_text(text)
+    change(without(day / "laser.toml", name="broken.toml"), '"laser.csv"', '"absent.csv"')
     ended = CliRunner().invoke(cli.app, ["run", f"{server}/day%201/broken.toml", "--out", str(tmp_path / "r")])
     assert ended.exit_code == 2
     assert f"{server}/day%201/broken.toml, line" in ended.output
@@ -248,7 +247,7 @@ def test_where_a_server_may_send(named, location, refused):
 def test_two_campaigns_of_one_folder_keep_their_files(shelf):
     address, day = shelf
     shutil.copy(day / "laser.csv", day / "other.csv")
-    (day / "second.toml").write_text((day / "laser.toml").read_text().replace("laser.csv", "other.csv"))
+    change(without(day / "laser.toml", name="second.toml"), "laser.csv", "other.csv")
     first = fetch_campaign(f"{address}/day%201/laser.toml")
     second = fetch_campaign(f"{address}/day%201/second.toml")
     assert (first.folder / "laser.csv").is_file() and (second.folder / "other.csv").is_file()
