@@ -7,7 +7,6 @@ differs from what was fetched before.
 from __future__ import annotations
 
 import csv
-import json
 import os
 import re
 import shutil
@@ -28,7 +27,7 @@ import pooch
 from fusion.campaign.values import FILE_KEYS
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.results.progress import Report, silent
-from fusion.results.store import write_json
+from fusion.results.store import read_json_object, write_json
 from interferometry.common import InterferometryError
 from thermography.common import ThermographyError
 from thermography.io.files import write_atomically
@@ -194,10 +193,8 @@ class _Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / _STAMPS
         with filelock.FileLock(self.folder / ".lock"):
-            try:
-                stamps = dict(json.loads(path.read_text(encoding="utf-8"))["files"])
-            except (OSError, ValueError, KeyError, TypeError):
-                stamps = {}
+            noted = read_json_object(path).get("files")
+            stamps = noted if isinstance(noted, dict) else {}
             try:
                 yield stamps
             finally:
