@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+from typer import Argument, Option
 
 from fusion.messages import (
     ExitCode,
@@ -33,12 +34,7 @@ if TYPE_CHECKING:
     from fusion.results.progress import Report
     from fusion.results.results import Results
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
+app = typer.Typer(no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 console = Terminal()
 errors = Terminal(stderr=True, soft_wrap=True)
 #: Characters of a line of a wide table where the output is no terminal.
@@ -58,8 +54,8 @@ class ExportFormat(StrEnum):
 
 
 #: Arguments and options that several commands have.
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
-ResultsFolder = Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
+ResultsFolder = Annotated[Path, Argument(metavar="RESULTS", help="Results folder of a run.")]
 
 
 def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
@@ -104,7 +100,7 @@ def _print_version(requested: bool) -> None:
 @app.callback()
 def common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
     """Explain the thermal drift of a machine-tool axis from FLIR frames and laser readings."""
@@ -114,38 +110,36 @@ def common(
 def run(
     campaigns: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="CAMPAIGN.toml...",
             help="One campaign file or its address (s3://, https://), or two of one machine.",
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Results folder; left out: 'results' next to the campaign file, or here for an address."),
+        Option(help="Results folder; left out: 'results' next to the campaign file, or here for an address."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue a run that is in the results folder.")] = False,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="dask scheduler for the per-frame work.")
-    ] = None,
+    resume: Annotated[bool, Option("--resume", help="Continue a run that is in the results folder.")] = False,
+    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="dask scheduler for the per-frame work.")] = None,
     no_plugins: Annotated[
-        bool, typer.Option("--no-plugins", help="Leave out effects that other installed distributions add.")
+        bool, Option("--no-plugins", help="Leave out effects that other installed distributions add.")
     ] = False,
     watch: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--watch", help="First follow the test while its files grow, a line per cycle; Ctrl-C ends it, then run."
         ),
     ] = False,
     until_idle: Annotated[
         float | None,
-        typer.Option(
+        Option(
             metavar="SECONDS", min=0.0, help="With --watch: the test has ended when no data have arrived for this time."
         ),
     ] = None,
     wanted: Annotated[
-        str, typer.Option(metavar="U", help="With --watch: wanted standard uncertainty of a position.")
+        str, Option(metavar="U", help="With --watch: wanted standard uncertainty of a position.")
     ] = "0.1 um",
-    processes: Annotated[int, typer.Option(min=1, max=2, help="2: a second process shares the work.")] = 2,
+    processes: Annotated[int, Option(min=1, max=2, help="2: a second process shares the work.")] = 2,
     quiet: Quiet = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
@@ -269,18 +263,14 @@ def _folders(campaigns: list[Path | str], out: Path | None) -> list[tuple[Path |
 def fleet(
     paths: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="FOLDER|CAMPAIGN.toml...", help="Campaign files, or folders with a campaign.toml in each."
-        ),
+        Argument(metavar="FOLDER|CAMPAIGN.toml...", help="Campaign files, or folders with a campaign.toml in each."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the summary and the results of every campaign.")] = Path(
-        "fleet"
-    ),
+    out: Annotated[Path, Option(help="Folder for the summary and the results of every campaign.")] = Path("fleet"),
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Most campaigns at a time; left out: one per processor, as memory allows.")
+        int | None, Option(min=1, help="Most campaigns at a time; left out: one per processor, as memory allows.")
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Keep campaigns that are finished and unchanged, continue the others.")
+        bool, Option("--resume", help="Keep campaigns that are finished and unchanged, continue the others.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -313,12 +303,9 @@ def fleet(
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with the files of one measurement.")],
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder with the files of one measurement.")],
     yes: Annotated[
-        bool,
-        typer.Option(
-            "--yes", "-y", help="Do not ask: leave marked lines to fill in for what the files do not contain."
-        ),
+        bool, Option("--yes", "-y", help="Do not ask: leave marked lines to fill in for what the files do not contain.")
     ] = False,
 ) -> None:
     """Write a commented campaign file for a folder.
@@ -328,17 +315,14 @@ def init(
     from fusion.pipeline.check import check_campaign
     from fusion.pipeline.draft import Asker, DraftError, unused_files, write_campaign
 
+    def ask(question: str, default: str) -> str:
+        shown = printable(f"{question} [{default}]" if default else question)
+        return str(typer.prompt(shown, default=default, show_default=False))
+
     with _answering():
         if not yes and not sys.stdin.isatty():
             raise DraftError("there is no terminal to ask at; add --yes, which leaves marked lines to fill in")
-        ask = (
-            None
-            if yes
-            else lambda question, default: typer.prompt(
-                printable(f"{question} [{default}]" if default else question), default=default, show_default=False
-            )
-        )
-        path, missing = write_campaign(folder, Asker(ask, lambda text: errors.print(text)))
+        path, missing = write_campaign(folder, Asker(None if yes else ask, errors.print))
         console.print(f"campaign: {path.resolve()}", soft_wrap=True)
         lines = [f"not used: {line}" for line in unused_files(path)]
         lines += [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
@@ -348,11 +332,10 @@ def init(
 @app.command("app")
 def application(
     folder: Annotated[
-        Path | None,
-        typer.Argument(metavar="FOLDER", help="Folder that it may read and write; left out: the present one."),
+        Path | None, Argument(metavar="FOLDER", help="Folder that it may read and write; left out: the present one.")
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: a free one.")] = 0,
-    open_browser: Annotated[bool, typer.Option("--open", help="Open it in the browser of this system.")] = False,
+    port: Annotated[int, Option(min=0, max=65535, help="Port on this machine; 0: a free one.")] = 0,
+    open_browser: Annotated[bool, Option("--open", help="Open it in the browser of this system.")] = False,
 ) -> None:
     """Set a campaign up and run it in the browser.
 
@@ -372,10 +355,10 @@ def application(
 @app.command()
 def check(
     campaign: Annotated[
-        str, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign file, or its address (s3://, https://).")
+        str, Argument(metavar="CAMPAIGN.toml", help="The campaign file, or its address (s3://, https://).")
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print faults and doubts only.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="Print faults and doubts only.")] = False,
 ) -> None:
     """Check a campaign without running it.
 
@@ -409,9 +392,9 @@ def _fetched(text: str, *, whole: bool, quiet: bool) -> tuple[Path, Callable[[st
 
 @app.command()
 def reproduce(
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a finished run; only read.")],
+    results: Annotated[Path, Argument(metavar="RESULTS", help="Results folder of a finished run; only read.")],
     campaign: Annotated[
-        str | None, typer.Option(help="The campaign file or its address; left out: where the run found it.")
+        str | None, Option(help="The campaign file or its address; left out: where the run found it.")
     ] = None,
 ) -> None:
     """Compute a run again and tell whether its results are equal, byte for byte.
@@ -419,10 +402,9 @@ def reproduce(
     Exit code 0 where they are, 1 where inputs or results differ.
     """
     from fusion.pipeline.reproduce import reproduce as compute_again
-    from fusion.results.progress import Reporter
 
     with _answering():
-        with Reporter(console) as report:
+        with _progress(quiet=False) as report:
             found = compute_again(results, campaign=None if campaign is None else _place(campaign), report=report)
         _print_lines(found.lines)
         if not found.equal:
@@ -432,18 +414,17 @@ def reproduce(
 @app.command()
 def simulate(
     recipe: Annotated[
-        Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does; or demo, paper, record.")
+        Path, Argument(metavar="RECIPE.toml", help="What the machine of the twin does; or demo, paper, record.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the campaign; must be empty or absent.")],
+    out: Annotated[Path, Option(help="Folder of the campaign; must be empty or absent.")],
 ) -> None:
     """Simulate a campaign with known truth.
 
     Writes the files that the instruments would write; the truth is kept next to the folder.
     """
-    from fusion.results.progress import Reporter
     from fusion.twin.instruments import simulate_campaign
 
-    with _answering(), Reporter(console) as report:
+    with _answering(), _progress(quiet=False) as report:
         simulate_campaign(recipe, out, progress=lambda done, total, what: report(what, done, total))
         console.print(f"campaign: {(out / 'campaign.toml').resolve()}", soft_wrap=True)
 
@@ -452,14 +433,14 @@ def simulate(
 def inspect(
     paths: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="FILE|FOLDER...",
             help="Any file that a run reads or its address (s3://, https://), or folders of them.",
         ),
     ],
-    thumbnails: Annotated[Path | None, typer.Option(help="Folder for a small PNG of every thermal file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print faults and warnings only.")] = False,
+    thumbnails: Annotated[Path | None, Option(help="Folder for a small PNG of every thermal file.")] = None,
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="Print faults and warnings only.")] = False,
 ) -> None:
     """Print what files hold, with warnings about implausible content.
 
@@ -492,17 +473,17 @@ def inspect(
 def iso230(
     test: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="FILE|CAMPAIGN.toml|RESULTS",
             help="Deviations (.rtl, a table as text, XLSX or ODS, a log of a positioning test), a campaign file, or a results folder.",
         ),
     ],
     cycles: Annotated[
-        str | None, typer.Option(help="Window, for example 1-5; left out: the most settled five cycles.")
+        str | None, Option(help="Window, for example 1-5; left out: the most settled five cycles.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print the values per target as CSV.")] = False,
+    out: Annotated[Path | None, Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
+    as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
+    as_csv: Annotated[bool, Option("--csv", help="Print the values per target as CSV.")] = False,
 ) -> None:
     """Evaluate a test by ISO 230-2.
 
@@ -530,7 +511,7 @@ def iso230(
 
 @app.command()
 def schema(
-    name: Annotated[str, typer.Argument(metavar="results|campaign|recipe", help="Which file to describe.")] = "results",
+    name: Annotated[str, Argument(metavar="results|campaign|recipe", help="Which file to describe.")] = "results",
 ) -> None:
     """Print the JSON Schema of a file."""
     from fusion.campaign.config import campaign_schema
@@ -546,22 +527,20 @@ def schema(
 @app.command()
 def export(
     results: ResultsFolder,
-    format: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
-    out: Annotated[Path | None, typer.Option(help="Folder for the files; left out: RESULTS/export.")] = None,
-    axis: Annotated[
-        str | None, typer.Option(help="Name of the axis in the control; left out: the campaign's axis.")
-    ] = None,
+    format: Annotated[ExportFormat, Option("--format", help="What to write.")],
+    out: Annotated[Path | None, Option(help="Folder for the files; left out: RESULTS/export.")] = None,
+    axis: Annotated[str | None, Option(help="Name of the axis in the control; left out: the campaign's axis.")] = None,
     spacing: Annotated[
-        str | None, typer.Option(help='Distance of the points of the table, "25 mm"; left out: the targets.')
+        str | None, Option(help='Distance of the points of the table, "25 mm"; left out: the targets.')
     ] = None,
     reference: Annotated[
-        str | None, typer.Option(help='Position at which the correction is zero, "0 mm"; left out: the first target.')
+        str | None, Option(help='Position at which the correction is zero, "0 mm"; left out: the first target.')
     ] = None,
-    fields: Annotated[bool, typer.Option("--fields", help="With csv: the fields too, a large file.")] = False,
+    fields: Annotated[bool, Option("--fields", help="With csv: the fields too, a large file.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Write a compensation table even if the results do not support it.")
+        bool, Option("--force", help="Write a compensation table even if the results do not support it.")
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Export tables, a workbook, or a control's compensation.
 
@@ -591,18 +570,13 @@ def export(
 @app.command()
 def report(
     results: ResultsFolder,
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Print it to PDF with an installed Chrome, Chromium or Edge.")
-    ] = False,
+    pdf: Annotated[bool, Option("--pdf", help="Print it to PDF with an installed Chrome, Chromium or Edge.")] = False,
     out: Annotated[
-        Path | None,
-        typer.Option(help="File to write, which must not exist; left out: report.html or report.pdf in RESULTS."),
+        Path | None, Option(help="File to write, which must not exist; left out: report.html or report.pdf in RESULTS.")
     ] = None,
-    full: Annotated[
-        bool, typer.Option("--full", help="With --pdf: also the parts that are folded on the screen.")
-    ] = False,
+    full: Annotated[bool, Option("--full", help="With --pdf: also the parts that are folded on the screen.")] = False,
     browser: Annotated[
-        str | None, typer.Option(help="With --pdf: the browser that prints; left out: one is looked for.")
+        str | None, Option(help="With --pdf: the browser that prints; left out: one is looked for.")
     ] = None,
 ) -> None:
     """Make the report of a finished run again, or print it to PDF."""
@@ -621,11 +595,9 @@ def report(
 def compare(
     results: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RESULTS RESULTS...", help="Results folders of one machine; the first is the reference."
-        ),
+        Argument(metavar="RESULTS RESULTS...", help="Results folders of one machine; the first is the reference."),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Compare campaigns of one machine: what changed by more than the uncertainties.
 
@@ -658,18 +630,18 @@ def compare(
 @app.command()
 def plan(
     source: Annotated[
-        list[str], typer.Option(metavar="NAME=TIME", help="A heat source that can be switched, with its time constant.")
+        list[str], Option(metavar="NAME=TIME", help="A heat source that can be switched, with its time constant.")
     ],
-    effect: Annotated[str, typer.Option(help="Smallest drift of one source to be detected.")] = "1 um",
+    effect: Annotated[str, Option(help="Smallest drift of one source to be detected.")] = "1 um",
     drift: Annotated[
-        str, typer.Option(help="Random walk of the axis in one hour (the report's unexplained drift).")
+        str, Option(help="Random walk of the axis in one hour (the report's unexplained drift).")
     ] = "0.4 um",
-    noise: Annotated[str, typer.Option(help="Noise of one cycle's mean.")] = "0.1 um",
-    cycle: Annotated[str, typer.Option(help="Length of one cycle.")] = "252 s",
+    noise: Annotated[str, Option(help="Noise of one cycle's mean.")] = "0.1 um",
+    cycle: Annotated[str, Option(help="Length of one cycle.")] = "252 s",
     power: Annotated[
-        float, typer.Option(min=0.1, max=0.99, help="Wanted probability of detecting the weakest source.")
+        float, Option(min=0.1, max=0.99, help="Wanted probability of detecting the weakest source.")
     ] = 0.8,
-    seed: Annotated[int, typer.Option(help="Another seed is another, equally valid schedule.")] = 0,
+    seed: Annotated[int, Option(help="Another seed is another, equally valid schedule.")] = 0,
 ) -> None:
     """Propose a random duty schedule for a new test.
 

@@ -66,13 +66,7 @@ def failed_code(count: int) -> int:
 
 
 class Stopped(KeyboardInterrupt):
-    """The process was asked to stop.
-
-    Parameters
-    ----------
-    number : int
-        Signal.
-    """
+    """The process was asked to stop by a signal of this number."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -255,22 +249,7 @@ _LONGEST_LINE, _MOST_LINES = 4_000, 2_000
 
 
 def printable(text: str) -> str:
-    r"""Return a text in which nothing acts on a terminal: such characters are written as in Python, ``\x1b``.
-
-    Parameters
-    ----------
-    text : str
-        With names, titles and values from files.
-
-    Notes
-    -----
-    Control functions of ECMA-48; direction of text by Unicode Standard Annex 9.
-
-    Examples
-    --------
-    >>> print(printable("axis \x1b[2J"))
-    axis \x1b[2J
-    """
+    r"""Return a text in which nothing acts on a terminal (ECMA-48, UAX 9): such characters are written as in Python, ``\x1b``."""
     return _ACTING.sub(lambda found: repr(found.group())[1:-1], text)
 
 
@@ -337,26 +316,9 @@ _LONGEST_NAME = 255
 
 @contextmanager
 def naming(file: Path, *, readings: Path | None = None) -> Iterator[None]:
-    """Put the file in front of the message of an error that is raised within by what does not know the file.
+    """Put the file in front of the message of an error that is raised within by what does not know it; a path is left as it is.
 
-    Parameters
-    ----------
-    file : Path
-        The campaign file, or what else was asked for.
-    readings : Path or None
-        File of the readings, which errors of the package `interferometry` are about; None where they are about `file` too.
-
-    Raises
-    ------
-    FusionError, InterferometryError, ThermographyError
-        The same error; a message that begins with a path is left as it is.
-
-    Examples
-    --------
-    >>> with naming(Path("x/campaign.toml")):
-    ...     raise FusionError("the plan grids differ")
-    Traceback (most recent call last):
-    fusion.common.FusionError: x/campaign.toml: the plan grids differ
+    Errors of the package `interferometry` are about `readings`, the file of the readings, where that is given.
     """
     try:
         yield

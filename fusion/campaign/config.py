@@ -27,6 +27,7 @@ from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.values import (
+    FILE_KEYS,
     Celsius,
     Feed,
     Fraction,
@@ -690,7 +691,7 @@ class Campaign(Table):
     def input_files(self) -> dict[str, Path]:
         """Return every file that the campaign reads, keyed by its path relative to the campaign file."""
         files = {relative_name(self.path, self.folder): self.path}
-        for table in ("thermography", "plan", "interferometry", "sensors", "drivers", "record"):
+        for table in FILE_KEYS:
             files |= self.files_of(table)
         return files
 
@@ -699,12 +700,10 @@ class Campaign(Table):
         stated = getattr(self, table)
         if stated is None:
             return {}
-        keys = ("fiducials", "regions", "deviations", "environment", "file", "places", "lens")
-        names = [getattr(stated, key, None) for key in keys if table != "record"]
-        if table == "thermography" and self.thermography is not None and self.thermography.stack is not None:
-            names.append(self.thermography.stack.times)
         paths = list({"thermography": self.frame_paths, "record": self.record_paths}.get(table, tuple)())
-        paths += [self.resolve(name) for name in names if name is not None]
+        for key in FILE_KEYS.get(table, ()) if table != "record" else ():
+            name = reduce(lambda within, part: getattr(within, part, None), key.split("."), stated)
+            paths += [self.resolve(name)] if isinstance(name, str) else []
         return {relative_name(path, self.folder): path for path in paths}
 
 

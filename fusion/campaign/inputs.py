@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -45,7 +45,7 @@ from fusion.campaign.logs import (
     split_heading,
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
-from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
+from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
 from fusion.campaign.values import matching_pipes
 from fusion.common import FusionError
 from fusion.messages import naming
@@ -111,22 +111,22 @@ def _read_times(path: Path, table: StackTable) -> dict[tuple[str, int], np.datet
     return times
 
 
-def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameReference]) -> list[Notice]:
+def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameReference]) -> Iterator[Notice]:
     """Return notices of what was assumed of a camera whose files hold temperatures."""
     if not any(isinstance(frame, TemperatureFrame) for frame in frames):
-        return []
-    accuracy = Notice(
-        "camera_accuracy_assumed",
-        "The files hold temperatures and not what camera took them: the accuracy of an uncooled camera was assumed.",
-        'Write the accuracy of its data sheet under [thermography], for example camera_offset_u = "1 K" and camera_scale_u = 0.01.',
-    )
-    emissivity = Notice(
-        "stack_emissivity_unknown",
-        "The emissivity with which the camera's program calculated the temperatures is not stated; they are taken as they are.",
-        "Write emissivity and reflected_temperature under [thermography.stack] as they were set in the camera.",
-    )
-    unstated = table.stack is None or table.stack.emissivity is None
-    return [*([accuracy] if table.camera_offset_u_K is None else []), *([emissivity] if unstated else [])]
+        return
+    if table.camera_offset_u_K is None:
+        yield Notice(
+            "camera_accuracy_assumed",
+            "The files hold temperatures and not what camera took them: the accuracy of an uncooled camera was assumed.",
+            'Write the accuracy of its data sheet under [thermography], for example camera_offset_u = "1 K" and camera_scale_u = 0.01.',
+        )
+    if table.stack is None or table.stack.emissivity is None:
+        yield Notice(
+            "stack_emissivity_unknown",
+            "The emissivity with which the camera's program calculated the temperatures is not stated; they are taken as they are.",
+            "Write emissivity and reflected_temperature under [thermography.stack] as they were set in the camera.",
+        )
 
 
 # What a campaign was read into, before anything is calculated: the inputs of either instrument, or of both.
@@ -156,21 +156,7 @@ def cycles_of_readings(deviations: xr.Dataset) -> Cycles:
 
 
 def cycles_of_frames(times: NDArray[np.datetime64], window_s: float) -> Cycles:
-    """Return consecutive windows of equal length that serve as cycles, from the first frame on; windows without a frame are left out.
-
-    Parameters
-    ----------
-    times : (frames,) ndarray of datetime64
-        Times of the frames, sorted.
-    window_s : float, s
-        Length of a window.
-
-    Examples
-    --------
-    >>> minutes = np.datetime64("2026-03-09T08:00", "ns") + 60 * np.arange(12) * np.timedelta64(1, "s")
-    >>> cycles_of_frames(minutes, 300.0).number.tolist()
-    [1, 2, 3]
-    """
+    """Return consecutive windows of equal length, s, that serve as cycles, from the first of the sorted frames on, without empty ones."""
     length = np.timedelta64(round(window_s * 1e9), "ns")
     start = times.astype("datetime64[ns]")[0]
     number = np.unique((times.astype("datetime64[ns]") - start) // length).astype(np.int64)
@@ -414,14 +400,10 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
     frames, rejected = _read_frames(campaign)
     if cycles is None or plan.in_pixels:
         _raise_if_no_rise(campaign, frames, rejected)
-    if plan.in_pixels:
-        try:
-            grid = picture_grid(frames[0].shape, plan.cell_px)
-        except ThermographyError as error:
-            raise SourceError(f"{campaign.path}: plan.{error}") from None
-    else:
-        assert plan.size_mm is not None and plan.cell_size_mm is not None
-        grid = PlanGrid(*plan.size_mm, plan.cell_size_mm)
+    try:
+        grid = plan_grid(plan, frames[0].shape)
+    except ThermographyError as error:
+        raise SourceError(f"{campaign.path}: plan.{error}") from None
     camera: dict[str, Any] = {
         "thermography": thermography,
         "plan": plan,
@@ -438,6 +420,14 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
         times = camera_on_laser_clock(frame_times(frames), thermography.clock_offset_s or 0.0)
         camera["cycles"] = cycles_of_frames(times, thermography.window_s or usual_window_s(times))
     return camera
+
+
+def plan_grid(plan: PlanTable, shape: tuple[int, int]) -> PlanGrid:
+    """Return the cells of a plan in mm, or of the picture (rows, columns) that is the plan."""
+    if plan.in_pixels:
+        return picture_grid(shape, plan.cell_px)
+    assert plan.size_mm is not None and plan.cell_size_mm is not None
+    return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 
 
 def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
@@ -654,7 +644,7 @@ def _raise_if_clocks_disagree(source: Source) -> None:
     covered = covered_share(readings, frames)
     shift = likely_zone_shift(readings, frames)
     laser = f"readings of {source.deviations.attrs.get('source', 'the laser')}"
-    span = f"frames {_shown(frames[0])} to {_shown(frames[-1])}, {laser} {_shown(readings.min())} to {_shown(readings.max())}"
+    span = f"frames {utc(frames[0])} to {utc(frames[-1])}, {laser} {utc(readings.min())} to {utc(readings.max())}"
     if covered < _COVERED_NOW and shift is not None:
         raise AlignmentError(
             f"{path}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
@@ -666,11 +656,6 @@ def _raise_if_clocks_disagree(source: Source) -> None:
             f"{path}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
             "or check that both folders belong to the same test"
         )
-
-
-def _shown(time: np.datetime64) -> str:
-    """Return a time to the second with its zone."""
-    return f"{np.datetime_as_string(time, unit='s')}Z"
 
 
 # A record of one run or of several: every table read, the runs in the order of their times, held to the same columns.

@@ -13,35 +13,13 @@ from fusion.campaign.config import CampaignError
 from interferometry.io.tables import NO_ZONE
 
 
+def utc(time: np.datetime64) -> str:
+    """Return a time as results.json writes it, ISO 8601 in UTC to the second."""
+    return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
 def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Dataset:
-    """Bring times that a file gives without a zone to UTC.
-
-    Parameters
-    ----------
-    table : Dataset
-        With ``time``; its attribute ``reference`` says whether the file gives a zone.
-    zone : str or None
-        IANA name of the zone that the campaign file states; None leaves the times as they are, taken as UTC.
-    file : str
-        The file, for the message.
-
-    Returns
-    -------
-    Dataset
-        With times in UTC; times that carry their zone in the file are kept.
-
-    Raises
-    ------
-    CampaignError
-        If a time does not exist in that zone, or occurs twice, because clocks are changed for summer.
-
-    Examples
-    --------
-    >>> table = xr.Dataset(coords={"time": np.array(["2026-07-01T10:00"], "datetime64[ns]")})
-    >>> table["time"].attrs["reference"] = NO_ZONE
-    >>> str(bring_to_utc(table, "Europe/Vienna", file="laser.csv")["time"].values[0])
-    '2026-07-01T08:00:00.000000000'
-    """
+    """Bring times that a file gives without a zone from the stated one to UTC; others, and those without a stated zone, are kept."""
     if zone is None or not lacks_zone(table):
         return table
     local = table["time"].values

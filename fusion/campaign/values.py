@@ -6,6 +6,7 @@ import errno
 import math
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
@@ -138,6 +139,15 @@ def split_uncertainty(text: str) -> tuple[str, str | None]:
     return value, uncertainty[0]
 
 
+#: Keys of a campaign file that name files, by table; a list holds patterns.
+FILE_KEYS: Mapping[str, tuple[str, ...]] = {
+    "thermography": ("frames", "lens", "stack.times"),
+    "plan": ("fiducials", "regions"),
+    "interferometry": ("deviations", "environment"),
+    "sensors": ("file", "places"),
+    "drivers": ("file",),
+    "record": ("file", "files", "test"),
+}
 #: Folders of a pattern, each of which is searched within the one before.
 _MAX_PARTS = 64
 

@@ -137,7 +137,7 @@ def _correlation_part(
         "false_alarm_rate": float(session["false_alarm_rate"]),
         "source": {
             **source.model_dump(exclude_unset=True),
-            "area": _rectangle(regions[source.name] if source.kind == "region" else source.area),
+            "area": regions[source.name] if source.kind == "region" else source.area,
             "sensitivity_um_per_K": scaled(
                 source.sensitivity_um_per_K.model_dump(exclude_unset=True),
                 place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float)),
@@ -164,10 +164,6 @@ def _duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
         tested = {"cause": bool(load["p_value"] <= LEVEL), "p_value": float(load["p_value"])}
         found.append({"name": str(name), **tested, "drift_at_full_duty_um": drift, "time_constants_s": constants})
     return found
-
-
-def _rectangle(area: AreaPart | None) -> dict[str, float] | None:
-    return None if area is None else area.model_dump()
 
 
 def _mode_areas(maps: xr.DataTree) -> dict[str, AreaPart | None]:
@@ -206,7 +202,7 @@ def _candidate_parts(
             if kind == "mode":
                 parts[channel]["p_given_leading_mode"] = float(found["p_beside"])
         label = f"mode {candidate[kind].item()}" if kind == "mode" else str(candidate[kind].item())
-        place = {"x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "area": _rectangle(areas[label])}
+        place = {"x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "area": areas[label]}
         listed.append({"name": label, **place, "parts": parts})
     return listed
 

@@ -373,11 +373,12 @@ def _extent(fiducials: Sequence[Fiducial]) -> tuple[str, str]:
     if not fiducials:
         return "", ""
     radius = max(one.diameter_mm for one in fiducials) / 2.0
-    sides = []
-    for places in ([one.x_mm for one in fiducials], [one.y_mm for one in fiducials]):
+
+    def side(places: Sequence[float]) -> str:
         tens = max(round((min(places) + max(places)) / 10.0), math.ceil((max(places) + radius) / 10.0))
-        sides.append(f"{10 * tens} mm")
-    return sides[0], sides[1]
+        return f"{10 * tens} mm"
+
+    return side([one.x_mm for one in fiducials]), side([one.y_mm for one in fiducials])
 
 
 def _direction(asker: Asker) -> str:

@@ -29,7 +29,8 @@ from fusion.analysis.effects.effect import Effect, Prior
 from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import EXPANSION_U_PPM_PER_K
 from fusion.campaign.inputs import Inputs, LaserInputs, Source
-from fusion.pipeline.positioning import diagnose_positions, sites_of, utc
+from fusion.campaign.time_zones import utc
+from fusion.pipeline.positioning import diagnose_positions, sites_of
 from fusion.results import store
 from fusion.results.loop import ResidualTestsPart
 from fusion.results.progress import Report, counted

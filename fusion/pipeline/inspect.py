@@ -262,25 +262,21 @@ def _describe_deviations(found: Recognised) -> list[str]:
     ]
 
 
-def _describe_log(name: str, log: xr.Dataset) -> list[str]:
+def _describe_log(found: Recognised) -> list[str]:
+    if found.kind is Kind.DRIVERS:
+        from fusion.campaign.logs import read_drivers
+
+        name, log = "drivers", read_drivers(found.path)
+    else:
+        from interferometry.io.readings import read_environment
+
+        name, log = "environment", read_environment(found.path)
     first, last = log["time"].values[0], log["time"].values[-1]
     lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}{_zone(log)}"]
     for variable, values in log.data_vars.items():
         unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
         lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
     return lines + _warnings(log)
-
-
-def _describe_environment(found: Recognised) -> list[str]:
-    from interferometry.io.readings import read_environment
-
-    return _describe_log("environment", read_environment(found.path))
-
-
-def _describe_drivers(found: Recognised) -> list[str]:
-    from fusion.campaign.logs import read_drivers
-
-    return _describe_log("drivers", read_drivers(found.path))
 
 
 def _describe_record(found: Recognised) -> list[str]:
@@ -359,8 +355,8 @@ def _describe_recipe(found: Recognised) -> list[str]:
 
 _DESCRIBERS: dict[Kind, Callable[[Recognised], list[str]]] = {
     Kind.DEVIATIONS: _describe_deviations,
-    Kind.ENVIRONMENT: _describe_environment,
-    Kind.DRIVERS: _describe_drivers,
+    Kind.ENVIRONMENT: _describe_log,
+    Kind.DRIVERS: _describe_log,
     Kind.RECORD: _describe_record,
     Kind.FIDUCIALS: _describe_fiducials,
     Kind.REGIONS: _describe_regions,

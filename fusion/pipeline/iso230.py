@@ -302,8 +302,6 @@ def _pair(
 
 # A test by ISO 230-2 from a file of readings, a campaign file or the results of a run, evaluated for its own page.
 
-_STATED_INPUTS = ("device", "alignment", "material_temperature", "expansion_coefficient")
-
 
 @dataclass(frozen=True)
 class StandardTest:
@@ -341,7 +339,7 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
     deviations = read_deviations(path, rotary=True)
     rotary = deviations["deviation"].attrs["units"] == "arcsec"
     origin: Origin = "not of a rotary axis" if rotary else "assumed"
-    budget = StatedBudget(SCATTER_ALONE if rotary else Iso230Budget(), dict.fromkeys(_STATED_INPUTS, origin))
+    budget = StatedBudget(SCATTER_ALONE if rotary else Iso230Budget(), dict.fromkeys(_INPUTS, origin))
     try:
         return _evaluate(path.name, deviations, budget, cycles)
     except InterferometryError as error:

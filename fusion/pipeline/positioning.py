@@ -15,6 +15,7 @@ from fusion.analysis.consistency.readings import find_gross_readings
 from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose, undetermined_check
 from fusion.campaign.inputs import LaserInputs, Source
 from fusion.campaign.recompensation import material_by_cycle
+from fusion.campaign.time_zones import utc
 from fusion.pipeline.iso230 import evaluate_standard
 from fusion.report.wording import moment
 from fusion.results.progress import Report, counted, listed, silent
@@ -60,42 +61,30 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
     }
     if drift is not None:
         parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
-        parts["drift"] = _drift_part(deviations, drift)
+        course = drift["drift"].mean("direction")
+        range_u = drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0)
+        parts["drift"] = {
+            **{f"{name}_um": by_direction(drift[name]) for name in ("profile", "profile_u", "scatter")},
+            "position_mm": deviations["position"].values.tolist(),
+            # Of the mean of both approaches.
+            "range_um": (course.max("cycle") - course.min("cycle")).values.tolist(),
+            "range_u_um": range_u.values.tolist(),
+        }
     report("deviations", 1, 1)
     return Outcome(dataset, parts, (*_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
-
-
-def utc(time: np.datetime64) -> str:
-    """Return a time as results.json writes it, ISO 8601 in UTC to the second."""
-    return f"{np.datetime_as_string(time, unit='s')}Z"
-
-
-def _drift_part(deviations: xr.Dataset, drift: xr.Dataset) -> dict[str, Any]:
-    """Return the part ``drift`` of results.json; the range of every target's drift is that of the mean of both approaches, um."""
-    course = drift["drift"].mean("direction")
-    range_u = drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0)
-    return {
-        "profile_um": by_direction(drift["profile"]),
-        "profile_u_um": by_direction(drift["profile_u"]),
-        "scatter_um": by_direction(drift["scatter"]),
-        "position_mm": deviations["position"].values.tolist(),
-        "range_um": (course.max("cycle") - course.min("cycle")).values.tolist(),
-        "range_u_um": range_u.values.tolist(),
-    }
 
 
 def _approach_notices(deviations: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that a test of one approach has no bidirectional values."""
     read = deviations["deviation"].notnull().any(("cycle", "target"))
     sides = [str(name) for name in read["direction"].values[read.values]]
-    if len(sides) == 2:
-        return
-    yield Notice(
-        "one_approach",
-        f"Positions were approached in the {sides[0]} direction only: unidirectional values are given; reversal error, bidirectional "
-        "values and the drift of the reversal need both.",
-        "Approach every position from both sides.",
-    )
+    if len(sides) == 1:
+        yield Notice(
+            "one_approach",
+            f"Positions were approached in the {sides[0]} direction only: unidirectional values are given; reversal error, bidirectional "
+            "values and the drift of the reversal need both.",
+            "Approach every position from both sides.",
+        )
 
 
 def _scatter_notices(drift: xr.Dataset | None) -> Iterator[Notice]:
@@ -148,56 +137,49 @@ def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
 
 def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
     """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
-    used, gross = _without_gross(deviations)
+    used, notices = _without_gross(deviations, source.campaign.zone_of("interferometry"))
     fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
-    gross_notices = _gross_notices(deviations, gross, source.campaign.zone_of("interferometry"))
-    return fused, [*gross_notices, *_outside_notices(fused), *_gap_notices(fields, deviations)]
+    return fused, [*notices, *_outside_notices(fused), *_gap_notices(fields, deviations)]
 
 
 def align_with_logs(source: LaserInputs, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
     """Give every reading the environment and the drivers at its own time, where there are no frames."""
-    used, gross = _without_gross(deviations)
+    used, notices = _without_gross(deviations, source.campaign.zone_of("interferometry"))
     fused = align_logs(used, environment=source.environment, drivers=source.drivers)
     sensors, plan = source.sensors, source.campaign.plan
     if sensors is not None and plan is not None and plan.axis is not None:
         axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
         fused = add_sensor_line(fused, sensors.temperature, sensors.x_mm, sensors.y_mm, axis, file=sensors.file)
-    gross_notices = _gross_notices(deviations, gross, source.campaign.zone_of("interferometry"))
-    return fused, [*_sensor_notices(fused), *gross_notices]
+    return fused, [*_sensor_notices(fused), *notices]
 
 
 def _sensor_notices(fused: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that contact sensors replace the camera, with what the line between them misses."""
-    if "interpolation_u" not in fused:
-        return
-    missed, share = float(fused["interpolation_u"]), float(fused["axis_scale_u"])
-    yield Notice(
-        "sensors_for_the_camera",
-        "The rise along the axis comes from contact sensors, on a straight line from one to the next. A sensor is missed by the "
-        f"line through the others by {missed:.2g} K ({share:.0%} of the rise), which enters the uncertainty of every coefficient "
-        "per kelvin; a warm spot between the sensors is not seen.",
-        "Place sensors where the table warms most, evenly along the axis.",
-    )
+    if "interpolation_u" in fused:
+        missed, share = float(fused["interpolation_u"]), float(fused["axis_scale_u"])
+        yield Notice(
+            "sensors_for_the_camera",
+            "The rise along the axis comes from contact sensors, on a straight line from one to the next. A sensor is missed by the "
+            f"line through the others by {missed:.2g} K ({share:.0%} of the rise), which enters the uncertainty of every coefficient "
+            "per kelvin; a warm spot between the sensors is not seen.",
+            "Place sensors where the table warms most, evenly along the axis.",
+        )
 
 
-def _without_gross(deviations: xr.Dataset) -> tuple[xr.Dataset, xr.DataArray]:
-    """Return the readings without those that are errors of reading, and which these are."""
+def _without_gross(deviations: xr.Dataset, zone: str | None) -> tuple[xr.Dataset, list[Notice]]:
+    """Return the readings without those that are errors of reading, and a notice of these."""
     gross = find_gross_readings(group(deviations, "drift")["standardised"])
-    return deviations.assign(deviation=deviations["deviation"].where(~gross)), gross
-
-
-def _gross_notices(deviations: xr.Dataset, gross: xr.DataArray, zone: str | None) -> Iterator[Notice]:
-    """Return a notice for the readings that are errors of reading."""
     if not gross.any():
-        return
+        return deviations, []
     deviation, named = deviations["deviation"], _names(gross, deviations, zone)
     largest = float(np.abs(deviation.where(gross) - deviation.median("cycle")).max())
-    yield Notice(
+    notice = Notice(
         "gross_readings",
         f"{counted(int(gross.sum()), 'reading')} more than ten standard deviations of their position off, by up to {largest:.3g} µm: "
         f"{listed(named)}; left out where drift and field are compared and modelled.",
         f"Check {listed(named)} (beam, unit, typing error), and correct or remove these readings in {_file(deviations)}.",
     )
+    return deviations.assign(deviation=deviation.where(~gross)), [notice]
 
 
 def _names(marked: xr.DataArray, deviations: xr.Dataset, zone: str | None) -> list[str]:
@@ -326,14 +308,13 @@ MOST_CYCLES = 500
 def insufficient_for_model(deviations: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that a test is too small for positions that stand out and for the closed loop; empty where it is not."""
     cycles, targets = deviations.sizes["cycle"], deviations.sizes["target"]
-    if cycles >= LEAST_CYCLES and targets >= LEAST_TARGETS:
-        return
-    yield Notice(
-        "too_small_for_model",
-        f"{counted(cycles, 'cycle')} at {counted(targets, 'target')}: ISO 230-2, profile, scatter and drift are evaluated; positions "
-        f"that stand out, causes of drift and closed loop need at least {LEAST_CYCLES} cycles (better 50) at {LEAST_TARGETS} targets.",
-        f"Measure at least {LEAST_CYCLES} cycles, better 50, for the causes of the drift.",
-    )
+    if cycles < LEAST_CYCLES or targets < LEAST_TARGETS:
+        yield Notice(
+            "too_small_for_model",
+            f"{counted(cycles, 'cycle')} at {counted(targets, 'target')}: ISO 230-2, profile, scatter and drift are evaluated; positions "
+            f"that stand out, causes of drift and closed loop need at least {LEAST_CYCLES} cycles (better 50) at {LEAST_TARGETS} targets.",
+            f"Measure at least {LEAST_CYCLES} cycles, better 50, for the causes of the drift.",
+        )
 
 
 def choose_targets(deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
@@ -381,11 +362,10 @@ def average_cycles(fused: xr.Dataset, field: xr.DataArray) -> tuple[xr.Dataset, 
 def insufficient_for_correlation(fields: xr.Dataset) -> Iterator[Notice]:
     """Return the notice that a test is too small for drift and field to be compared; empty where it is not."""
     frames = fields.sizes["time"]
-    if frames >= LEAST_FRAMES:
-        return
-    yield Notice(
-        "too_few_frames",
-        f"{counted(frames, 'frame')}: fields and hotspots are evaluated; which part of the field goes with the drift needs at least "
-        f"{LEAST_FRAMES} frames.",
-        "Take a frame in every cycle, or once a minute.",
-    )
+    if frames < LEAST_FRAMES:
+        yield Notice(
+            "too_few_frames",
+            f"{counted(frames, 'frame')}: fields and hotspots are evaluated; which part of the field goes with the drift needs at least "
+            f"{LEAST_FRAMES} frames.",
+            "Take a frame in every cycle, or once a minute.",
+        )

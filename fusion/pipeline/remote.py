@@ -7,7 +7,6 @@ differs from what was fetched before.
 from __future__ import annotations
 
 import csv
-import json
 import os
 import re
 import shutil
@@ -25,9 +24,10 @@ from urllib.parse import quote, unquote, urljoin, urlsplit
 import filelock
 import pooch
 
+from fusion.campaign.values import FILE_KEYS
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.results.progress import Report, silent
-from fusion.results.store import write_json
+from fusion.results.store import read_json_object, write_json
 from interferometry.common import InterferometryError
 from thermography.common import ThermographyError
 from thermography.io.files import write_atomically
@@ -35,15 +35,6 @@ from thermography.io.files import write_atomically
 #: Names a folder that keeps what is fetched; left out, that of the user's cache.
 CACHE_VARIABLE = "THERMOFUSE_CACHE"
 _STAMPS = ".origin.json"
-#: Keys of a campaign file that name files, by table; a list holds patterns.
-FILE_KEYS: Mapping[str, tuple[str, ...]] = {
-    "thermography": ("frames", "lens", "stack.times"),
-    "plan": ("fiducials", "regions"),
-    "interferometry": ("deviations", "environment"),
-    "sensors": ("file", "places"),
-    "drivers": ("file",),
-    "record": ("file", "files", "test"),
-}
 #: A file whose connection is lost is asked for so many times, with a pause that doubles, s.
 _TRIALS, _PAUSE_S = 4, 0.5
 #: Files that are fetched at a time: many small ones wait for the answer, not for the line.
@@ -202,10 +193,8 @@ class _Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / _STAMPS
         with filelock.FileLock(self.folder / ".lock"):
-            try:
-                stamps = dict(json.loads(path.read_text(encoding="utf-8"))["files"])
-            except (OSError, ValueError, KeyError, TypeError):
-                stamps = {}
+            noted = read_json_object(path).get("files")
+            stamps = noted if isinstance(noted, dict) else {}
             try:
                 yield stamps
             finally:

@@ -131,12 +131,10 @@ def note_changes(before: Mapping[str, FileState], after: Mapping[str, FileState]
         for what, names in parts.items()
         if names
     ]
-    if not words:
-        return
-    message = (
-        f"Input files were altered while the run read them: {'; '.join(words)}. The products may mix both versions."
-    )
-    yield Notice("inputs_changed", message, "Wait until the recording has ended and run again.")
+    if words:
+        altered = f"Input files were altered while the run read them: {'; '.join(words)}."
+        remedy = "Wait until the recording has ended and run again."
+        yield Notice("inputs_changed", f"{altered} The products may mix both versions.", remedy)
 
 
 def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]]) -> None:

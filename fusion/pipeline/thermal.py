@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import SurfaceTable, ThermographyTable, relative_name
 from fusion.campaign.inputs import CameraInputs, Source, SourceError, frames_notices
+from fusion.campaign.time_zones import utc
 from fusion.common import Array
 from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
@@ -196,7 +198,7 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     share = signal_slope(background + ZERO_CELSIUS_K, parameters) / at_table
     uneven = np.abs(signal_slope(table + spread + ZERO_CELSIUS_K, parameters) / at_table - 1.0)
     u_K = share * np.hypot(correction.u_K, uneven * correction.correction_K)
-    steps = [(_time(frames[step.index]), {"value": step.value_K, "u": step.u_K}) for step in correction.steps]
+    steps = [(utc(frames[step.index].time), {"value": step.value_K, "u": step.u_K}) for step in correction.steps]
     correction_K, largest_u_K = share * correction.correction_K, float(u_K.max())
     part |= {
         "steps": [{"time": time, "step_K": size} for time, size in steps],
@@ -264,14 +266,12 @@ def _series(source: CameraInputs, background: Array, table: Array) -> LevelSerie
 def _repeat_notices(survey: Survey) -> Iterator[Notice]:
     """Return one notice for frames that the camera wrote twice."""
     flags = find_repeats(survey.repeated, np.array([frame.time for frame in survey.frames], "datetime64[ms]"))
-    if not flags:
-        return
-    named = [f"{np.datetime_as_string(flag.time, unit='s')}Z: {flag.message}" for flag in flags]
-    yield Notice(
-        "frames_repeated",
-        f"The camera wrote frames more than once: {listed(named)}.",
-        "Compare the times of the frames with the camera's own list; a frozen output shows no change of temperature.",
-    )
+    if flags:
+        yield Notice(
+            "frames_repeated",
+            f"The camera wrote frames more than once: {listed(f'{utc(flag.time)}: {flag.message}' for flag in flags)}.",
+            "Compare the times of the frames with the camera's own list; a frozen output shows no change of temperature.",
+        )
 
 
 _NO_SURROUNDINGS = Notice(
@@ -292,7 +292,7 @@ _NO_SURROUNDINGS_IN_A_PICTURE = Notice(
 def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameReference], u_K: float) -> Iterator[Notice]:
     """Return one notice each for steps, for a drift, and for what cannot be distinguished."""
     if correction.steps:
-        named = [f"{step.value_K:+.2f} K at {_time(frames[step.index])}" for step in correction.steps]
+        named = [f"{step.value_K:+.2f} K at {utc(frames[step.index].time)}" for step in correction.steps]
         yield Notice(
             "camera_steps_corrected",
             f"{counted(len(correction.steps), 'step')} of the camera's zero (flat-field correction, FFC) removed from all later "
@@ -317,44 +317,24 @@ def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameRefe
         )
 
 
-def _time(frame: FrameReference) -> str:
-    """Time of a frame to the second, UTC."""
-    return f"{np.datetime_as_string(frame.time, unit='s')}Z"
-
-
 # Radiometry of a campaign: parameters and their uncertainties, surfaces with an emissivity of their own, total
 # uncertainty.
 
-#: Attribute of `InputUncertainty` -> attribute of ``[thermography]`` that states it.
+#: Camera parameters that a campaign file may override.
+_OVERRIDABLE = (
+    "emissivity", "reflected_temperature_K", "atmospheric_temperature_K", "relative_humidity", "object_distance_m", "window_transmission",
+    "window_temperature_K",
+)  # fmt: skip
+#: Attribute of `InputUncertainty` -> attribute of ``[thermography]`` that states it, with _u before the unit.
 _STATED = {
-    "emissivity": "emissivity_u",
-    "reflected_temperature_K": "reflected_temperature_u_K",
-    "atmospheric_temperature_K": "atmospheric_temperature_u_K",
-    "relative_humidity": "relative_humidity_u",
-    "object_distance_m": "object_distance_u_m",
-    "window_transmission": "window_transmission_u",
-    "window_temperature_K": "window_temperature_u_K",
-    "camera_offset_K": "camera_offset_u_K",
-    "camera_scale": "camera_scale_u",
-    "camera_drift_K": "camera_drift_u_K",
-}
-
-
-#: Camera parameter -> attribute of ``[thermography]`` that overrides it.
-_OVERRIDING = {
-    "emissivity": "emissivity",
-    "relative_humidity": "relative_humidity",
-    "object_distance_m": "object_distance_m",
-    "reflected_temperature_K": "reflected_temperature_degC",
-    "atmospheric_temperature_K": "atmospheric_temperature_degC",
-    "window_transmission": "window_transmission",
-    "window_temperature_K": "window_temperature_degC",
+    name: re.sub("(_K|_m|)$", r"_u\1", name, count=1)
+    for name in (*_OVERRIDABLE, "camera_offset_K", "camera_scale", "camera_drift_K")
 }
 
 
 def overridden_parameters(table: ThermographyTable) -> dict[str, float]:
-    """Return the camera parameters that the campaign file overrides."""
-    stated = {name: getattr(table, key) for name, key in _OVERRIDING.items()}
+    """Return the camera parameters that the campaign file overrides, where temperatures are in degC."""
+    stated = {name: getattr(table, name.replace("_K", "_degC")) for name in _OVERRIDABLE}
     given = {name: value for name, value in stated.items() if value is not None}
     return {name: value + ZERO_CELSIUS_K if name.endswith("_K") else value for name, value in given.items()}
 
@@ -496,15 +476,16 @@ def _zero_left_K(fields: xr.Dataset) -> float:
 def _drift_notices(table: ThermographyTable, fields: xr.Dataset) -> Iterator[Notice]:
     """Return a notice where the stated drift of the camera's zero is not the one that the frames leave."""
     stated_K, left_K = table.camera_drift_u_K, _zero_left_K(fields)
-    if stated_K is None or left_K == 0.0:
-        return
-    larger = "the stated one" if stated_K >= left_K else "that of the frames"
-    yield Notice(
-        "camera_drift_stated",
-        f"camera_drift_u = {stated_K:.2g} K is stated; the frames leave up to {left_K:.2g} K of the camera's zero uncertain. The "
-        f"larger was taken, {larger}.",
-        "" if stated_K >= left_K else "Leave camera_drift_u out, or keep a surface of constant temperature in view.",
-    )
+    if stated_K is not None and left_K > 0.0:
+        larger = "the stated one" if stated_K >= left_K else "that of the frames"
+        yield Notice(
+            "camera_drift_stated",
+            f"camera_drift_u = {stated_K:.2g} K is stated; the frames leave up to {left_K:.2g} K of the camera's zero uncertain. The "
+            f"larger was taken, {larger}.",
+            ""
+            if stated_K >= left_K
+            else "Leave camera_drift_u out, or keep a surface of constant temperature in view.",
+        )
 
 
 def _surface_part(
@@ -530,14 +511,10 @@ def _surface_part(
 
 def _edge_notices(edge: NDArray[np.bool_], regions: list[EmissivityRegion]) -> Iterator[Notice]:
     """Return a notice for the cells that see two surfaces."""
-    if not regions:
-        return
-    named = ", ".join(region.outline.name for region in regions)
-    yield Notice(
-        "surface_edges",
-        f"{counted(int(edge.sum()), 'cell')} at the edges of {named} see two surfaces and were left empty.",
-        "",
-    )
+    if regions:
+        named = ", ".join(region.outline.name for region in regions)
+        count = counted(int(edge.sum()), "cell")
+        yield Notice("surface_edges", f"{count} at the edges of {named} see two surfaces and were left empty.", "")
 
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
@@ -657,15 +634,14 @@ def _reduce_on_clock(
 
 def clock_notices(clock: ClockOffset) -> Iterator[Notice]:
     """Return a notice where the offset of the clocks is one of several that a periodic test shows."""
-    if not clock.rivals_s:
-        return
-    others = listed(f"{offset:.1f} s" for offset in clock.rivals_s)
-    yield Notice(
-        "clock_offset_periodic",
-        f"The motion repeats: clock offsets of {others} fit about as well as {clock.offset_s:.1f} s, which is the smallest and was "
-        "taken as an assumption.",
-        "Write thermography.clock_offset if the clocks may be further apart, or film from before the first reading to after the last.",
-    )
+    if clock.rivals_s:
+        others = listed(f"{offset:.1f} s" for offset in clock.rivals_s)
+        yield Notice(
+            "clock_offset_periodic",
+            f"The motion repeats: clock offsets of {others} fit about as well as {clock.offset_s:.1f} s, which is the smallest and was "
+            "taken as an assumption.",
+            "Write thermography.clock_offset if the clocks may be further apart, or film from before the first reading to after the last.",
+        )
 
 
 _ASSUMED_CLOCK = Notice(
@@ -683,18 +659,16 @@ def _bounds(source: CameraInputs, offset_s: float) -> np.ndarray:
 def pixel_notices(counts: np.ndarray) -> Iterator[Notice]:
     """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column)."""
     flags = find_bad_pixels(counts)
-    count = int(np.count_nonzero(flags))
-    if not count:
-        return
-    kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
-    named = ", ".join(
-        f"{int(np.count_nonzero(flags & flag))} {name}" for name, flag in kinds.items() if (flags & flag).any()
-    )
-    yield Notice(
-        "bad_pixels",
-        f"{counted(count, 'pixel')} do not follow their neighbours ({named}); they are included in the cell averages.",
-        "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
-    )
+    if flags.any():
+        kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
+        counts_by_kind = {name: int(np.count_nonzero(flags & flag)) for name, flag in kinds.items()}
+        named = ", ".join(f"{count} {name}" for name, count in counts_by_kind.items() if count)
+        pixels = counted(int(np.count_nonzero(flags)), "pixel")
+        yield Notice(
+            "bad_pixels",
+            f"{pixels} do not follow their neighbours ({named}); they are included in the cell averages.",
+            "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
+        )
 
 
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
@@ -735,9 +709,7 @@ def _registration_part(registration: Registration, source: CameraInputs) -> dict
         "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
         "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
         "unchecked": list(registration.unchecked),
-        "contradicted_hints": registration.contradicted_hints,
-        "mirrored": registration.mirrored,
-        "area_ratio": registration.area_ratio,
+        **{name: getattr(registration, name) for name in ("contradicted_hints", "mirrored", "area_ratio")},
         "span": float(cv2.contourArea(hull)) / (source.grid.width_mm * source.grid.height_mm),
         "leave_one_out_mm": registration.leave_one_out_mm,
     }
@@ -745,14 +717,13 @@ def _registration_part(registration: Registration, source: CameraInputs) -> dict
 
 def _registration_notices(registration: Registration) -> Iterator[Notice]:
     """Return one notice for all fiducials that were not used."""
-    if not registration.left_out:
-        return
-    named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
-    yield Notice(
-        "fiducials_left_out",
-        f"{counted(len(registration.left_out), 'fiducial')} or hints not used: {named}.",
-        "Correct the list of fiducials, or clean and repaint the discs; the registration rests on the others.",
-    )
+    if registration.left_out:
+        named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
+        yield Notice(
+            "fiducials_left_out",
+            f"{counted(len(registration.left_out), 'fiducial')} or hints not used: {named}.",
+            "Correct the list of fiducials, or clean and repaint the discs; the registration rests on the others.",
+        )
 
 
 #: Attributes of the fields that list frames: sentence that follows their number, remedy.

@@ -19,7 +19,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AlignmentError, cycle_bounds
 from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import counted, stack_options
+from fusion.campaign.inputs import counted, plan_grid, stack_options
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.common import Array
 from fusion.pipeline.positioning import insufficient_for_model
@@ -45,7 +45,7 @@ from thermography.radiometry.planck import Overrides, calibrate
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.projection import read_lens
-from thermography.registration.register import Registration, picture_grid, register, register_picture
+from thermography.registration.register import Registration, register, register_picture
 
 # Mean field of every finished cycle on the plan, for a first look: what `thermofuse run` does to all frames comes
 # after the test.
@@ -106,13 +106,10 @@ class FieldsOfCycles:
             : 1 if self._moving else _REGISTRATION_FRAMES
         ]
         reference = np.mean([calibrate(frame.read_counts(), self._override(frame)) for frame in first], axis=0)
-        plan = self._plan
-        if plan.in_pixels:
-            self._grid = picture_grid(reference.shape, plan.cell_px)
+        self._grid = plan_grid(self._plan, reference.shape)
+        if self._plan.in_pixels:
             registration = register_picture(reference.shape)
         else:
-            assert plan.size_mm is not None and plan.cell_size_mm is not None
-            self._grid = PlanGrid(*plan.size_mm, plan.cell_size_mm)
             registration = register(reference, self._fiducials, grid=self._grid, lens=self._lens)
         self._registrations = Registrations([RegistrationSpan(0, registration)], self.grid)
         self._registration = registration

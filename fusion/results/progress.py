@@ -73,13 +73,7 @@ def silent(label: str, done: int, total: int) -> None:
 
 
 class Reporter(AbstractContextManager["Reporter"]):
-    """Shows the progress of a run: bars on a terminal, otherwise one line at each start, end and every ten seconds.
-
-    Parameters
-    ----------
-    console : Console
-        Where the progress is shown.
-    """
+    """Shows the progress of a run on a console: bars on a terminal, otherwise one line at each start, end and every ten seconds."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

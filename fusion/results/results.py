@@ -205,11 +205,9 @@ class Results(ResultPart):
 
 def _expanded(value: Quantity) -> str:
     """A value with its expanded uncertainty, k = 2, in um."""
-    return (
-        _micrometres(value.value)
-        if value.u is None
-        else f"{_micrometres(value.value, '')} ± {_micrometres(2.0 * value.u)}"
-    )
+    if value.u is None:
+        return _micrometres(value.value)
+    return f"{_micrometres(value.value, '')} ± {_micrometres(2.0 * value.u)}"
 
 
 def _micrometres(value: Number, unit: str = " µm") -> str:

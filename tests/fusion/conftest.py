@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.fusion.campaign_parts import simulated
+
 RECIPE = """\
 [campaign]
 title = "Small campaign"
@@ -41,14 +43,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared; cells of 20 mm keep it quick."""
-    from fusion.twin.instruments import simulate_campaign
-
-    folder = tmp_path_factory.mktemp("twin")
-    (folder / "recipe.toml").write_text(RECIPE)
-    campaign = simulate_campaign(folder / "recipe.toml", folder / "campaign")
-    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
-    return campaign.parent
+    """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared."""
+    return simulated(tmp_path_factory.mktemp("twin"), RECIPE).parent
 
 
 @pytest.fixture(scope="session")

@@ -52,21 +52,11 @@ LOOP = {
     "not_admitted": {},
 }
 LEFT = {"shape": "", "rms_um": 0.0, "p_value": 0.4, "closest_effect": ""}
+SHAPES = (
+    "autocorrelation", "event", "periodicity", "curvature", "single_target", "direction", "direction_along_axis", "pattern", "slow_pattern",
+)  # fmt: skip
 RESIDUAL = {
-    "p_values": dict.fromkeys(
-        (
-            "autocorrelation",
-            "event",
-            "periodicity",
-            "curvature",
-            "single_target",
-            "direction",
-            "direction_along_axis",
-            "pattern",
-            "slow_pattern",
-        ),
-        0.4,
-    ),
+    "p_values": dict.fromkeys(SHAPES, 0.4),
     "drift_common_um": 0.1,
     "drift_stretch_um": 0.0,
     "event_s": 60.0,

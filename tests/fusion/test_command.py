@@ -28,15 +28,11 @@ main()
 def test_a_signal_while_libraries_load_is_told_in_one_line(library: str, number: signal.Signals) -> None:
     text = LOADING.format(library=library, number=int(number))
     ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (
-        128 + number,
-        "",
-        f"thermofuse: stopped by {number.name}\n",
-    )
+    assert (ended.returncode, ended.stdout) == (128 + number, "")
+    assert ended.stderr == f"thermofuse: stopped by {number.name}\n"
 
 
 def test_the_command_runs() -> None:
-    ended = subprocess.run(
-        [sys.executable, "-m", "thermofuse", "--version"], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "thermofuse", "--version"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0 and ended.stdout.startswith("thermofuse ")

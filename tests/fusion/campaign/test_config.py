@@ -134,6 +134,10 @@ BAD = [
     ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9)"),
     ('title = "X axis"', 'title = ""', ', line 2: campaign.title = "": this text is empty; fill it in'),
     ('title = "X axis"', "title = 5", ", line 2: campaign.title = 5: this is text; write it in quotes"),
+    ("table_offset", "table_ofset", ', line 29: model.declared = "table_ofset": unknown effect; did you mean table_offset?'),
+    ("table_offset", "camera_offset", ', line 29: model.declared = "camera_offset": the columns of this effect need a fitted'),
+    ("table_offset", "reflected_source", ', line 29: model.declared = "reflected_source": the columns of this effect need a'),
+    ("table_offset", "quasi_static", ', line 29: model.declared = "quasi_static": this effect does not apply to a campaign with'),
     ('"-2 min"', '"1e12 s"', ', line 11: thermography.clock_offset = "1e12 s": this time in s must be above -3e+09'),
 ]  # fmt: skip
 
@@ -144,13 +148,6 @@ def test_bad_input_is_named_with_place_value_and_remedy(folder: Path, old: str, 
     with pytest.raises(CampaignError) as error:
         load(folder, TEXT.replace(old, new))
     assert str(error.value).startswith(f"{folder}/campaign.toml" + message.format(folder=folder))
-
-
-def test_an_unknown_effect_is_answered_with_the_nearest(folder: Path) -> None:
-    with pytest.raises(
-        CampaignError, match=r'line 29: model.declared = "table_ofset": unknown effect; did you mean table_offset[?]'
-    ):
-        load(folder, TEXT.replace("table_offset", "table_ofset"))
 
 
 def test_all_faults_come_in_one_message(folder: Path) -> None:
@@ -168,28 +165,16 @@ def test_files_and_effects_are_checked_together_with_the_values(folder: Path) ->
     first, second, third = str(error.value).splitlines()
     assert "thermography.emissivity = 97" in first
     assert 'interferometry.deviations = "laser.csv": no such file' in second
-    assert third == (
-        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect are not known beforehand; '
-        "remove it, the closed loop tries it anyway; can be declared here: axis_expansion, table_offset, dead_path, air_index, "
-        "material_compensation"
+    assert third.startswith(
+        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect'
     )
-
-
-@pytest.mark.parametrize("effect", ["camera_offset", "reflected_source"])
-def test_an_error_of_the_camera_is_refused_for_its_true_reason(folder: Path, effect: str) -> None:
-    with pytest.raises(CampaignError, match=f'"{effect}": the columns of this effect need a fitted model; remove it'):
-        load(folder, TEXT.replace("table_offset", effect))
+    assert third.endswith(": axis_expansion, table_offset, dead_path, air_index, material_compensation")
 
 
 def test_a_record_is_declared_with_what_has_a_meaning_for_it(folder: Path) -> None:
     assert load(folder, RECORD + '[model]\ndeclared = ["quasi_static"]\n').model.declared == ("quasi_static",)
-    with pytest.raises(
-        CampaignError,
-        match=r'line 10: model.declared = "dead_path": this effect does not apply to a record; can be declared here: quasi_static',
-    ):
+    with pytest.raises(CampaignError, match=r'line 10: model.declared = "dead_path": .*declared here: quasi_static'):
         load(folder, RECORD + '[model]\ndeclared = ["dead_path"]\n')
-    with pytest.raises(CampaignError, match='"quasi_static": this effect does not apply to a campaign with positions'):
-        load(folder, TEXT.replace("table_offset", "quasi_static"))
 
 
 def test_an_effect_of_a_users_own_is_declared_where_it_says_so(folder: Path) -> None:
@@ -203,16 +188,12 @@ def test_an_effect_of_a_users_own_is_declared_where_it_says_so(folder: Path) -> 
     (folder / "campaign.toml").write_text(text)
     loaded = load_campaign(folder / "campaign.toml", effects={**library(), own.name: own})
     assert loaded.model.declared == ("axis_expansion", "bed_bending")
-    with pytest.raises(
-        CampaignError, match=r'model\.declared = "bed_bending": the parameters of this effect are not known beforehand'
-    ):
+    with pytest.raises(CampaignError, match=r'model\.declared = "bed_bending": .* are not known beforehand'):
         load_campaign(folder / "campaign.toml", effects={**library(), own.name: replace(own, declarable=False)})
 
 
 def test_no_campaign_file(folder: Path) -> None:
-    with pytest.raises(
-        CampaignError, match=r"absent\.toml: no such campaign file; check the name or give its full path"
-    ):
+    with pytest.raises(CampaignError, match=r"absent\.toml: no such campaign file; .* give its full path"):
         load_campaign(folder / "absent.toml")
     with pytest.raises(CampaignError, match="is a folder; name the campaign file in it"):
         load_campaign(folder)
@@ -245,13 +226,11 @@ STATES = 'states = [{ cycle = 7, temperature = "22 degC" }, { cycle = 7, tempera
     [
         (
             'rectangle = [["100 mm", "50 mm"], ["100 mm", "90 mm"]]\nemissivity = 0.3',
-            "[thermography.region]: region chuck with the corners (100, 50), (100, 50), (100, 90), (100, 90) mm has no area; give corners "
-            "that enclose one",
+            "region chuck with the corners (100, 50), ",
         ),
         (
-            'rectangle = [["100 mm", "50 mm"], ["200 mm", "90 mm"]]\n' + STATES,
-            "[thermography.region]: both states of region chuck are cycle 7; name two cycles in which its temperature differs, as one "
-            "state cannot tell emissivity and reflection apart",
+            f'rectangle = [["100 mm", "50 mm"], ["200 mm", "90 mm"]]\n{STATES}',
+            "both states of region chuck are cycle 7; ",
         ),
     ],
 )
@@ -260,7 +239,7 @@ def test_a_region_that_tells_nothing_is_refused_at_its_line(folder: Path, lines:
     line = text.splitlines().index('name = "chuck"')
     with pytest.raises(CampaignError) as error:
         load(folder, text)
-    assert str(error.value) == f"{folder}/campaign.toml, line {line}: {message}"
+    assert str(error.value).startswith(f"{folder}/campaign.toml, line {line}: [thermography.region]: {message}")
 
 
 def test_a_fault_of_both_entries_of_a_list_is_told_once(folder: Path) -> None:
@@ -281,6 +260,7 @@ AXIS = 'plan.axis = { origin = ["5 mm", "5 mm"], direction = [1, 0] }'
 PIXELS = 'plan.registration = "pixels"'
 SENSORS = 'sensors = { file = "laser.csv", places = "laser.csv" }'
 LOGGED = 'record = { file = "laser.csv", time = "t", temperatures = ["T"], displacements = ["X"] }'
+RANDOM = 'drivers = { file = "laser.csv", randomised = ["spindle [1/min]"]'
 MOVING = 'thermography.table = "moving"'
 
 
@@ -332,14 +312,21 @@ def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: t
         ((CAMERA, PIXELS, SENSORS), 4, 'plan.registration = "pixels", but [sensors] needs the places of the sensors'),
         ((PIXELS, LASER), 2, 'registration = "pixels" makes the picture of a camera the plan'),
         ((CAMERA, MOVING, PIXELS), 3, 'plan.registration = "pixels", but it holds for a table at rest'),
-        (
-            (CAMERA, 'thermography.lens = "laser.csv"', PIXELS),
-            3,
-            'plan.registration = "pixels", but a lens calibration',
-        ),
+        ((CAMERA, 'thermography.lens = "laser.csv"', PIXELS), 3, 'plan.registration = "pixels", but a lens'),
         ((CAMERA, PIXELS, PLAN, AXIS), 3, "[plan]: size, cell_size, fiducials, axis in millimetres cannot be combined"),
         ((LASER, LOGGED), 3, "[record] cannot be combined with [interferometry]"),
         (('path = "x"',), 2, "unknown key path; remove it"),
+        (
+            (LASER, 'model.declared = ["axis_expansion"]'),
+            3,
+            'model.declared = "axis_expansion": this effect follows the',
+        ),
+        ((LASER, f"{RANDOM} }}"), 3, "[drivers]: randomised and mean_dwell belong together"),
+        (
+            (LASER, f'{RANDOM}, mean_dwell = "2 min", least_dwell = "3 min" }}'),
+            3,
+            "[drivers]: least_dwell 180 s must be",
+        ),
     ],
 )
 def test_what_a_campaign_lacks_is_named_at_its_line(
@@ -367,10 +354,8 @@ def test_uncertainties_carry_their_unit() -> None:
 
 def test_only_tolerances_that_are_stated_are_judged() -> None:
     assert AcceptanceTable().limits() == {}
-    assert AcceptanceTable.model_validate({"A": "10 um", "R_unidirectional": "4000 nm"}).limits() == {
-        "A": 10.0,
-        "R_unidirectional": 4.0,
-    }
+    stated = AcceptanceTable.model_validate({"A": "10 um", "R_unidirectional": "4000 nm"})
+    assert stated.limits() == {"A": 10.0, "R_unidirectional": 4.0}
 
 
 def test_every_condition_may_be_left_out() -> None:

@@ -24,7 +24,7 @@ from fusion.campaign.inputs import (
 from fusion.pipeline.positioning import evaluate_interferometry
 from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
-from tests.fusion.campaign_parts import without
+from tests.fusion.campaign_parts import change, keep_cycles, without
 from thermography.io.flir import index_frames
 from thermography.radiometry.planck import calibrate
 
@@ -61,9 +61,8 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     messages = {notice.code: notice.message for notice in source.notices}
     assert messages["frames_rejected"].startswith("3 frames left out: ")
     assert str(copied) not in messages["frames_rejected"]
-    assert messages["pipes_left_out"] == (
-        "thermography.frames also matches 1 pipe, socket or device, which is left out: thermal/live.jpg."
-    )
+    assert messages["pipes_left_out"].startswith("thermography.frames also matches 1 pipe, socket or device")
+    assert "thermal/live.jpg" in messages["pipes_left_out"]
     assert "2 lines of laser.csv left out: line 11 ('abc' is not a number)" in messages["readings_left_out"]
     assert "line 21 ('upward'" in messages["readings_left_out"]
     outcome = evaluate_interferometry(source)
@@ -75,78 +74,66 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
 
 def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: Path) -> None:
     shift_frames(copied, 1.0)
-    with pytest.raises(
-        AlignmentError,
-        match=r"the clocks look 1 h apart, as in two time zones \(frames 2026-03-09T06:",
-    ):
+    with pytest.raises(AlignmentError, match=r"the clocks look 1 h apart, .* \(frames 2026-03-09T06:"):
         read_source(load_campaign(copied / "campaign.toml"))
-    text = (copied / "campaign.toml").read_text()
-    (copied / "campaign.toml").write_text(text.replace('clock_offset = "0 s"', 'clock_offset = "-1 h"'))
-    assert read_source(load_campaign(copied / "campaign.toml")).thermography.clock_offset_s == -3600
+    path = change(copied / "campaign.toml", 'clock_offset = "0 s"', 'clock_offset = "-1 h"')
+    assert read_source(load_campaign(path)).thermography.clock_offset_s == -3600
 
 
 def test_recordings_of_two_days_are_refused(copied: Path) -> None:
     shift_frames(copied, 100.0)
-    with pytest.raises(
-        AlignmentError,
-        match=r"frames and readings never meet \(frames 2026-03-09T06:32:44Z to 2026-03-09T07:41:44Z, readings of laser\.csv 202",
-    ):
+    with pytest.raises(AlignmentError, match=r"T06:32:44Z to 2026-03-09T07:41:44Z, readings of laser\.csv 2026-03-13T"):
         read_source(load_campaign(copied / "campaign.toml"))
 
 
 def test_a_link_whose_frame_is_gone_is_named(copied: Path) -> None:
     (copied / "thermal" / "IR_gone.jpg").symlink_to(copied / "nowhere.jpg")
-    with pytest.raises(
-        CampaignError, match=r"thermal/IR_gone.jpg is a link to a file that does not exist; restore the file"
-    ):
+    with pytest.raises(CampaignError, match=r"thermal/IR_gone.jpg is a link .*; restore the file"):
         load_campaign(copied / "campaign.toml")
 
 
 def test_a_single_frame_is_not_enough(copied: Path) -> None:
     for frame in sorted((copied / "thermal").glob("*.jpg"))[1:]:
         frame.unlink()
-    message = r"1 usable frame, at least 2 are needed, as a rise is the change since the first \(none rejected\); check thermography.frames"
-    with pytest.raises(SourceError, match=message):
+    with pytest.raises(
+        SourceError, match=r"1 usable frame, at least 2 .* \(none rejected\); check thermography.frames"
+    ):
         read_source(load_campaign(copied / "campaign.toml"))
 
 
 def test_windows_shorter_than_a_minute_are_told_in_seconds(copied: Path) -> None:
     path = without(copied / "campaign.toml", "interferometry", "plan.axis", "model", "drivers", name="camera.toml")
-    path.write_text(path.read_text().replace('table = "still"', 'window = "40 s"\ntable = "still"'))
+    change(path, 'table = "still"', 'window = "40 s"\ntable = "still"')
     (notice,) = [one for one in read_source(load_campaign(path)).notices if one.code == "cycles_from_windows"]
     assert "windows of 40 s, as" in notice.message
 
 
 def test_a_short_test_is_refused_before_the_long_work(copied: Path) -> None:
-    lines = (copied / "laser.csv").read_text().splitlines()
-    short = [line for line in lines if line.split(",")[0] in {"cycle", "1"}]
-    (copied / "laser.csv").write_text("\n".join(short) + "\n")
-    message = r"laser.csv: 1 cycle at 6 targets; scatter and drift need at least 2 cycles at 2 targets; measure more"
-    with pytest.raises(SourceError, match=message):
+    keep_cycles(copied / "laser.csv", 1)
+    with pytest.raises(
+        SourceError, match=r"laser.csv: 1 cycle at 6 targets; .* at least 2 cycles at 2 targets; measure"
+    ):
         read_source(load_campaign(copied / "campaign.toml"))
 
 
+STATES = 'states = [{ cycle = 1, temperature = "22 degC" }, { cycle = 900, temperature = "24 degC" }]'
+
+
 @pytest.mark.parametrize(
-    ("lines", "message"),
+    ("corners", "known", "message"),
     [
         (
-            'rectangle = [["2000 mm", "50 mm"], ["2100 mm", "100 mm"]]\nemissivity = 0.3',
-            r"region chuck: \(x 2000..2100, y 50..100 mm\) holds no part of the plan; give its corners in plan mm; the plan is 700 x",
+            '["2000 mm", "50 mm"], ["2100 mm", "100 mm"]',
+            "emissivity = 0.3",
+            r"chuck: \(x 2000..2100, y 50..100 mm\) .*the plan is 700 x",
         ),
-        (
-            'rectangle = [["100 mm", "50 mm"], ["110 mm", "100 mm"]]\nemissivity = 0.3',
-            "region chuck: no cell lies inside and away from its edge",
-        ),
-        (
-            'rectangle = [["100 mm", "40 mm"], ["200 mm", "140 mm"]]\n'
-            'states = [{ cycle = 1, temperature = "22 degC" }, { cycle = 900, temperature = "24 degC" }]',
-            "region chuck name cycle 900, but .* holds the cycles 1 to ",
-        ),
+        ('["100 mm", "50 mm"], ["110 mm", "100 mm"]', "emissivity = 0.3", "region chuck: no cell lies inside"),
+        ('["100 mm", "40 mm"], ["200 mm", "140 mm"]', STATES, "region chuck name cycle 900, .* the cycles 1 to "),
     ],
 )
-def test_a_region_that_cannot_be_used_is_refused_before_the_long_work(copied: Path, lines: str, message: str) -> None:
+def test_a_region_that_cannot_be_used_is_refused(copied: Path, corners: str, known: str, message: str) -> None:
     path = copied / "campaign.toml"
-    path.write_text(path.read_text() + f'\n[[thermography.region]]\nname = "chuck"\n{lines}\n')
+    path.write_text(path.read_text() + f'\n[[thermography.region]]\nname = "chuck"\nrectangle = [{corners}]\n{known}\n')
     with pytest.raises(SourceError, match=message):
         read_source(load_campaign(path))
 
@@ -166,8 +153,7 @@ def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:
     write_rtl(copied / "laser.rtl", read.assign(deviation=lost))
     alone = without(copied / "campaign.toml", "thermography", "plan", "model")
     reconstructed = '"laser.rtl"\ntime_zone = "UTC"\nfeed = "1000 mm/min"\ndwell = "3 s"'
-    alone.write_text(alone.read_text().replace('"laser.csv"', reconstructed))
-    source = read_source(load_campaign(alone))
+    source = read_source(load_campaign(change(alone, '"laser.csv"', reconstructed)))
     assert isinstance(source, LaserInputs)
     numbers = source.deviations["cycle"].values.tolist()
     assert numbers == [n for n in range(1, numbers[-1] + 1) if n not in (2, 5)]
@@ -175,18 +161,13 @@ def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:
     assert told == f"2 cycles of {numbers[-1]} in laser.rtl left out, as none of their readings has a time: 2; 5."
     lost = read["deviation"].where(read["cycle"] == 1)
     write_rtl(copied / "laser.rtl", read.assign(deviation=lost))
-    with pytest.raises(
-        SourceError, match=r"part\.toml: laser\.rtl: 1 cycle at .* cycles of \d+ in laser\.rtl left out"
-    ):
+    with pytest.raises(SourceError, match=r"part\.toml: laser\.rtl: 1 cycle at .* cycles of \d+ in laser\.rtl left"):
         read_source(load_campaign(alone))
 
 
 def test_a_driver_of_the_name_of_a_logged_condition_is_refused(copied: Path) -> None:
-    path = copied / "drivers.csv"
-    path.write_text(path.read_text().replace("duty [1]", "air_temperature [degC]"))
-    with pytest.raises(
-        SourceError, match=r"drivers\.csv: the driver 'air_temperature' is logged in environment\.csv too"
-    ):
+    change(copied / "drivers.csv", "duty [1]", "air_temperature [degC]")
+    with pytest.raises(SourceError, match=r"drivers\.csv: the driver 'air_temperature' .* environment\.csv too"):
         read_source(load_campaign(copied / "campaign.toml"))
 
 
@@ -248,11 +229,7 @@ def test_a_stated_camera_needs_no_notice(stack_folder: Path) -> None:
         ('unit = "degC"\nstart = "2026-03-09T06:30Z"\ntimes = "times.csv"', "", "times and start each say when"),
         ('unit = "degF"', "", "degC"),
         ('unit = "degC"', "emissivity = 0.9", "write that as emissivity under .thermography.stack."),
-        (
-            'unit = "degC"',
-            'object_distance = "1 m"',
-            r"\[thermography\]: object_distance is already corrected for in temperatures",
-        ),
+        ('unit = "degC"', 'object_distance = "1 m"', r"\[thermography\]: object_distance is already corrected for"),
     ],
 )
 def test_what_cannot_be_is_refused(stack_folder: Path, stack: str, camera: str, message: str) -> None:

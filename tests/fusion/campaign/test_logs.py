@@ -44,9 +44,7 @@ def test_headings_carry_name_and_unit() -> None:
     assert split_heading(Path("x"), "head (deg C)") == ("head", "degC")
     assert split_heading(Path("x"), "Z [Microns]") == ("Z", "um")
     assert split_heading(Path("x"), "spindle speed (RPM) ") == ("spindle speed", "RPM")
-    with pytest.raises(
-        TableError, match=r'the column "duty" has no unit; write it in the heading, for example "duty \[1\]"'
-    ):
+    with pytest.raises(TableError, match=r'the column "duty" has no unit; .* for example "duty \[1\]"'):
         split_heading(Path("drivers.csv"), "duty")
 
 
@@ -105,17 +103,10 @@ def test_a_number_sign_in_a_heading_is_part_of_it_and_lines_are_counted_in_the_f
     )
     data = read_record(load_campaign(campaign))
     assert data["sensor"].values.tolist() == ["t #1"]
-    assert [(one["line"], one["value"]) for one in json.loads(data.attrs["left_out"])] == [(9, "5 fields"), (8, "?")]
-
-
-def test_lines_of_a_record_that_do_not_fit_its_header_are_listed(tmp_path: Path) -> None:
-    rows = "".join(f"{k},20,1,0\n" for k in range(5))
-    campaign = record(tmp_path, f"time [min],t1 [degC],ch1 [um],spindle [rpm]\n{rows}5,20,1,0,7\n6,20,1,0\n")
-    data = read_record(load_campaign(campaign))
-    assert data.sizes["time"] == 6
-    assert json.loads(data.attrs["left_out"]) == [
-        {"path": "record.csv", "line": 7, "value": "5 fields", "reason": "4 were expected"}
-    ]
+    assert data.sizes["time"] == 5
+    misfit, no_time = json.loads(data.attrs["left_out"])
+    assert misfit == {"path": "record.csv", "line": 9, "value": "5 fields", "reason": "4 were expected"}
+    assert (no_time["line"], no_time["value"]) == (8, "?")
 
 
 def test_a_time_of_day_that_is_missing_is_listed(tmp_path: Path) -> None:
@@ -354,10 +345,7 @@ def test_runs_that_count_from_their_own_zero_follow_the_order_of_the_files(tmp_p
         ('file = "a.csv"\nfiles = ["a.csv", "b.csv"]', "write either file"),
         ("", "write either file"),
         ('file = "a.csv"\ntest = ["a.csv"]', "test names runs among files"),
-        (
-            'files = ["a.csv", "b.csv"]\ntest = ["c.csv"]',
-            "test names c.csv, which files does not; the runs are a.csv, b.csv",
-        ),
+        ('files = ["a.csv", "b.csv"]\ntest = ["c.csv"]', "test names c.csv, .* the runs are a.csv, b.csv"),
         ('files = ["a.csv", "b.csv"]\ntest = ["*.csv"]', "test names c.csv"),
         ('files = ["a.csv", "b.csv"]\ntest = ["a.csv", "b.csv"]', "test names all 2 runs"),
     ],

@@ -27,11 +27,12 @@ from interferometry.compensation import CompensationError, air_index, environmen
 from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from interferometry.iso230 import Iso230Budget
+from tests.fusion.campaign_parts import change, without
 from tests.interferometry.simulated_campaigns import START, simulate
 
 
-def table(**keys: object) -> InterferometryTable:
-    return InterferometryTable.model_validate({"deviations": "laser.csv", **keys})
+def table(uncertainty: dict[str, str] | None = None, **keys: Any) -> InterferometryTable:
+    return InterferometryTable.model_validate({"deviations": "laser.csv", "uncertainty": uncertainty or {}, **keys})
 
 
 def assumed_budget() -> StatedBudget:
@@ -99,10 +100,7 @@ def test_a_factor_in_a_rtl_is_taken_out_and_the_logged_conditions_put_in(
 def test_what_cannot_be_redone_is_refused(readings: xr.Dataset, log: xr.Dataset) -> None:
     with pytest.raises(RecompensationError, match=r'compensation = "redo" needs the air: log air temperature'):
         compensate_readings(readings, None, table(compensation="redo"))
-    with pytest.raises(
-        ValidationError,
-        match=r'material_temperature = "camera" without compensation = "redo"',
-    ):
+    with pytest.raises(ValidationError, match=r'material_temperature = "camera" without compensation = "redo"'):
         table(material_temperature="camera")
     wrong = table(compensation="redo", environment_factor=["0.3 um", "0.3 um"])
     with pytest.raises(CompensationError, match=r"the environment factor 0.3 um differs by \d+ ppm"):
@@ -130,13 +128,9 @@ def test_the_camera_gives_the_mean_temperature_between_zero_and_the_target(readi
 
 
 def test_a_campaign_with_the_camera_as_thermometer(copied: Path, results_folder: Path) -> None:
-    text = (copied / "campaign.toml").read_text()
-    asked = text.replace(
-        "[interferometry]\n", '[interferometry]\ncompensation = "redo"\nmaterial_temperature = "camera"\n'
-    )
-    other = copied / "camera.toml"
-    other.write_text(asked)
-    source = read_source(load_campaign(other))
+    other = without(copied / "campaign.toml", name="camera.toml")
+    asked = '[interferometry]\ncompensation = "redo"\nmaterial_temperature = "camera"\n'
+    source = read_source(load_campaign(change(other, "[interferometry]\n", asked)))
     recorded = read_source(load_campaign(copied / "campaign.toml"))
     assert source.deviations.identical(recorded.deviations)
     source, notices = compensate_by_camera(source, read_dataset(results_folder / "fields.nc"))
@@ -163,27 +157,18 @@ def test_a_campaign_with_the_camera_as_thermometer(copied: Path, results_folder:
 # The budget of a campaign: stated, measured, assumed.
 
 
-def stating(uncertainty: dict[str, str] | None = None, **keys: Any) -> InterferometryTable:
-    return InterferometryTable.model_validate({"deviations": "laser.csv", "uncertainty": uncertainty or {}, **keys})
-
-
 def test_what_is_stated_replaces_what_is_assumed() -> None:
-    found = state_budget(stating({"device": "0.1 um/m", "environmental_variation": "300 nm"}))
+    found = state_budget(table({"device": "0.1 um/m", "environmental_variation": "300 nm"}))
     assert found.budget == Iso230Budget(device_ppm=0.1, environmental_variation_um=0.3)
-    assert found.origins == {
-        "device": "stated",
-        "alignment": "assumed",
-        "material_temperature": "assumed",
-        "expansion_coefficient": "assumed",
-        "environmental_variation": "stated",
-    }
+    stated = dict.fromkeys(("device", "environmental_variation"), "stated")
+    assert found.origins == {**assumed_budget().origins, **stated}
 
 
 @pytest.mark.parametrize(
     "asked",
     [
-        stating({"expansion_coefficient": "0.8 ppm/K"}, expansion_coefficient="10.5 ppm/K"),
-        stating(expansion_coefficient="10.5 +- 0.8 ppm/K"),
+        table({"expansion_coefficient": "0.8 ppm/K"}, expansion_coefficient="10.5 ppm/K"),
+        table(expansion_coefficient="10.5 +- 0.8 ppm/K"),
     ],
 )
 def test_the_uncertainty_of_the_coefficient_may_stand_beside_it_or_in_the_budget(asked: InterferometryTable) -> None:
@@ -194,17 +179,14 @@ def test_the_uncertainty_of_the_coefficient_may_stand_beside_it_or_in_the_budget
 
 
 def test_two_uncertainties_of_one_coefficient_are_refused() -> None:
-    with pytest.raises(
-        ValidationError,
-        match=r"of the expansion coefficient is 0.8 ppm/K with",
-    ):
-        stating({"expansion_coefficient": "1 ppm/K"}, expansion_coefficient="10.5 +- 0.8 ppm/K")
+    with pytest.raises(ValidationError, match=r"of the expansion coefficient is 0.8 ppm/K with"):
+        table({"expansion_coefficient": "1 ppm/K"}, expansion_coefficient="10.5 +- 0.8 ppm/K")
 
 
 def test_the_camera_as_thermometer_has_its_own_uncertainty_unless_one_is_stated() -> None:
-    assert state_budget(stating(), camera_u_K=0.7).budget.material_temperature_K == 0.7
-    assert state_budget(stating(), camera_u_K=0.7).origins["material_temperature"] == "from the camera"
-    stated = state_budget(stating({"material_temperature": "0.4 K"}), camera_u_K=0.7)
+    assert state_budget(table(), camera_u_K=0.7).budget.material_temperature_K == 0.7
+    assert state_budget(table(), camera_u_K=0.7).origins["material_temperature"] == "from the camera"
+    stated = state_budget(table({"material_temperature": "0.4 K"}), camera_u_K=0.7)
     assert (stated.budget.material_temperature_K, stated.origins["material_temperature"]) == (0.4, "stated")
 
 

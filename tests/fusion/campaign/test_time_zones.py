@@ -12,6 +12,7 @@ from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_record, read_source
 from fusion.campaign.time_zones import bring_to_utc, lacks_zone, refuse_mixed_zones
 from interferometry.io.tables import NO_ZONE
+from tests.fusion.campaign_parts import change
 
 
 def table(*times: str, reference: str = NO_ZONE) -> xr.Dataset:
@@ -45,10 +46,7 @@ def test_times_with_a_zone_or_without_a_stated_one_stay() -> None:
 
 @pytest.mark.parametrize("time", ["2026-10-25T02:30", "2026-03-29T02:30"])
 def test_the_hour_in_which_clocks_are_changed_is_refused(time: str) -> None:
-    with pytest.raises(
-        CampaignError,
-        match=rf"drivers.csv: 1 times, the first {time}:00, occur twice or not at all in Europe/Vienna.*export the times in UTC",
-    ):
+    with pytest.raises(CampaignError, match=rf"drivers.csv: 1 times, the first {time}:00, .* in Europe/Vienna.*in UTC"):
         bring_to_utc(table("2026-03-01T10:00", time), "Europe/Vienna", file="drivers.csv")
 
 
@@ -56,10 +54,7 @@ def test_logs_with_and_without_a_zone_are_not_mixed() -> None:
     bare, zoned = table("2026-03-09T06:30"), table("2026-03-09T06:30", reference="UTC in the file")
     refuse_mixed_zones({"laser.csv": bare, "drivers.csv": bare}, source="campaign.toml")
     refuse_mixed_zones({"laser.csv": zoned, "drivers.csv": zoned, "empty.dat": table("NaT")}, source="campaign.toml")
-    with pytest.raises(
-        CampaignError,
-        match=r"laser.csv gives times without a zone, drivers.csv with one; .*time_zone = \"Europe/Vienna\"",
-    ):
+    with pytest.raises(CampaignError, match=r"laser.csv gives .* without a zone, drivers.csv with one; .*time_zone = "):
         refuse_mixed_zones({"laser.csv": bare, "drivers.csv": zoned}, source="campaign.toml")
 
 
@@ -79,21 +74,13 @@ def test_a_laser_log_in_local_time_is_refused_or_put_right_by_its_zone(copied: P
     sound = read_source(load_campaign(copied / "campaign.toml"))
     drop_zone(copied / "laser.csv", 1)
     path = copied / "campaign.toml"
-    with pytest.raises(
-        CampaignError, match=r"laser.csv gives times without a zone, environment.csv, drivers.csv with one"
-    ):
+    with pytest.raises(CampaignError, match=r"laser.csv gives .* a zone, environment.csv, drivers.csv with one"):
         read_source(load_campaign(path))
-    text = path.read_text(encoding="utf-8")
-    path.write_text(
-        text.replace("[interferometry]\n", '[interferometry]\ntime_zone = "Europe/Vienna"\n'), encoding="utf-8"
-    )
+    change(path, "[interferometry]\n", '[interferometry]\ntime_zone = "Europe/Vienna"\n')
     placed = read_source(load_campaign(path))
     np.testing.assert_array_equal(placed.deviations["time"], sound.deviations["time"])
-    path.write_text(
-        text.replace("[interferometry]\n", '[interferometry]\ntime_zone = "Europe/Wien"\n'), encoding="utf-8"
-    )
     with pytest.raises(CampaignError, match=r"time_zone = \"Europe/Wien\": there is no such time zone; did you mean"):
-        load_campaign(path)
+        load_campaign(change(path, "Europe/Vienna", "Europe/Wien"))
 
 
 def test_a_campaign_without_any_zone_goes_on_as_one_clock(copied: Path) -> None:

@@ -81,10 +81,7 @@ def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: A
 
 @pytest.mark.parametrize("pattern", ["/**/*", "/**/*.jpg", "/*/**/*.jpg", "../" * 20 + "**/*.seq"])
 def test_a_pattern_does_not_search_the_whole_disk(tmp_path: Path, pattern: str) -> None:
-    with pytest.raises(
-        ValueError,
-        match=r"any depth \(\*\*\) below /, the root of a disk; name the folder of the files before the first",
-    ):
+    with pytest.raises(ValueError, match=r"any depth \(\*\*\) below /, the root of a disk; name the folder"):
         value_types.check_pattern(tmp_path, pattern)
 
 

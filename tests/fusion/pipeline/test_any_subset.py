@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fusion.analysis.alignment.align import AlignmentError
-from fusion.campaign.config import CampaignError, load_campaign
 from fusion.pipeline.check import check_campaign
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import ExportError, export_results
@@ -16,7 +15,7 @@ from fusion.report.terminal import summary_rows
 from fusion.results.folder import claim, read_manifest
 from fusion.results.results import read_results
 from fusion.results.store import read_dataset, read_tree
-from tests.fusion.campaign_parts import without
+from tests.fusion.campaign_parts import BOTH, change, keep_cycles, without, write_laser
 
 pytestmark = pytest.mark.chain
 
@@ -62,33 +61,15 @@ def test_the_laser_alone_gives_all_that_needs_no_field(laser_results, results_fo
     assert not {"registration", "drift and field"} & {name for name, _ in summary_rows(results)}
 
 
-def test_an_effect_of_the_field_cannot_be_declared_without_one(copied):
-    with pytest.raises(CampaignError, match="follows the temperature of the table, which this campaign does not"):
-        load_campaign(without(copied / "campaign.toml", "thermography", "plan"))
-
-
-def test_the_products_of_the_laser_are_exported_and_resumed(laser_results, folder, tmp_path):
+def test_the_products_of_the_laser_are_exported(laser_results, tmp_path):
     names = [path.name for path in export_results(laser_results, "csv", tmp_path).files]
     assert "drift.csv" in names and "fields.csv" not in names
-    labels = []
-    before = read_results(laser_results)
-    campaign = folder / "laser.toml"
-    assert run_campaign(campaign, laser_results, resume=True, report=lambda label, *_: labels.append(label)) == before
-    assert "run (kept)" in labels
 
 
-@pytest.fixture(scope="module")
-def camera_results(folder, tmp_path_factory):
-    """The products of the small campaign without the laser."""
-    out = tmp_path_factory.mktemp("camera") / "results"
+def test_the_camera_alone_gives_fields_by_windows_of_time(folder, results_folder, tmp_path):
     path = without(folder / "campaign.toml", "interferometry", "plan.axis", "model", name="camera.toml")
-    path.write_text(path.read_text().replace('table = "still"', 'window = "6 min"\ntable = "still"'))
-    run_campaign(path, out)
-    return out
-
-
-def test_the_camera_alone_gives_fields_by_windows_of_time(camera_results, results_folder, tmp_path):
-    results = read_results(camera_results)
+    camera_results = tmp_path / "results"
+    results = run_campaign(change(path, 'table = "still"', 'window = "6 min"\ntable = "still"'), camera_results)
     fields, both = read_dataset(camera_results / "fields.nc"), read_dataset(results_folder / "fields.nc")
     # 24 cycles of 3 min, of which two make a window; the same frames in the same places.
     assert fields.sizes["cycle"] == len(list((camera_results / "maps").glob("*.exr"))) == 12
@@ -115,18 +96,12 @@ def test_the_camera_alone_gives_fields_by_windows_of_time(camera_results, result
         export_results(camera_results, "linuxcnc", tmp_path)
 
 
-@pytest.fixture(scope="module")
-def picture_results(folder, tmp_path_factory):
-    """The products of the frames of the small campaign, of whose places nothing is known."""
-    out = tmp_path_factory.mktemp("picture") / "results"
-    path = without(folder / "campaign.toml", "interferometry", "plan", "model", "drivers", name="picture.toml")
-    path.write_text(path.read_text() + '\n[plan]\nregistration = "pixels"\n')
-    run_campaign(path, out)
-    return out
-
-
-def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(picture_results, tmp_path):
-    results = read_results(picture_results)
+def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(folder, tmp_path):
+    tables, pixels = ("interferometry", "plan", "model", "drivers"), '\n[plan]\nregistration = "pixels"\n'
+    picture_results = tmp_path / "results"
+    results = run_campaign(
+        without(folder / "campaign.toml", *tables, name="picture.toml", added=pixels), picture_results
+    )
     fields = read_dataset(picture_results / "fields.nc")
     rows, columns = fields["reference_frame"].shape
     cell = float(fields["x"].diff("x")[0])
@@ -148,11 +123,9 @@ def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(pictur
 
 
 def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_path):
-    lines = (folder / "laser.csv").read_text().splitlines()
-    short = [line for line in lines if line.split(",")[0] in {"cycle", "1", "2", "3", "4", "5"}]
-    (folder / "five.csv").write_text("\n".join(short) + "\n")
-    path, out = folder / "five.toml", tmp_path / "results"
-    path.write_text((folder / "campaign.toml").read_text().replace('"laser.csv"', '"five.csv"'))
+    keep_cycles(Path(shutil.copy(folder / "laser.csv", folder / "five.csv")), *range(1, 6))
+    path, out = without(folder / "campaign.toml", name="five.toml"), tmp_path / "results"
+    change(path, '"laser.csv"', '"five.csv"')
     results = run_campaign(path, out)
     assert results.iso230.window == "cycles 1 to 5"
     assert results.drift is not None and results.neighbours is not None and results.hotspots is not None
@@ -162,31 +135,6 @@ def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_pat
     assert {"fields", "drift", "iso230"} <= sections(out)
     assert not {"anomalies", "correlation", "loop"} & sections(out)
     assert "mean_rise" in read_tree(out / "fusion.nc").to_dataset()
-
-
-def write_laser(folder: Path, cycles: int, targets: int, directions: tuple[str, ...]) -> Path:
-    """A campaign of the laser alone, made by hand: a profile, a drift that grows along the axis, noise of 0.25 um."""
-    rng = np.random.default_rng(1)
-    profile, seconds, rows = rng.normal(0.0, 0.6, targets), 0.0, []
-    for cycle in range(1, cycles + 1):
-        for direction in directions:
-            order = range(targets) if direction == "positive" else range(targets - 1, -1, -1)
-            for k in order:
-                seconds += 4.0
-                share = k / (targets - 1)
-                value = profile[k] + (2.0 + 6.0 * share) * (1.0 - np.exp(-seconds / 5400.0)) + rng.normal(0.0, 0.25)
-                time = np.datetime64("2026-03-09T06:30:00.000") + np.timedelta64(round(1000 * seconds), "ms")
-                rows.append(f"{cycle},{direction},{k + 1},{20.0 * k:.1f},{time}Z,{value:.3f}")
-            seconds += 20.0
-    folder.mkdir()
-    heading = "cycle,direction,target,position_mm,time,deviation_um"
-    (folder / "laser.csv").write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
-    path = folder / "campaign.toml"
-    path.write_text('[campaign]\ntitle = "Size"\n\n[interferometry]\ndeviations = "laser.csv"\n', encoding="utf-8")
-    return path
-
-
-BOTH = ("positive", "negative")
 
 
 @pytest.mark.parametrize(
@@ -299,12 +247,11 @@ def test_readings_without_times_are_evaluated_by_the_standard(untimed):
 
 def test_products_of_an_instrument_that_is_gone_do_not_stay(untimed, tmp_path):
     shutil.copytree(untimed.parent, tmp_path, dirs_exist_ok=True)
-    folder, campaign = tmp_path / "results", tmp_path / "campaign.toml"
+    folder, campaign = tmp_path / "results", change(tmp_path / "campaign.toml", '"wide"', '"the laser alone"')
     (folder / "maps").mkdir()
     claim(folder, "fields.nc", "maps/cycle_0001.exr")
     for name in ("fields.nc", "maps/cycle_0001.exr", "notes.txt"):
         (folder / name).write_text("of an earlier run, or of a person")
-    campaign.write_text(campaign.read_text(encoding="utf-8").replace('"wide"', '"the laser alone"'), encoding="utf-8")
     run_campaign(campaign, folder, resume=True)
     assert not (folder / "fields.nc").exists() and not (folder / "maps").exists()
     assert (folder / "notes.txt").exists() and (folder / "deviations.nc").exists()
@@ -320,10 +267,8 @@ def test_readings_without_times_are_exported_without_drift(untimed, tmp_path):
 
 
 def test_readings_without_times_beside_a_camera_are_refused(folder):
-    text = (folder / "campaign.toml").read_text(encoding="utf-8")
     (folder / "wide.csv").write_text(WIDE, encoding="utf-8")
-    path = folder / "untimed.toml"
-    path.write_text(text.replace('"laser.csv"', '"wide.csv"'), encoding="utf-8")
+    path = change(without(folder / "campaign.toml", name="untimed.toml"), '"laser.csv"', '"wide.csv"')
     with pytest.raises(AlignmentError, match=r"wide.csv: no reading has a time.*leave \[thermography\] out"):
         run_campaign(path, folder / "never")
     assert not (folder / "never").exists()

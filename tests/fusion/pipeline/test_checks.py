@@ -1,7 +1,6 @@
 """The check finds what a run would refuse, all of it at once where it can, and leaves nothing behind."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,15 +15,7 @@ from fusion.pipeline.run import run_campaign
 from fusion.report.terminal import summary_rows
 from fusion.results.results import read_results
 from tests.fusion.analysis.consistency import lies
-from tests.fusion.campaign_parts import without
-
-
-def change(campaign: Path, old: str, new: str) -> Path:
-    file = campaign / "campaign.toml"
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-    return file
+from tests.fusion.campaign_parts import change, keep_cycles, record_of_rows, without
 
 
 def test_a_sound_campaign_is_ready(campaign_folder):
@@ -41,7 +32,7 @@ def test_a_sound_campaign_is_ready(campaign_folder):
 
 
 def test_an_axis_beyond_the_plan_is_found_before_the_frames_are_reduced(copied):
-    file = change(copied, 'origin = ["', 'origin = ["1')
+    file = change(copied / "campaign.toml", 'origin = ["', 'origin = ["1')
     (fault,) = check_campaign(file).faults
     assert fault.startswith(f"{file}: plan.axis: the measured line leaves the plan: axis position")
     with pytest.raises(AlignmentError, match=r"check \[plan.axis\] origin and direction"):
@@ -62,25 +53,16 @@ def test_every_broken_file_is_named(copied):
 def test_quiet_leaves_faults_and_doubts(copied):
     assert check_campaign(copied / "campaign.toml").lines(quiet=True) == []
     absent = check_campaign(copied / "absent.toml")
-    assert absent.lines(quiet=True) == [
-        f"fault: {copied / 'absent.toml'}: no such campaign file; check the name or give its full path"
-    ]
+    (line,) = absent.lines(quiet=True)
+    assert line.startswith(f"fault: {copied / 'absent.toml'}: no such campaign file")
 
 
 def test_a_doubt_is_named_and_does_not_refuse(copied):
-    """Readings of the last three cycles copied from the cycles before."""
-    lines = (copied / "laser.csv").read_text().splitlines()
-    fields = [line.split(",") for line in lines]
-    name = fields[0].index("deviation_um")
-    last = {tuple(row[:3]): row for row in fields[1:]}
-    for (cycle, direction, target), row in last.items():
-        if int(cycle) > 21:
-            row[name] = last[(str(int(cycle) - 3), direction, target)][name]
-    (copied / "laser.csv").write_text("\n".join(",".join(row) for row in fields) + "\n")
+    lies.copied_cycle(copied)
     checked = check_campaign(copied / "campaign.toml")
     assert checked.faults == () and [one.code for one in checked.doubts] == ["copied_cycles"]
     assert checked.lines()[-1].endswith(", 1 doubt")
-    accepted = change(copied, "[model]", '[accept]\ndoubts = ["copied_cycles"]\n\n[model]')
+    accepted = change(copied / "campaign.toml", "[model]", '[accept]\ndoubts = ["copied_cycles"]\n\n[model]')
     assert check_campaign(accepted).doubts == []
 
 
@@ -89,15 +71,10 @@ def test_a_record_is_checked(tmp_path):
     rng = np.random.default_rng(5)
     warm = 20 + 5 * (1 - np.exp(-seconds / 9000))
     rows = [f"{s},{t:.3f},{3 * (t - 20) + 0.1 * rng.standard_normal():.3f}" for s, t in zip(seconds, warm, strict=True)]
-    (tmp_path / "a.csv").write_text("time [s],t1 [degC],ch1 [um]\n" + "\n".join(rows) + "\n")
-    file = tmp_path / "campaign.toml"
-    file.write_text(
-        '[campaign]\ntitle = "R"\n[record]\nfile = "a.csv"\ntime = "time [s]"\ntemperatures = ["t*"]\ndisplacements = ["ch*"]\n'
-    )
+    file = record_of_rows(tmp_path, *rows)
     checked = check_campaign(file)
     assert checked.faults == () and checked.content == ("record: 1 run, 1 temperature, 1 displacement, 600 rows",)
-    file.write_text(file.read_text().replace('["ch*"]', '["z*"]'))
-    assert 'no column is named "z*"' in check_campaign(file).faults[0]
+    assert 'no column is named "z*"' in check_campaign(change(file, '["ch*"]', '["z*"]')).faults[0]
 
 
 def test_a_campaign_of_one_instrument_is_checked_for_what_it_has(copied):
@@ -171,18 +148,15 @@ def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, tmp_pa
 @pytest.mark.chain
 def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied, tmp_path):
     lies.copied_cycle(copied)
-    # Nine cycles about the copy are too few for a model, and take the least time.
-    head, *lines = (copied / "laser.csv").read_text().splitlines()
-    kept = [line for line in lines if 6 <= int(line.split(",")[0]) <= 14]
-    (copied / "laser.csv").write_text("\n".join([head, *kept]) + "\n")
+    # Nine cycles about the copy are too few for a model.
+    keep_cycles(copied / "laser.csv", *range(6, 15))
     path = without(
         copied / "campaign.toml", "thermography", "plan", "model", added='[accept]\ndoubts = ["copied_cycles"]\n'
     )
     inputs = run_campaign(path, tmp_path / "out").inputs
     assert (inputs.state, inputs.accepted) == ("sound", ("copied_cycles",))
-    path.write_text(path.read_text().replace("copied_cycles", "weather"), encoding="utf-8")
     with pytest.raises(CampaignError, match=r"accept\.doubts = 'weather': no such check; there are"):
-        run_campaign(path, tmp_path / "other")
+        run_campaign(change(path, "copied_cycles", "weather"), tmp_path / "other")
 
 
 def test_one_error_of_reading_changes_neither_the_verdict_on_the_field_nor_the_causes(copied, tmp_path, results_folder):

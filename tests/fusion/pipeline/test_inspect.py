@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,9 +112,7 @@ def test_a_log_is_described_with_its_range_and_its_zone(tmp_path):
 def test_the_files_of_a_campaign(campaign_folder):
     campaign = described(campaign_folder / "campaign.toml")
     assert campaign[0].endswith("campaign, Small campaign") and "thermofuse check" in campaign[-1]
-    assert described(campaign_folder / "fiducials.csv")[0].startswith(
-        f"{campaign_folder / 'fiducials.csv'}: fiducials, 12 discs, x 40"
-    )
+    assert "fiducials.csv: fiducials, 12 discs, x 40" in described(campaign_folder / "fiducials.csv")[0]
     assert "  duty" in described(campaign_folder / "drivers.csv")[1]
     laser = described(campaign_folder / "laser.csv")
     assert "deviations, 24 cycles, 6 targets from 0 to 250 mm, 288 of 288 readings" in laser[0]
@@ -193,11 +190,7 @@ def test_plug_ins_are_asked_before_the_reader_of_flir_files_as_in_a_run(tmp_path
         ("a.csv", "Position [mm],1+ [um],1- [um]\n0,0.1,0.2\n100,0.3,0.4\n", Kind.DEVIATIONS),
         ("a.csv", "time,spindle [1/min],pump [1]\n2026-03-09T06:30:00Z,1,0\n", Kind.DRIVERS),
         ("a.txt", "zeit (s)\tt1(°C)\tch1(um)\n0\t20\t0\n", Kind.RECORD),
-        (
-            "a.csv",
-            "cycle,direction,target,position_mm,time,deviation_um\n1,positive,1,0,2026-03-09T06:30:00Z,0.1\n",
-            Kind.DEVIATIONS,
-        ),
+        ("a.csv", "cycle,direction,target,position_mm,deviation_um\n1,positive,1,0,0.1\n", Kind.DEVIATIONS),
         ("a.yml", "%YAML:1.0\ncamera_matrix: !!opencv-matrix\n", Kind.LENS),
         ("a.md", "# Notes\n\nNothing measured.\n", Kind.UNKNOWN),
         ("a.bin", "\0\1\2", Kind.UNKNOWN),
@@ -340,7 +333,6 @@ def test_a_series_without_a_frame_is_refused(tmp_path, campaign_folder):
         (tmp_path / f"{name}.jpg").write_bytes(whole[:500])
     with pytest.raises(ThermographyError, match="s: no frame can be read; "):
         describe_series(sorted(tmp_path.iterdir()), label="s")
-    shutil.rmtree(tmp_path)
 
 
 START = np.datetime64("2026-03-09T06:00:00", "ns")

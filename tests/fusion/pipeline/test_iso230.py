@@ -18,6 +18,7 @@ from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.io.readings import read_deviations
 from interferometry.iso230 import Iso230Budget, evaluate_iso230
+from tests.fusion.campaign_parts import without, write_laser
 from tests.interferometry.simulated_campaigns import simulate
 
 ASSUMED = StatedBudget(
@@ -110,27 +111,8 @@ def test_the_date_of_the_test_is_that_of_its_readings():
         assert date.endswith("UTC" if zone is None else "JST")
 
 
-LASER = """cycle,direction,target,position_mm,time,deviation_um
-{rows}
-"""
-
-
-def laser_file(path: Path, cycles: int) -> Path:
-    """A table of readings at five targets."""
-    rng = np.random.default_rng(4)
-    rows, minute = [], 0
-    for cycle in range(1, cycles + 1):
-        for direction in ("positive", "negative"):
-            for target in range(1, 6):
-                minute += 1
-                time = np.datetime64("2026-03-09T06:30:00") + np.timedelta64(minute, "m")
-                rows.append(f"{cycle},{direction},{target},{37.0 * target},{time}+00:00,{rng.normal(target, 0.5):.4f}")
-    path.write_text(LASER.format(rows="\n".join(rows)))
-    return path
-
-
 def test_a_file_of_readings(tmp_path):
-    file = laser_file(tmp_path / "laser.csv", 6)
+    file = write_laser(tmp_path / "test", 6, 5).with_name("laser.csv")
     found = read_test(file, "2-6")
     assert found.part.settled.cycles == (2, 3, 4, 5, 6) and found.part.settled_rule == ""
     axis = evaluate_iso230(read_deviations(file), cycles=[2, 3, 4, 5, 6])
@@ -140,19 +122,14 @@ def test_a_file_of_readings(tmp_path):
 
 
 def test_a_single_run_keeps_its_deviations(tmp_path):
-    found = read_test(laser_file(tmp_path / "laser.csv", 1), None)
+    found = read_test(write_laser(tmp_path / "test", 1, 5).with_name("laser.csv"), None)
     assert found.part is None and found.dataset.sizes["cycle"] == 1
 
 
 def test_a_campaign_of_the_laser_alone_brings_its_budget_and_tolerances(tmp_path):
-    laser_file(tmp_path / "laser.csv", 6)
-    campaign = tmp_path / "campaign.toml"
-    campaign.write_text(
-        '[campaign]\ntitle = "T"\n[interferometry]\ndeviations = "laser.csv"\n'
-        '[interferometry.uncertainty]\ndevice = "2 ppm"\n[acceptance]\nA = "1 m"\n'
-    )
-    found = read_test(campaign, None)
-    assert found.title == "T"
+    stated = '[interferometry.uncertainty]\ndevice = "2 ppm"\n[acceptance]\nA = "1 m"\n'
+    found = read_test(without(write_laser(tmp_path / "test", 6, 5), added=stated), None)
+    assert found.title == "Size"
     assert found.part.settled.contributions[0].origin == "stated"
     assert [row.decision for row in found.part.tolerances] == ["pass"]
 
@@ -171,6 +148,8 @@ def test_a_window_of_cycles_is_read():
     deviations = build_deviations(range(1, 9), [1, 2], np.array([0.0, 1.0]), x, time)
     assert read_window(" 2 - 4 ", deviations) == [2, 3, 4]
     assert read_window("8", deviations) == [8]
+    with pytest.raises(CampaignError, match='--cycles "a" is not a window of cycles; write for example 1-5'):
+        read_window("a", deviations)
     with pytest.raises(CampaignError, match="ends before it begins; write for example 2-4"):
         read_window("4-2", deviations)
     with pytest.raises(CampaignError, match="were not measured; there are 1 to 8"):

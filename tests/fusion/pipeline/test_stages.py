@@ -25,13 +25,13 @@ from fusion.pipeline.stages import (
     kept_results,
     note_changes,
     refuse_other_campaign,
-    versions,
 )
 from fusion.pipeline.workers import Worker
 from fusion.report.charts.campaign import Drawn
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome
 from fusion.results.store import OutputError, StageStamps, write_json
+from tests.fusion.campaign_parts import change as change_text
 
 
 class Counting:
@@ -211,11 +211,6 @@ def test_the_campaign_file_is_found_from_the_results_without_naming_folders_of_t
     assert run["campaign_file"] == (None if place is None else place.format(campaign.folder.name))
 
 
-def test_every_version_is_known():
-    known = versions()
-    assert known["python"].startswith("3.") and "not installed" not in {known["numpy"], known["xarray"]}
-
-
 def test_inputs_that_change_during_a_run_are_told():
     before = {name: FileState(100, 1) for name in ("laser.csv", "a.jpg", "b.jpg", "c.jpg", "d.jpg")}
     after = {"laser.csv": FileState(140, 2), "e.jpg": FileState(100, 1)}
@@ -241,11 +236,6 @@ def first_frame(campaign: Path) -> Path:
     return min((campaign / "thermal").iterdir())
 
 
-def replace_in(path: Path, old: str, new: str) -> None:
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new))
-
-
 def other_digit(readings: Path) -> None:
     """One digit of a reading: the size of the file stays."""
     text = readings.read_text()
@@ -256,7 +246,7 @@ CHANGES: dict[str, Callable[[Path, Path], object]] = {
     "reading": lambda campaign, out: other_digit(campaign / "laser.csv"),
     "another frame": lambda campaign, out: shutil.copy(first_frame(campaign), campaign / "thermal" / "IR_9999.jpg"),
     "a frame less": lambda campaign, out: first_frame(campaign).unlink(),
-    "title": lambda campaign, out: replace_in(campaign / "campaign.toml", "Small campaign", "Another title"),
+    "title": lambda campaign, out: change_text(campaign / "campaign.toml", "Small campaign", "Another title"),
     "missing page": lambda campaign, out: (out / "report.html").unlink(),
     "damaged map": lambda campaign, out: (out / "maps" / "cycle_0003.exr").write_bytes(b"x"),
     "missing stage": lambda campaign, out: (out / ".stages" / "model.nc").unlink(),

@@ -28,9 +28,10 @@ from fusion.results.progress import silent
 from fusion.results.results import Outcome, assemble
 from fusion.results.store import read_dataset
 from fusion.twin import simulate
-from fusion.twin.instruments import simulate_campaign, write_campaign
+from fusion.twin.instruments import write_campaign
 from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import Truth
+from tests.fusion.campaign_parts import change, simulated
 from tests.thermography.flir_mutations import without_checksums
 from thermography.common import ThermographyError
 from thermography.io.flir import index_frames
@@ -58,9 +59,7 @@ def test_the_offset_of_a_periodic_test_is_said_as_an_assumption():
     assert list(clock_notices(clock)) == []
     (notice,) = clock_notices(replace(clock, rivals_s=(-215.0, 289.0)))
     assert notice.code == "clock_offset_periodic"
-    assert notice.message.startswith(
-        "The motion repeats: clock offsets of -215.0 s; 289.0 s fit about as well as 37.0 s"
-    )
+    assert "clock offsets of -215.0 s; 289.0 s fit about as well as 37.0 s" in notice.message
 
 
 def test_fields_pass_the_cf_checker(results_folder):
@@ -81,16 +80,12 @@ def test_fields_pass_the_cf_checker(results_folder):
 @pytest.mark.chain
 def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path):
     """The clock is 37 s ahead and nobody says so; 13 s between frames do not divide the cycle, 0.2 s is a tenth of the dwell."""
-    (tmp_path / "recipe.toml").write_text(
+    recipe = (
         "[campaign]\nseed = 3\n[test]\ncycles = 4\ntargets = 7\nspacing_mm = 40\nperiod_s = 200\n"
         '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\n'
         "frame_interval_s = 13.0\nclock_offset_s = 37.0\nstate_clock_offset = false\n"
     )
-    campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
-    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
-    outcome = reduce_thermography(
-        read_source(load_campaign(campaign)), checkpoint=tmp_path / "cycles", scheduler=None, report=silent
-    )
+    outcome = _reduce(simulated(tmp_path, recipe))
     assert outcome.parts["alignment"]["clock_offset_s"]["value"] == pytest.approx(37.0, abs=0.2)
     place = outcome.dataset["table_position"]
     assert float(place.max() - place.min()) == pytest.approx(240.0, abs=0.5)
@@ -100,13 +95,11 @@ def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path):
 @pytest.mark.chain
 def test_points_picked_by_hand_and_a_calibrated_lens_serve_a_campaign(tmp_path):
     """A table without painted discs, and the lens that the recipe gave the camera; a wrong list is refused by its name."""
-    (tmp_path / "recipe.toml").write_text(
+    recipe = (
         "[campaign]\nseed = 4\n[plan]\nhint_error_px = 0.7\n[test]\ncycles = 12\ntargets = 5\nperiod_s = 120\n"
         '[camera]\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1500.0\nframes_per_cycle = 1\n'
     )
-    campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
-    text = campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"')
-    campaign.write_text(text.replace("[thermography]", '[thermography]\nlens = "lens.json"'))
+    campaign = change(simulated(tmp_path, recipe), "[thermography]", '[thermography]\nlens = "lens.json"')
     (campaign.parent / "lens.json").write_text(
         '{"K": [[600, 0, 159.5], [0, 600, 119.5], [0, 0, 1]], "D": [-0.3, 0, 0, 0], "image_width": 320, "image_height": 240}'
     )
@@ -114,9 +107,8 @@ def test_points_picked_by_hand_and_a_calibrated_lens_serve_a_campaign(tmp_path):
 
     def registered(table):
         table.to_csv(campaign.parent / "fiducials.csv", index=False)
+        part = _reduce(campaign).parts["registration"]
         source = read_source(load_campaign(campaign))
-        outcome = reduce_thermography(source, checkpoint=tmp_path / "cycles", scheduler=None, report=silent)
-        part = outcome.parts["registration"]
         assert [check.code for check in check_plan(source, part) if not check.passed] == []
         return part
 
@@ -137,9 +129,7 @@ def _campaign(folder: Path, *, room: dict[str, float] | None = None, **camera: f
     small = {"columns": 320, "rows": 240, "focal_px": 765.0, "file": "seq", **camera}
     test = {"cycles": CYCLES, "targets": 5}
     truth = simulate(Recipe().vary(campaign={"seed": 8}, test=test, room=room or {}, camera=small))
-    campaign = write_campaign(truth, folder)
-    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
-    return truth, campaign
+    return truth, change(write_campaign(truth, folder), 'cell_size = "5 mm"', 'cell_size = "20 mm"')
 
 
 def _reduce(campaign: Path) -> Outcome:
@@ -196,16 +186,16 @@ def test_steps_and_drift_are_taken_out_before_the_fields_are_made(tmp_path):
 def test_a_reference_patch_carries_the_correction(tmp_path):
     """The wall of a room that keeps its temperature serves as the patch; no log of the air is needed."""
     truth, campaign = _campaign(tmp_path / "campaign", room={"swing_K": 0.0, "trend_K_per_h": 0.0}, ffc_step_K=0.3)
-    text = campaign.read_text().replace('environment = "environment.csv"\n', "")
-    campaign.write_text(text.replace("[thermography]\n", "[thermography]\nreference_patch = [10, 10, 60, 20]\n"))
+    change(campaign, 'environment = "environment.csv"\n', "")
+    change(campaign, "[thermography]\n", "[thermography]\nreference_patch = [10, 10, 60, 20]\n")
     outcome = _reduce(campaign)
     planted = truth.frames["camera_offset_K"].values
     # The room still wanders by some hundredths of a kelvin.
     assert outcome.dataset["camera_correction"].values == pytest.approx(-(planted - planted[0]) / 0.963, abs=0.15)
-    campaign.write_text(campaign.read_text().replace("[10, 10, 60, 20]", "[300, 10, 60, 20]"))
+    change(campaign, "[10, 10, 60, 20]", "[300, 10, 60, 20]")
     with pytest.raises(SourceError, match=r"reference_patch = \[300, 10, 60, 20\]: leaves the frames of 320 x 240"):
         _reduce(campaign)
-    campaign.write_text(campaign.read_text().replace("[300, 10, 60, 20]", "[150, 110, 12, 12]"))
+    change(campaign, "[300, 10, 60, 20]", "[150, 110, 12, 12]")
     with pytest.raises(SourceError, match=r"reference_patch = \[150, 110, 12, 12\]: 100 % of its pixels show the plan"):
         _reduce(campaign)
 
@@ -257,12 +247,10 @@ REGION = '\n[[thermography.region]]\nname = "steel"\nrectangle = [["80 mm", "20 
 
 def completed(campaign: Path, results_folder: Path, *changes: tuple[str, str], region: str = "") -> Outcome[xr.Dataset]:
     """The fields of the small campaign, completed once more after changes of its file."""
-    text = campaign.read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
     changed = campaign.with_name("changed.toml")
-    changed.write_text(text + region)
+    changed.write_text(campaign.read_text() + region)
+    for old, new in changes:
+        change(changed, old, new)
     source = read_source(load_campaign(changed))
     fields = read_dataset(results_folder / "fields.nc").drop_vars(ADDED)
     return complete_fields(source, fields, Overrides(overridden_parameters(source.thermography)))
@@ -309,9 +297,7 @@ def test_a_stated_emissivity_is_its_share_of_every_rise(campaign, results_folder
     stated = ("emissivity = 0.97", f'emissivity = "0.97 +- 0.0097"{exact}{camera}')
     outcome = completed(campaign, results_folder, stated)
     assert outcome.parts["radiometry"]["rise_scale_u"] == pytest.approx(0.01, rel=0.05)
-    assert {entry["input"]: entry["source"] for entry in outcome.parts["radiometry"]["budget"]}[
-        "emissivity"
-    ] == "stated"
+    assert outcome.parts["radiometry"]["budget"][0].items() >= {"input": "emissivity", "source": "stated"}.items()
     rise, u = (outcome.dataset[name].isel(cycle=-1) for name in ("temperature_rise", "temperature_rise_u"))
     common = np.sqrt(u**2 - outcome.dataset["temperature_rise_noise_u"].isel(cycle=-1) ** 2)
     zero = float(outcome.dataset["camera_correction_u"][-1])
@@ -321,9 +307,8 @@ def test_a_stated_emissivity_is_its_share_of_every_rise(campaign, results_folder
 
 @pytest.mark.parametrize(("stated_K", "taken"), [(2.0, "stated"), (0.001, "measured")])
 def test_the_larger_of_stated_and_measured_drift_is_taken_and_said(campaign, results_folder, stated_K, taken):
-    outcome = completed(
-        campaign, results_folder, ("emissivity = 0.97", f'emissivity = 0.97\ncamera_drift_u = "{stated_K} K"')
-    )
+    stated = ("emissivity = 0.97", f'emissivity = 0.97\ncamera_drift_u = "{stated_K} K"')
+    outcome = completed(campaign, results_folder, stated)
     entry = next(item for item in outcome.parts["radiometry"]["budget"] if item["input"] == "camera_drift_K")
     left_K = float(outcome.dataset["camera_correction_u"].max())
     assert entry["source"] == taken and entry["u"] == pytest.approx(max(stated_K, left_K))
@@ -357,10 +342,7 @@ def test_the_emissivity_of_a_region_comes_from_two_states(campaign, results_fold
     """The table of the twin is painted: what the camera reads in two cycles, taken as contact temperatures, gives 0.97 again."""
     fields = read_dataset(results_folder / "fields.nc").sel(x=slice(100, 220), y=slice(40, 140))["temperature"]
     first, last = (float(fields.sel(cycle=cycle).mean()) for cycle in (1, 24))
-    known = [
-        f'{{cycle = {cycle}, temperature = "{celsius:.4f} +- 0.01 degC"}}'
-        for cycle, celsius in ((1, first), (24, last))
-    ]
+    known = (f'{{cycle = {n}, temperature = "{celsius:.4f} +- 0.01 degC"}}' for n, celsius in ((1, first), (24, last)))
     states = f"states = [{', '.join(known)}]\n"
     outcome = completed(campaign, results_folder, region=REGION + states)
     steel = outcome.parts["radiometry"]["surfaces"][1]

@@ -13,15 +13,14 @@ from fusion.pipeline import two_campaigns as records
 from fusion.pipeline.run import run_campaign
 from fusion.pipeline.two_campaigns import compare_runs
 from fusion.results.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
-from tests.fusion.campaign_parts import without
+from tests.fusion.campaign_parts import change, record_of_rows, without
 
 
 @pytest.fixture
 def folders(results_folder, tmp_path):
     """The same results twice, the second one under another title."""
     pair = [Path(shutil.copytree(results_folder, tmp_path / name)) for name in ("monday", "tuesday")]
-    path = pair[1] / "results.json"
-    path.write_text(path.read_text().replace("Small campaign", "Second campaign"))
+    change(pair[1] / "results.json", "Small campaign", "Second campaign")
     as_if_run(pair[1], "results.json")
     return pair
 
@@ -70,28 +69,13 @@ def test_products_that_no_run_wrote_are_refused(folders, tmp_path, name):
     assert not (tmp_path / "joint.json").exists()
 
 
-CAMPAIGN = """\
-[campaign]
-title = "{title}"
-
-[record]
-file = "{title}.csv"
-time = "time [s]"
-temperatures = ["t*"]
-displacements = ["ch*"]
-"""
-
-
 def write_record(folder: Path, title: str) -> Path:
     """A channel that follows one sensor, an hour long."""
     rng = np.random.default_rng(5)
     temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.1, 60))
     noise = rng.normal(0.0, 0.05, 60)
     rows = [f"{60 * k},{t:.3f},{2.0 * t + noise[k]:.3f}" for k, t in enumerate(temperature)]
-    (folder / f"{title}.csv").write_text("time [s],t1 [degC],ch1 [um]\n" + "\n".join(rows) + "\n", encoding="utf-8")
-    path = folder / f"{title}.toml"
-    path.write_text(CAMPAIGN.format(title=title), encoding="utf-8")
-    return path
+    return record_of_rows(folder, *rows, name=title)
 
 
 @pytest.mark.chain

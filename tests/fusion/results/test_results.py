@@ -27,9 +27,8 @@ def test_a_full_document_keeps_the_schema_and_the_order_of_the_design() -> None:
     document = assemble("A", PARTS, [Notice("clock", "the clocks disagree", "set clock_offset")]).as_json()
     validator().validate(document)
     assert list(document) == ["schema", "campaign", "warnings", *PARTS]
-    assert document["warnings"] == [
-        {"code": "clock", "message": "the clocks disagree", "remedy": "set clock_offset", "effect_um": None}
-    ]
+    notice = {"code": "clock", "message": "the clocks disagree", "remedy": "set clock_offset", "effect_um": None}
+    assert document["warnings"] == [notice]
 
 
 @pytest.mark.parametrize("parts", [PARTS, {"loop": RECORD_LOOP}], ids=["instruments", "record"])
@@ -99,9 +98,8 @@ def test_results_print_themselves_as_the_command_does() -> None:
 
 @pytest.mark.parametrize(("value", "written"), [(float("nan"), None), (0.5, 0.5)])
 def test_a_number_that_is_not_determined_is_null_and_a_key_that_does_not_apply_absent(value, written) -> None:
-    assert plain({"a": Coefficient(value=value, u=np.float64(0.1), unit="um")}) == {
-        "a": {"value": written, "u": 0.1, "unit": "um"}
-    }
+    told = plain({"a": Coefficient(value=value, u=np.float64(0.1), unit="um")})
+    assert told == {"a": {"value": written, "u": 0.1, "unit": "um"}}
 
 
 def test_results_that_cannot_be_read_name_file_and_remedy(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_datasets_come_back_equal(tmp_path: Path, rng: np.random.Generator) -> N
     xr.testing.assert_identical(read_dataset(write_dataset(tmp_path / "x.nc", dataset)), dataset)
 
 
-@pytest.mark.parametrize("read", [read_dataset, read_tree])
+@pytest.mark.parametrize("read", [read_dataset, read_tree, open_dataset])
 @pytest.mark.parametrize(
     "damage", [lambda whole: b"", lambda whole: whole[: len(whole) // 2], lambda whole: b"[" * 5_000]
 )
@@ -186,9 +186,6 @@ def test_large_arrays_are_written_in_pieces_and_stay_in_the_file(
 def test_a_small_dataset_is_opened_into_memory(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "fields.nc", xr.Dataset({"rise": ("cycle", np.arange(3.0))}))
     assert open_dataset(path)["rise"].variable._in_memory
-    (tmp_path / "bad.nc").write_bytes(path.read_bytes()[:200])
-    with pytest.raises(DamagedProductError, match=r"bad\.nc: is damaged"):
-        open_dataset(tmp_path / "bad.nc")
 
 
 @pytest.fixture

@@ -23,10 +23,8 @@ def temperature_by_hand(counts: np.ndarray, camera: Camera) -> np.ndarray:
     k, t = SC660, camera.atmospheric_temperature_degC
 
     def black(celsius: float) -> float:
-        return (
-            k["planck_r1"] / (k["planck_r2"] * (np.exp(k["planck_b"] / (celsius + 273.15)) - k["planck_f"]))
-            - k["planck_o"]
-        )
+        spectral = np.exp(k["planck_b"] / (celsius + 273.15)) - k["planck_f"]
+        return k["planck_r1"] / (k["planck_r2"] * spectral) - k["planck_o"]
 
     omega = camera.relative_humidity * np.exp(1.5587 + 6.939e-2 * t - 2.7816e-4 * t**2 + 6.8455e-7 * t**3)
     root = np.sqrt(camera.distance_mm / 1000)
@@ -34,9 +32,8 @@ def temperature_by_hand(counts: np.ndarray, camera: Camera) -> np.ndarray:
     tau += (1 - k["atmosphere_x"]) * np.exp(-root * (k["atmosphere_alpha2"] + k["atmosphere_beta2"] * np.sqrt(omega)))
     surface = (counts - (1 - tau) * black(t)) / tau
     surface = (surface - (1 - camera.emissivity) * black(camera.reflected_temperature_degC)) / camera.emissivity
-    return (
-        k["planck_b"] / np.log(k["planck_r1"] / (k["planck_r2"] * (surface + k["planck_o"])) + k["planck_f"]) - 273.15
-    )
+    ratio = k["planck_r1"] / (k["planck_r2"] * (surface + k["planck_o"]))
+    return k["planck_b"] / np.log(ratio + k["planck_f"]) - 273.15
 
 
 def test_pixels_and_plan_are_each_others_inverse():
@@ -52,13 +49,8 @@ def test_lens_is_the_one_of_opencv():
     straight = make_view(Camera(k1=0.0)).to_sensor(points)
     normal = (straight - view.centre_px) / camera.focal_px
     inner = np.array([[camera.focal_px, 0, view.centre_px[0]], [0, camera.focal_px, view.centre_px[1]], [0, 0, 1]])
-    projected, _ = cv2.projectPoints(
-        np.column_stack([normal, np.ones(len(normal))]),
-        np.zeros(3),
-        np.zeros(3),
-        inner,
-        np.array([camera.k1, 0, 0, 0.0]),
-    )
+    ahead, lens = np.column_stack([normal, np.ones(len(normal))]), np.array([camera.k1, 0, 0, 0.0])
+    projected, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), inner, lens)
     # float64 throughout
     np.testing.assert_allclose(view.to_sensor(points), projected[:, 0], atol=1e-9)
 
@@ -150,9 +142,8 @@ def test_knock_moves_everything_from_its_cycle_on():
 
 def test_camera_offset_lifts_every_pixel():
     plain = Renderer(twin(**QUIET)).render(11).astype(float)
-    offset = simulate(
-        BASE.vary(camera=QUIET, effect=(EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 6}),))
-    )
+    effect = EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 6})
+    offset = simulate(BASE.vary(camera=QUIET, effect=(effect,)))
     lifted = Renderer(offset).render(11).astype(float)
     # half a count of rounding in either frame
     np.testing.assert_allclose(lifted - plain, 0.5 * float(counts_of(25.5) - counts_of(24.5)), atol=1.0)
@@ -161,18 +152,16 @@ def test_camera_offset_lifts_every_pixel():
 
 def test_reflected_source_shows_at_its_spot_by_what_the_paint_mirrors():
     spot = {"x_mm": 300.0, "y_mm": 110.0, "spread_mm": 30.0, "follows": "constant"}
-    truth = simulate(
-        BASE.vary(camera=QUIET, effect=(EffectRecipe("reflected_source", amplitude_K=40.0, parameters=spot),))
-    )
+    effect = EffectRecipe("reflected_source", amplitude_K=40.0, parameters=spot)
+    truth = simulate(BASE.vary(camera=QUIET, effect=(effect,)))
     column, row = np.rint(make_view(truth.recipe.camera).to_sensor(np.array([[300.0, 110.0]]))[0]).astype(int)
     extra = Renderer(truth).render(11).astype(float) - Renderer(twin(**QUIET)).render(11)
     surround = truth.recipe.camera.reflected_temperature_degC
     strength = float(truth.frames["reflected_K"][11])
     tau = air_transmission(1.76, 24.0, 0.45)
     assert strength > 30.0
-    assert extra[row, column] == pytest.approx(
-        tau * 0.03 * float(counts_of(surround + strength) - counts_of(surround)), abs=1.5
-    )
+    mirrored = 0.03 * float(counts_of(surround + strength) - counts_of(surround))
+    assert extra[row, column] == pytest.approx(tau * mirrored, abs=1.5)
     assert np.abs(extra[:40]).max() <= 1.0
 
 

@@ -144,9 +144,8 @@ def test_local_temperature_is_seen_on_the_plan_under_its_target(plain):
 
 
 def test_stick_slip_stops_short_of_the_target():
-    value = (
-        simulate(BASE.vary(anomaly=(AnomalyRecipe(5, "stick_slip"),))).readings["anomaly_5_stick_slip"].sel(target=5)
-    )
+    truth = simulate(BASE.vary(anomaly=(AnomalyRecipe(5, "stick_slip"),)))
+    value = truth.readings["anomaly_5_stick_slip"].sel(target=5)
     assert float(value.sel(direction="positive").max()) == 0.0
     assert float(value.sel(direction="negative").min()) == 0.0
     assert float((value == 0).mean()) == pytest.approx(0.75, abs=0.15)

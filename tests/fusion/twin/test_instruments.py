@@ -55,20 +55,15 @@ def test_campaign_file_names_what_is_there(campaign):
     folder = campaign.parent
     assert content["campaign"]["title"] == "Three cycles"
     assert len(list(folder.glob(content["thermography"]["frames"][0]))) == 3
-    for table, key in (
-        ("plan", "fiducials"),
-        ("interferometry", "deviations"),
-        ("interferometry", "environment"),
-        ("drivers", "file"),
-    ):
-        assert (folder / content[table][key]).is_file()
+    laser = content["interferometry"]
+    for name in (content["plan"]["fiducials"], laser["deviations"], laser["environment"], content["drivers"]["file"]):
+        assert (folder / name).is_file()
     assert "clock_offset" not in content["thermography"]
 
 
 def test_truth_stands_beside_the_campaign_and_is_not_stated_in_it(campaign):
     beside = truth_folder(campaign.parent)
     assert {path.name for path in beside.iterdir()} == {"truth.nc", "truth.json"}
-    assert beside.parent == campaign.parent.resolve().parent
     for path in campaign.parent.rglob("*"):
         assert "truth" not in path.name
         if path.suffix in (".toml", ".csv"):
@@ -195,10 +190,7 @@ def test_what_fails_or_is_stopped_leaves_nothing(tmp_path: Path, exists: bool, f
         raise fault
     assert [path.name for path in tmp_path.rglob("*")] == (["campaign"] if exists else [])
     if isinstance(fault, OSError):
-        assert str(told.value) == (
-            f"{out}: cannot be written (No space left on device), and nothing is left there; make room, allow writing there, "
-            "or name another folder with --out"
-        )
+        assert f"{out}: cannot be written (No space left on device), and nothing is left there" in str(told.value)
 
 
 @pytest.mark.parametrize("existing", ["campaign", "campaign-truth"])

@@ -19,11 +19,6 @@ def test_anomalies_of_the_recipe_are_those_of_the_machine():
     assert get_args(get_type_hints(AnomalyRecipe)["kind"]) == tuple(ANOMALIES)
 
 
-def test_defaults_are_a_valid_recipe_and_are_returned_unchanged():
-    recipe = Recipe()
-    assert check_recipe(recipe) is recipe
-
-
 def test_vary_changes_the_named_values_only():
     recipe = Recipe().vary(test={"cycles": 5}, effect=())
     assert recipe.test.cycles == 5
@@ -36,10 +31,7 @@ def test_vary_changes_the_named_values_only():
     ("tables", "message"),
     [
         ({"test": {"feed_mm_per_min": 0.0}}, r"test\.feed_mm_per_min = 0\.0: input should be greater than 0"),
-        (
-            {"plan": {"origin_mm": (1.0, 2.0, 3.0)}},
-            r"plan\.origin_mm = \[1\.0, 2\.0, 3\.0\]: tuple should have at most 2 items",
-        ),
+        ({"plan": {"origin_mm": (1.0, 2.0, 3.0)}}, r"plan\.origin_mm = \[1\.0, 2\.0, 3\.0\]: .* at most 2 items"),
         ({"camera": {"file": "png"}}, r"camera\.file = \"png\": input should be 'jpg' or 'seq'"),
         ({"anomaly": (AnomalyRecipe(1), AnomalyRecipe(2, "odd"))}, r'^anomaly\.1\.kind: anomaly\.kind = "odd"'),
     ],
@@ -52,24 +44,14 @@ def test_recipe_made_in_python_is_checked_like_a_file(tables, message):
 # A recipe is read as it is meant, or refused with file, key, value and remedy.
 
 
-ROOT = Path(__file__).parents[3]
-
-
 def write(folder: Path, text: str) -> Path:
     path = folder / "RECIPE.toml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-@pytest.mark.parametrize(
-    "path", [ROOT / "fusion/twin/recipes/demo.toml", packaged_recipe("paper")], ids=lambda path: path.stem
-)
-def test_shipped_recipes_are_valid(path):
-    assert read_recipe(path).test.targets == 16
-
-
 def test_empty_recipe_is_the_default(tmp_path):
-    assert read_recipe(write(tmp_path, "")) == Recipe()
+    assert read_recipe(write(tmp_path, "")) == Recipe() == check_recipe(Recipe())
 
 
 def test_tables_and_lists_reach_the_recipe(tmp_path):
@@ -116,10 +98,7 @@ def test_tables_and_lists_reach_the_recipe(tmp_path):
         ("[[source]]\nname = 'a'", r"line 1: \[source\] lacks x_mm"),
         ("[[effect]]\nname = 'slip'", r'line 1: effect\.name = "slip": known: air_index, angular_growth'),
         ("[[effect]]\nname = 'step_evnt'", r"did you mean step_event\?"),
-        (
-            "[[effect]]\nname = 'step_event'\nat = 3",
-            r"line 1: effect step_event: unknown key at; .*at_cycle, at_part, um",
-        ),
+        ("[[effect]]\nname = 'step_event'\nat = 3", r"line 1: effect step_event: unknown key at; .*at_cycle, at_part"),
         ("[[effect]]\nname = 'step_event'\nat_cycle = 'two'", r'at_cycle = "two": this is a whole number'),
         ("[[effect]]\nname = 'thermal_lag'\nshape = 'cubic'", r"shape = \"cubic\": input should be 'flat' or 'linear'"),
         ("[[effect]]\nname = 'dead_path'\namplitude_K = 1", r"amplitude_K is for effects that only the camera sees"),
@@ -135,9 +114,7 @@ def test_wrong_recipe_is_refused(tmp_path, text, message):
 
 
 def test_missing_recipe_is_refused(tmp_path):
-    with pytest.raises(
-        RecipeError, match=r"none\.toml: cannot be read \(No such file or directory\); name an existing"
-    ):
+    with pytest.raises(RecipeError, match=r"none\.toml: cannot be read \(No such file or directory\); name"):
         read_recipe(tmp_path / "none.toml")
 
 
@@ -149,31 +126,16 @@ def test_unknown_packaged_recipe_names_those_there_are():
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        (
-            {"test": {"period_s": 100.0}},
-            r"test\.period_s = 100\.0 is shorter than one cycle, 19\d\.\d s; raise it or the feed",
-        ),
+        ({"test": {"period_s": 100.0}}, r"test\.period_s = 100\.0 is shorter than one cycle, 19\d\.\d s; raise it"),
         ({"test": {"positions_mm": (0.0, 5.0, 4.0)}}, r"the target positions do not increase"),
+        ({"camera": {"frame_after_s": 90.0}}, r"the last frame .* 28\d\.\d s after its start, past its end at 252"),
+        ({"effect": (EffectRecipe("step_event", 1.0, parameters={"at_cycle": 90}),)}, r"step_event: .* to 1\.0 um rms"),
         (
-            {"camera": {"frame_after_s": 90.0}},
-            r"camera: the last frame of a cycle is due 28\d\.\d s after its start, past its end at 252",
+            {"effect": (EffectRecipe("sensor_fault", 1.0, parameters={"kind": "stuck"}),)},
+            "sensor_fault: .*kind = 'jump'",
         ),
-        (
-            {"effect": (EffectRecipe("step_event", amplitude_um=1.0, parameters={"at_cycle": 90}),)},
-            r"effect step_event: nothing moves in this test, so it cannot be scaled to 1\.0 um rms",
-        ),
-        (
-            {"effect": (EffectRecipe("sensor_fault", amplitude_um=1.0, parameters={"kind": "stuck"}),)},
-            r"effect sensor_fault: the error of a stuck sensor follows from the air; remove amplitude_um, or use kind = 'jump'",
-        ),
-        (
-            {"effect": (EffectRecipe("sensor_fault"), EffectRecipe("sensor_fault"))},
-            r"effect sensor_fault is there more than once; the twin has one of it",
-        ),
-        (
-            {"effect": (EffectRecipe("reflected_source", amplitude_um=1.0),)},
-            r"effect reflected_source: amplitude_um has no meaning for a spot; write amplitude_K",
-        ),
+        ({"effect": 2 * (EffectRecipe("sensor_fault"),)}, "effect sensor_fault is there more than once"),
+        ({"effect": (EffectRecipe("reflected_source", 1.0),)}, "reflected_source: amplitude_um .*; write amplitude_K"),
     ],
 )
 def test_test_that_cannot_be_is_refused(tables, message):
@@ -207,8 +169,9 @@ def test_the_schema_accepts_every_recipe_of_the_project_and_refuses_what_the_rea
     schema = recipe_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
-    for path in (ROOT / "fusion/twin/recipes/demo.toml", *(ROOT / "fusion" / "twin" / "recipes").glob("*.toml")):
+    for path in packaged_recipe("demo").parent.glob("*.toml"):
         validator.validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        read_recipe(path)
     for name, effect in EFFECTS.items():
         validator.validate({"effect": [{"name": name, "amplitude_um": 1.0, **effect.parameters}]})
         assert not validator.is_valid({"effect": [{"name": name, "colour": 1}]})

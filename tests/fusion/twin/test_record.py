@@ -39,10 +39,8 @@ def test_steps_of_another_length_give_the_same_temperatures():
 
 @pytest.mark.parametrize("name", IN_A_RECORD)
 def test_switched_effect_changes_only_its_own_series(name):
-    plain = simulate_record(BASE)
-    truth = simulate_record(
-        BASE.vary(effect=(EffectRecipe(name, 0.7, parameters={"at_cycle": 6} if name == "step_event" else {}),))
-    )
+    plain, parameters = simulate_record(BASE), {"at_cycle": 6} if name == "step_event" else {}
+    truth = simulate_record(BASE.vary(effect=(EffectRecipe(name, 0.7, parameters=parameters),)))
     for part in plain.parts:
         np.testing.assert_array_equal(truth.table[part].values, plain.table[part].values)
     np.testing.assert_array_equal(truth.table["temperature"].values, plain.table["temperature"].values)
@@ -86,14 +84,8 @@ def test_record_is_read_back(tmp_path):
         ({"record": {"hours": 0.0}}, r"record\.hours = 0\.0: input should be greater than 0"),
         ({"record": {"channels": 7}}, r"record\.channels = 7: input should be less than or equal to 6"),
         ({"anomaly": (AnomalyRecipe(3),)}, r"anomaly: a record has no targets; remove the \[\[anomaly\]\] tables"),
-        (
-            {"effect": (EffectRecipe("dead_path"),)},
-            r"effect dead_path: a record has no positions; use one of thermal_lag, ",
-        ),
-        (
-            {"effect": (EffectRecipe("step_event", 1.0, parameters={"at_cycle": 30}),)},
-            r"effect step_event: nothing moves in this record",
-        ),
+        ({"effect": (EffectRecipe("dead_path"),)}, r"effect dead_path: .* use one of thermal_lag, "),
+        ({"effect": (EffectRecipe("step_event", 1.0, parameters={"at_cycle": 30}),)}, "step_event: nothing moves"),
     ],
 )
 def test_record_that_cannot_be_is_refused(tables, message):
