@@ -52,7 +52,6 @@ from fusion.analysis.drift_model.search import (
     not_confirmed,
     open_hold_out,
     refine,
-    rivals,
     score_effects,
     search,
     verdict,
@@ -547,42 +546,27 @@ _CANDIDATES = {
 }
 
 
-@dataclass(frozen=True)
-class RecordEffect:
-    """An effect of the library in a record: a built-in one with columns of its own, a user's with those of the record's readings."""
-
-    effect: Effect
-
-    @property
-    def excited_by(self) -> str:
-        """As in the library."""
-        return self.effect.excited_by
-
-    @property
-    def repeats(self) -> bool:
-        """As in the library."""
-        return self.effect.repeats
-
-    def candidates(self, record: Record, near: Candidate | None) -> Iterator[Candidate]:
-        """Columns (blocks, q) that every channel follows with its own coefficients, for a closer look those near a candidate."""
-        if self.effect.name in _CANDIDATES:
-            return _CANDIDATES[self.effect.name](record, near)
-        return self.effect.candidates(record.view(), {}, near)
-
-    def needs(self, record: Record) -> str | None:
-        """Why it cannot be tried with this record, or None."""
-        if self.effect.name not in _CANDIDATES:
-            return self.effect.needs(record.view())
-        if self.effect.name == "unseen_heat_source" and not record.drivers:
-            return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
-        if self.effect.name == "sensor_fault" and not sensor_faults(record):
-            return "no sensor jumps alone"
-        return None
+def candidates_of(effect: Effect, record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """Columns (blocks, q) that every channel follows with its own coefficients; a user's effect makes them of the record's readings."""
+    if effect.name in _CANDIDATES:
+        return _CANDIDATES[effect.name](record, near)
+    return effect.candidates(record.view(), {}, near)
 
 
-def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, RecordEffect], dict[str, str]]:
+def needs_of(effect: Effect, record: Record) -> str | None:
+    """Why an effect cannot be tried with this record, or None."""
+    if effect.name not in _CANDIDATES:
+        return effect.needs(record.view())
+    if effect.name == "unseen_heat_source" and not record.drivers:
+        return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
+    if effect.name == "sensor_fault" and not sensor_faults(record):
+        return "no sensor jumps alone"
+    return None
+
+
+def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, Effect], dict[str, str]]:
     """Effects that can act in a record, and why the others of the library are not tried."""
-    offered = {name: RecordEffect(effect) for name, effect in (library() if effects is None else effects).items()}
+    offered = library() if effects is None else effects
     not_tried = {name: "a record has no positions" for name in offered if name in BUILT_IN - _CANDIDATES.keys()}
     return {name: effect for name, effect in offered.items() if name not in not_tried}, not_tried
 
@@ -733,7 +717,7 @@ RecordState = LoopState[RecordFit]
 class RecordProblem(Problem[RecordFit]):
     """A record, the blocks of it that may be used, and the library, for :mod:`fusion.analysis.drift_model.search`."""
 
-    effects: Mapping[str, RecordEffect]
+    effects: Mapping[str, Effect]
     entry_level = ENTRY_LEVEL
 
     def __init__(
@@ -748,7 +732,7 @@ class RecordProblem(Problem[RecordFit]):
 
     def start(self, declared: Sequence[Term]) -> RecordState:
         """The state before the search: the declared model, and the effects that this record cannot show."""
-        missing = {name: effect.needs(self.record) for name, effect in self.effects.items()}
+        missing = {name: needs_of(effect, self.record) for name, effect in self.effects.items()}
         return RecordState(fit_record(self.record, declared, self.train)).without_effects(
             {**self._not_tried, **missing}
         )
@@ -805,7 +789,7 @@ class RecordProblem(Problem[RecordFit]):
 
     def offer(self, name: str, model: RecordFit, near: Candidate | None) -> list[Candidate]:
         """Candidates of an effect that vary over the training part."""
-        offered = self.effects[name].candidates(self.record, near)
+        offered = candidates_of(self.effects[name], self.record, near)
         return [one for one in offered if (np.ptp(one.columns[self.train], axis=0) > 0.0).all()]
 
     def near(self, name: str, model: RecordFit, chosen: Candidate) -> list[Candidate]:
@@ -1147,13 +1131,9 @@ class RecordResult:
 
     def _step(self, place: int) -> schema.RecordStep:
         step, term = self.state.steps[place], self.state.added[place]
-        tied, runner_up = rivals(step.score, step.round.scores)
         squares = self.contribution(term) ** 2
         return schema.RecordStep(
-            effect=term.effect,
-            parameters=term.candidate.parameters,
-            parameter_ranges=step.score.ranges,
-            p_value=step.score.family_wise_p,
+            **step.described(term.candidate, self.doubts[place]),
             rmse_before_um=known_mean(self.errors[place]),
             rmse_after_um=known_mean(self.errors[place + 1]),
             rmse_without_um=self.state.errors_without_um[place],
@@ -1163,12 +1143,7 @@ class RecordResult:
             rms_by_channel_um={name: np.sqrt(np.mean(squares[:, k])) for k, name in enumerate(self.record.channels)},
             chained_rmse_before_um=step.round.start_error_um,
             chained_rmse_after_um=step.score.error_um,
-            tied=tied,
-            runner_up=runner_up,
             rejected=_rejected(step.round),
-            confirmed=not self.doubts[place],
-            doubt=self.doubts[place],
-            confirmed_by=str(step.confirmed),
             event_s=term.candidate.event_s,
         )
 
@@ -1192,12 +1167,7 @@ def _round_scores(scored: Round) -> list[schema.RecordScorePart]:
     rejected = _rejected(scored)
     return [
         schema.RecordScorePart(
-            effect=score.name,
-            parameters=score.candidate.parameters if score.candidate else {},
-            gain=score.gain,
-            excess_gain=score.excess,
-            p_value=score.p_value,
-            family_wise_p=score.family_wise_p,
+            **score.described(),
             chained_rmse_before_um=scored.start_error_um,
             chained_rmse_after_um=score.error_um,
             chosen=score.is_confirmed,

@@ -19,6 +19,7 @@ from fusion.analysis.drift_model.record import (
     RecordGrounds,
     RecordProblem,
     _smoothed,
+    candidates_of,
     chain_forward,
     channel_gains,
     channel_rmse,
@@ -26,6 +27,7 @@ from fusion.analysis.drift_model.record import (
     fit_record,
     hold_out,
     last_values,
+    needs_of,
     one_switching_share,
     predict,
     record_library,
@@ -300,7 +302,7 @@ def record(*, block_s: float = 300.0, drivers: bool = True) -> Record:
 
 
 def candidates(name: str, of: Record, near: Candidate | None = None) -> list[Candidate]:
-    return list(record_library()[0][name].candidates(of, near))
+    return list(candidates_of(record_library()[0][name], of, near))
 
 
 def near(event_s: float | None = None, **parameters: float | str) -> Candidate:
@@ -435,9 +437,9 @@ def test_a_users_effect_sees_the_record_as_readings_of_one_place():
 
     own = Effect("own", "", "", offer, needs=lambda readings: f"{len(readings.drivers)} drivers", excited_by="driver")
     effects, _ = record_library({**library(), "own": own})
-    (candidate,) = effects["own"].candidates(record(), None)
+    (candidate,) = candidates_of(effects["own"], record(), None)
     assert asked == [(MANY, {}, None)] and candidate.columns.shape == (MANY, 1)
-    assert (effects["own"].needs(record()), effects["own"].excited_by) == ("1 drivers", "driver")
+    assert (needs_of(effects["own"], record()), effects["own"].excited_by) == ("1 drivers", "driver")
 
 
 # Grounds of a record: excitation by its drivers, noise of its sensors, the course of a delayed sensor.

@@ -34,7 +34,6 @@ from fusion.analysis.drift_model.search import (
     Score,
     Step,
     exceeds_noise,
-    is_confirmed,
 )
 from fusion.analysis.effects.effect import Candidate, Prior
 from fusion.results.loop import AxisLoop, AxisStep, Baselines, DetectionLimit, ErrorInterval, ResidualTestsPart
@@ -478,7 +477,6 @@ def test_a_site_that_only_one_block_holds_is_left_out():
     ],
 )
 def test_an_effect_is_confirmed_by_a_share_of_the_error_beyond_the_noise(with_um, without_um, noise_um, confirmed):
-    assert is_confirmed(with_um, without_um, noise_um) is confirmed
     assert (doubt_of(with_um, without_um, noise_um, "on the hold-out set") == "") is confirmed
 
 
