@@ -273,29 +273,10 @@ def _remaining(difference: _Difference, state: Sequence[_Shape], positions: Arra
 _LEAST_FREEDOM = 2.0
 
 
-@dataclass(frozen=True)
-class ScatterChange:
-    """Change of the scatter at one position.
-
-    Attributes
-    ----------
-    position_mm : float
-    before_um, after_um : float
-        Standard deviation of a reading after profile and drift were subtracted, um.
-    p_value : float
-        Two-sided, of this position by itself.
-    """
-
-    position_mm: float
-    before_um: float
-    after_um: float
-    p_value: float
-
-
 def compare_scatters(
     position_mm: Array, before_um: Array, after_um: Array, before_freedom: Array, after_freedom: Array
-) -> list[ScatterChange]:
-    """Compare the scatter at every position of two tests."""
+) -> list[Change]:
+    """Compare the scatter at every position of two tests: standard deviation of a reading after profile and drift were subtracted, um."""
     used = (before_um > 0) & (after_um > 0) & (before_freedom >= _LEAST_FREEDOM) & (after_freedom >= _LEAST_FREEDOM)
     if used.sum() < 5:
         return []
@@ -309,9 +290,12 @@ def compare_scatters(
     f_ratio = np.exp(beyond) * special.fdtri(later, earlier, 0.5)
     p = 2.0 * np.minimum(special.fdtrc(later, earlier, f_ratio), special.fdtr(later, earlier, f_ratio))
     return [
-        ScatterChange(float(at), float(was), float(now), float(min(chance, 1.0)))
+        Change(
+            "scatter", "scatter", float(at), "um", Quantity(value=float(was), u=None), Quantity(value=float(now), u=None),
+            Quantity(value=float(now) / float(was), u=None), float(min(chance, 1.0)), True,
+        )
         for at, was, now, chance in zip(place, one, other, p, strict=True)
-    ]
+    ]  # fmt: skip
 
 
 #: Level at which something counts as changed, over everything that is compared.
@@ -479,22 +463,18 @@ def _profile(
     return found
 
 
-def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[Change]:
+def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]:
     """The scatter at positions that both campaigns have."""
     if before.drift is None or after.drift is None:
-        return
+        return []
     one, other = (campaign.drift.sortby("position") for campaign in (before, after) if campaign.drift is not None)
     gaps = np.abs(one["position"].values[:, None] - other["position"].values)
     first, second = np.nonzero(gaps <= SAME_POSITION_MM)
     one, other = one.isel(target=first), other.isel(target=second)
     freedom = [test["scatter_freedom"].sum("direction").values for test in (one, other)]
-    for found in compare_scatters(
+    return compare_scatters(
         one["position"].values, one["scatter_position"].values, other["scatter_position"].values, *freedom
-    ):
-        yield Change(
-            "scatter", "scatter", found.position_mm, "um", Quantity(value=found.before_um, u=None),
-            Quantity(value=found.after_um, u=None), Quantity(value=found.after_um / found.before_um, u=None), found.p_value, True,
-        )  # fmt: skip
+    )
 
 
 def _coefficients(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str]) -> Iterator[Change]:

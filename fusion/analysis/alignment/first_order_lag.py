@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
 from fusion.common import Array
-
-if TYPE_CHECKING:
-    pass
 
 
 @njit(cache=True)

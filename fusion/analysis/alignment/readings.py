@@ -200,6 +200,14 @@ class Readings:
         return replace(self, **{name: getattr(self, name)[keep] for name in per_reading}, places=None)
 
 
+def known_mean(values: Array, axis: int | None = None) -> Array:
+    """Mean over the values that are known, NaN where there is none."""
+    known = np.isfinite(values)
+    number = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
+
+
 def sample_noise(samples: Array) -> float:
     """Estimate the noise of single samples of a slow series from their second differences."""
     return float(scatter_by_median(np.diff(samples, 2)) / np.sqrt(6.0))

@@ -173,11 +173,9 @@ def lay_grid(seconds: Array, temperature: Array, drivers: Array | None) -> list[
     span = np.ptp(loads, axis=0)
     loads = (loads - loads.min(axis=0))[:, span > 0.0] / span[span > 0.0]
     loads = np.hstack([loads, loads**2])
-    lengths = [step * max(1, int(np.ceil(seconds.size / most))) for most in (FINE_BINS, BLOCKS)]
-    grids = [_grid(seconds, temperature, loads, length, is_fine=False) for length in lengths[1:]]
-    if lengths[0] < lengths[1]:
-        grids.insert(0, _grid(seconds, temperature, loads, lengths[0], is_fine=True))
-    return grids
+    fine, coarse = (step * max(1, int(np.ceil(seconds.size / most))) for most in (FINE_BINS, BLOCKS))
+    grids = [_grid(seconds, temperature, loads, fine, is_fine=True)] if fine < coarse else []
+    return [*grids, _grid(seconds, temperature, loads, coarse, is_fine=False)]
 
 
 def _grid(seconds: Array, temperature: Array, loads: Array, length: float, *, is_fine: bool) -> Grid:
@@ -423,8 +421,6 @@ def _without_signal(seconds: Array, temperature: Array) -> list[SensorFault]:
 
 def _longest_run(values: Array, wanted: float | None = None) -> tuple[int, int, int]:
     """Length of the longest run of equal values (of one value, where it is wanted), its first place, and the length of the next longest."""
-    if values.size == 0:
-        return 0, 0, 0
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     lengths = np.diff(np.r_[starts, values.size])
     if wanted is not None:
@@ -507,14 +503,12 @@ def _changed(grids: list[Grid], kept: Sequence[int]) -> list[SensorFault]:
 def _strongest(grids: list[Grid], sensor: int, others: list[int], sensors: int) -> _Suspicion:
     """The strongest excursion of a sensor from what others, loads and its past predict, over all durations."""
     limit = excursion_limit(sensors * sum(len(grid.durations()) for grid in grids))
-    chosen = None
+    chosen = _Suspicion(sensor, 0.0, Excursion(0, 0, 0, 0.0), grids[-1])
     for grid in grids:
         for duration in grid.durations():
             found = largest_excursion(predicted_changes(grid, sensor, others, duration))
-            if found is not None and (chosen is None or found.ratio / limit > chosen.excess):
+            if found is not None and found.ratio / limit > chosen.excess:
                 chosen = _Suspicion(sensor, found.ratio / limit, found, grid)
-    if chosen is None:
-        return _Suspicion(sensor, 0.0, Excursion(0, 0, 0, 0.0), grids[-1])
     return chosen
 
 

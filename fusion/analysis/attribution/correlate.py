@@ -406,13 +406,6 @@ def _naive_correlation(series: DriftSeries, field: FieldSeries) -> Array:
     return (values @ regressors) / np.where(size > 0, size, 1.0)
 
 
-def _session_verdict(result: AttributionResult, excitation: Excitation) -> int:
-    if excitation.warm_up_only:
-        return NOT_SEPARABLE
-    passed = any((test.p_value <= LEVEL).any() for test in result.sets.values())
-    return ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
-
-
 def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.Dataset:
     """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarm rates, verdict."""
     cells = result.sets["cells"]
@@ -426,7 +419,9 @@ def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.D
         "cells_false_alarm_rate": cells.false_alarm_rate,
         "warm_up_share": excitation.warm_up_share,
     }
-    verdict = _FLAG_MEANINGS.split()[_session_verdict(result, excitation)].replace("_", " ")
+    passed = any((test.p_value <= LEVEL).any() for test in result.sets.values())
+    flag = NOT_SEPARABLE if excitation.warm_up_only else ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
+    verdict = _FLAG_MEANINGS.split()[flag].replace("_", " ")
     return xr.Dataset(
         {name: _variable(name, value) for name, value in values.items()},
         coords={"channel": list(cells.names)},

@@ -7,6 +7,7 @@ The same weights are applied to the temperature at the time of each reading, so 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,10 @@ class DriftSeries:
     seconds: Array
     cycle: NDArray[np.int64]
     sampling: Array
+
+    def lagged_sampling(self, operators: Sequence[Array]) -> Array:
+        """How it samples the field under every lag, (lags, n, frames)."""
+        return np.stack([self.sampling @ operator for operator in operators])
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.attribution.drift_channels import MIN_CYCLES
 from fusion.analysis.attribution.modes import warm_up_columns
 from fusion.analysis.attribution.significance import (
@@ -220,7 +221,7 @@ def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residu
 def _without_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -> Array:
     """Return deviations (cycle, direction, target) less each target's mean and each pass's level and stretch, by backfitting."""
     present = np.isfinite(deviation)
-    rest = deviation - _mean_over_cycles(deviation)
+    rest = deviation - np.nan_to_num(known_mean(deviation, axis=0))
     for _ in range(50):
         passes = np.zeros_like(deviation)
         for index in np.ndindex(deviation.shape[:2]):
@@ -229,17 +230,11 @@ def _without_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -
                 passes[index] = design @ np.linalg.lstsq(design[used], rest[index][used], rcond=None)[0]
             else:
                 passes[index] = np.nan
-        profile = _mean_over_cycles(rest - passes)
+        profile = np.nan_to_num(known_mean(rest - passes, axis=0))
         rest = rest - profile
         if np.abs(profile).max() < 1e-6:
             break
     return rest - passes
-
-
-def _mean_over_cycles(values: Array) -> Array:
-    """Return the mean over the first dimension without NaN, 0 where there is nothing else."""
-    finite = np.isfinite(values)
-    return np.asarray(np.where(finite, values, 0.0).sum(axis=0) / np.maximum(finite.sum(axis=0), 1), float)
 
 
 def _typical_scatter(residuals: Array, design: Array, sound: NDArray[np.bool_], column: int) -> float:

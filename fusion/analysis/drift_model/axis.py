@@ -30,6 +30,7 @@ from fusion.analysis.drift_model.admissibility import (
     CandidateScorer,
     evaluate_on_hold_out,
     inconsistent_patterns,
+    prior_rows,
     refuse,
     refuse_in_heteroscedastic_drift,
     warm_up_share,
@@ -800,11 +801,7 @@ def _left_out(model: ModelFit, block: NDArray[np.bool_]) -> Array:
     system = replace(fit.system, observed=~block)
     columns = np.column_stack([fit.response, fit.design])
     whitened, _ = system.whiten(columns)
-    y, x = whitened[:, :1], whitened[:, 1:]
-    for place, prior in model.priors():
-        row = np.zeros((1, x.shape[1]))
-        row[0, place] = fit.sigma / prior.u
-        y, x = np.vstack([y, [[fit.sigma * prior.mean / prior.u]]]), np.vstack([x, row])
+    y, x = prior_rows(model).append(whitened[:, :1], whitened[:, 1:])
     coefficients = solve(x.T @ x, x.T @ y)[:, 0]
     levels = system.smooth(columns).levels
     drift = np.einsum("nc,ncp->np", fit.system.loadings, levels)

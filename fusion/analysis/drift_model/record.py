@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
 from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
@@ -150,19 +151,9 @@ def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
     return float(known_mean(channel_rmse(record, predicted, where)))
 
 
-def known_mean(values: Array, axis: int | None = None) -> Array:
-    """Mean over the values that are known, NaN where there is none."""
-    known = np.isfinite(values)
-    number = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
-    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
-
-
 def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
     """Root mean square error of every channel over some blocks."""
-    squares = (record.displacement - predicted)[where] ** 2
-    number = np.isfinite(squares).sum(axis=0)
-    return np.asarray(np.sqrt(np.where(number > 0, np.nansum(squares, axis=0) / np.maximum(number, 1), np.nan)))
+    return np.asarray(np.sqrt(known_mean((record.displacement - predicted)[where] ** 2, axis=0)))
 
 
 def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array, Array]]:
@@ -244,15 +235,13 @@ def _named(runs: Sequence[str]) -> str:
 
 def declare(declared: Sequence[str], record: Record) -> list[Term]:
     """Make the terms of the declared model."""
-    terms = []
     for name in declared:
         if name != QUASI_STATIC:
             raise RecordError(
                 f'declared effect {name!r} cannot be computed from a record; declare "{QUASI_STATIC}" (every displacement linear '
                 "in the temperatures), the search tries the rest of the library"
             )
-        terms += [Term(QUASI_STATIC, one) for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
-    return terms
+    return [Term(name, one) for name in declared for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
 
 
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
@@ -271,7 +260,6 @@ class RecordFit:
     terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
     channels : the generalised least-squares fit of every channel under its own drift
     rows : the blocks of each channel's fit, as indices
-    levels : number of each channel's constants, the first columns of its design: one for every run
     """
 
     record: Record
@@ -279,7 +267,11 @@ class RecordFit:
     terms: tuple[Term, ...]
     channels: tuple[DriftFit, ...]
     rows: tuple[NDArray[np.intp], ...]
-    levels: tuple[int, ...]
+
+    @property
+    def levels(self) -> list[int]:
+        """Number of each channel's constants, the first columns of its design: one for every run."""
+        return [np.unique(self.record.run[rows]).size for rows in self.rows]
 
     @property
     def sigma(self) -> Array:
@@ -299,11 +291,11 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
     columns = np.concatenate([columns_of(record, []), *parts], axis=1)
     columns = columns[:, independent(columns[used])]
     rng = np.random.default_rng(0)
-    fits, rows, levels = [], [], []
+    fits, rows = [], []
     for k, name in enumerate(record.channels):
         response = record.displacement[:, k]
         here = np.flatnonzero(used & np.isfinite(response))
-        design, constants = _with_levels(record, columns, here)
+        design = _with_levels(record, columns, here)
         if here.size < _LEAST_PER_COEFFICIENT * design.shape[1]:
             raise RecordError(
                 f'channel "{name}" has {here.size} blocks for a model of {design.shape[1]} coefficients; record for longer, or leave it '
@@ -313,8 +305,7 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
         shaken = response[here] + 1e-6 * np.ptp(response[here]) * rng.standard_normal(here.size)
         fits.append(_estimate(name, record.seconds[here], shaken, design))
         rows.append(here)
-        levels.append(constants)
-    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows), tuple(levels))
+    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows))
 
 
 def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> DriftFit:
@@ -332,15 +323,15 @@ def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> D
         ) from None
 
 
-def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> tuple[Array, int]:
-    """Design of one channel at its blocks: a constant for every run, then the columns; and the number of constants."""
+def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> Array:
+    """Design of one channel at its blocks: a constant for every run, then the columns."""
     run = record.run[here]
     later = np.unique(run)[1:]
     if not later.size:
-        return np.column_stack([np.ones(here.size), columns[here]]), 1
+        return np.column_stack([np.ones(here.size), columns[here]])
     levels = (run[:, None] == later).astype(float)
     both = np.column_stack([levels, columns[here]])
-    return np.column_stack([np.ones(here.size), both[:, independent(both)]]), 1 + later.size
+    return np.column_stack([np.ones(here.size), both[:, independent(both)]])
 
 
 def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:

@@ -26,7 +26,7 @@ from fusion.analysis.attribution.significance import (
     whitening_grid,
 )
 
-VARIED = Excitation(0.5, False, 3)
+VARIED = Excitation(0.5, False)
 SECONDS = np.arange(60) * 252.0
 
 

@@ -447,7 +447,7 @@ def test_a_users_effect_sees_the_record_as_readings_of_one_place():
 
 def quiet(record: Record, used: np.ndarray | None = None) -> RecordFit:
     """A record and which of its blocks are used: what most grounds are asked of needs no fit."""
-    return RecordFit(record, np.ones(MANY, bool) if used is None else used, (), (), (), ())
+    return RecordFit(record, np.ones(MANY, bool) if used is None else used, (), (), ())
 
 
 def switching() -> np.ndarray:
