@@ -41,14 +41,11 @@ class ShapeChange:
 
     Attributes
     ----------
-    shape : {"slope", "bow", "mean reversal", "position", "reversal at a position"}
-        Slope: over the whole travel. Bow: height of a parabola over the travel. Position: both approaches together.
-    change_um, u_um : float
-        After minus before, um, and its standard uncertainty.
-    p_value : float
-        Of this change by itself, two-sided.
-    machine : bool
-        Whether no thermal state gives it, so that the machine or the set-up must have changed.
+    shape : {"slope", "bow", "mean reversal", "position", "reversal at a position"}; slope: over the whole travel; bow: height of a
+        parabola over the travel; position: both approaches together
+    change_um, u_um : after minus before, um, and its standard uncertainty
+    p_value : of this change by itself, two-sided
+    machine : whether no thermal state gives it, so that the machine or the set-up must have changed
     """
 
     shape: str
@@ -65,16 +62,12 @@ class ProfileChange:
 
     Attributes
     ----------
-    position_mm : (n,) ndarray
-        Positions that both tests have, mm.
-    left_out : int
-        Positions that one test has alone.
-    remaining_um, remaining_u_um : (n,) ndarray
-        Difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and its standard uncertainty.
-    shapes : tuple of ShapeChange
-        Slope, bow and mean reversal, then the single positions beyond the family-wise level, the strongest first.
-    tests : int
-        How many shapes were tried.
+    position_mm : (n,) positions that both tests have, mm
+    left_out : positions that one test has alone
+    remaining_um, remaining_u_um : (n,) difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and
+        its standard uncertainty
+    shapes : slope, bow and mean reversal, then the single positions beyond the family-wise level, the strongest first
+    tests : how many shapes were tried
     """
 
     position_mm: Array
@@ -310,10 +303,8 @@ class ComparedCampaign:
 
     Attributes
     ----------
-    axis : str
-        Name of the measured axis; empty where the run does not tell.
-    drift : Dataset or None
-        Joint estimate with ``position`` (target; mm); None where there are no readings with times.
+    axis : name of the measured axis; empty where the run does not tell
+    drift : joint estimate with ``position`` (target; mm); None where there are no readings with times
     """
 
     folder: Path
@@ -334,16 +325,11 @@ class Change:
 
     Attributes
     ----------
-    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}
-        What it belongs to.
-    before, after : Quantity or None
-        In both campaigns; None for a change of shape, which has no value of its own.
-    change : Quantity
-        After minus before; of a scatter the ratio, without unit.
-    p_value : float
-        Two-sided, family-wise over everything that is compared.
-    machine : bool
-        Whether no thermal state of the test gives it, so that the machine or the set-up must have changed.
+    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}; what it belongs to
+    before, after : in both campaigns; None for a change of shape, which has no value of its own
+    change : after minus before; of a scatter the ratio, without unit
+    p_value : two-sided, family-wise over everything that is compared
+    machine : whether no thermal state of the test gives it, so that the machine or the set-up must have changed
     """
 
     quantity: str
@@ -368,12 +354,9 @@ class PairComparison:
 
     Attributes
     ----------
-    profile : ProfileChange or None
-        Difference of the profiles; None where they cannot be compared.
-    not_compared : tuple of str
-        What cannot be compared, and why, one sentence each.
-    tests : int
-        Tests of the family, over all campaigns.
+    profile : difference of the profiles; None where they cannot be compared
+    not_compared : what cannot be compared, and why, one sentence each
+    tests : tests of the family, over all campaigns
     """
 
     before: ComparedCampaign

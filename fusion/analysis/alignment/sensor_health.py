@@ -44,18 +44,12 @@ class Grid:
 
     Attributes
     ----------
-    seconds : (n,) ndarray, s
-        Middle of each step.
-    step_s : float, s
-        Length of a step.
-    temperature : (n, sensors) ndarray, degC
-        Interpolated where nothing was read.
-    known : (n, sensors) ndarray of bool
-        Where something was read.
-    drivers : (n, k) ndarray
-        Loads as shares of their range, and their squares.
-    is_fine : bool
-        Whether it is the fine grid.
+    seconds : (n,) middle of each step, s
+    step_s : length of a step, s
+    temperature : (n, sensors) interpolated where nothing was read, degC
+    known : (n, sensors) True where something was read
+    drivers : (n, k) loads as shares of their range, and their squares
+    is_fine : whether it is the fine grid
     """
 
     seconds: Array
@@ -137,14 +131,10 @@ class Changes:
 
     Attributes
     ----------
-    before, after : (m,) ndarray of int
-        Last step before and first step after each change.
-    residual : (m,) ndarray, K
-        What is left of the change by the prediction.
-    reach : int
-        Steps within which two changes share samples.
-    least_K : float
-        Resolution of the sensor.
+    before, after : (m,) last step before and first step after each change
+    residual : (m,) what is left of the change by the prediction, K
+    reach : steps within which two changes share samples
+    least_K : resolution of the sensor
     """
 
     before: NDArray[np.intp]
@@ -329,20 +319,13 @@ class SensorFault:
 
     Attributes
     ----------
-    sensor : int
-        Place among the sensors.
-    kind : Kind
-        What it does.
-    is_clear : bool
-        Whether nothing that a machine does looks like it; else the sensor is suspected.
-    onset_s, onset_u_s : float, s
-        When it began, since the first sample, and the standard uncertainty of that.
-    size : float
-        Change beyond the prediction, K; of noise its ratio, 1; nan of a signal that is none.
-    ratio, limit : float
-        Excursion over the next largest of the sensor, and the limit; nan where none is compared.
-    reason : str
-        Why it is only suspected; empty where it is clear.
+    sensor : place among the sensors
+    kind : what it does
+    is_clear : whether nothing that a machine does looks like it; else the sensor is suspected
+    onset_s, onset_u_s : when it began, since the first sample, and the standard uncertainty of that, s
+    size : change beyond the prediction, K; of noise its ratio, 1; nan of a signal that is none
+    ratio, limit : excursion over the next largest of the sensor, and the limit; nan where none is compared
+    reason : why it is only suspected; empty where it is clear
     """
 
     sensor: int

@@ -68,10 +68,8 @@ class Shift:
 
     Attributes
     ----------
-    seconds : float, s
-        By how much the log is late.
-    left, left_within : float
-        What the shift leaves unexplained, and what the best delay of physics leaves, as shares of the standard deviation.
+    seconds : by how much the log is late, s
+    left, left_within : what the shift leaves unexplained, and what the best delay of physics leaves, as shares of the standard deviation
     """
 
     seconds: float
@@ -196,14 +194,10 @@ class _Rate:
 
     Attributes
     ----------
-    seconds : (n + 1,) ndarray, s
-        Times of the frames.
-    weight : (n,) ndarray
-        One over the square root of each step.
-    trend : (n, 3) ndarray
-        Orthonormal columns of a steady rate and of a warm-up before the log.
-    modes : (n, 2) ndarray
-        The increments.
+    seconds : (n + 1,) times of the frames, s
+    weight : (n,) one over the square root of each step
+    trend : (n, 3) orthonormal columns of a steady rate and of a warm-up before the log
+    modes : (n, 2) the increments
     """
 
     seconds: Array

@@ -13,10 +13,8 @@ class CauseRecord:
 
     Attributes
     ----------
-    words : str
-        Name in words.
-    check : str
-        What to inspect on the machine, or how to repeat the test; one sentence.
+    words : name in words
+    check : what to inspect on the machine, or how to repeat the test; one sentence
     """
 
     words: str

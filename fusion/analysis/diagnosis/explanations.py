@@ -52,18 +52,12 @@ class DirectionParts:
 
     Attributes
     ----------
-    rows : (n,) integer ndarray
-        Indices of the cycles used.
-    mean : (n,) ndarray, um times `unit`
-        Sum of the directions over the square root of 2, or the only direction.
-    difference : (n,) ndarray or None, um times `unit`
-        Difference of the directions over the square root of 2.
-    sides : (2, n) ndarray or None, um
-        Positive and negative direction.
-    unit : float
-        Factor between `mean` and the average of the directions: square root of 2, or 1 for a single direction.
-    grid : Grid
-        Whitenings under every random walk considered, for the times of these cycles.
+    rows : (n,) indices of the cycles used
+    mean : (n,) sum of the directions over the square root of 2, or the only direction, um times `unit`
+    difference : (n,) difference of the directions over the square root of 2, um times `unit`; None of a single direction, as `sides`
+    sides : (2, n) positive and negative direction, um
+    unit : factor between `mean` and the average of the directions: square root of 2, or 1 for a single direction
+    grid : whitenings under every random walk considered, for the times of these cycles
     """
 
     rows: NDArray[np.int64]
@@ -80,18 +74,12 @@ class Residual:
 
     Attributes
     ----------
-    target : int
-        Target number, from 1.
-    seconds : (cycles,) ndarray, s
-        Mean time of the target's readings in each cycle since the first reading.
-    values : (2, cycles) ndarray, um
-        Residual in the positive and in the negative direction, NaN where missing.
-    cycle : (cycles,) integer ndarray
-        Cycle numbers.
-    typical_um : float, um
-        Robust standard deviation that this target would have if it scattered like the others.
-    temperature : tuple of two (frames,) ndarray, or None
-        Times, s, and local temperature rise, K; None where the camera does not see the target.
+    target : target number, from 1
+    seconds : (cycles,) mean time of the target's readings in each cycle since the first reading, s
+    values : (2, cycles) residual in the positive and in the negative direction, NaN where missing, um
+    cycle : (cycles,) cycle numbers
+    typical_um : robust standard deviation that this target would have if it scattered like the others, um
+    temperature : (frames,) each, times, s, and local temperature rise, K; None where the camera does not see the target
     """
 
     target: int
@@ -135,19 +123,13 @@ class ProfileFit:
 
     Attributes
     ----------
-    log_likelihood : float, nats
-        Of the mean and the difference of the directions together.
-    p_value : float
-        Parametric bootstrap over all candidates, against white noise plus random walk.
-    best : int
-        Index of the best candidate (lag or step).
-    coefficient, coefficient_u : float, um/K or um
-        Its coefficient, with standard uncertainty, for the average of the directions.
-    by_direction : tuple of two floats, um/K or um
-        Its coefficient in each direction alone, NaN where one was not read.
-    hold_out_gain : float, nats
-        Log-likelihood gained in each direction by the candidate and the coefficient fitted to the other, sum of both; NaN where only
-        one direction was read.
+    log_likelihood : of the mean and the difference of the directions together, nats
+    p_value : parametric bootstrap over all candidates, against white noise plus random walk
+    best : index of the best candidate (lag or step)
+    coefficient, coefficient_u : its coefficient, with standard uncertainty, for the average of the directions, um/K or um
+    by_direction : its coefficient in each direction alone, NaN where one was not read, um/K or um
+    hold_out_gain : log-likelihood gained in each direction by the candidate and the coefficient fitted to the other, sum of both, nats;
+        NaN where only one direction was read
     """
 
     log_likelihood: float
@@ -165,12 +147,9 @@ class RandomWalkFit:
 
     Attributes
     ----------
-    white : float
-        White noise alone.
-    shared : float
-        A random walk that both directions share.
-    one_direction : float
-        A random walk in one direction only; minus infinity where one was not read.
+    white : white noise alone
+    shared : a random walk that both directions share
+    one_direction : a random walk in one direction only; minus infinity where one was not read
     """
 
     white: float
@@ -374,13 +353,10 @@ class ScatterFit:
 
     Attributes
     ----------
-    both : float
-        Excess scatter equal in both directions, Gaussian or with rare large values.
-    one_direction : float
-        Excess scatter in one direction only.
-    along_approach : float
-        One-sided, exponentially distributed amounts along the direction of motion, short of the target (as of a carriage that sticks)
-        or beyond it.
+    both : excess scatter equal in both directions, Gaussian or with rare large values
+    one_direction : excess scatter in one direction only
+    along_approach : one-sided, exponentially distributed amounts along the direction of motion, short of the target (as of a carriage
+        that sticks) or beyond it
     """
 
     both: float

@@ -117,23 +117,26 @@ def test_what_cannot_be_diagnosed_is_named(rng, flags, cycles, message):
         diagnose(fused, [Flag(target) for target in flags])
 
 
+EQUAL = "standard deviations equal within their uncertainty: "
+BOTH = "1.00 µm in the positive direction, {:.2f} µm in the negative direction"
+
+
 @pytest.mark.parametrize(
-    ("negative_um", "sentence"),
+    ("readings", "negative_um", "sentence"),
     [
         # 51 readings each: u = s / 10, so that 1.00 and 1.30 differ by 0.30 and agree within 2 * hypot(0.10, 0.13) = 0.33.
-        (
-            1.3,
-            "standard deviations equal within their uncertainty: 1.00 µm in the positive direction, 1.30 µm in the negative direction",
-        ),
-        (1.4, "standard deviation 1.00 µm in the positive direction, 1.40 µm in the negative direction"),
-        (np.nan, "directions not compared: fewer than two readings in one of them"),
+        (51, 1.3, EQUAL + BOTH),
+        (51, 1.4, "standard deviation " + BOTH),
+        (51, np.nan, "directions not compared: fewer than two readings in one of them"),
+        # Nine readings each, eight degrees of freedom: u = s / 4, so that 1.00 and 0.46 agree within 2 * hypot(0.25, 0.115) = 0.55.
+        (9, 0.46, EQUAL + BOTH),
+        (9, 0.44, "standard deviation " + BOTH),
     ],
 )
-def test_directions_are_called_equal_only_within_their_uncertainty(negative_um, sentence):
-    row = np.resize([1.0, -1.0], 51)
-    row /= row.std()
+def test_directions_are_called_equal_only_within_their_uncertainty(readings, negative_um, sentence):
+    row = np.resize([1.0, -1.0], readings)
     residual = SimpleNamespace(values=np.stack([row, negative_um * row]), scatter_um=(1.0, negative_um))
-    assert _directions_sentence(residual) == sentence
+    assert _directions_sentence(residual) == sentence.format(negative_um)
 
 
 def fitted(**changes):
@@ -223,14 +226,6 @@ def test_a_walk_in_one_direction_pays_for_its_parameter_and_its_bar():
     case.random_walk.one_direction = 2.0 + 0.5 * np.log(100) + 1.0
     probability = _probabilities(case)
     assert probability["stick_slip"] / probability["structural"] == pytest.approx(np.e)
-
-
-def test_few_readings_have_their_degrees_of_freedom():
-    """Nine readings each, eight degrees of freedom: u = s / 4, so that 1.00 and 0.46 agree within 2 * hypot(0.25, 0.115) = 0.55."""
-    row = np.resize([1.0, -1.0], 9)
-    for negative_um, equal in ((0.46, True), (0.44, False)):
-        residual = SimpleNamespace(values=np.stack([row, row]), scatter_um=(1.0, negative_um))
-        assert _directions_sentence(residual).startswith("standard deviations equal") is equal
 
 
 def test_the_gain_of_an_approach_is_that_of_the_better_of_its_two_forms():

@@ -453,14 +453,6 @@ def test_unusable_columns_of_a_user_are_recorded_and_those_of_the_library_raised
     assert decision.evidence["because"] == f"SearchError: {fault.value}"
 
 
-def test_any_fault_of_a_users_effect_is_recorded():
-    def broken():
-        raise KeyError("no such series")
-
-    families, (decision,) = collect_candidates({"own": broken}, 3, built_in=frozenset())
-    assert families == {} and decision.sentence.endswith("KeyError: 'no such series'")
-
-
 def test_columns_of_many_candidates_are_kept_on_disk_with_the_same_values(monkeypatch, rng):
     for module in (scoring_module, spool_module):
         monkeypatch.setattr(module, "IN_MEMORY_BYTES", 200)
