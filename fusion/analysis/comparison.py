@@ -36,27 +36,6 @@ class ComparisonError(FusionError):
 
 
 @dataclass(frozen=True)
-class ShapeChange:
-    """One shape by which the profile differs between two tests.
-
-    Attributes
-    ----------
-    shape : {"slope", "bow", "mean reversal", "position", "reversal at a position"}; slope: over the whole travel; bow: height of a
-        parabola over the travel; position: both approaches together
-    change_um, u_um : after minus before, um, and its standard uncertainty
-    p_value : of this change by itself, two-sided
-    machine : whether no thermal state gives it, so that the machine or the set-up must have changed
-    """
-
-    shape: str
-    position_mm: float | None
-    change_um: float
-    u_um: float
-    p_value: float
-    machine: bool
-
-
-@dataclass(frozen=True)
 class ProfileChange:
     """How the profile differs between two tests.
 
@@ -66,7 +45,8 @@ class ProfileChange:
     left_out : positions that one test has alone
     remaining_um, remaining_u_um : (n,) difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and
         its standard uncertainty
-    shapes : slope, bow and mean reversal, then the single positions beyond the family-wise level, the strongest first
+    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then the single positions (of
+        both approaches together, or their reversal) beyond the family-wise level, the strongest first
     tests : how many shapes were tried
     """
 
@@ -74,13 +54,13 @@ class ProfileChange:
     left_out: int
     remaining_um: Array
     remaining_u_um: Array
-    shapes: tuple[ShapeChange, ...]
+    shapes: tuple[Change, ...]
     tests: int
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """A shape over the cells (direction, target) of both tests; `machine` as in `ShapeChange`."""
+    """A shape over the cells (direction, target) of both tests; `machine` as in `Change`."""
 
     name: str
     position_mm: float | None
@@ -133,7 +113,10 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     size, covariance = difference.fit(reported)
     u = np.sqrt(np.diag(covariance))
     shapes = tuple(
-        ShapeChange(shape.name, shape.position_mm, float(size[k]), float(u[k]), difference.p_value(size[k] / u[k]), shape.machine)
+        Change(
+            shape.name, "profile", shape.position_mm, "um", None, None, Quantity(value=float(size[k]), u=float(u[k])),
+            difference.p_value(size[k] / u[k]), shape.machine,
+        )
         for k, shape in enumerate(reported)
         if shape.name not in ("offset", "drift")
     )  # fmt: skip
@@ -395,14 +378,7 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int) -
     changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *_standard(before, after, lacks)]
     profile = _profile(before, after, lacks, pairs=pairs, tests=len(changes) + 2)
     if profile is not None:
-        shapes = [
-            Change(
-                one.shape, "profile", one.position_mm, "um", None, None,
-                Quantity(value=one.change_um, u=one.u_um), one.p_value, one.machine,
-            )
-            for one in profile.shapes
-        ]  # fmt: skip
-        changes = [*shapes, *changes]
+        changes = [*profile.shapes, *changes]
     tests = pairs * (len(changes) if profile is None else len(changes) - len(profile.shapes) + 2 + profile.tests)
     familywise = tuple(replace(change, p_value=min(1.0, change.p_value * tests)) for change in changes)
     return PairComparison(before, after, familywise, profile, tuple(lacks), tests)
