@@ -84,14 +84,12 @@ class Prediction:
     ----------
     predicted : (blocks, channels) um
     coefficients : (p, channels) of the columns, um per unit of each
-    centre : (p,) values of the columns at which the prediction is the channel's mean
     penalty : the shrinkage that forward chaining chose
     chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN where there is none
     """
 
     predicted: Array
     coefficients: Array
-    centre: Array
     penalty: float
     chained_rmse: float
 
@@ -101,7 +99,7 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
     asked = folds(record, train)
     errors = np.full((len(asked), PENALTIES.size), np.nan)
     for place, (before, part) in enumerate(asked):
-        for k, (predicted, _, _) in enumerate(_paths(record, columns, before)):
+        for k, (predicted, _) in enumerate(_paths(record, columns, before)):
             errors[place, k] = rmse(record, predicted, part)
     mean = known_mean(errors, axis=0)
     best = int(np.argmin(mean)) if np.isfinite(mean).all() else PENALTIES.size // 2
@@ -156,8 +154,8 @@ def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> 
     return np.asarray(np.sqrt(known_mean((record.displacement - predicted)[where] ** 2, axis=0)))
 
 
-def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array, Array]]:
-    """Predictions (blocks, channels), coefficients (p, channels) and centre (p,) under every penalty."""
+def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array]]:
+    """Predictions (blocks, channels) and coefficients (p, channels) under every penalty."""
     centre, scale = columns[train].mean(axis=0), columns[train].std(axis=0)
     scale = np.where(scale > 0.0, scale, np.inf)
     standard = (columns - centre) / scale
@@ -172,7 +170,7 @@ def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tup
         projected = vectors.T @ ((x - offset).T @ (y - middle) / here.sum())
         coefficients[:, :, channel] = (projected / (np.maximum(values, 0.0) + PENALTIES[:, None])) @ vectors.T
         levels[:, channel] = middle - coefficients[:, :, channel] @ offset
-    return [(standard @ one + levels[k], one / scale[:, None], centre) for k, one in enumerate(coefficients)]
+    return [(standard @ one + levels[k], one / scale[:, None]) for k, one in enumerate(coefficients)]
 
 
 # Plain predictions of a record's hold-out set, which the model has to beat: last value, mean, and regressions on all

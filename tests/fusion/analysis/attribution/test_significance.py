@@ -36,7 +36,7 @@ def walks(rng, columns):
 
 
 def drift(name, values):
-    return DriftSeries(name, values, np.ones(60), SECONDS, np.arange(1, 61), np.eye(60))
+    return DriftSeries(name, values, np.ones(60), SECONDS, np.eye(60))
 
 
 def evaluate(rng, values, candidates, **changes):

@@ -162,7 +162,7 @@ def test_an_effect_must_earn_its_place_on_later_parts_and_an_event_must_not_harm
     near = [asked.best]
     monkeypatch.setattr(problem, "near", lambda name, model, chosen: near)
     nothing = np.empty(0)
-    monkeypatch.setattr(problem, "predict", lambda terms: Prediction(nothing, nothing, nothing, 1.0, after))
+    monkeypatch.setattr(problem, "predict", lambda terms: Prediction(nothing, nothing, 1.0, after))
     state = problem.start([]).scored(Round((asked,), start_error_um=2.0))
     confirmation = problem.confirm(asked, state).confirmation
     assert confirmation.passed is passed

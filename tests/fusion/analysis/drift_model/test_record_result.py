@@ -66,8 +66,8 @@ def result(*, shape: str = "") -> RecordResult:
         hold_out=np.array([False, False, True, True]),
         held_out="1.0 h to 2.0 h held out",
         predictions=[
-            Prediction(nothing, coefficients[:2], np.zeros(2), 1.0, 0.8),
-            Prediction(nothing, coefficients, np.zeros(3), 1.0, 0.4),
+            Prediction(nothing, coefficients[:2], 1.0, 0.8),
+            Prediction(nothing, coefficients, 1.0, 0.4),
         ],
         errors=np.array([[1.0, 3.0], [0.5, np.nan]]),
         plain={name: np.full((4, 2), [4.0, 6.0]) for name in Baselines.model_fields},
