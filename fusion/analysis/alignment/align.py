@@ -257,30 +257,13 @@ def rise_since_first(frames: Array | xr.DataArray) -> Iterator[Array]:
 
 
 class MeasuredLine:
-    """The measured line on the plan, sampled four times per cell, and averaged across its width.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Plan coordinates ``x`` and ``y``, mm, evenly spaced.
-    axis : AxisGeometry
-        Where the line lies.
-    position_mm : (target,) ndarray, mm
-        Axis positions of the targets.
+    """The measured line on an evenly spaced plan, sampled four times per cell, and averaged across its width; it must not leave the plan.
 
     Attributes
     ----------
-    along_mm : (sample,) ndarray, mm
-        Axis positions of the samples; position 0 and every target are among them.
-    nearest : (target,) ndarray of int
-        Index of the sample at every target.
-    reach : int
-        Number of samples on either side that a point average takes.
-
-    Raises
-    ------
-    AlignmentError
-        If the line leaves the plan.
+    along_mm : (sample,) axis positions of the samples, mm; position 0 and every target are among them
+    nearest : (target,) index of the sample at every target
+    reach : number of samples on either side that a point average takes
     """
 
     def __init__(self, fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> None:

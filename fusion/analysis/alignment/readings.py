@@ -60,7 +60,7 @@ class Series:
         ]
 
     def lagged(self, time_constant_s: float, *, at_rest: float | None = None) -> Series:
-        """Return the response of a first-order system to the series; see `fusion.analysis.alignment.readings.respond`."""
+        """Return the response of a first-order system to the series; see `fusion.analysis.alignment.first_order_lag.respond`."""
         if time_constant_s <= 0.0:
             return self
         if len(self.first) > 1:
@@ -81,10 +81,8 @@ class Gap:
 
     Attributes
     ----------
-    series : str
-        Name of the series.
-    start_s, end_s : float, s
-        Times of the samples on either side, since the first reading.
+    series : its name
+    start_s, end_s : times of the samples on either side, since the first reading, s
     """
 
     series: str
