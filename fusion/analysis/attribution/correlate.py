@@ -63,8 +63,15 @@ IN_MODE = 0.5
 
 def piece_with_peak(strength: Array, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the connected piece of cells that holds the strongest one."""
-    labels, _ = ndimage.label(inside, np.ones((3, 3)))
-    return np.asarray(labels == labels[np.unravel_index(int(strength.argmax()), strength.shape)], bool)
+    return _pieces(strength, inside)[0]
+
+
+def _pieces(strength: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[tuple[np.intp, ...]]]:
+    """The connected piece of cells with the strongest one, and the strongest cell of every other piece."""
+    labels, count = ndimage.label(inside, np.ones((3, 3)))
+    leading = labels[np.unravel_index(int(strength.argmax()), strength.shape)]
+    others = (np.where(labels == label, strength, -np.inf) for label in range(1, count + 1) if label != leading)
+    return labels == leading, [np.unravel_index(int(other.argmax()), strength.shape) for other in others]
 
 
 def mode_cells(pattern: Array) -> NDArray[np.bool_]:
@@ -501,24 +508,15 @@ def _surroundings(
     modes = maps.children["modes"].to_dataset()
     pattern = np.abs(np.nan_to_num(modes["pattern"].sel(mode=int(best["mode"])).values))
     _, elsewhere = _split(pattern, pattern >= _PEAK, plan)
-    inside, _ = _split(pattern, pattern >= IN_MODE, plan)
-    return inside, [*elsewhere, *others]
+    return mode_cells(pattern), [*elsewhere, *others]
 
 
 def _split(
     strength: Array, equal: NDArray[np.bool_], plan: xr.Dataset
 ) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
     """The connected piece of equal cells with the strongest one, and the strongest cell (x, y in mm) of every other piece."""
-    labels, count = ndimage.label(equal, np.ones((3, 3)))
-    row, column = np.unravel_index(int(strength.argmax()), strength.shape)
-    leading = int(labels[row, column])
-    others = []
-    for label in range(1, count + 1):
-        if label == leading:
-            continue
-        place = np.unravel_index(int(np.where(labels == label, strength, -np.inf).argmax()), strength.shape)
-        others.append((float(plan["x"][place[1]]), float(plan["y"][place[0]])))
-    return labels == leading, others
+    piece, others = _pieces(strength, equal)
+    return piece, [(float(plan["x"][column]), float(plan["y"][row])) for row, column in others]
 
 
 def recommend_measurement(maps: xr.DataTree, source: SourcePart) -> str:

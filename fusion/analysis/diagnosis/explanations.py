@@ -19,7 +19,7 @@ from scipy import special
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.attribution.drift_channels import MIN_CYCLES
-from fusion.analysis.attribution.modes import warm_up_columns
+from fusion.analysis.attribution.modes import level_and_trend, warm_up_columns
 from fusion.analysis.attribution.significance import (
     Grid,
     estimate_effects,
@@ -331,8 +331,7 @@ def serial_p_value(residual: Residual, rng: np.random.Generator) -> float:
 
 def warm_up_share(seconds: Array, temperature: Array) -> float:
     """Return the share of a temperature's variance that one warm-up explains: a trend and exponentials from the first value on."""
-    trend = (seconds - seconds.mean()) / np.ptp(seconds)
-    design = np.column_stack([np.ones_like(seconds), trend, warm_up_columns(seconds)])
+    design = np.column_stack([level_and_trend(seconds), warm_up_columns(seconds)])
     centred = temperature - temperature.mean()
     rest = centred - design @ np.linalg.lstsq(design, centred, rcond=None)[0]
     return 1.0 - float((rest @ rest) / max(float(centred @ centred), 1e-30))
