@@ -36,58 +36,31 @@ class ComparisonError(FusionError):
 
 
 @dataclass(frozen=True)
-class ShapeChange:
-    """One shape by which the profile differs between two tests.
-
-    Attributes
-    ----------
-    shape : {"slope", "bow", "mean reversal", "position", "reversal at a position"}
-        Slope: over the whole travel. Bow: height of a parabola over the travel. Position: both approaches together.
-    change_um, u_um : float
-        After minus before, um, and its standard uncertainty.
-    p_value : float
-        Of this change by itself, two-sided.
-    machine : bool
-        Whether no thermal state gives it, so that the machine or the set-up must have changed.
-    """
-
-    shape: str
-    position_mm: float | None
-    change_um: float
-    u_um: float
-    p_value: float
-    machine: bool
-
-
-@dataclass(frozen=True)
 class ProfileChange:
     """How the profile differs between two tests.
 
     Attributes
     ----------
-    position_mm : (n,) ndarray
-        Positions that both tests have, mm.
-    left_out : int
-        Positions that one test has alone.
-    remaining_um, remaining_u_um : (n,) ndarray
-        Difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and its standard uncertainty.
-    shapes : tuple of ShapeChange
-        Slope, bow and mean reversal, then the single positions beyond the family-wise level, the strongest first.
-    tests : int
-        How many shapes were tried.
+    position_mm : (n,) positions that both tests have, mm
+    left_out : positions that one test has alone
+    remaining_um, remaining_u_um : (n,) difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and
+        its standard uncertainty
+    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then the single positions (of
+        both approaches together, or their reversal) beyond the family-wise level, the strongest first
+    tests : how many shapes were tried
     """
 
     position_mm: Array
     left_out: int
     remaining_um: Array
     remaining_u_um: Array
-    shapes: tuple[ShapeChange, ...]
+    shapes: tuple[Change, ...]
     tests: int
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """A shape over the cells (direction, target) of both tests; `machine` as in `ShapeChange`."""
+    """A shape over the cells (direction, target) of both tests; `machine` as in `Change`."""
 
     name: str
     position_mm: float | None
@@ -140,7 +113,10 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     size, covariance = difference.fit(reported)
     u = np.sqrt(np.diag(covariance))
     shapes = tuple(
-        ShapeChange(shape.name, shape.position_mm, float(size[k]), float(u[k]), difference.p_value(size[k] / u[k]), shape.machine)
+        Change(
+            shape.name, "profile", shape.position_mm, "um", None, None, Quantity(value=float(size[k]), u=float(u[k])),
+            difference.p_value(size[k] / u[k]), shape.machine,
+        )
         for k, shape in enumerate(reported)
         if shape.name not in ("offset", "drift")
     )  # fmt: skip
@@ -273,29 +249,10 @@ def _remaining(difference: _Difference, state: Sequence[_Shape], positions: Arra
 _LEAST_FREEDOM = 2.0
 
 
-@dataclass(frozen=True)
-class ScatterChange:
-    """Change of the scatter at one position.
-
-    Attributes
-    ----------
-    position_mm : float
-    before_um, after_um : float
-        Standard deviation of a reading after profile and drift were subtracted, um.
-    p_value : float
-        Two-sided, of this position by itself.
-    """
-
-    position_mm: float
-    before_um: float
-    after_um: float
-    p_value: float
-
-
 def compare_scatters(
     position_mm: Array, before_um: Array, after_um: Array, before_freedom: Array, after_freedom: Array
-) -> list[ScatterChange]:
-    """Compare the scatter at every position of two tests."""
+) -> list[Change]:
+    """Compare the scatter at every position of two tests: standard deviation of a reading after profile and drift were subtracted, um."""
     used = (before_um > 0) & (after_um > 0) & (before_freedom >= _LEAST_FREEDOM) & (after_freedom >= _LEAST_FREEDOM)
     if used.sum() < 5:
         return []
@@ -309,9 +266,12 @@ def compare_scatters(
     f_ratio = np.exp(beyond) * special.fdtri(later, earlier, 0.5)
     p = 2.0 * np.minimum(special.fdtrc(later, earlier, f_ratio), special.fdtr(later, earlier, f_ratio))
     return [
-        ScatterChange(float(at), float(was), float(now), float(min(chance, 1.0)))
+        Change(
+            "scatter", "scatter", float(at), "um", Quantity(value=float(was), u=None), Quantity(value=float(now), u=None),
+            Quantity(value=float(now) / float(was), u=None), float(min(chance, 1.0)), True,
+        )
         for at, was, now, chance in zip(place, one, other, p, strict=True)
-    ]
+    ]  # fmt: skip
 
 
 #: Level at which something counts as changed, over everything that is compared.
@@ -326,10 +286,8 @@ class ComparedCampaign:
 
     Attributes
     ----------
-    axis : str
-        Name of the measured axis; empty where the run does not tell.
-    drift : Dataset or None
-        Joint estimate with ``position`` (target; mm); None where there are no readings with times.
+    axis : name of the measured axis; empty where the run does not tell
+    drift : joint estimate with ``position`` (target; mm); None where there are no readings with times
     """
 
     folder: Path
@@ -350,16 +308,11 @@ class Change:
 
     Attributes
     ----------
-    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}
-        What it belongs to.
-    before, after : Quantity or None
-        In both campaigns; None for a change of shape, which has no value of its own.
-    change : Quantity
-        After minus before; of a scatter the ratio, without unit.
-    p_value : float
-        Two-sided, family-wise over everything that is compared.
-    machine : bool
-        Whether no thermal state of the test gives it, so that the machine or the set-up must have changed.
+    group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}; what it belongs to
+    before, after : in both campaigns; None for a change of shape, which has no value of its own
+    change : after minus before; of a scatter the ratio, without unit
+    p_value : two-sided, family-wise over everything that is compared
+    machine : whether no thermal state of the test gives it, so that the machine or the set-up must have changed
     """
 
     quantity: str
@@ -384,12 +337,9 @@ class PairComparison:
 
     Attributes
     ----------
-    profile : ProfileChange or None
-        Difference of the profiles; None where they cannot be compared.
-    not_compared : tuple of str
-        What cannot be compared, and why, one sentence each.
-    tests : int
-        Tests of the family, over all campaigns.
+    profile : difference of the profiles; None where they cannot be compared
+    not_compared : what cannot be compared, and why, one sentence each
+    tests : tests of the family, over all campaigns
     """
 
     before: ComparedCampaign
@@ -428,14 +378,7 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int) -
     changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *_standard(before, after, lacks)]
     profile = _profile(before, after, lacks, pairs=pairs, tests=len(changes) + 2)
     if profile is not None:
-        shapes = [
-            Change(
-                one.shape, "profile", one.position_mm, "um", None, None,
-                Quantity(value=one.change_um, u=one.u_um), one.p_value, one.machine,
-            )
-            for one in profile.shapes
-        ]  # fmt: skip
-        changes = [*shapes, *changes]
+        changes = [*profile.shapes, *changes]
     tests = pairs * (len(changes) if profile is None else len(changes) - len(profile.shapes) + 2 + profile.tests)
     familywise = tuple(replace(change, p_value=min(1.0, change.p_value * tests)) for change in changes)
     return PairComparison(before, after, familywise, profile, tuple(lacks), tests)
@@ -479,22 +422,18 @@ def _profile(
     return found
 
 
-def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[Change]:
+def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]:
     """The scatter at positions that both campaigns have."""
     if before.drift is None or after.drift is None:
-        return
+        return []
     one, other = (campaign.drift.sortby("position") for campaign in (before, after) if campaign.drift is not None)
     gaps = np.abs(one["position"].values[:, None] - other["position"].values)
     first, second = np.nonzero(gaps <= SAME_POSITION_MM)
     one, other = one.isel(target=first), other.isel(target=second)
     freedom = [test["scatter_freedom"].sum("direction").values for test in (one, other)]
-    for found in compare_scatters(
+    return compare_scatters(
         one["position"].values, one["scatter_position"].values, other["scatter_position"].values, *freedom
-    ):
-        yield Change(
-            "scatter", "scatter", found.position_mm, "um", Quantity(value=found.before_um, u=None),
-            Quantity(value=found.after_um, u=None), Quantity(value=found.after_um / found.before_um, u=None), found.p_value, True,
-        )  # fmt: skip
+    )
 
 
 def _coefficients(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str]) -> Iterator[Change]:

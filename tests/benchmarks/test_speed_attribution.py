@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 CYCLES, SERIES = 100, 32
 SECONDS = np.arange(CYCLES) * 252.0
-VARIED = Excitation(0.5, False, 3)
+VARIED = Excitation(0.5, False)
 
 
 def film(columns: int, rng: np.random.Generator) -> FieldSeries:

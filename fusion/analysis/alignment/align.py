@@ -46,15 +46,19 @@ class AxisGeometry:
     origin_mm: tuple[float, float]
     direction: tuple[float, float]
 
+    @property
+    def step(self) -> Array:
+        """Unit vector (x, y) on the plan along the measured line."""
+        return np.asarray(self.direction, float) / np.hypot(*self.direction)
+
     def points(self, position_mm: Array) -> tuple[Array, Array]:
         """Return the plan coordinates x and y, mm, of axis positions, mm; both have the shape of `position_mm`."""
-        step = np.asarray(self.direction, float) / np.hypot(*self.direction)
+        step = self.step
         return self.origin_mm[0] + step[0] * position_mm, self.origin_mm[1] + step[1] * position_mm
 
     def across(self) -> tuple[float, float]:
         """Return the unit vector (x, y) on the plan at right angles to the measured line."""
-        step = np.asarray(self.direction, float) / np.hypot(*self.direction)
-        return float(-step[1]), float(step[0])
+        return float(-self.step[1]), float(self.step[0])
 
 
 def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
@@ -253,30 +257,13 @@ def rise_since_first(frames: Array | xr.DataArray) -> Iterator[Array]:
 
 
 class MeasuredLine:
-    """The measured line on the plan, sampled four times per cell, and averaged across its width.
-
-    Parameters
-    ----------
-    fields : Dataset
-        Plan coordinates ``x`` and ``y``, mm, evenly spaced.
-    axis : AxisGeometry
-        Where the line lies.
-    position_mm : (target,) ndarray, mm
-        Axis positions of the targets.
+    """The measured line on an evenly spaced plan, sampled four times per cell, and averaged across its width; it must not leave the plan.
 
     Attributes
     ----------
-    along_mm : (sample,) ndarray, mm
-        Axis positions of the samples; position 0 and every target are among them.
-    nearest : (target,) ndarray of int
-        Index of the sample at every target.
-    reach : int
-        Number of samples on either side that a point average takes.
-
-    Raises
-    ------
-    AlignmentError
-        If the line leaves the plan.
+    along_mm : (sample,) axis positions of the samples, mm; position 0 and every target are among them
+    nearest : (target,) index of the sample at every target
+    reach : number of samples on either side that a point average takes
     """
 
     def __init__(self, fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> None:
@@ -335,10 +322,13 @@ class MeasuredLine:
         return np.concatenate([self._integrate_some(self._sample_some(rise)) for rise in rise_since_first(frames)])
 
     def _integrate_some(self, samples: Array) -> Array:
-        steps = 0.5 * (samples[:, 1:] + samples[:, :-1]) * np.diff(self.along_mm)
-        integral = np.concatenate([np.zeros((samples.shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
-        zero = int(np.argmin(np.abs(self.along_mm)))
-        return (integral - integral[:, [zero]])[:, self.nearest]
+        return _integral_from_zero(samples, self.along_mm)[:, self.nearest]
+
+
+def _integral_from_zero(line: Array, places_mm: Array) -> Array:
+    """Integral of values along a line (time, place) from its place 0 to every place, (time, place)."""
+    integral = integrate.cumulative_trapezoid(line, places_mm, axis=1, initial=0.0)
+    return np.asarray(integral - integral[:, [int(np.argmin(np.abs(places_mm)))]])
 
 
 def _check_overlap(reading_time: NDArray[np.datetime64], frame_time: NDArray[np.datetime64]) -> None:
@@ -453,8 +443,7 @@ def add_sensor_line(
     fused: xr.Dataset, temperature: xr.DataArray, x_mm: Array, y_mm: Array, axis: AxisGeometry, *, file: str
 ) -> xr.Dataset:
     """Give readings the mean rise of contact sensors and its integral along the measured line."""
-    step = np.asarray(axis.direction, float) / np.hypot(*axis.direction)
-    along = (x_mm - axis.origin_mm[0]) * step[0] + (y_mm - axis.origin_mm[1]) * step[1]
+    along = (x_mm - axis.origin_mm[0]) * axis.step[0] + (y_mm - axis.origin_mm[1]) * axis.step[1]
     rise = temperature.values - temperature.values[0]
     places, group = np.unique(np.round(along, 1), return_inverse=True)
     rise = np.stack([rise[:, group == k].mean(axis=1) for k in range(places.size)], axis=1)
@@ -474,17 +463,15 @@ def add_sensor_line(
         )
     samples = np.unique(np.concatenate([np.linspace(low, high, 200), position, places, [0.0]]))
     line = np.stack([np.interp(samples, places, row) for row in rise])
-    integral = integrate.cumulative_trapezoid(line, samples, axis=1, initial=0.0)
-    integral -= integral[:, [int(np.argmin(np.abs(samples)))]]
+    integral = _integral_from_zero(line, samples)
     # Root mean square by which every sensor is missed by the line through the others.
     errors = []
     for k in range(places.size):
         others = np.arange(places.size) != k
         errors.append(rise[:, k] - [np.interp(places[k], places[others], row[others]) for row in rise])
     missed_K = float(np.sqrt(np.mean(np.square(errors))))
-    kelvin = {"units": "K", "units_metadata": "temperature: difference"}
     return fused.assign(
-        mean_rise_series=("sensor_time", rise.mean(axis=1), kelvin),
+        mean_rise_series=("sensor_time", rise.mean(axis=1), _KELVIN),
         axis_integral_series=(
             ("sensor_time", "target"),
             integral[:, np.searchsorted(samples, position)],

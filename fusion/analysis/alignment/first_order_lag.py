@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
 from fusion.common import Array
-
-if TYPE_CHECKING:
-    pass
 
 
 @njit(cache=True)
@@ -27,38 +23,12 @@ def _respond(values: Array, seconds: Array, time_constant_s: float, start: Array
 
 
 def respond(values: Array, seconds: Array, *, time_constant_s: float, start: Array | None = None) -> Array:
-    """Return the response of a first-order system to an input that is linear between its samples.
+    """Return the response (n, columns) of first-order systems to inputs (n, columns), in their unit, that are linear between samples.
 
-    Parameters
-    ----------
-    values : (n, columns) ndarray
-        Input at the samples, one column per system, in any unit.
-    seconds : (n,) ndarray, s
-        Times of the samples, increasing; the steps may differ.
-    time_constant_s : float, s
-        Up to 0 the response is the input itself.
-    start : (columns,) ndarray, optional
-        Response at the first sample, in the unit of the input; by default the input there (steady state before the first sample).
-
-    Returns
-    -------
-    (n, columns) ndarray
-        Response at the samples, in the unit of the input.
-
-    Notes
-    -----
-    Exact solution of ``tau dr/dt = v - r`` over a step h with ``v(t) = v0 + (v1 - v0) t / h``::
+    Times are in s and may be uneven. Up to a time constant of 0 the response is the input itself; it starts in equilibrium with the first
+    sample, or where `start` (columns,) says. Exact solution of ``tau dr/dt = v - r`` over a step h with ``v(t) = v0 + (v1 - v0) t / h``::
 
         r1 = v1 - g + (r0 - v0 + g) exp(-h / tau),   g = tau (v1 - v0) / h
-
-    Examples
-    --------
-    A step of 1 K reaches 63 % after one time constant:
-
-    >>> import numpy as np
-    >>> step = np.array([[0.0], [1.0], [1.0]])
-    >>> respond(step, np.array([0.0, 1e-6, 600.0]), time_constant_s=600.0).round(3).ravel().tolist()
-    [0.0, 0.0, 0.632]
     """
     if time_constant_s <= 0:
         return values

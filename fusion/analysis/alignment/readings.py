@@ -60,7 +60,7 @@ class Series:
         ]
 
     def lagged(self, time_constant_s: float, *, at_rest: float | None = None) -> Series:
-        """Return the response of a first-order system to the series; see `fusion.analysis.alignment.readings.respond`."""
+        """Return the response of a first-order system to the series; see `fusion.analysis.alignment.first_order_lag.respond`."""
         if time_constant_s <= 0.0:
             return self
         if len(self.first) > 1:
@@ -81,10 +81,8 @@ class Gap:
 
     Attributes
     ----------
-    series : str
-        Name of the series.
-    start_s, end_s : float, s
-        Times of the samples on either side, since the first reading.
+    series : its name
+    start_s, end_s : times of the samples on either side, since the first reading, s
     """
 
     series: str
@@ -198,6 +196,14 @@ class Readings:
         """Return the readings where `keep`, (n,) bool, is true; series stay complete."""
         per_reading = ("seconds", "response", "cycle", "target", "position_mm", "sign")
         return replace(self, **{name: getattr(self, name)[keep] for name in per_reading}, places=None)
+
+
+def known_mean(values: Array, axis: int | None = None) -> Array:
+    """Mean over the values that are known, NaN where there is none."""
+    known = np.isfinite(values)
+    number = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 
 def sample_noise(samples: Array) -> float:

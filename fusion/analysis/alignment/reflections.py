@@ -38,10 +38,8 @@ class SwitchingPatch:
 
     Attributes
     ----------
-    pattern : (y, x) ndarray
-        Relative size of the jump, about 1 on the patch, 0 where the plan is not seen.
-    course : (time,) ndarray, K
-        How much warmer than at first each frame shows the patch by its jumps.
+    pattern : (y, x) relative size of the jump, about 1 on the patch, 0 where the plan is not seen
+    course : (time,) how much warmer than at first each frame shows the patch by its jumps, K
     """
 
     pattern: Array

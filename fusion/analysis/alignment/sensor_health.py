@@ -44,18 +44,12 @@ class Grid:
 
     Attributes
     ----------
-    seconds : (n,) ndarray, s
-        Middle of each step.
-    step_s : float, s
-        Length of a step.
-    temperature : (n, sensors) ndarray, degC
-        Interpolated where nothing was read.
-    known : (n, sensors) ndarray of bool
-        Where something was read.
-    drivers : (n, k) ndarray
-        Loads as shares of their range, and their squares.
-    is_fine : bool
-        Whether it is the fine grid.
+    seconds : (n,) middle of each step, s
+    step_s : length of a step, s
+    temperature : (n, sensors) interpolated where nothing was read, degC
+    known : (n, sensors) True where something was read
+    drivers : (n, k) loads as shares of their range, and their squares
+    is_fine : whether it is the fine grid
     """
 
     seconds: Array
@@ -137,14 +131,10 @@ class Changes:
 
     Attributes
     ----------
-    before, after : (m,) ndarray of int
-        Last step before and first step after each change.
-    residual : (m,) ndarray, K
-        What is left of the change by the prediction.
-    reach : int
-        Steps within which two changes share samples.
-    least_K : float
-        Resolution of the sensor.
+    before, after : (m,) last step before and first step after each change
+    residual : (m,) what is left of the change by the prediction, K
+    reach : steps within which two changes share samples
+    least_K : resolution of the sensor
     """
 
     before: NDArray[np.intp]
@@ -173,11 +163,9 @@ def lay_grid(seconds: Array, temperature: Array, drivers: Array | None) -> list[
     span = np.ptp(loads, axis=0)
     loads = (loads - loads.min(axis=0))[:, span > 0.0] / span[span > 0.0]
     loads = np.hstack([loads, loads**2])
-    lengths = [step * max(1, int(np.ceil(seconds.size / most))) for most in (FINE_BINS, BLOCKS)]
-    grids = [_grid(seconds, temperature, loads, length, is_fine=False) for length in lengths[1:]]
-    if lengths[0] < lengths[1]:
-        grids.insert(0, _grid(seconds, temperature, loads, lengths[0], is_fine=True))
-    return grids
+    fine, coarse = (step * max(1, int(np.ceil(seconds.size / most))) for most in (FINE_BINS, BLOCKS))
+    grids = [_grid(seconds, temperature, loads, fine, is_fine=True)] if fine < coarse else []
+    return [*grids, _grid(seconds, temperature, loads, coarse, is_fine=False)]
 
 
 def _grid(seconds: Array, temperature: Array, loads: Array, length: float, *, is_fine: bool) -> Grid:
@@ -331,20 +319,13 @@ class SensorFault:
 
     Attributes
     ----------
-    sensor : int
-        Place among the sensors.
-    kind : Kind
-        What it does.
-    is_clear : bool
-        Whether nothing that a machine does looks like it; else the sensor is suspected.
-    onset_s, onset_u_s : float, s
-        When it began, since the first sample, and the standard uncertainty of that.
-    size : float
-        Change beyond the prediction, K; of noise its ratio, 1; nan of a signal that is none.
-    ratio, limit : float
-        Excursion over the next largest of the sensor, and the limit; nan where none is compared.
-    reason : str
-        Why it is only suspected; empty where it is clear.
+    sensor : place among the sensors
+    kind : what it does
+    is_clear : whether nothing that a machine does looks like it; else the sensor is suspected
+    onset_s, onset_u_s : when it began, since the first sample, and the standard uncertainty of that, s
+    size : change beyond the prediction, K; of noise its ratio, 1; nan of a signal that is none
+    ratio, limit : excursion over the next largest of the sensor, and the limit; nan where none is compared
+    reason : why it is only suspected; empty where it is clear
     """
 
     sensor: int
@@ -423,8 +404,6 @@ def _without_signal(seconds: Array, temperature: Array) -> list[SensorFault]:
 
 def _longest_run(values: Array, wanted: float | None = None) -> tuple[int, int, int]:
     """Length of the longest run of equal values (of one value, where it is wanted), its first place, and the length of the next longest."""
-    if values.size == 0:
-        return 0, 0, 0
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     lengths = np.diff(np.r_[starts, values.size])
     if wanted is not None:
@@ -507,14 +486,12 @@ def _changed(grids: list[Grid], kept: Sequence[int]) -> list[SensorFault]:
 def _strongest(grids: list[Grid], sensor: int, others: list[int], sensors: int) -> _Suspicion:
     """The strongest excursion of a sensor from what others, loads and its past predict, over all durations."""
     limit = excursion_limit(sensors * sum(len(grid.durations()) for grid in grids))
-    chosen = None
+    chosen = _Suspicion(sensor, 0.0, Excursion(0, 0, 0, 0.0), grids[-1])
     for grid in grids:
         for duration in grid.durations():
             found = largest_excursion(predicted_changes(grid, sensor, others, duration))
-            if found is not None and (chosen is None or found.ratio / limit > chosen.excess):
+            if found is not None and found.ratio / limit > chosen.excess:
                 chosen = _Suspicion(sensor, found.ratio / limit, found, grid)
-    if chosen is None:
-        return _Suspicion(sensor, 0.0, Excursion(0, 0, 0, 0.0), grids[-1])
     return chosen
 
 

@@ -63,8 +63,15 @@ IN_MODE = 0.5
 
 def piece_with_peak(strength: Array, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the connected piece of cells that holds the strongest one."""
-    labels, _ = ndimage.label(inside, np.ones((3, 3)))
-    return np.asarray(labels == labels[np.unravel_index(int(strength.argmax()), strength.shape)], bool)
+    return _pieces(strength, inside)[0]
+
+
+def _pieces(strength: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[tuple[np.intp, ...]]]:
+    """The connected piece of cells with the strongest one, and the strongest cell of every other piece."""
+    labels, count = ndimage.label(inside, np.ones((3, 3)))
+    leading = labels[np.unravel_index(int(strength.argmax()), strength.shape)]
+    others = (np.where(labels == label, strength, -np.inf) for label in range(1, count + 1) if label != leading)
+    return labels == leading, [np.unravel_index(int(other.argmax()), strength.shape) for other in others]
 
 
 def mode_cells(pattern: Array) -> NDArray[np.bool_]:
@@ -406,13 +413,6 @@ def _naive_correlation(series: DriftSeries, field: FieldSeries) -> Array:
     return (values @ regressors) / np.where(size > 0, size, 1.0)
 
 
-def _session_verdict(result: AttributionResult, excitation: Excitation) -> int:
-    if excitation.warm_up_only:
-        return NOT_SEPARABLE
-    passed = any((test.p_value <= LEVEL).any() for test in result.sets.values())
-    return ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
-
-
 def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.Dataset:
     """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarm rates, verdict."""
     cells = result.sets["cells"]
@@ -426,7 +426,9 @@ def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.D
         "cells_false_alarm_rate": cells.false_alarm_rate,
         "warm_up_share": excitation.warm_up_share,
     }
-    verdict = _FLAG_MEANINGS.split()[_session_verdict(result, excitation)].replace("_", " ")
+    passed = any((test.p_value <= LEVEL).any() for test in result.sets.values())
+    flag = NOT_SEPARABLE if excitation.warm_up_only else ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
+    verdict = _FLAG_MEANINGS.split()[flag].replace("_", " ")
     return xr.Dataset(
         {name: _variable(name, value) for name, value in values.items()},
         coords={"channel": list(cells.names)},
@@ -506,24 +508,15 @@ def _surroundings(
     modes = maps.children["modes"].to_dataset()
     pattern = np.abs(np.nan_to_num(modes["pattern"].sel(mode=int(best["mode"])).values))
     _, elsewhere = _split(pattern, pattern >= _PEAK, plan)
-    inside, _ = _split(pattern, pattern >= IN_MODE, plan)
-    return inside, [*elsewhere, *others]
+    return mode_cells(pattern), [*elsewhere, *others]
 
 
 def _split(
     strength: Array, equal: NDArray[np.bool_], plan: xr.Dataset
 ) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
     """The connected piece of equal cells with the strongest one, and the strongest cell (x, y in mm) of every other piece."""
-    labels, count = ndimage.label(equal, np.ones((3, 3)))
-    row, column = np.unravel_index(int(strength.argmax()), strength.shape)
-    leading = int(labels[row, column])
-    others = []
-    for label in range(1, count + 1):
-        if label == leading:
-            continue
-        place = np.unravel_index(int(np.where(labels == label, strength, -np.inf).argmax()), strength.shape)
-        others.append((float(plan["x"][place[1]]), float(plan["y"][place[0]])))
-    return labels == leading, others
+    piece, others = _pieces(strength, equal)
+    return piece, [(float(plan["x"][column]), float(plan["y"][row])) for row, column in others]
 
 
 def recommend_measurement(maps: xr.DataTree, source: SourcePart) -> str:

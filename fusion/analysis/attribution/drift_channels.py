@@ -7,6 +7,7 @@ The same weights are applied to the temperature at the time of each reading, so 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +40,11 @@ class DriftSeries:
     values: Array
     variance: Array
     seconds: Array
-    cycle: NDArray[np.int64]
     sampling: Array
+
+    def lagged_sampling(self, operators: Sequence[Array]) -> Array:
+        """How it samples the field under every lag, (lags, n, frames)."""
+        return np.stack([self.sampling @ operator for operator in operators])
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,6 @@ class ClockedReadings:
     deviation: Array
     seconds: Array
     design: Array
-    cycle: NDArray[np.int64]
     directions: tuple[str, ...]
     targets: NDArray[np.int64]
     frame_seconds: Array
@@ -108,7 +111,6 @@ def clock_readings(fused: xr.Dataset, frame_time: NDArray[np.datetime64]) -> Clo
         deviation=deviation.reshape(cycles, -1),
         seconds=np.where(seen & inside, seconds, np.nan).reshape(cycles, -1),
         design=design,
-        cycle=ordered["cycle"].values.astype(np.int64),
         directions=tuple(str(name) for name in ordered["direction"].values),
         targets=ordered["target"].values.astype(np.int64),
         frame_seconds=frame_seconds,
@@ -174,7 +176,6 @@ def reduce_channels(readings: ClockedReadings) -> list[DriftSeries]:
                 values=values[:, c],
                 variance=np.array([(reducer[c] ** 2).sum() for reducer in reducers]),
                 seconds=seconds,
-                cycle=readings.cycle[kept],
                 sampling=_sample(readings.seconds[kept], weights, readings.frame_seconds),
             )
         )

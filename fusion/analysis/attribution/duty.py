@@ -131,12 +131,9 @@ def _check_law(place: str, seconds: Array, states: Array, law: DutyLaw) -> None:
 
 def duty_responses(seconds: Array, courses: Array) -> Array:
     """Return the thermal responses to duty for every pair of time constants."""
-    bodies: dict[float, Array] = {}
-    responses = []
-    for first, second in _RESPONSES_S:
-        if first not in bodies:
-            bodies[first] = respond(courses, seconds, time_constant_s=first)
-        responses.append(respond(bodies[first], seconds, time_constant_s=second))
+    firsts = dict.fromkeys(first for first, _ in _RESPONSES_S)
+    bodies = {first: respond(courses, seconds, time_constant_s=first) for first in firsts}
+    responses = [respond(bodies[first], seconds, time_constant_s=second) for first, second in _RESPONSES_S]
     return np.stack(responses, axis=2)
 
 

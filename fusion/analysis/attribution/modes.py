@@ -38,12 +38,11 @@ class Excitation:
     """How the field was excited.
 
     ``warm_up_share`` is the share of the field's resolved temporal variation that exponentials from one common start explain;
-    ``warm_up_only`` where it leaves nothing by which sources could be separated; ``resolved_modes`` are above the noise of the field.
+    ``warm_up_only`` where it leaves nothing by which sources could be separated.
     """
 
     warm_up_share: float
     warm_up_only: bool
-    resolved_modes: int
 
     @property
     def protected(self) -> bool:
@@ -96,11 +95,11 @@ def describe_excitation(values: Array, seconds: Array) -> Excitation:
     """Measure how much of a field is one warm-up."""
     courses, _ = thermal_modes(values)
     if courses.shape[1] == 0:
-        return Excitation(0.0, False, 0)
+        return Excitation(0.0, False)
     design = np.column_stack([level_and_trend(seconds), warm_up_columns(seconds)])
     rest = courses - design @ np.linalg.lstsq(design, courses, rcond=None)[0]
     share = 1.0 - float((rest**2).sum() / (courses**2).sum())
-    return Excitation(share, share >= _ONLY_SHARE, courses.shape[1])
+    return Excitation(share, share >= _ONLY_SHARE)
 
 
 #: Rotation stops when the varimax criterion grows by less than this share.

@@ -110,7 +110,7 @@ def choose_sensors(
     operators = lag_operators(cells.seconds, LAGS_S)
     # Mean square over the targets of a shift, and of a stretch that is 1 at the ends of travel.
     weight = {"common": 1.0, "proportional": float((readings.design[:, 1] ** 2).mean())}
-    tasks = [_Task(one, np.stack([one.sampling @ operator for operator in operators])) for one in series]
+    tasks = [_Task(one, one.lagged_sampling(operators)) for one in series]
     most = min(most, contact.shape[1])
     # Choose cells by all values; what is whitened for that, which is large, ends here.
     parts = [_Part(task, np.ones(task.series.values.size, bool)) for task in tasks]

@@ -407,7 +407,7 @@ def evaluate_candidates(
         for channel, columns in zip(series, given, strict=True)
     ]
     sources = [
-        _Source(bank, whiten_series(bank, stack), _lagged_sampling(channel, operators))
+        _Source(bank, whiten_series(bank, stack), channel.lagged_sampling(operators).astype(np.float32))
         for channel, bank, stack in zip(series, banks, _draw(series, banks, draws, checks, rng), strict=True)
     ]
     names = [channel.name for channel in series]
@@ -491,11 +491,6 @@ class _Tally:
             self.maxima[channel] = np.maximum(self.maxima[channel], best[1:].max(axis=1))
             bins = np.minimum((best[1:] / _BINS[1]).astype(np.int64), _BINS.size - 2)
             self.pooled[channel] += np.bincount(bins.ravel(), minlength=_BINS.size - 1)
-
-
-def _lagged_sampling(series: DriftSeries, operators: Sequence[Array]) -> Array32:
-    """How a series samples the field under every lag, (lags, n, frames)."""
-    return np.stack([series.sampling @ operator for operator in operators]).astype(np.float32)
 
 
 def _test_field(sources: Sequence[_Source], field: FieldSeries, lags: int, tally: _Tally) -> Iterator[slice]:
@@ -670,7 +665,6 @@ def screen(
     lags_s: Sequence[float] = LAGS_S,
     permutations: int = 999,
     rng: np.random.Generator,
-    progress: Callable[[float], None] | None = None,
 ) -> Screening:
     """Test every column of a field against every target and direction."""
     seconds = targets.seconds
@@ -697,8 +691,6 @@ def screen(
         tile = slice(start, min(start + _TILE, columns))
         for task in tasks:
             task.test(np.ascontiguousarray(values32[:, tile]), tile, result)
-        if progress is not None:
-            progress(tile.stop / columns)
     return result.finish(tasks, permutations)
 
 

@@ -28,12 +28,9 @@ class Condition:
 
     Attributes
     ----------
-    assumption : str
-        What has to be right, as it follows "only if".
-    figures : tuple of Figures
-        What holds only then.
-    endangers : str
-        The same in words.
+    assumption : what has to be right, as it follows "only if"
+    figures : what holds only then
+    endangers : the same in words
     """
 
     assumption: str
@@ -192,14 +189,10 @@ class Check:
 
     Attributes
     ----------
-    code : str
-        For programs and for ``[accept] doubts``.
-    value, limit : float
-        In the unit that the evidence names.
-    evidence : str
-        One sentence with the numbers.
-    remedy : str
-        Empty where the check is passed.
+    code : for programs and for ``[accept] doubts``
+    value, limit : in the unit that the evidence names
+    evidence : one sentence with the numbers
+    remedy : empty where the check is passed
     """
 
     code: str

@@ -68,10 +68,8 @@ class Shift:
 
     Attributes
     ----------
-    seconds : float, s
-        By how much the log is late.
-    left, left_within : float
-        What the shift leaves unexplained, and what the best delay of physics leaves, as shares of the standard deviation.
+    seconds : by how much the log is late, s
+    left, left_within : what the shift leaves unexplained, and what the best delay of physics leaves, as shares of the standard deviation
     """
 
     seconds: float
@@ -179,9 +177,7 @@ def _rate_against_jump(rate: _Rate, at: Array, load: Array, start: int, factor: 
 
 def _load_left(rate: _Rate, at: Array, load: Array) -> float:
     """Share of the variance of the field's rate that a load leaves, at the best delay of physics."""
-    columns = rate.columns(at, load, _LOG_SHIFTS_S[_delays(_LOG_DELAY_S)])
-    explained = ((columns.reshape(-1, columns.shape[-1]) @ rate.modes) ** 2).sum(axis=1)
-    return 1.0 - float(explained.max()) / max(float((rate.modes**2).sum()), 1e-30)
+    return float(rate.left(rate.columns(at, load, _LOG_SHIFTS_S[_delays(_LOG_DELAY_S)])).min())
 
 
 def _is_load(column: xr.DataArray) -> bool:
@@ -198,14 +194,10 @@ class _Rate:
 
     Attributes
     ----------
-    seconds : (n + 1,) ndarray, s
-        Times of the frames.
-    weight : (n,) ndarray
-        One over the square root of each step.
-    trend : (n, 3) ndarray
-        Orthonormal columns of a steady rate and of a warm-up before the log.
-    modes : (n, 2) ndarray
-        The increments.
+    seconds : (n + 1,) times of the frames, s
+    weight : (n,) one over the square root of each step
+    trend : (n, 3) orthonormal columns of a steady rate and of a warm-up before the log
+    modes : (n, 2) the increments
     """
 
     seconds: Array
@@ -247,15 +239,18 @@ class _Rate:
         columns[~(length[..., 0] > 1e-9 * max(float(length.max()), 1e-12))] = 0.0
         return columns
 
+    def left(self, columns: Array) -> Array:
+        """Share of the modes' variance that each unit response (shifts, shapes, n) leaves, (shifts * shapes,)."""
+        explained = ((columns.reshape(-1, columns.shape[-1]) @ self.modes) ** 2).sum(axis=1)
+        return 1.0 - explained / max(float((self.modes**2).sum()), 1e-30)
+
 
 def _load_shift(rate: _Rate, at: Array, load: Array) -> Shift | None:
     """Shift by which the field's rate follows a load, None where the delays of physics do nearly as well or chance does."""
     columns = rate.columns(at, load)
-    shapes = columns.shape[1]
+    shapes, left = columns.shape[1], rate.left(columns)
     flat = columns.reshape(-1, columns.shape[-1])
     within = np.repeat(_delays(_LOG_DELAY_S), shapes)
-    total = float((rate.modes**2).sum())
-    left = 1.0 - ((flat @ rate.modes) ** 2).sum(axis=1) / max(total, 1e-30)
     best, allowed = int(np.argmin(left)), int(np.flatnonzero(within)[np.argmin(left[within])])
     if within[best] or 1.0 - left[best] < _LEAST_EXPLAINED or left[allowed] < _LEFT_RATIO * left[best]:
         return None

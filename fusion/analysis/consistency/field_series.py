@@ -27,14 +27,10 @@ class FieldSeries:
 
     Attributes
     ----------
-    start : datetime64[ns]
-        Time of the first frame.
-    seconds : (n,) ndarray, s
-        Times since `start`, at least a minute apart.
-    temperature : (n, cells) ndarray, degC
-        Of cells that every frame shows whole.
-    x_mm, y_mm : (cells,) ndarray, mm
-        Centres of the cells.
+    start : time of the first frame
+    seconds : (n,) times since `start`, at least a minute apart, s
+    temperature : (n, cells) of cells that every frame shows whole, degC
+    x_mm, y_mm : (cells,) centres of the cells, mm
     """
 
     start: np.datetime64

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy import sparse, special
 
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.consistency.checks import Check, Severity, judge
 from fusion.common import Array
 from thermography.common import scatter_by_median
@@ -158,13 +159,6 @@ def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:
         yield start, (holds[rows] @ holds.T).toarray() / np.maximum(both, 1.0)
 
 
-def _means(values: Array) -> Array:
-    """Return the mean of every column, NaN where it holds no value."""
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0))
-
-
 def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     """A reversal error that changes its sign and keeps its size at one cycle shows exchanged labels of approach."""
     sound = judge("approach_labels", 0.0, _EXCHANGE_SIGMAS, "The reversal error keeps its sign over the test.")
@@ -176,7 +170,7 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     reversal, cycles = reversal[known], deviations["cycle"].values[known]
     best, place = 0.0, 0
     for k in range(_LEAST_SIDE, reversal.shape[0] - _LEAST_SIDE + 1):
-        before, after = _means(reversal[:k]), _means(reversal[k:])
+        before, after = known_mean(reversal[:k], axis=0), known_mean(reversal[k:], axis=0)
         sigma = noise_um * np.sqrt(2.0) * np.sqrt(1.0 / k + 1.0 / (reversal.shape[0] - k))
         if not np.isfinite(after - before).any():
             continue

@@ -13,10 +13,8 @@ class CauseRecord:
 
     Attributes
     ----------
-    words : str
-        Name in words.
-    check : str
-        What to inspect on the machine, or how to repeat the test; one sentence.
+    words : name in words
+    check : what to inspect on the machine, or how to repeat the test; one sentence
     """
 
     words: str
@@ -52,22 +50,7 @@ CAUSES: dict[Cause, CauseRecord] = {
 
 
 def undetermined_check(leading: str) -> str:
-    """Return what to do where no cause is named, and what to inspect if the leading explanation holds after all.
-
-    Parameters
-    ----------
-    leading : str
-        Leading explanation; one that is no cause (a random walk) has nothing of its own to inspect.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> undetermined_check("step").partition(". ")[2][:50]
-    'If the cause is sudden step: inspect fixture, opti'
-    """
+    """Return what to do where no cause is named, and what to inspect if the leading explanation, unless it is none, holds after all."""
     generic = CAUSES["undetermined"].check
     candidate = None if leading == "undetermined" else CAUSES.get(leading)  # type: ignore[call-overload]
     if candidate is None:

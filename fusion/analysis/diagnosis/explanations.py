@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fusion.analysis.alignment.first_order_lag import respond
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.attribution.drift_channels import MIN_CYCLES
-from fusion.analysis.attribution.modes import warm_up_columns
+from fusion.analysis.attribution.modes import level_and_trend, warm_up_columns
 from fusion.analysis.attribution.significance import (
     Grid,
     estimate_effects,
@@ -51,18 +52,12 @@ class DirectionParts:
 
     Attributes
     ----------
-    rows : (n,) integer ndarray
-        Indices of the cycles used.
-    mean : (n,) ndarray, um times `unit`
-        Sum of the directions over the square root of 2, or the only direction.
-    difference : (n,) ndarray or None, um times `unit`
-        Difference of the directions over the square root of 2.
-    sides : (2, n) ndarray or None, um
-        Positive and negative direction.
-    unit : float
-        Factor between `mean` and the average of the directions: square root of 2, or 1 for a single direction.
-    grid : Grid
-        Whitenings under every random walk considered, for the times of these cycles.
+    rows : (n,) indices of the cycles used
+    mean : (n,) sum of the directions over the square root of 2, or the only direction, um times `unit`
+    difference : (n,) difference of the directions over the square root of 2, um times `unit`; None of a single direction, as `sides`
+    sides : (2, n) positive and negative direction, um
+    unit : factor between `mean` and the average of the directions: square root of 2, or 1 for a single direction
+    grid : whitenings under every random walk considered, for the times of these cycles
     """
 
     rows: NDArray[np.int64]
@@ -79,18 +74,12 @@ class Residual:
 
     Attributes
     ----------
-    target : int
-        Target number, from 1.
-    seconds : (cycles,) ndarray, s
-        Mean time of the target's readings in each cycle since the first reading.
-    values : (2, cycles) ndarray, um
-        Residual in the positive and in the negative direction, NaN where missing.
-    cycle : (cycles,) integer ndarray
-        Cycle numbers.
-    typical_um : float, um
-        Robust standard deviation that this target would have if it scattered like the others.
-    temperature : tuple of two (frames,) ndarray, or None
-        Times, s, and local temperature rise, K; None where the camera does not see the target.
+    target : target number, from 1
+    seconds : (cycles,) mean time of the target's readings in each cycle since the first reading, s
+    values : (2, cycles) residual in the positive and in the negative direction, NaN where missing, um
+    cycle : (cycles,) cycle numbers
+    typical_um : robust standard deviation that this target would have if it scattered like the others, um
+    temperature : (frames,) each, times, s, and local temperature rise, K; None where the camera does not see the target
     """
 
     target: int
@@ -134,19 +123,13 @@ class ProfileFit:
 
     Attributes
     ----------
-    log_likelihood : float, nats
-        Of the mean and the difference of the directions together.
-    p_value : float
-        Parametric bootstrap over all candidates, against white noise plus random walk.
-    best : int
-        Index of the best candidate (lag or step).
-    coefficient, coefficient_u : float, um/K or um
-        Its coefficient, with standard uncertainty, for the average of the directions.
-    by_direction : tuple of two floats, um/K or um
-        Its coefficient in each direction alone, NaN where one was not read.
-    hold_out_gain : float, nats
-        Log-likelihood gained in each direction by the candidate and the coefficient fitted to the other, sum of both; NaN where only
-        one direction was read.
+    log_likelihood : of the mean and the difference of the directions together, nats
+    p_value : parametric bootstrap over all candidates, against white noise plus random walk
+    best : index of the best candidate (lag or step)
+    coefficient, coefficient_u : its coefficient, with standard uncertainty, for the average of the directions, um/K or um
+    by_direction : its coefficient in each direction alone, NaN where one was not read, um/K or um
+    hold_out_gain : log-likelihood gained in each direction by the candidate and the coefficient fitted to the other, sum of both, nats;
+        NaN where only one direction was read
     """
 
     log_likelihood: float
@@ -164,12 +147,9 @@ class RandomWalkFit:
 
     Attributes
     ----------
-    white : float
-        White noise alone.
-    shared : float
-        A random walk that both directions share.
-    one_direction : float
-        A random walk in one direction only; minus infinity where one was not read.
+    white : white noise alone
+    shared : a random walk that both directions share
+    one_direction : a random walk in one direction only; minus infinity where one was not read
     """
 
     white: float
@@ -220,7 +200,7 @@ def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residu
 def _without_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -> Array:
     """Return deviations (cycle, direction, target) less each target's mean and each pass's level and stretch, by backfitting."""
     present = np.isfinite(deviation)
-    rest = deviation - _mean_over_cycles(deviation)
+    rest = deviation - np.nan_to_num(known_mean(deviation, axis=0))
     for _ in range(50):
         passes = np.zeros_like(deviation)
         for index in np.ndindex(deviation.shape[:2]):
@@ -229,17 +209,11 @@ def _without_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -
                 passes[index] = design @ np.linalg.lstsq(design[used], rest[index][used], rcond=None)[0]
             else:
                 passes[index] = np.nan
-        profile = _mean_over_cycles(rest - passes)
+        profile = np.nan_to_num(known_mean(rest - passes, axis=0))
         rest = rest - profile
         if np.abs(profile).max() < 1e-6:
             break
     return rest - passes
-
-
-def _mean_over_cycles(values: Array) -> Array:
-    """Return the mean over the first dimension without NaN, 0 where there is nothing else."""
-    finite = np.isfinite(values)
-    return np.asarray(np.where(finite, values, 0.0).sum(axis=0) / np.maximum(finite.sum(axis=0), 1), float)
 
 
 def _typical_scatter(residuals: Array, design: Array, sound: NDArray[np.bool_], column: int) -> float:
@@ -357,8 +331,7 @@ def serial_p_value(residual: Residual, rng: np.random.Generator) -> float:
 
 def warm_up_share(seconds: Array, temperature: Array) -> float:
     """Return the share of a temperature's variance that one warm-up explains: a trend and exponentials from the first value on."""
-    trend = (seconds - seconds.mean()) / np.ptp(seconds)
-    design = np.column_stack([np.ones_like(seconds), trend, warm_up_columns(seconds)])
+    design = np.column_stack([level_and_trend(seconds), warm_up_columns(seconds)])
     centred = temperature - temperature.mean()
     rest = centred - design @ np.linalg.lstsq(design, centred, rcond=None)[0]
     return 1.0 - float((rest @ rest) / max(float(centred @ centred), 1e-30))
@@ -379,13 +352,10 @@ class ScatterFit:
 
     Attributes
     ----------
-    both : float
-        Excess scatter equal in both directions, Gaussian or with rare large values.
-    one_direction : float
-        Excess scatter in one direction only.
-    along_approach : float
-        One-sided, exponentially distributed amounts along the direction of motion, short of the target (as of a carriage that sticks)
-        or beyond it.
+    both : excess scatter equal in both directions, Gaussian or with rare large values
+    one_direction : excess scatter in one direction only
+    along_approach : one-sided, exponentially distributed amounts along the direction of motion, short of the target (as of a carriage
+        that sticks) or beyond it
     """
 
     both: float

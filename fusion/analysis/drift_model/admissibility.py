@@ -329,9 +329,9 @@ _EARLY_SHARE = 0.5
 _VALUES_AT_ONCE = 2**20
 
 
-def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> PriorRows:
-    """Priors of a model's coefficients in units of the noise; in a simulated response the coefficient is zero and its
-    prior off by chance.
+def prior_rows(model: ModelFit, rng: np.random.Generator | None = None, *, draws: int = DRAWS) -> PriorRows:
+    """Priors of a model's coefficients in units of the noise; in a simulated response the coefficient is zero and its prior off by
+    chance. Without a generator there are none for simulated responses.
     """
     priors = model.priors()
     design = np.zeros((len(priors), model.fit.design.shape[1]))
@@ -339,7 +339,8 @@ def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS)
     for row, (place, prior) in enumerate(priors):
         design[row, place] = model.fit.sigma / prior.u
         response[row] = model.fit.sigma * prior.mean / prior.u
-    return PriorRows(design, response, model.fit.sigma * rng.standard_normal((len(priors), draws)))
+    by_chance = np.empty((len(priors), 0)) if rng is None else rng.standard_normal((len(priors), draws))
+    return PriorRows(design, response, model.fit.sigma * by_chance)
 
 
 @dataclass(frozen=True)
@@ -577,8 +578,7 @@ def heteroscedastic_interval(model: ModelFit, instant_s: float) -> Heteroscedast
     """Find the time about an instant in which faster drift suits the readings best."""
     fit = model.fit
     columns = np.column_stack([fit.residual(), fit.design])
-    # No draws: nothing is taken from the generator.
-    priors = prior_rows(model, np.random.default_rng(), draws=0).beside(fit.coefficients)
+    priors = prior_rows(model).beside(fit.coefficients)
     even = max(_likelihood(system, columns, priors) for system in scaled_systems(fit, SHIFT_AND_STRETCH))
 
     def tried(inside: NDArray[np.bool_], factors: Sequence[tuple[float, float]]) -> list[HeteroscedasticInterval]:

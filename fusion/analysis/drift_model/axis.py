@@ -30,6 +30,7 @@ from fusion.analysis.drift_model.admissibility import (
     CandidateScorer,
     evaluate_on_hold_out,
     inconsistent_patterns,
+    prior_rows,
     refuse,
     refuse_in_heteroscedastic_drift,
     warm_up_share,
@@ -73,7 +74,6 @@ from fusion.analysis.drift_model.search import (
     no_progress,
     open_hold_out,
     refine,
-    rivals,
     score_effects,
     search,
     verdict,
@@ -801,11 +801,7 @@ def _left_out(model: ModelFit, block: NDArray[np.bool_]) -> Array:
     system = replace(fit.system, observed=~block)
     columns = np.column_stack([fit.response, fit.design])
     whitened, _ = system.whiten(columns)
-    y, x = whitened[:, :1], whitened[:, 1:]
-    for place, prior in model.priors():
-        row = np.zeros((1, x.shape[1]))
-        row[0, place] = fit.sigma / prior.u
-        y, x = np.vstack([y, [[fit.sigma * prior.mean / prior.u]]]), np.vstack([x, row])
+    y, x = prior_rows(model).append(whitened[:, :1], whitened[:, 1:])
     coefficients = solve(x.T @ x, x.T @ y)[:, 0]
     levels = system.smooth(columns).levels
     drift = np.einsum("nc,ncp->np", fit.system.loadings, levels)
@@ -996,12 +992,7 @@ def _words_of(parameter: tuple[str, Any]) -> str:
 def _score_of(score: Score) -> schema.AxisScore:
     confirmation = score.confirmation or Confirmation(False, Confirmed.LATER_CYCLES)
     return schema.AxisScore(
-        effect=score.name,
-        parameters=score.candidate.parameters if score.candidate else {},
-        gain=score.gain,
-        excess_gain=score.excess,
-        p_value=score.p_value,
-        family_wise_p=score.family_wise_p,
+        **score.described(),
         held_out_gain=confirmation.gain,
         held_out_p=confirmation.p_value,
         collinear_share=score.collinear,
@@ -1016,7 +1007,6 @@ def report_steps(state: LoopState[ModelFit], wrong: Mapping[int, Decision]) -> l
 def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None) -> AddedEffect:
     model, term, step = state.model, state.added[place], state.steps[place]
     event_s = term.candidate.event_s
-    tied, runner_up = rivals(step.score, step.round.scores)
     before_um, after_um, without_um = (np.nan,) * 3
     if not step.is_from_second_search:
         before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
@@ -1038,11 +1028,8 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
         errors_um = rmse(cross_after_um), rmse(cross_before_um)
         doubt = doubt_of(*errors_um, model.fit.sigma, "of blocks that are left out")
     return AddedEffect(
-        effect=term.effect,
-        parameters=term.candidate.parameters,
-        parameter_ranges=step.score.ranges,
+        **step.described(term.candidate, doubt),
         coefficients=coefficients_of(model, term),
-        p_value=step.score.family_wise_p,
         held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
         rmse_before_um=before_um,
         rmse_after_um=after_um,
@@ -1052,11 +1039,6 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
         cross_rmse_before_um=rmse(cross_before_um),
         cross_rmse_after_um=rmse(cross_after_um),
         rms_um=_size(model, term),
-        tied=tied,
-        runner_up=runner_up,
-        confirmed=not doubt,
-        doubt=doubt,
-        confirmed_by=str(step.confirmed),
         event_cycle=event_cycle,
     )
 

@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
 from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
@@ -52,7 +53,6 @@ from fusion.analysis.drift_model.search import (
     not_confirmed,
     open_hold_out,
     refine,
-    rivals,
     score_effects,
     search,
     verdict,
@@ -84,14 +84,12 @@ class Prediction:
     ----------
     predicted : (blocks, channels) um
     coefficients : (p, channels) of the columns, um per unit of each
-    centre : (p,) values of the columns at which the prediction is the channel's mean
     penalty : the shrinkage that forward chaining chose
     chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN where there is none
     """
 
     predicted: Array
     coefficients: Array
-    centre: Array
     penalty: float
     chained_rmse: float
 
@@ -101,7 +99,7 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
     asked = folds(record, train)
     errors = np.full((len(asked), PENALTIES.size), np.nan)
     for place, (before, part) in enumerate(asked):
-        for k, (predicted, _, _) in enumerate(_paths(record, columns, before)):
+        for k, (predicted, _) in enumerate(_paths(record, columns, before)):
             errors[place, k] = rmse(record, predicted, part)
     mean = known_mean(errors, axis=0)
     best = int(np.argmin(mean)) if np.isfinite(mean).all() else PENALTIES.size // 2
@@ -151,23 +149,13 @@ def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
     return float(known_mean(channel_rmse(record, predicted, where)))
 
 
-def known_mean(values: Array, axis: int | None = None) -> Array:
-    """Mean over the values that are known, NaN where there is none."""
-    known = np.isfinite(values)
-    number = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
-    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
-
-
 def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
     """Root mean square error of every channel over some blocks."""
-    squares = (record.displacement - predicted)[where] ** 2
-    number = np.isfinite(squares).sum(axis=0)
-    return np.asarray(np.sqrt(np.where(number > 0, np.nansum(squares, axis=0) / np.maximum(number, 1), np.nan)))
+    return np.asarray(np.sqrt(known_mean((record.displacement - predicted)[where] ** 2, axis=0)))
 
 
-def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array, Array]]:
-    """Predictions (blocks, channels), coefficients (p, channels) and centre (p,) under every penalty."""
+def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array]]:
+    """Predictions (blocks, channels) and coefficients (p, channels) under every penalty."""
     centre, scale = columns[train].mean(axis=0), columns[train].std(axis=0)
     scale = np.where(scale > 0.0, scale, np.inf)
     standard = (columns - centre) / scale
@@ -182,7 +170,7 @@ def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tup
         projected = vectors.T @ ((x - offset).T @ (y - middle) / here.sum())
         coefficients[:, :, channel] = (projected / (np.maximum(values, 0.0) + PENALTIES[:, None])) @ vectors.T
         levels[:, channel] = middle - coefficients[:, :, channel] @ offset
-    return [(standard @ one + levels[k], one / scale[:, None], centre) for k, one in enumerate(coefficients)]
+    return [(standard @ one + levels[k], one / scale[:, None]) for k, one in enumerate(coefficients)]
 
 
 # Plain predictions of a record's hold-out set, which the model has to beat: last value, mean, and regressions on all
@@ -245,15 +233,13 @@ def _named(runs: Sequence[str]) -> str:
 
 def declare(declared: Sequence[str], record: Record) -> list[Term]:
     """Make the terms of the declared model."""
-    terms = []
     for name in declared:
         if name != QUASI_STATIC:
             raise RecordError(
                 f'declared effect {name!r} cannot be computed from a record; declare "{QUASI_STATIC}" (every displacement linear '
                 "in the temperatures), the search tries the rest of the library"
             )
-        terms += [Term(QUASI_STATIC, one) for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
-    return terms
+    return [Term(name, one) for name in declared for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
 
 
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
@@ -272,7 +258,6 @@ class RecordFit:
     terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
     channels : the generalised least-squares fit of every channel under its own drift
     rows : the blocks of each channel's fit, as indices
-    levels : number of each channel's constants, the first columns of its design: one for every run
     """
 
     record: Record
@@ -280,7 +265,11 @@ class RecordFit:
     terms: tuple[Term, ...]
     channels: tuple[DriftFit, ...]
     rows: tuple[NDArray[np.intp], ...]
-    levels: tuple[int, ...]
+
+    @property
+    def levels(self) -> list[int]:
+        """Number of each channel's constants, the first columns of its design: one for every run."""
+        return [np.unique(self.record.run[rows]).size for rows in self.rows]
 
     @property
     def sigma(self) -> Array:
@@ -300,11 +289,11 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
     columns = np.concatenate([columns_of(record, []), *parts], axis=1)
     columns = columns[:, independent(columns[used])]
     rng = np.random.default_rng(0)
-    fits, rows, levels = [], [], []
+    fits, rows = [], []
     for k, name in enumerate(record.channels):
         response = record.displacement[:, k]
         here = np.flatnonzero(used & np.isfinite(response))
-        design, constants = _with_levels(record, columns, here)
+        design = _with_levels(record, columns, here)
         if here.size < _LEAST_PER_COEFFICIENT * design.shape[1]:
             raise RecordError(
                 f'channel "{name}" has {here.size} blocks for a model of {design.shape[1]} coefficients; record for longer, or leave it '
@@ -314,8 +303,7 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
         shaken = response[here] + 1e-6 * np.ptp(response[here]) * rng.standard_normal(here.size)
         fits.append(_estimate(name, record.seconds[here], shaken, design))
         rows.append(here)
-        levels.append(constants)
-    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows), tuple(levels))
+    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows))
 
 
 def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> DriftFit:
@@ -333,15 +321,15 @@ def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> D
         ) from None
 
 
-def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> tuple[Array, int]:
-    """Design of one channel at its blocks: a constant for every run, then the columns; and the number of constants."""
+def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> Array:
+    """Design of one channel at its blocks: a constant for every run, then the columns."""
     run = record.run[here]
     later = np.unique(run)[1:]
     if not later.size:
-        return np.column_stack([np.ones(here.size), columns[here]]), 1
+        return np.column_stack([np.ones(here.size), columns[here]])
     levels = (run[:, None] == later).astype(float)
     both = np.column_stack([levels, columns[here]])
-    return np.column_stack([np.ones(here.size), both[:, independent(both)]]), 1 + later.size
+    return np.column_stack([np.ones(here.size), both[:, independent(both)]])
 
 
 def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:
@@ -547,42 +535,27 @@ _CANDIDATES = {
 }
 
 
-@dataclass(frozen=True)
-class RecordEffect:
-    """An effect of the library in a record: a built-in one with columns of its own, a user's with those of the record's readings."""
-
-    effect: Effect
-
-    @property
-    def excited_by(self) -> str:
-        """As in the library."""
-        return self.effect.excited_by
-
-    @property
-    def repeats(self) -> bool:
-        """As in the library."""
-        return self.effect.repeats
-
-    def candidates(self, record: Record, near: Candidate | None) -> Iterator[Candidate]:
-        """Columns (blocks, q) that every channel follows with its own coefficients, for a closer look those near a candidate."""
-        if self.effect.name in _CANDIDATES:
-            return _CANDIDATES[self.effect.name](record, near)
-        return self.effect.candidates(record.view(), {}, near)
-
-    def needs(self, record: Record) -> str | None:
-        """Why it cannot be tried with this record, or None."""
-        if self.effect.name not in _CANDIDATES:
-            return self.effect.needs(record.view())
-        if self.effect.name == "unseen_heat_source" and not record.drivers:
-            return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
-        if self.effect.name == "sensor_fault" and not sensor_faults(record):
-            return "no sensor jumps alone"
-        return None
+def candidates_of(effect: Effect, record: Record, near: Candidate | None) -> Iterator[Candidate]:
+    """Columns (blocks, q) that every channel follows with its own coefficients; a user's effect makes them of the record's readings."""
+    if effect.name in _CANDIDATES:
+        return _CANDIDATES[effect.name](record, near)
+    return effect.candidates(record.view(), {}, near)
 
 
-def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, RecordEffect], dict[str, str]]:
+def needs_of(effect: Effect, record: Record) -> str | None:
+    """Why an effect cannot be tried with this record, or None."""
+    if effect.name not in _CANDIDATES:
+        return effect.needs(record.view())
+    if effect.name == "unseen_heat_source" and not record.drivers:
+        return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
+    if effect.name == "sensor_fault" and not sensor_faults(record):
+        return "no sensor jumps alone"
+    return None
+
+
+def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, Effect], dict[str, str]]:
     """Effects that can act in a record, and why the others of the library are not tried."""
-    offered = {name: RecordEffect(effect) for name, effect in (library() if effects is None else effects).items()}
+    offered = library() if effects is None else effects
     not_tried = {name: "a record has no positions" for name in offered if name in BUILT_IN - _CANDIDATES.keys()}
     return {name: effect for name, effect in offered.items() if name not in not_tried}, not_tried
 
@@ -733,7 +706,7 @@ RecordState = LoopState[RecordFit]
 class RecordProblem(Problem[RecordFit]):
     """A record, the blocks of it that may be used, and the library, for :mod:`fusion.analysis.drift_model.search`."""
 
-    effects: Mapping[str, RecordEffect]
+    effects: Mapping[str, Effect]
     entry_level = ENTRY_LEVEL
 
     def __init__(
@@ -748,7 +721,7 @@ class RecordProblem(Problem[RecordFit]):
 
     def start(self, declared: Sequence[Term]) -> RecordState:
         """The state before the search: the declared model, and the effects that this record cannot show."""
-        missing = {name: effect.needs(self.record) for name, effect in self.effects.items()}
+        missing = {name: needs_of(effect, self.record) for name, effect in self.effects.items()}
         return RecordState(fit_record(self.record, declared, self.train)).without_effects(
             {**self._not_tried, **missing}
         )
@@ -805,7 +778,7 @@ class RecordProblem(Problem[RecordFit]):
 
     def offer(self, name: str, model: RecordFit, near: Candidate | None) -> list[Candidate]:
         """Candidates of an effect that vary over the training part."""
-        offered = self.effects[name].candidates(self.record, near)
+        offered = candidates_of(self.effects[name], self.record, near)
         return [one for one in offered if (np.ptp(one.columns[self.train], axis=0) > 0.0).all()]
 
     def near(self, name: str, model: RecordFit, chosen: Candidate) -> list[Candidate]:
@@ -1147,13 +1120,9 @@ class RecordResult:
 
     def _step(self, place: int) -> schema.RecordStep:
         step, term = self.state.steps[place], self.state.added[place]
-        tied, runner_up = rivals(step.score, step.round.scores)
         squares = self.contribution(term) ** 2
         return schema.RecordStep(
-            effect=term.effect,
-            parameters=term.candidate.parameters,
-            parameter_ranges=step.score.ranges,
-            p_value=step.score.family_wise_p,
+            **step.described(term.candidate, self.doubts[place]),
             rmse_before_um=known_mean(self.errors[place]),
             rmse_after_um=known_mean(self.errors[place + 1]),
             rmse_without_um=self.state.errors_without_um[place],
@@ -1163,12 +1132,7 @@ class RecordResult:
             rms_by_channel_um={name: np.sqrt(np.mean(squares[:, k])) for k, name in enumerate(self.record.channels)},
             chained_rmse_before_um=step.round.start_error_um,
             chained_rmse_after_um=step.score.error_um,
-            tied=tied,
-            runner_up=runner_up,
             rejected=_rejected(step.round),
-            confirmed=not self.doubts[place],
-            doubt=self.doubts[place],
-            confirmed_by=str(step.confirmed),
             event_s=term.candidate.event_s,
         )
 
@@ -1192,12 +1156,7 @@ def _round_scores(scored: Round) -> list[schema.RecordScorePart]:
     rejected = _rejected(scored)
     return [
         schema.RecordScorePart(
-            effect=score.name,
-            parameters=score.candidate.parameters if score.candidate else {},
-            gain=score.gain,
-            excess_gain=score.excess,
-            p_value=score.p_value,
-            family_wise_p=score.family_wise_p,
+            **score.described(),
             chained_rmse_before_um=scored.start_error_um,
             chained_rmse_after_um=score.error_um,
             chosen=score.is_confirmed,

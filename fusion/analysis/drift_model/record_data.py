@@ -7,7 +7,7 @@ time constant; drivers are averaged after they are raised to a power, because he
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.analysis.alignment.readings import Readings, Series, sample_noise
+from fusion.analysis.alignment.readings import Readings, Series, known_mean, sample_noise
 from fusion.analysis.effects.thermal import SENSOR_PREFIX
 from fusion.common import Array, FusionError
 
@@ -40,6 +40,8 @@ _POSSIBLE = {
 }
 #: Share of its largest size by which a constant may differ from its mean.
 _ROUNDING = 1e-12
+#: Share of its squared length that a column must keep beside those before it.
+_DEPENDENT = 1e-8
 #: Blocks on either side of a switching that are near it.
 _NEAR_SWITCHING = 2
 #: Most and fewest parts that a record is cut into for forward chaining.
@@ -148,15 +150,13 @@ class Record:
     def view(self) -> Readings:
         """The record as readings of one place, so that effects that only need time, series and drivers work on it."""
         one = np.ones(self.seconds.size)
-        known = np.isfinite(self.displacement)
-        total = np.where(known, self.displacement, 0.0).sum(axis=1)
         rise = self.rise
         series = {"mean_rise": self.series(rise.mean(axis=1), "K")}
         series |= {f"{SENSOR_PREFIX}{name}": self.series(rise[:, k], "K") for k, name in enumerate(self.sensors)}
         series |= {name: self.series(powers[1], "1") for name, powers in self.drivers.items()}
         return Readings(
             seconds=self.seconds,
-            response=np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan),
+            response=known_mean(self.displacement, axis=1),
             cycle=np.arange(1, self.seconds.size + 1),
             target=one.astype(np.int64),
             position_mm=one,
@@ -256,7 +256,7 @@ def reduce_record(table: xr.Dataset) -> Record:
             f"{blocks.source}: no temperature changes; nothing that a displacement could follow; add sensors that warm"
         )
     per_block = max(1.0, elapsed.size / blocks.seconds.size)
-    drivers = _drivers(table, blocks)
+    drivers, driver_sizes = _drivers(table, blocks)
     return Record(
         start=time[0],
         seconds=blocks.seconds,
@@ -274,7 +274,7 @@ def reduce_record(table: xr.Dataset) -> Record:
         impossible=impossible,
         runs=_runs(table, blocks),
         first=blocks.first,
-        driver_sizes=_driver_sizes(table, drivers),
+        driver_sizes=driver_sizes,
     )
 
 
@@ -345,30 +345,23 @@ def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
     )
 
 
-def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:
-    """Powers of every driver as shares of its largest size; one that never changes is left out."""
-    drivers: dict[str, dict[int, Array]] = {}
+def _drivers(table: xr.Dataset, blocks: _Blocks) -> tuple[dict[str, dict[int, Array]], dict[str, tuple[float, str]]]:
+    """Powers of every driver as shares of its largest size, and that size with its unit ("1" where the table states none); one that
+    never changes is left out.
+    """
+    units = table["driver_units"].values if "driver_units" in table else ["1"] * table.sizes["driver_name"]
+    drivers, sizes = {}, {}
     for k, name in enumerate(str(one) for one in table["driver_name"].values):
         values = table["driver"].values[:, k]
         largest = float(np.nanmax(np.abs(values), initial=0.0))
         if largest == 0.0 or np.nanmin(values) == np.nanmax(values):
             continue
         drivers[name] = {exponent: blocks.filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
-    return drivers
+        sizes[name] = (largest, str(units[k]))
+    return drivers, sizes
 
 
-def _driver_sizes(table: xr.Dataset, kept: Collection[str]) -> dict[str, tuple[float, str]]:
-    """Largest size of every driver that was kept, with its unit ("1" where the table states none)."""
-    units = table["driver_units"].values if "driver_units" in table else ["1"] * table.sizes["driver_name"]
-    largest = np.nanmax(np.abs(table["driver"].values), axis=0, initial=0.0)
-    return {
-        str(name): (float(size), str(unit))
-        for name, size, unit in zip(table["driver_name"].values, largest, units, strict=True)
-        if str(name) in kept
-    }
-
-
-def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
+def independent(columns: Array) -> list[int]:
     """Columns of which a part is not a linear combination of those before."""
     kept: list[int] = []
     centred = columns - columns.mean(axis=0)
@@ -380,7 +373,7 @@ def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
         left = centred[:, k] - basis @ (basis.T @ centred[:, k])
         left -= basis @ (basis.T @ left)
         rest = float(left @ left)
-        if own > 0.0 and rest > tolerance * own:
+        if own > 0.0 and rest > _DEPENDENT * own:
             kept.append(k)
             basis = np.column_stack([basis, left / np.sqrt(rest)])
     return kept

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fusion.analysis.drift_model.fit import Term
 from fusion.analysis.drift_model.gains import Gains
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
-from fusion.analysis.effects.effect import Candidate, Separable, Wave
+from fusion.analysis.effects.effect import Candidate, Effect, Separable, Wave
 from fusion.analysis.effects.library import LIBRARY
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
@@ -303,6 +303,17 @@ class Score:
         """Whether the best candidate acts from one instant on."""
         return self.candidate is not None and self.candidate.event_s is not None
 
+    def described(self) -> dict[str, Any]:
+        """What results.json holds of every score, on a record and along an axis."""
+        return {
+            "effect": self.name,
+            "parameters": self.candidate.parameters if self.candidate else {},
+            "gain": self.gain,
+            "excess_gain": self.excess,
+            "p_value": self.p_value,
+            "family_wise_p": self.family_wise_p,
+        }
+
 
 def rivals(score: Score, scores: Sequence[Score]) -> tuple[list[str], schema.RunnerUp | schema.Nothing]:
     """Effects that these data cannot separate from the chosen one, and the runner-up."""
@@ -349,6 +360,21 @@ class Step:
     def is_from_second_search(self) -> bool:
         """Whether it entered after the hold-out set had been opened."""
         return self.confirmed is Confirmed.SECOND_SEARCH
+
+    def described(self, candidate: Candidate, doubt: str) -> dict[str, Any]:
+        """What results.json holds of every step, on a record and along an axis."""
+        tied, runner_up = rivals(self.score, self.round.scores)
+        return {
+            "effect": self.effect,
+            "parameters": candidate.parameters,
+            "parameter_ranges": self.score.ranges,
+            "p_value": self.score.family_wise_p,
+            "tied": tied,
+            "runner_up": runner_up,
+            "confirmed": not doubt,
+            "doubt": doubt,
+            "confirmed_by": str(self.confirmed),
+        }
 
 
 class Model(Protocol):
@@ -460,11 +486,6 @@ class LoopState(Generic[M]):
         decided = self.decide(Decision(score.name, Reason.ENTERED))
         return replace(decided, model=model, steps=(*self.steps, step))
 
-    def without(self, places: Collection[int], model: M, decisions: Sequence[Decision]) -> LoopState[M]:
-        """The state after some steps were taken out again; ``model`` is fitted without them."""
-        steps = tuple(step for place, step in enumerate(self.steps) if place not in places)
-        return replace(self.decide(*decisions), model=model, steps=steps)
-
     def kept(self, places: Collection[int]) -> tuple[Term, ...]:
         """Declared terms and those of the steps that are not among ``places``."""
         return (*self.declared, *(term for place, term in enumerate(self.added) if place not in places))
@@ -484,14 +505,6 @@ def no_progress(done: int, total: int, what: str) -> None:
     """Report nothing."""
 
 
-class LibraryEffect(Protocol):
-    """What the search asks of an effect of the library."""
-
-    @property
-    def repeats(self) -> bool:
-        """Whether it may be present more than once."""
-
-
 class Problem(ABC, Generic[M]):
     """The data, as the procedure sees them.
 
@@ -501,7 +514,7 @@ class Problem(ABC, Generic[M]):
     entry_level : family-wise p-value up to which an effect may enter
     """
 
-    effects: Mapping[str, LibraryEffect]
+    effects: Mapping[str, Effect]
     entry_level: float
 
     @abstractmethod
@@ -636,7 +649,9 @@ def withdraw(
     problem: Problem[M], state: LoopState[M], places: Collection[int], decisions: Sequence[Decision]
 ) -> LoopState[M]:
     """Take steps out of the model again and fit what is kept."""
-    return state.without(places, problem.refit(state.model, state.kept(places)), decisions)
+    model = problem.refit(state.model, state.kept(places))
+    steps = tuple(step for place, step in enumerate(state.steps) if place not in places)
+    return replace(state.decide(*decisions), model=model, steps=steps)
 
 
 def open_hold_out(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
@@ -840,15 +855,10 @@ def _rmse(squares: Array, number: Array) -> Array:
 GAIN_SHARE = 0.04
 
 
-def is_confirmed(with_um: float, without_um: float, noise_um: float) -> bool:
-    """Whether a prediction is better with an effect by more than chance changes it."""
-    beyond_noise = max(0.0, without_um**2 - noise_um**2)
-    return with_um < without_um and without_um**2 - with_um**2 >= GAIN_SHARE * beyond_noise
-
-
 def doubt_of(with_um: float, without_um: float, noise_um: float, where: str) -> str:
-    """Why an effect is not confirmed, in words; empty where it is."""
-    if is_confirmed(with_um, without_um, noise_um):
+    """Why an effect is not confirmed, in words; empty where a prediction is better with it by more than chance changes it."""
+    beyond_noise = max(0.0, without_um**2 - noise_um**2)
+    if with_um < without_um and without_um**2 - with_um**2 >= GAIN_SHARE * beyond_noise:
         return ""
     return f"the error {where} is {without_um:.3g} µm without it and {with_um:.3g} µm with it"
 

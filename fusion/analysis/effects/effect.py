@@ -40,11 +40,9 @@ class Wave:
 
     Attributes
     ----------
-    shape : callable
-        ``numpy.cos`` or ``numpy.sin``.
-    seconds : (n,) ndarray
-        Time of each reading, s.
-    period_s : float
+    shape : ``numpy.cos`` or ``numpy.sin``
+    seconds : (n,) time of each reading, s
+    period_s : its period, s
     """
 
     shape: Callable[[Array], Array]
@@ -69,11 +67,9 @@ class Separable:
 
     Attributes
     ----------
-    courses : tuple of ndarray or Wave
-        (n,) each, one per column; candidates that follow the same course share it.
-    place : (n,) ndarray of int
-        Place of every reading, a row of the weights; shared by candidates too.
-    weights : (places, q) ndarray
+    courses : (n,) each, one per column; candidates that follow the same course share it
+    place : (n,) place of every reading, a row of the weights; shared by candidates too
+    weights : (places, q) of the courses
     """
 
     courses: tuple[Array | Wave, ...]

@@ -128,7 +128,7 @@ def estimate(
 
 def moved_positions(found: ProfileChange) -> list[tuple[str, float | None]]:
     """Single positions that count as changed."""
-    return [(shape.shape, shape.position_mm) for shape in found.shapes if shape.position_mm is not None]
+    return [(shape.quantity, shape.position_mm) for shape in found.shapes if shape.position_mm is not None]
 
 
 def test_another_thermal_state_changes_no_position(rng: np.random.Generator) -> None:
@@ -144,14 +144,14 @@ def test_positions_that_moved_are_told_from_their_neighbours(rng: np.random.Gene
     assert set(moved_positions(found)) >= {("position", 100.0)}
     assert {place for _, place in moved_positions(found)} == {100.0, 250.0}
     size = next(shape for shape in found.shapes if shape.position_mm == 100.0)
-    assert abs(size.change_um - 3.0) < 4 * size.u_um
+    assert abs(size.change.value - 3.0) < 4 * size.change.u
     assert all(shape.machine for shape in found.shapes if shape.position_mm is not None)
 
 
 def test_slope_and_bow_are_told_and_are_no_change_of_the_machine(rng: np.random.Generator) -> None:
     bow = np.linspace(-1.0, 1.0, 8)
     found = compare_profiles(estimate(rng), estimate(rng, extra=10.0 * (1.0 - bow**2)), level=0.05)
-    shapes = {shape.shape: shape for shape in found.shapes}
+    shapes = {shape.quantity: shape for shape in found.shapes}
     assert shapes["bow"].p_value < 1e-6
     assert not shapes["bow"].machine and not shapes["slope"].machine
 
@@ -162,9 +162,9 @@ def test_a_reversal_that_drifts_in_a_test_is_no_change_between_tests(
 ) -> None:
     more = np.array([[0.5], [-0.5]])
     found = compare_profiles(estimate(rng, components=components), estimate(rng, extra=more), level=0.05)
-    reversal = next(shape for shape in found.shapes if shape.shape == "mean reversal")
+    reversal = next(shape for shape in found.shapes if shape.quantity == "mean reversal")
     assert reversal.machine is machine
-    assert reversal.change_um == pytest.approx(1.0, abs=4 * reversal.u_um)
+    assert reversal.change.value == pytest.approx(1.0, abs=4 * reversal.change.u)
 
 
 def test_what_remains_has_no_slope_and_its_uncertainty(rng: np.random.Generator) -> None:
@@ -199,7 +199,7 @@ def test_a_repair_is_found_between_two_tests_of_the_twin_and_nothing_else() -> N
     found = compare_profiles(drift_of(before), drift_of(repaired(after, 1.0)), level=0.05)
     assert moved_positions(found) == [("position", REPAIRED_MM)]
     size = next(shape for shape in found.shapes if shape.position_mm == REPAIRED_MM)
-    assert size.change_um == pytest.approx(1.0, abs=4 * size.u_um)
+    assert size.change.value == pytest.approx(1.0, abs=4 * size.change.u)
 
 
 # Scatters of two tests.
@@ -231,7 +231,7 @@ def test_a_position_that_repeats_worse_is_found(rng: np.random.Generator) -> Non
     one, other, freedom = sample(rng, 100), sample(rng, 100, worse), np.full(16, 100.0)
     found = compare_scatters(PLACE, one, other, freedom, freedom)
     assert [change.position_mm for change in found if 16 * change.p_value <= 0.05] == [80.0]
-    assert found[4].after_um == other[4]
+    assert found[4].after.value == other[4]
 
 
 def test_too_few_positions_are_not_compared() -> None:

@@ -108,11 +108,8 @@ def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
     assert peak < 1.5 * frames.nbytes
 
 
-def test_heat_and_noise_are_no_patch(warming):
+def test_heat_noise_and_a_camera_offset_are_no_patch(warming):
     assert find_switching_patch(warming) is None
-
-
-def test_a_camera_offset_is_no_patch(warming):
     warming[30:] += 1.0
     assert find_switching_patch(warming) is None
 

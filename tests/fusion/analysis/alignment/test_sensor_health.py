@@ -92,21 +92,16 @@ def test_a_load_that_is_switched_once_explains_what_a_sensor_does_then(sound):
     assert fault.reason == "a load was switched then, too rarely to compare"
 
 
-def test_two_sensors_that_jump_together_are_suspected_only(sound):
+@pytest.mark.parametrize(
+    ("jumps", "clear"), [({2: (900, 5.0), 6: (900, 5.0)}, False), ({2: (500, 5.0), 6: (1100, -4.0)}, True)]
+)
+def test_two_sensors_are_suspected_where_they_jump_together_and_named_one_after_the_other(sound, jumps, clear):
     seconds, temperature, load = sound
     spoilt = temperature.copy()
-    spoilt[900:, [2, 6]] += 5.0
+    for sensor, (first, jump_K) in jumps.items():
+        spoilt[first:, sensor] += jump_K
     faults = examine_sensors(seconds, spoilt, load)
-    assert [(fault.sensor, fault.is_clear) for fault in faults] == [(2, False), (6, False)]
-
-
-def test_two_sensors_that_jump_one_after_the_other_are_both_named(sound):
-    seconds, temperature, load = sound
-    spoilt = temperature.copy()
-    spoilt[500:, 2] += 5.0
-    spoilt[1100:, 6] -= 4.0
-    faults = examine_sensors(seconds, spoilt, load)
-    assert [(fault.sensor, fault.is_clear) for fault in faults] == [(2, True), (6, True)]
+    assert [(fault.sensor, fault.is_clear) for fault in faults] == [(2, clear), (6, clear)]
 
 
 def test_a_logger_that_stands_still_is_no_fault_of_its_sensors(sound):

@@ -175,6 +175,6 @@ def test_exponentials_of_other_constants_are_within_reach_of_the_columns():
 
 
 def test_a_warm_up_that_dominates_becomes_part_of_every_hypothesis():
-    assert nuisance_columns(SECONDS, Excitation(0.94, False, 3)).shape == (100, 2)
-    protected = nuisance_columns(SECONDS, Excitation(0.96, False, 3))
+    assert nuisance_columns(SECONDS, Excitation(0.94, False)).shape == (100, 2)
+    protected = nuisance_columns(SECONDS, Excitation(0.96, False))
     np.testing.assert_array_equal(protected[:, 2:], warm_up_columns(SECONDS))

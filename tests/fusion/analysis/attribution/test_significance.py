@@ -26,7 +26,7 @@ from fusion.analysis.attribution.significance import (
     whitening_grid,
 )
 
-VARIED = Excitation(0.5, False, 3)
+VARIED = Excitation(0.5, False)
 SECONDS = np.arange(60) * 252.0
 
 
@@ -36,7 +36,7 @@ def walks(rng, columns):
 
 
 def drift(name, values):
-    return DriftSeries(name, values, np.ones(60), SECONDS, np.arange(1, 61), np.eye(60))
+    return DriftSeries(name, values, np.ones(60), SECONDS, np.eye(60))
 
 
 def evaluate(rng, values, candidates, **changes):

@@ -8,54 +8,51 @@ from pathlib import Path
 import pandas as pd
 
 
-def _laser(folder: Path, edit: Callable[[pd.DataFrame], None]) -> None:
+def _laser(folder: Path, column: str, values: Callable[[pd.DataFrame], pd.Series]) -> None:
     table = pd.read_csv(folder / "laser.csv")
-    edit(table)
+    table[column] = values(table)
     table.to_csv(folder / "laser.csv", index=False)
 
 
 def deviations_in_mm(folder: Path) -> None:
     """Deviations in mm where um are asked for."""
-    _laser(folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"] / 1000.0))
+    _laser(folder, "deviation_um", lambda table: table["deviation_um"] / 1000.0)
 
 
 def deviations_in_nm(folder: Path) -> None:
     """Deviations in nm where um are asked for."""
-    _laser(folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"] * 1000.0))
+    _laser(folder, "deviation_um", lambda table: table["deviation_um"] * 1000.0)
 
 
 def positions_in_inch(folder: Path) -> None:
     """Positions in inch where mm are asked for."""
-    _laser(folder, lambda table: table.__setitem__("position_mm", table["position_mm"] / 25.4))
+    _laser(folder, "position_mm", lambda table: table["position_mm"] / 25.4)
 
 
 def inverted_signs(folder: Path) -> None:
     """Deviations with the opposite sign."""
-    _laser(folder, lambda table: table.__setitem__("deviation_um", -table["deviation_um"]))
+    _laser(folder, "deviation_um", lambda table: -table["deviation_um"])
 
 
 def one_gross_reading(folder: Path) -> None:
     """One reading of a metre."""
-    _laser(
-        folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"].where(table.index != 100, 1e6))
-    )
+    _laser(folder, "deviation_um", lambda table: table["deviation_um"].where(table.index != 100, 1e6))
 
 
 def new_datum(folder: Path) -> None:
     """The beam was broken before cycle 15."""
-    _laser(
-        folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"] + 80.0 * (table["cycle"] >= 15))
-    )
+    _laser(folder, "deviation_um", lambda table: table["deviation_um"] + 80.0 * (table["cycle"] >= 15))
 
 
 def copied_cycle(folder: Path) -> None:
     """Cycle 13 holds the deviations of cycle 12."""
 
-    def edit(table: pd.DataFrame) -> None:
-        source = table.loc[table["cycle"] == 12, "deviation_um"].to_numpy()
-        table.loc[table["cycle"] == 13, "deviation_um"] = source
+    def copied(table: pd.DataFrame) -> pd.Series:
+        deviation = table["deviation_um"].copy()
+        deviation[table["cycle"] == 13] = deviation[table["cycle"] == 12].to_numpy()
+        return deviation
 
-    _laser(folder, edit)
+    _laser(folder, "deviation_um", copied)
 
 
 def drivers_of_another_day(folder: Path) -> None:
@@ -71,17 +68,20 @@ def drivers_end_early(folder: Path) -> None:
     table.head(len(table) // 2).to_csv(folder / "drivers.csv", index=False)
 
 
+def _campaign_file(folder: Path, **changed: str) -> None:
+    """Lines of campaign.toml by key, each written anew."""
+    path = folder / "campaign.toml"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert changed.keys() <= {line.partition(" =")[0] for line in lines}
+    written = [f"{key} = {changed[key]}" if (key := line.partition(" =")[0]) in changed else line for line in lines]
+    path.write_text("\n".join(written) + "\n", encoding="utf-8")
+
+
 def axis_the_other_way_round(folder: Path) -> None:
     """The same stretch of the plan with its direction reversed."""
-    path = folder / "campaign.toml"
-    text = path.read_text(encoding="utf-8")
-    assert 'origin = ["500 mm", "90 mm"]' in text and "direction = [-1, 0]" in text
-    text = text.replace('origin = ["500 mm", "90 mm"]', 'origin = ["250 mm", "90 mm"]')
-    path.write_text(text.replace("direction = [-1, 0]", "direction = [1, 0]"), encoding="utf-8")
+    _campaign_file(folder, origin='["250 mm", "90 mm"]', direction="[1, 0]")
 
 
 def emissivity_of_half(folder: Path) -> None:
     """An emissivity of 0.5 for a painted table."""
-    path = folder / "campaign.toml"
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace("emissivity = 0.97", "emissivity = 0.5"), encoding="utf-8")
+    _campaign_file(folder, emissivity="0.5")

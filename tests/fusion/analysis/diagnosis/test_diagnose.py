@@ -33,12 +33,15 @@ def test_a_plain_effect_gets_its_name(cause):
     assert "local_temperature" not in named or cause == "local_temperature"
 
 
+def diagnosed(fused, course_um):
+    """The diagnosis of target 3 that follows a course (cycles,) in both directions."""
+    fused["deviation"][:, :, 2] += course_um[:, None]
+    return diagnose(fused, [Flag(3)])[0]
+
+
 def test_the_step_is_dated_and_measured(rng):
     fused = odd_position("structural", rng, rms_um=0.0)
-    deviation = fused["deviation"].values.copy()
-    deviation[60:, :, 2] += 1.0
-    fused["deviation"] = (fused["deviation"].dims, deviation)
-    diagnosis = diagnose(fused, [Flag(3)])[0]
+    diagnosis = diagnosed(fused, 1.0 * (np.arange(100) >= 60))
     assert diagnosis.cause == "step"
     # The first reading after the step is that of cycle 61.
     assert abs(diagnosis.evidence["step_cycle"] - 61) <= 1
@@ -52,10 +55,7 @@ def test_sensitivity_and_lag_of_a_local_temperature(rng):
     fused = odd_position("structural", rng, rms_um=0.0)
     rise = fused["local_rise_series"].values[:, 2]
     response = simulator.first_order(rise - rise[0], 1800.0)
-    deviation = fused["deviation"].values.copy()
-    deviation[:, :, 2] += 0.3 * response[:, None]
-    fused["deviation"] = (fused["deviation"].dims, deviation)
-    diagnosis = diagnose(fused, [Flag(3)])[0]
+    diagnosis = diagnosed(fused, 0.3 * response)
     assert diagnosis.cause == "local_temperature"
     assert diagnosis.evidence["temperature_lag_s"] == 1800.0
     u = diagnosis.evidence["temperature_u_um_per_K"]
@@ -67,10 +67,7 @@ def test_a_local_warm_up_is_not_called_a_cause(rng):
     fused = odd_position("structural", rng, rms_um=0.0)
     warm = 3.0 * (1 - np.exp(-np.arange(100) * simulator.PERIOD_S / 4500.0))
     fused["local_rise_series"] = (("frame_time", "target"), np.tile(warm[:, None], (1, 16)))
-    deviation = fused["deviation"].values.copy()
-    deviation[:, :, 2] += warm[:, None]
-    fused["deviation"] = (fused["deviation"].dims, deviation)
-    diagnosis = diagnose(fused, [Flag(3)])[0]
+    diagnosis = diagnosed(fused, warm)
     assert diagnosis.cause == "undetermined"
     assert diagnosis.evidence["temperature_warm_up_share"] > 0.98
 
@@ -106,40 +103,40 @@ def test_missing_readings_are_tolerated(rng):
     assert diagnose(fused, [Flag(3)])[0].cause == "structural"
 
 
-def test_an_unknown_target_is_refused(rng):
-    with pytest.raises(DiagnosisError, match=r"target 40 is not among the measured targets \[1, 2, 3"):
-        diagnose(odd_position("structural", rng), [Flag(40)])
+@pytest.mark.parametrize(
+    ("flags", "cycles", "message"),
+    [
+        ([40], 100, r"target 40 is not among the measured targets \[1, 2, 3"),
+        (range(1, 15), 100, "only 2 targets are free of anomalies"),
+        ([3], 8, "target 3 has readings in 8 cycles; a diagnosis needs 12"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_named(rng, flags, cycles, message):
+    fused = odd_position("structural", rng).isel(cycle=slice(0, cycles))
+    with pytest.raises(DiagnosisError, match=message):
+        diagnose(fused, [Flag(target) for target in flags])
 
 
-def test_too_few_sound_targets_are_refused(rng):
-    flags = [Flag(target) for target in range(1, 15)]
-    with pytest.raises(DiagnosisError, match="only 2 targets are free of anomalies"):
-        diagnose(odd_position("structural", rng), flags)
-
-
-def test_too_few_cycles_are_refused(rng):
-    fused = odd_position("structural", rng).isel(cycle=slice(0, 8))
-    with pytest.raises(DiagnosisError, match="target 3 has readings in 8 cycles; a diagnosis needs 12"):
-        diagnose(fused, [Flag(3)])
+EQUAL = "standard deviations equal within their uncertainty: "
+BOTH = "1.00 µm in the positive direction, {:.2f} µm in the negative direction"
 
 
 @pytest.mark.parametrize(
-    ("negative_um", "sentence"),
+    ("readings", "negative_um", "sentence"),
     [
         # 51 readings each: u = s / 10, so that 1.00 and 1.30 differ by 0.30 and agree within 2 * hypot(0.10, 0.13) = 0.33.
-        (
-            1.3,
-            "standard deviations equal within their uncertainty: 1.00 µm in the positive direction, 1.30 µm in the negative direction",
-        ),
-        (1.4, "standard deviation 1.00 µm in the positive direction, 1.40 µm in the negative direction"),
-        (np.nan, "directions not compared: fewer than two readings in one of them"),
+        (51, 1.3, EQUAL + BOTH),
+        (51, 1.4, "standard deviation " + BOTH),
+        (51, np.nan, "directions not compared: fewer than two readings in one of them"),
+        # Nine readings each, eight degrees of freedom: u = s / 4, so that 1.00 and 0.46 agree within 2 * hypot(0.25, 0.115) = 0.55.
+        (9, 0.46, EQUAL + BOTH),
+        (9, 0.44, "standard deviation " + BOTH),
     ],
 )
-def test_directions_are_called_equal_only_within_their_uncertainty(negative_um, sentence):
-    row = np.resize([1.0, -1.0], 51)
-    row /= row.std()
+def test_directions_are_called_equal_only_within_their_uncertainty(readings, negative_um, sentence):
+    row = np.resize([1.0, -1.0], readings)
     residual = SimpleNamespace(values=np.stack([row, negative_um * row]), scatter_um=(1.0, negative_um))
-    assert _directions_sentence(residual) == sentence
+    assert _directions_sentence(residual) == sentence.format(negative_um)
 
 
 def fitted(**changes):
@@ -229,14 +226,6 @@ def test_a_walk_in_one_direction_pays_for_its_parameter_and_its_bar():
     case.random_walk.one_direction = 2.0 + 0.5 * np.log(100) + 1.0
     probability = _probabilities(case)
     assert probability["stick_slip"] / probability["structural"] == pytest.approx(np.e)
-
-
-def test_few_readings_have_their_degrees_of_freedom():
-    """Nine readings each, eight degrees of freedom: u = s / 4, so that 1.00 and 0.46 agree within 2 * hypot(0.25, 0.115) = 0.55."""
-    row = np.resize([1.0, -1.0], 9)
-    for negative_um, equal in ((0.46, True), (0.44, False)):
-        residual = SimpleNamespace(values=np.stack([row, row]), scatter_um=(1.0, negative_um))
-        assert _directions_sentence(residual).startswith("standard deviations equal") is equal
 
 
 def test_the_gain_of_an_approach_is_that_of_the_better_of_its_two_forms():

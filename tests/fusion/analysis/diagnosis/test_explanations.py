@@ -81,16 +81,14 @@ def test_temperature_response_through_a_lag_is_recovered(rng):
     rise = np.cumsum(rng.standard_normal(frames.size)) * 0.2
     columns = lagged_temperature(residual_of(np.zeros((2, CYCLES)), (frames, rise)))
     assert columns is not None and columns.shape == (CYCLES, len(LAGS_S))
+    # Without a camera there is no temperature.
+    assert lagged_temperature(residual_of(np.zeros((2, CYCLES)))) is None
     np.testing.assert_allclose(columns[:, 0], np.interp(SECONDS, frames, rise))
     lagged = 2  # 1800 s
     values = 0.5 * columns[:, lagged] + 0.1 * rng.standard_normal((2, CYCLES))
     fit = fit_profile(residual_of(values), columns, rng)
     assert fit.best == lagged
     assert fit.coefficient == pytest.approx(0.5, abs=4 * fit.coefficient_u)
-
-
-def test_without_a_camera_there_is_no_temperature():
-    assert lagged_temperature(residual_of(np.zeros((2, CYCLES)))) is None
 
 
 def test_walk_in_one_direction_is_told_from_a_shared_one(rng):

@@ -71,71 +71,66 @@ class Stated:
         return self.advantage
 
 
-def test_an_event_at_a_switching_is_refused_first():
-    decision = refuse("step_event", "field", CANDIDATE, Stated(hours=2.5, noise=("t1", 1.0, 0.01)))
-    assert decision == Decision("step_event", Reason.AT_SWITCHING, {"hours": 2.5})
-    assert refuse("step_event", "", CANDIDATE, Stated(hours=0.0)).reason is Reason.AT_SWITCHING
+WRONG = {"noise": ("t1", 1.0, 0.01), "rate": True, "advantage": -9.0}
+SINGLE = Decision("a", Reason.SINGLE_WARM_UP, {"share_percent": 99.5, "gain": 1.0})
 
 
-def test_an_effect_that_needs_no_switching_is_asked_no_more():
-    grounds = Stated(noise=("t1", 1.0, 0.01), rate=True, advantage=-9.0)
-    assert refuse("dead_path", "", CANDIDATE, grounds) is None
-    assert grounds.asked == ["switching"]
+def noisy(percent: float) -> Decision:
+    evidence = {"series": "t1", "noise_percent": pytest.approx(percent), "limit_percent": 1.0}
+    return Decision("a", Reason.TEMPERATURE_NOISE, evidence)
 
 
-def test_a_source_is_only_asked_for_its_excitation():
-    grounds = Stated(noise=("t1", 1.0, 0.01), rate=True, advantage=-9.0)
-    assert refuse("unseen_heat_source", "driver", CANDIDATE, grounds) is None
-    assert grounds.asked == ["switching", "single driver"]
-    single = Decision("unseen_heat_source", Reason.SINGLE_SWITCHING, {"driver": "duty", "share_percent": 99.5})
-    assert refuse("unseen_heat_source", "driver", CANDIDATE, Stated(single=single)) is single
-
-
-def test_a_lag_passes_every_check_in_turn():
-    grounds = Stated()
-    assert refuse("thermal_lag", "field", CANDIDATE, grounds) is None
-    assert grounds.asked == ["switching", "noise", "single field", "rate", "smoothing", "heat"]
-
-
-def test_a_lag_is_not_told_from_heat_that_was_not_logged():
-    decision = refuse("thermal_lag", "field", CANDIDATE, Stated(heat=False))
-    assert decision == Decision("thermal_lag", Reason.UNLOGGED_HEAT)
-    assert refuse("unseen_heat_source", "driver", CANDIDATE, Stated(heat=False)) is None
-    assert refuse("dead_path", "", CANDIDATE, Stated(heat=False)) is None
+@pytest.mark.parametrize(
+    ("excited_by", "stated", "decision", "asked"),
+    [
+        # An event at a switching is refused first; an effect that needs no switching is asked no more.
+        ("field", {"hours": 2.5, **WRONG}, Decision("a", Reason.AT_SWITCHING, {"hours": 2.5}), "switching"),
+        ("", {"hours": 0.0}, Decision("a", Reason.AT_SWITCHING, {"hours": 0.0}), "switching"),
+        ("", {**WRONG, "heat": False}, None, "switching"),
+        # A source is only asked for its excitation.
+        ("driver", {**WRONG, "heat": False}, None, "switching, single driver"),
+        ("driver", {"single": SINGLE}, SINGLE, "switching, single driver"),
+        # A lag passes every check in turn, each at its limit.
+        ("field", {}, None, "switching, noise, single field, rate, smoothing, heat"),
+        (
+            "field",
+            {"noise": ("t1", 0.01, 0.01), "advantage": 2.0},
+            None,
+            "switching, noise, single field, rate, smoothing, heat",
+        ),
+        ("field", {"noise": ("t1", 0.0101, 0.01)}, noisy(1.01), "switching, noise"),
+        ("field", {"single": SINGLE, "rate": True}, SINGLE, "switching, noise, single field"),
+        (
+            "field",
+            {"rate": True, "advantage": 0.0},
+            Decision("a", Reason.FOLLOWS_RATE, {"series": "t1"}),
+            "switching, noise, single field, rate",
+        ),
+        (
+            "field",
+            {"advantage": 1.99},
+            Decision("a", Reason.SMOOTHING, {"series": "t1", "advantage": 1.99}),
+            "switching, noise, single field, rate, smoothing",
+        ),
+        # It is not told from heat that was not logged.
+        (
+            "field",
+            {"heat": False},
+            Decision("a", Reason.UNLOGGED_HEAT),
+            "switching, noise, single field, rate, smoothing, heat",
+        ),
+    ],
+)
+def test_an_effect_is_refused_by_the_first_check_that_it_fails(excited_by, stated, decision, asked):
+    grounds = Stated(**stated)
+    assert refuse("a", excited_by, CANDIDATE, grounds) == decision
+    assert ", ".join(grounds.asked) == asked
 
 
 def test_a_campaign_logs_heat_where_it_has_a_driver():
     for drivers in ((), ("duty",)):
         readings = campaign(cycles=12, series={"duty": logged(np.arange(60.0), "1")}, drivers=drivers)
         assert AxisGrounds(model_of(readings)).heat_is_logged() is bool(drivers)
-
-
-@pytest.mark.parametrize(("noise", "refused"), [(0.01, False), (0.0101, True)])
-def test_a_lag_of_a_noisy_temperature_is_refused(noise, refused):
-    decision = refuse("thermal_lag", "field", CANDIDATE, Stated(noise=("the mean rise", noise, 0.01)))
-    assert (decision is not None) is refused
-    if decision is not None:
-        assert decision == Decision(
-            "thermal_lag",
-            Reason.TEMPERATURE_NOISE,
-            {"series": "the mean rise", "noise_percent": pytest.approx(1.01), "limit_percent": 1.0},
-        )
-
-
-def test_a_lag_that_was_excited_once_or_follows_the_rate_is_refused():
-    single = Decision("thermal_lag", Reason.SINGLE_WARM_UP, {"share_percent": 99.5, "gain": 1.0})
-    assert refuse("thermal_lag", "field", CANDIDATE, Stated(single=single, rate=True)) is single
-    assert refuse("thermal_lag", "field", CANDIDATE, Stated(rate=True, advantage=0.0)) == Decision(
-        "thermal_lag", Reason.FOLLOWS_RATE, {"series": "t1"}
-    )
-
-
-@pytest.mark.parametrize(("advantage", "refused"), [(2.0, False), (1.99, True)])
-def test_a_lag_that_only_smooths_is_refused(advantage, refused):
-    decision = refuse("thermal_lag", "field", CANDIDATE, Stated(advantage=advantage))
-    assert (decision is not None) is refused
-    if decision is not None:
-        assert decision == Decision("thermal_lag", Reason.SMOOTHING, {"series": "t1", "advantage": 1.99})
 
 
 def test_the_noise_of_a_series_is_seen_beside_its_course():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.analysis.alignment.align import AxisGeometry, align
-from fusion.analysis.alignment.readings import Readings, ReadingsError, Series, read_fused
+from fusion.analysis.alignment.readings import Readings, ReadingsError, read_fused
 from fusion.analysis.drift_model.axis import (
     LoopError,
     close_loop,
@@ -22,7 +22,6 @@ from fusion.analysis.drift_model.axis import (
 )
 from fusion.analysis.drift_model.search import Confirmed
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
-from fusion.analysis.effects.events import event_instants, instants_near
 from fusion.analysis.effects.library import library
 from fusion.results.loop import ResidualTestsPart
 from fusion.twin import simulate
@@ -199,17 +198,6 @@ def test_too_few_cycles_are_refused():
         readings_of(cycles=3)
 
 
-def test_gaps_in_a_log_are_found():
-    readings = readings_of(cycles=20)
-    duty = readings.series["duty"]
-    kept = (duty.seconds < 1200.0) | (duty.seconds > 2400.0)
-    holed = Series(duty.seconds[kept], duty.values[kept], duty.units)
-    (gap,) = replace(readings, series={**readings.series, "duty": holed}).gaps()
-    assert gap.series == "duty"
-    assert (gap.start_s, gap.end_s) == (pytest.approx(1200.0, abs=60.0), pytest.approx(2400.0, abs=61.0))
-    assert readings.gaps() == []
-
-
 def test_the_hold_out_set_is_asked_once_and_the_answer_is_logged():
     """A reversal of an eighth of the noise is too small for the search, and too large to be left unasked."""
     readings = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.05), seed=15, cycles=20)
@@ -237,18 +225,6 @@ def test_what_could_be_found_is_found_at_that_size():
 
 def _few(*names: str) -> dict[str, Effect]:
     return {name: library()[name] for name in (*DECLARED, *names)}
-
-
-def test_a_long_campaign_has_no_more_candidates_than_a_long_day():
-    """What is tried must not grow with the readings, or the search would grow with their square."""
-    long, short = readings_of(cycles=150), readings_of()
-    assert event_instants(short).size == 220  # four in each of the 55 cycles with enough cycles on both sides
-    assert 120 < event_instants(long).size <= 240
-    steps = np.diff(event_instants(long))
-    near = instants_near(long, float(event_instants(long)[40]))
-    # A closer look reaches from one tried instant to the next.
-    assert np.ptp(near) == pytest.approx(2.0 * np.median(steps), rel=0.1)
-    assert len(list(library()["periodic_disturbance"].candidates(long, {}, None))) <= 600
 
 
 def test_one_jump_of_the_camera_is_named_once():

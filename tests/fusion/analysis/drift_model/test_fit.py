@@ -311,10 +311,7 @@ def test_priors_are_further_rows_that_know_the_models_columns_only():
     assert (y.shape, x.shape) == ((4, 3), (4, 4))
     measured_only, _ = rows.append(np.zeros((3, 1)), np.ones((3, 2)))
     np.testing.assert_array_equal(measured_only[:, 0], [0.0, 0.0, 0.0, 5.0])
-
-
-def test_the_priors_of_the_measured_response_lose_what_coefficients_make_of_it():
-    rows = PriorRows(np.array([[0.0, 2.0]]), np.array([5.0]), np.array([[7.0, 8.0]]))
+    # The prior of the measured response loses what coefficients make of it.
     beside = rows.beside(np.array([9.0, 1.5]))
     np.testing.assert_array_equal(beside.responses(3), [[2.0, 7.0, 8.0]])
     assert beside.design is rows.design

@@ -36,12 +36,9 @@ def covariance_of_walk(order: int) -> np.ndarray:
     return matrix @ matrix.T
 
 
-def test_a_random_walk_has_the_covariance_of_theory():
-    np.testing.assert_allclose(covariance_of_walk(1), np.minimum.outer(SECONDS, SECONDS), atol=1e-9)
-
-
-def test_an_integrated_walk_has_the_covariance_of_theory():
+def test_walks_have_the_covariance_of_theory():
     early, late = np.minimum.outer(SECONDS, SECONDS), np.maximum.outer(SECONDS, SECONDS)
+    np.testing.assert_allclose(covariance_of_walk(1), early, atol=1e-9)
     np.testing.assert_allclose(covariance_of_walk(2), early**2 * (3.0 * late - early) / 6.0, rtol=1e-9, atol=1e-6)
 
 

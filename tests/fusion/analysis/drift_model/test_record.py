@@ -19,6 +19,7 @@ from fusion.analysis.drift_model.record import (
     RecordGrounds,
     RecordProblem,
     _smoothed,
+    candidates_of,
     chain_forward,
     channel_gains,
     channel_rmse,
@@ -26,6 +27,7 @@ from fusion.analysis.drift_model.record import (
     fit_record,
     hold_out,
     last_values,
+    needs_of,
     one_switching_share,
     predict,
     record_library,
@@ -160,7 +162,7 @@ def test_an_effect_must_earn_its_place_on_later_parts_and_an_event_must_not_harm
     near = [asked.best]
     monkeypatch.setattr(problem, "near", lambda name, model, chosen: near)
     nothing = np.empty(0)
-    monkeypatch.setattr(problem, "predict", lambda terms: Prediction(nothing, nothing, nothing, 1.0, after))
+    monkeypatch.setattr(problem, "predict", lambda terms: Prediction(nothing, nothing, 1.0, after))
     state = problem.start([]).scored(Round((asked,), start_error_um=2.0))
     confirmation = problem.confirm(asked, state).confirmation
     assert confirmation.passed is passed
@@ -300,7 +302,7 @@ def record(*, block_s: float = 300.0, drivers: bool = True) -> Record:
 
 
 def candidates(name: str, of: Record, near: Candidate | None = None) -> list[Candidate]:
-    return list(record_library()[0][name].candidates(of, near))
+    return list(candidates_of(record_library()[0][name], of, near))
 
 
 def near(event_s: float | None = None, **parameters: float | str) -> Candidate:
@@ -435,9 +437,9 @@ def test_a_users_effect_sees_the_record_as_readings_of_one_place():
 
     own = Effect("own", "", "", offer, needs=lambda readings: f"{len(readings.drivers)} drivers", excited_by="driver")
     effects, _ = record_library({**library(), "own": own})
-    (candidate,) = effects["own"].candidates(record(), None)
+    (candidate,) = candidates_of(effects["own"], record(), None)
     assert asked == [(MANY, {}, None)] and candidate.columns.shape == (MANY, 1)
-    assert (effects["own"].needs(record()), effects["own"].excited_by) == ("1 drivers", "driver")
+    assert (needs_of(effects["own"], record()), effects["own"].excited_by) == ("1 drivers", "driver")
 
 
 # Grounds of a record: excitation by its drivers, noise of its sensors, the course of a delayed sensor.
@@ -445,7 +447,7 @@ def test_a_users_effect_sees_the_record_as_readings_of_one_place():
 
 def quiet(record: Record, used: np.ndarray | None = None) -> RecordFit:
     """A record and which of its blocks are used: what most grounds are asked of needs no fit."""
-    return RecordFit(record, np.ones(MANY, bool) if used is None else used, (), (), (), ())
+    return RecordFit(record, np.ones(MANY, bool) if used is None else used, (), (), ())
 
 
 def switching() -> np.ndarray:

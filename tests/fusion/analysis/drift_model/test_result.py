@@ -34,7 +34,6 @@ from fusion.analysis.drift_model.search import (
     Score,
     Step,
     exceeds_noise,
-    is_confirmed,
 )
 from fusion.analysis.effects.effect import Candidate, Prior
 from fusion.results.loop import AxisLoop, AxisStep, Baselines, DetectionLimit, ErrorInterval, ResidualTestsPart
@@ -189,18 +188,13 @@ def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
     assert step.rms_um == pytest.approx(abs(height) * np.sqrt(np.mean((LATE - shares) ** 2)))
 
 
-@pytest.mark.parametrize(("event_s", "cycle"), [(650.0, 6), (650.1, 6), (720.1, 7), (5000.0, 12)])
-def test_an_event_belongs_to_the_cycle_of_the_next_reading(event_s, cycle):
+@pytest.mark.parametrize(("event_s", "cycle"), [(650.0, 6), (650.1, 6), (720.1, 7), (5000.0, 12), (None, None)])
+def test_an_event_belongs_to_the_cycle_of_the_next_reading_and_what_lasts_to_none(event_s, cycle):
     """Cycle 6 is read from 650 to 720 s, cycle 7 from 780 s on; 12 is the last."""
     model = fitted()
     later = term(LATE, "step_event", event_s=event_s)
     changed = replace(model, terms=(model.terms[0], later))
     assert report_steps(state(changed), {})[0].event_cycle == cycle
-
-
-def test_an_effect_that_lasts_belongs_to_no_cycle():
-    model = model_of(measured(), [term(WAVE), term(LATE, "step_event")])
-    assert report_steps(state(model), {})[0].event_cycle is None
 
 
 @pytest.mark.parametrize(("after", "confirmed"), [(0.3, True), (0.799, False), (0.9, False)])
@@ -478,7 +472,6 @@ def test_a_site_that_only_one_block_holds_is_left_out():
     ],
 )
 def test_an_effect_is_confirmed_by_a_share_of_the_error_beyond_the_noise(with_um, without_um, noise_um, confirmed):
-    assert is_confirmed(with_um, without_um, noise_um) is confirmed
     assert (doubt_of(with_um, without_um, noise_um, "on the hold-out set") == "") is confirmed
 
 

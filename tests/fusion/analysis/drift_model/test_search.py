@@ -133,15 +133,13 @@ def test_the_best_effect_that_is_significant_is_chosen():
     assert [one.gain for one in state.rounds[-1].scores] == [77.0, 0.0]
 
 
-@pytest.mark.parametrize(("p_value", "name"), [(LEVEL, "a"), (LEVEL * 1.001, "b")])
-def test_an_effect_enters_up_to_the_level(p_value, name):
-    _, chosen = choose(Script(), start(score("a", 20.0, p_value), score("b", 19.0)))
+@pytest.mark.parametrize(
+    ("p_value", "level", "name"),
+    [(LEVEL, None, "a"), (LEVEL * 1.001, None, "b"), (0.01, 0.005, "b"), (0.04, 0.05, "a")],
+)
+def test_an_effect_enters_up_to_the_level_or_another_that_is_asked_for(p_value, level, name):
+    _, chosen = choose(Script(), start(score("a", 20.0, p_value), score("b", 19.0)), level=level)
     assert chosen.name == name
-
-
-def test_another_level_can_be_asked_for():
-    assert choose(Script(), start(score("a", p_value=0.01)), level=0.005)[1] is None
-    assert choose(Script(), start(score("a", p_value=0.04)), level=0.05)[1].name == "a"
 
 
 def test_an_effect_without_a_candidate_or_withdrawn_for_good_is_passed_over():
@@ -455,14 +453,6 @@ def test_unusable_columns_of_a_user_are_recorded_and_those_of_the_library_raised
     assert decision.evidence["because"] == f"SearchError: {fault.value}"
 
 
-def test_any_fault_of_a_users_effect_is_recorded():
-    def broken():
-        raise KeyError("no such series")
-
-    families, (decision,) = collect_candidates({"own": broken}, 3, built_in=frozenset())
-    assert families == {} and decision.sentence.endswith("KeyError: 'no such series'")
-
-
 def test_columns_of_many_candidates_are_kept_on_disk_with_the_same_values(monkeypatch, rng):
     for module in (scoring_module, spool_module):
         monkeypatch.setattr(module, "IN_MEMORY_BYTES", 200)
@@ -612,58 +602,57 @@ def test_significant_effects_that_are_withheld_have_no_name():
 # How well nonlinear parameters are known, by profile likelihood.
 
 
-NOTHING = np.empty((0, 1))
+def varied(name: str, *values: float, **words: str) -> list[Candidate]:
+    """Candidates that differ in one number."""
+    return [Candidate(np.empty((0, 1)), {**words, name: value}, ("um",)) for value in values]
 
 
-def state(minutes: float, follows: str = "duty") -> Candidate:
-    return Candidate(NOTHING, {"follows": follows, "time_constant_min": minutes}, ("um",))
+def states(*minutes: float, follows: str = "duty") -> list[Candidate]:
+    return varied("time_constant_min", *minutes, follows=follows)
 
 
-def test_a_range_ends_where_the_likelihood_has_fallen_by_two():
-    near = [state(minutes) for minutes in (10.0, 20.0, 30.0, 40.0, 50.0)]
-    found = parameter_ranges(near, np.array([1.0, 8.5, 10.0, 9.0, 7.0]), near[2], 10.0)
-    assert found == {"time_constant_min": [10.0, 50.0]}
-
-
-def test_a_range_is_open_where_the_neighbourhood_ends_first():
-    near = [state(minutes) for minutes in (10.0, 20.0, 30.0)]
-    assert parameter_ranges(near, np.array([9.0, 10.0, 9.5]), near[1], 10.0) == {"time_constant_min": [None, None]}
-    assert parameter_ranges(near, np.array([5.0, 9.9, 10.0]), near[2], 10.0) == {"time_constant_min": [10.0, None]}
-
-
-@pytest.mark.parametrize(("behind", "minutes"), [(1.91, [10.0, None]), (1.93, [20.0, None])])
-def test_a_value_fits_as_well_within_half_a_chi_squared_of_one_degree(behind, minutes):
-    near = [state(minutes) for minutes in (10.0, 20.0, 30.0)]
-    gains = np.array([0.0, 10.0 - behind, 10.0])
-    assert parameter_ranges(near, gains, near[2], 10.0) == {"time_constant_min": minutes}
-
-
-def test_a_size_may_be_negative():
-    near = [Candidate(NOTHING, {"jump": size}, ("ppm",)) for size in (-20.0, -5.0, 5.0)]
-    gains = np.array([10.0, 0.0, 0.0])
-    assert parameter_ranges(near, gains, near[0], 10.0) == {"jump": [None, -5.0]}
-    assert parameter_ranges(near, gains[[1, 0, 2]], near[1], 10.0) == {"jump": [-20.0, 5.0]}
-
-
-def test_a_time_of_zero_is_the_lowest_and_an_absent_body_has_it():
-    near = [Candidate(NOTHING, {}, ("um",)), Candidate(NOTHING, {"second_time_constant_min": 5.0}, ("um",))]
-    found = parameter_ranges(near, np.array([9.0, 10.0]), near[1], 10.0)
-    assert found == {"second_time_constant_min": [0.0, None]}
-
-
-def test_values_that_were_computed_twice_are_one_and_derived_words_have_no_range():
-    near = [
-        Candidate(NOTHING, {"period_mm": period, "possible_leads": leads}, ("um",))
-        for period, leads in ((100.0 * (1.0 - 1e-7), "a"), (100.0, "b"), (120.0, "c"))
-    ]
-    assert parameter_ranges(near, np.array([2.0, 10.0, 2.0]), near[1], 10.0) == {"period_mm": [None, 120.0]}
-    assert parameter_ranges(near[1:2], np.array([10.0]), near[1], 10.0) == {}
-
-
-def test_a_state_that_fits_as_well_is_told_and_does_not_widen_the_numbers():
-    near = [state(10.0), state(20.0), state(30.0), state(80.0, "warm_up"), state(90.0, "mean_rise")]
-    found = parameter_ranges(near, np.array([5.0, 10.0, 5.0, 9.0, 7.9]), near[1], 10.0)
-    assert found == {"follows": ["warm_up"], "time_constant_min": [10.0, 30.0]}
+@pytest.mark.parametrize(
+    ("near", "gains", "best", "expected"),
+    [
+        # A range ends where the likelihood has fallen by two, and is open where the neighbourhood ends first.
+        (states(10, 20, 30, 40, 50), [1.0, 8.5, 10.0, 9.0, 7.0], 2, {"time_constant_min": [10.0, 50.0]}),
+        (states(10, 20, 30), [9.0, 10.0, 9.5], 1, {"time_constant_min": [None, None]}),
+        (states(10, 20, 30), [5.0, 9.9, 10.0], 2, {"time_constant_min": [10.0, None]}),
+        # A value fits as well within half a chi-squared of one degree, 1.92.
+        (states(10, 20, 30), [0.0, 10.0 - 1.91, 10.0], 2, {"time_constant_min": [10.0, None]}),
+        (states(10, 20, 30), [0.0, 10.0 - 1.93, 10.0], 2, {"time_constant_min": [20.0, None]}),
+        # A size may be negative.
+        (varied("jump", -20.0, -5.0, 5.0), [10.0, 0.0, 0.0], 0, {"jump": [None, -5.0]}),
+        (varied("jump", -20.0, -5.0, 5.0), [0.0, 10.0, 0.0], 1, {"jump": [-20.0, 5.0]}),
+        # A time of zero is the lowest, and an absent body has it.
+        (
+            [Candidate(np.empty((0, 1)), {}, ("um",)), *varied("second_time_constant_min", 5.0)],
+            [9.0, 10.0],
+            1,
+            {"second_time_constant_min": [0.0, None]},
+        ),
+        # Values that were computed twice are one, and derived words have no range.
+        (
+            [
+                *varied("period_mm", 100.0 * (1.0 - 1e-7), possible_leads="a"),
+                *varied("period_mm", 100.0, 120.0, possible_leads="b"),
+            ],
+            [2.0, 10.0, 2.0],
+            1,
+            {"period_mm": [None, 120.0]},
+        ),
+        (varied("period_mm", 100.0, possible_leads="b"), [10.0], 0, {}),
+        # A state that fits as well is told and does not widen the numbers.
+        (
+            [*states(10, 20, 30), *states(80, follows="warm_up"), *states(90, follows="mean_rise")],
+            [5.0, 10.0, 5.0, 9.0, 7.9],
+            1,
+            {"follows": ["warm_up"], "time_constant_min": [10.0, 30.0]},
+        ),
+    ],
+)
+def test_a_range_holds_the_values_that_fit_as_well(near, gains, best, expected):
+    assert parameter_ranges(near, np.array(gains), near[best], 10.0) == expected
 
 
 @pytest.mark.parametrize(

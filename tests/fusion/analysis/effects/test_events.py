@@ -204,6 +204,7 @@ def test_a_long_campaign_tries_every_second_quarter():
     assert np.diff(event_instants(campaign(cycles=60)))[0] == pytest.approx(32.5)
     long = campaign(cycles=61)
     np.testing.assert_allclose(np.diff(event_instants(long)), 65.0)
+    assert 120 < event_instants(campaign(cycles=150)).size <= 240
     # A closer look reaches to the next instants on either side, and stops at readings.
     np.testing.assert_array_equal(
         instants_near(long, 1300.0), [1240.0, 1300.0, 1310.0, 1320.0, 1330.0, 1340.0, 1350.0, 1360.0]
