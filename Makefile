@@ -37,7 +37,7 @@ test: lint
 
 # What shows within a minute whether a change broke something; `make test` runs everything.
 quick: $(VENV)/.test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m 'not slow and not chain and not browser' --numprocesses 2 --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m 'not slow and not chain and not browser and not long' --numprocesses 2 --dist loadfile
 
 # The documentation site, tutorials run, in build/docs. Needs no network; measured files that cannot be had leave their page unexecuted, and it says so.
 docs: $(VENV)/.docs

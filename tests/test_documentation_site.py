@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parents[1]
 #: What makes a browser load something at once, as opposed to a link.
 LOADED = re.compile(

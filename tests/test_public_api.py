@@ -106,6 +106,7 @@ def modules_with_examples() -> list[str]:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("module", modules_with_examples())
 def test_examples_in_docstrings_run(module, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

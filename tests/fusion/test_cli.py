@@ -21,6 +21,8 @@ from fusion import cli
 from fusion.results.results import results_schema
 from tests.fusion.campaign_parts import change, record_of_rows
 
+pytestmark = pytest.mark.long
+
 
 def invoke(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli.app, [str(argument) for argument in arguments], env={"COLUMNS": "160"})

@@ -18,6 +18,8 @@ from rich.console import Console
 from fusion.common import FusionError
 from fusion.messages import ExitCode, answering, failed_code, interrupt_ends_step
 
+pytestmark = pytest.mark.long
+
 
 def ending(fault: BaseException) -> tuple[int, str]:
     """Exit code and message of a command in which a fault happens."""

@@ -29,9 +29,12 @@ from tests.fusion.campaign_parts import change, keep_cycles, without
 pytest.importorskip("aiohttp", reason="needs thermofuse[remote]")
 
 # Both clients leave their sockets to the garbage collector.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::DeprecationWarning"
-)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.filterwarnings(
+        "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::DeprecationWarning"
+    ),
+]
 
 
 class Shelf(SimpleHTTPRequestHandler):

@@ -19,6 +19,8 @@ import pytest
 from fusion.common import FusionError
 from fusion.pipeline.workers import Worker, second_process
 
+pytestmark = pytest.mark.long
+
 
 def counted(upto: int, *, report: Callable[[str, int, int], None]) -> int:
     for done in range(upto + 1):

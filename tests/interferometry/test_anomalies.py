@@ -17,6 +17,8 @@ from interferometry.common import InterferometryError
 from interferometry.drift.estimate import estimate_drift
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
 
+pytestmark = pytest.mark.long
+
 PERMUTATIONS = 249
 
 

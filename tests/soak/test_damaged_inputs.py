@@ -14,6 +14,8 @@ import pytest
 from tests.soak.fuzz.harness import Kind, fuzz, shares
 from tests.soak.fuzz.kinds import kinds_of_inputs, kinds_of_products
 
+pytestmark = pytest.mark.long
+
 #: Findings are kept here.
 KEPT = Path("build/fuzz")
 

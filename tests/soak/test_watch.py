@@ -24,6 +24,8 @@ from tests.fusion.laboratory import Laboratory
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 
+pytestmark = pytest.mark.long
+
 #: Frames of a cycle, and its length.
 FRAMES, CYCLE_S = 6, 8
 TARGETS = 3

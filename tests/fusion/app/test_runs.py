@@ -14,6 +14,8 @@ from fusion.app.run_child import main, write_progress
 from fusion.app.runs import RUNS, Progress, RunError, Runs, is_begun
 from fusion.messages import ExitCode
 
+pytestmark = pytest.mark.long
+
 
 def test_a_page_opens_with_what_lies_in_its_folder(tmp_path):
     state = state_of(tmp_path)

@@ -13,6 +13,8 @@ from fusion.pipeline.inspect import scan_folder
 from thermography.io.flir import index_frames
 from thermography.radiometry.planck import calibrate
 
+pytestmark = pytest.mark.long
+
 ANSWERS = {
     "Title of the report": 'The "small" one',
     "Plan point under the spindle at axis position 0, x": "500 mm",

@@ -21,6 +21,8 @@ from interferometry.iso230 import Iso230Budget, evaluate_iso230
 from tests.fusion.campaign_parts import without, write_laser
 from tests.interferometry.simulated_campaigns import simulate
 
+pytestmark = pytest.mark.long
+
 ASSUMED = StatedBudget(
     Iso230Budget(), dict.fromkeys(("device", "alignment", "material_temperature", "expansion_coefficient"), "assumed")
 )

@@ -38,6 +38,8 @@ from thermography.io.frame import Frame
 from thermography.io.other_cameras import StackOptions, index_recordings
 from thermography.registration.register import RegistrationError
 
+pytestmark = pytest.mark.long
+
 
 def watched(folder: Path, laboratory: Laboratory, **options: Any) -> list[LiveState]:
     return list(follow(load_campaign(folder / "campaign.toml"), stop=laboratory, clock=laboratory.clock, **options))

@@ -17,6 +17,8 @@ from fusion.results.results import Notice, Results, ResultsError, assemble, read
 from fusion.results.store import plain
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 
+pytestmark = pytest.mark.long
+
 
 def validator() -> jsonschema.Draft202012Validator:
     jsonschema.Draft202012Validator.check_schema(results_schema())

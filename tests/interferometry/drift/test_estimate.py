@@ -19,6 +19,8 @@ from interferometry.drift.gls import AirNoise, drift_covariance, estimate_air_no
 from interferometry.drift.kalman import drift_system
 from tests.interferometry.simulated_campaigns import SIGMA_UM, schedule, simulate
 
+pytestmark = pytest.mark.long
+
 
 def test_with_complete_readings_the_profile_is_the_plain_mean(rng):
     deviations, _ = simulate(rng)

@@ -9,6 +9,8 @@ from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.planning import _fit_exponential, estimate_settling, plan_cycles, spacing_warnings
 from tests.interferometry.simulated_campaigns import CYCLE_S, simulate
 
+pytestmark = pytest.mark.long
+
 
 def test_planned_cycles_reach_the_wanted_uncertainty(rng):
     trial, _ = simulate(rng, cycles=25)

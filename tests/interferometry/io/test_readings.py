@@ -243,6 +243,7 @@ def test_a_missing_file_is_named_by_the_error(read, tmp_path):
     assert Path(caught.value.filename) == tmp_path / "laser.csv"
 
 
+@pytest.mark.long
 def test_damaged_files_raise_no_foreign_error(tmp_path):
     counts = fuzz(tmp_path, 250, seed=28)
     assert sum(taken for taken, _ in counts.values()) > 25
@@ -582,6 +583,7 @@ def test_what_a_wide_table_lacks_is_named(tmp_path, text, message):
         read_wide(tmp_path, text)
 
 
+@pytest.mark.long
 def test_one_wide_line_above_many_short_ones_does_not_fill_the_memory(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("Position [mm]" + "," * 16_000 + "\n" + "1\n" * 100_000)

@@ -15,6 +15,8 @@ from interferometry.io.faults import LaserFormatError
 from interferometry.io.spreadsheets import is_workbook, read_cells, read_sheets
 from tests.interferometry import old_workbooks as xls
 
+pytestmark = pytest.mark.long
+
 ODS = """<?xml version="1.0"?><office:document-content xmlns:office="urn:oasis:names:tc:opendocument:xmlns:office:1.0"
  xmlns:table="urn:oasis:names:tc:opendocument:xmlns:table:1.0" xmlns:text="urn:oasis:names:tc:opendocument:xmlns:text:1.0">
 <office:body><office:spreadsheet><table:table table:name="X">{rows}</table:table></office:spreadsheet></office:body>

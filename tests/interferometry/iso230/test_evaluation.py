@@ -20,6 +20,8 @@ from interferometry.iso230 import (
 from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 
+pytestmark = pytest.mark.long
+
 MOTION = "anderssandstrom__ecmc_target_muts_logger/b02"
 SLIT = "anderssandstrom__ecmccomgui/tools/iso230-2-obsolete"
 #: Printed values in um; E is wrong in all of these reports and R in those where the bidirectional part decides (the tool

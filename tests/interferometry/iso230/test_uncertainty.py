@@ -7,6 +7,8 @@ from interferometry.iso230 import CONTRIBUTIONS, Iso230Budget, evaluate_iso230
 from interferometry.iso230.uncertainty import SCATTER_ALONE, axis_quantities, target_quantities
 from tests.interferometry.iso230.made_tests import test_made
 
+pytestmark = pytest.mark.long
+
 
 def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_tests_confirm():
     rng = np.random.default_rng(11)

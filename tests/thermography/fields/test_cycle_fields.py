@@ -25,6 +25,8 @@ from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import counts_from_temperature, override, temperature_from_counts
 from thermography.registration.plan import PlanGrid, Polygon
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def products(tmp_path_factory):

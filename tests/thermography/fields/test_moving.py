@@ -16,6 +16,8 @@ from thermography.fields.moving import CellSums, add_frame, on_plan, reduce_movi
 from thermography.fields.still import CheckpointError
 from thermography.registration.plan import Fiducial, PlanGrid
 
+pytestmark = pytest.mark.long
+
 DIRECTION = (-1, 0)
 PLACES_MM = np.array([0.0, 121.3, 200.5, 299.7, 160.2, 5.5])
 

@@ -30,6 +30,8 @@ from thermography.fields.large_arrays import (
 from thermography.fields.scheduling import SchedulerError, in_order, open_pool, open_stored
 from thermography.fields.still import reduce_frames
 
+pytestmark = pytest.mark.long
+
 # The cluster's own event loop leaves sockets to the garbage collector after it has been closed.
 ends_late = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 

@@ -40,6 +40,8 @@ from thermography.radiometry.planck import calibrate, override
 from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
 from thermography.registration.plan import mask_discs
 
+pytestmark = pytest.mark.long
+
 SECOND = np.timedelta64(1, "s")
 
 

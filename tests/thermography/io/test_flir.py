@@ -337,6 +337,7 @@ def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path, monke
     assert len(alone[0]) + len(alone[1]) == 61 and len(alone[1]) > 4
 
 
+@pytest.mark.long
 def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path):
     read, refused = fuzz(tmp_path, 2000, seed=11)
     assert read > 700 and refused > 700
@@ -544,6 +545,7 @@ def _agrees_with_exiftool(frame: FrameReference, printed: dict[str, object]) -> 
     return True
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_file_by_reader_table(real_file):
     table = {}

@@ -28,6 +28,8 @@ from thermography.io.sequence import (
     usable_threads,
 )
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def mixed(tmp_path, monkeypatch):

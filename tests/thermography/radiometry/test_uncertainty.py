@@ -18,6 +18,8 @@ from thermography.radiometry.uncertainty import (
     temperature_uncertainty,
 )
 
+pytestmark = pytest.mark.long
+
 DRAWS = 20_000
 #: The Monte Carlo standard deviation of 20,000 draws scatters by 0.5 %; 3 % also holds what first order leaves out.
 TOLERANCE = 0.03

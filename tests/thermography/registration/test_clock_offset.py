@@ -6,6 +6,8 @@ import pytest
 from tests.thermography.table_motion import FEED_MM_S, T0, campaign, positioning_test
 from thermography.registration.clock_offset import ClockError, commanded_position, estimate_clock_offset
 
+pytestmark = pytest.mark.long
+
 
 def test_offset_of_37_s_is_found_and_its_uncertainty_covers():
     errors, stated = [], []

@@ -19,6 +19,8 @@ from thermography.registration.discs import (
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.register import register
 
+pytestmark = pytest.mark.long
+
 #: 2 px/mm, plan and sensor parallel.
 JACOBIAN = 2.0 * np.eye(2)
 SMALL_GRID = PlanGrid(100, 60, 5)

@@ -22,6 +22,8 @@ from thermography.registration.displacement import (
 )
 from thermography.registration.register import RegistrationError
 
+pytestmark = pytest.mark.long
+
 BARE = Scene(discs=())
 
 

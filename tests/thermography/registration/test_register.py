@@ -33,6 +33,8 @@ from thermography.registration.register import (
     spread_quadruples,
 )
 
+pytestmark = pytest.mark.long
+
 
 def hinted(scene, rng, error_px):
     """The discs with hints that are wrong by up to `error_px` in both directions."""

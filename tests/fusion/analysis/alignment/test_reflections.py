@@ -9,6 +9,8 @@ import pytest
 
 from fusion.analysis.alignment.reflections import find_switching_patch
 
+pytestmark = pytest.mark.long
+
 FRAMES, ROWS, COLUMNS = 60, 12, 20
 
 

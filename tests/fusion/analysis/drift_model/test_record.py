@@ -41,6 +41,8 @@ from fusion.analysis.effects.library import LIBRARY, library
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import SPINDLE, record_of, searched, spindle_table, twin_table
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(
     ("name", "size_um", "parameters"),

@@ -30,6 +30,8 @@ from fusion.twin.recipe import EffectRecipe
 from interferometry.drift.gls import drift_system, fit_fixed_effects
 from tests.fusion.record_tables import record_of, runs_table, searched, twin_table
 
+pytestmark = pytest.mark.long
+
 DECLARED = Candidate(np.zeros((4, 2)), {}, ("um/K", "um/K"))
 LOAD = Candidate(np.array([[0.0], [1.0], [1.0], [2.0]]), {"follows": "speed"}, ("um",), event_s=None)
 

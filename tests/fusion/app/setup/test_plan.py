@@ -24,6 +24,8 @@ from fusion.app.setup.plan import (
 )
 from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 
+pytestmark = pytest.mark.long
+
 GRID = PlanGrid(700, 180, 20)
 
 

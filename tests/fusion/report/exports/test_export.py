@@ -19,6 +19,8 @@ from fusion.results.store import read_dataset
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
 from tests.fusion.results_sample import PARTS
 
+pytestmark = pytest.mark.long
+
 
 def test_the_command_offers_every_format():
     assert {item.value for item in cli.ExportFormat} == set(FORMATS)
