@@ -21,7 +21,6 @@ from fusion.report.charts.style import (
     add_hover,
     add_ordered_lines,
     add_series,
-    add_zero_line,
     new_figure,
     palette,
     span_words,
@@ -139,8 +138,7 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
         mean[some][shown], most[some][shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
     unit, scale = ("h", 1.0) if hours[-1] >= _LEAST_HOURS else ("s", 3600.0)
     hours = scale * hours
-    drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K")
-    add_zero_line(drawn)
+    drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K", zero=True)
     add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
     seen_part = "picture" if plan_unit(fields) == "px" else "table"
     add_series(drawn, hours, mean, name=f"mean of the {seen_part}", colour=ACCENT)
@@ -163,8 +161,7 @@ def plot_axis_temperature(fused: xr.Dataset) -> Chart:
     rise = fused["local_rise"].mean("direction").transpose("cycle", "target").values[:, order]
     shown = np.isfinite(rise).any(axis=1)
     cycle = fused["cycle"].values[shown]
-    drawn = new_figure(x="position / mm", y="rise / K")
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="rise / K", zero=True)
     add_ordered_lines(drawn, [place] * int(shown.sum()), list(rise[shown]), cycle, "cycle")
     last = rise[shown][-1]
     seen = (
@@ -181,8 +178,7 @@ def plot_drift_temperature(fused: xr.Dataset, drift: xr.Dataset) -> Chart:
     place = fused["position"].values[order].astype(float)
     rise = fused["local_rise"].mean("direction").transpose("target", "cycle").values[order]
     moved = drift["drift"].mean("direction").transpose("target", "cycle").values[order]
-    drawn = new_figure(x="rise at the position / K", y="drift / µm", height=360)
-    add_zero_line(drawn)
+    drawn = new_figure(x="rise at the position / K", y="drift / µm", height=360, zero=True)
     add_ordered_lines(drawn, list(rise), list(moved), place, "position / mm")
     valid = np.isfinite(rise) & np.isfinite(moved)
     related = float(np.corrcoef(rise[valid], moved[valid])[0, 1]) if valid.sum() > 2 else float("nan")
@@ -207,8 +203,7 @@ def plot_sensors(sensors: xr.Dataset) -> Chart:
     start = sensors["time"].values[0]
     if "camera_time" in sensors:
         start = min(start, sensors["camera_time"].values[0])
-    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340, legend_columns=5)
-    add_zero_line(drawn)
+    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340, legend_columns=5, zero=True)
     rows: list[tuple[str, str, np.ndarray, np.ndarray]] = []
     said = []
     for k, name in enumerate(sensors["sensor"].values):

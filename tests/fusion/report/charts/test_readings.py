@@ -111,7 +111,7 @@ def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations):
     charts = [plot_cycles(deviations, side) for side in ("positive", "negative")]
     ends = {(chart.figure.y_range.start, chart.figure.y_range.end) for chart in charts}
     assert len(ends) == 1
-    lines = charts[1].figure.renderers[0].data_source.data
+    lines = charts[1].figure.renderers[1].data_source.data
     assert lines["order"].tolist() == deviations["cycle"].values.tolist()
     first = deviations["deviation"].sel(direction="negative").isel(cycle=0)
     np.testing.assert_array_equal(lines["ys"][0], first)
