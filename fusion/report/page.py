@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
-import io
 import json
 import os
 import shutil
@@ -15,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
 import rich.table
 import xarray as xr
 from markupsafe import Markup
@@ -316,12 +315,7 @@ def _refuse_angles(dataset: xr.Dataset, kind: str) -> None:
 
 def iso230_csv(part: Iso230Part | None, dataset: xr.Dataset) -> str:
     """Return the values per target as CSV text, one line per target."""
-    rows = _rows(part, dataset)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return pd.DataFrame(_rows(part, dataset)).to_csv(index=False, lineterminator="\n")
 
 
 def _rows(part: Iso230Part | None, dataset: xr.Dataset) -> list[dict[str, Any]]:
