@@ -22,9 +22,8 @@ from fusion.report.page import (
     sources_table,
 )
 from fusion.results.results import assemble
+from tests.browser import CHROMIUM, record_faults
 from tests.fusion.results_sample import PARTS
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +40,7 @@ def opened(report):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 900}, bypass_csp=True)
-        page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
-        page.on(
-            "console", lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None
-        )
-        page.on(
-            "request", lambda request: faults.append(f"request: {request.url}") if is_foreign(request.url) else None
-        )
+        record_faults(page, faults, own=("file://", "data:"))
         page.goto(report.as_uri())
         yield page, faults
         browser.close()
@@ -57,10 +50,6 @@ def opened(report):
 def made_anew(report):
     """The report once more, from its products."""
     return report_of(report.parent)
-
-
-def is_foreign(url: str) -> bool:
-    return not url.startswith(("file://", "data:"))
 
 
 def test_it_opens_offline_without_a_fault(opened, report):
