@@ -644,22 +644,15 @@ def _positions_below(
     block = [cells[i] for i in (*above, *range(at, first))]
     if len(block) > 1:
         block = [_fill(row, column + 1) for row in block]
-    runs: list[Run] = []
-    ignored: list[str] = []
-    for j in range(column + 1, len(cells[at])):
-        texts = [row[j] for row in block if row[j]]
-        values = [(lines[i], cells[i][j]) for i in data]
-        run = _read_run(texts, values)
-        if run is not None:
-            runs.append(run)
-        elif texts or any(text for _, text in values):
-            ignored.append(" ".join(texts) or f"column {j + 1}")
-    if not runs:
-        return None
+    candidates = [
+        ([row[j] for row in block if row[j]], [(lines[i], cells[i][j]) for i in data], f"column {j + 1}")
+        for j in range(column + 1, len(cells[at]))
+    ]
+    runs, ignored = _read_runs([one for one in candidates if one[0] or any(text for _, text in one[1])])
     titles = [text for row in cells[:first] for text in row]
     unit = heading.unit or find_unit(cells[first - 1][column].strip("[]() "))
     positions = [(lines[i], cells[i][column]) for i in data]
-    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored)
+    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
 
 
 def _positions_in_one_row(grid: Grid, cells: list[list[str]], lines: list[int], at: int) -> WideTable | None:
@@ -675,21 +668,16 @@ def _positions_in_one_row(grid: Grid, cells: list[list[str]], lines: list[int], 
     places = [j for j in range(after, len(row)) if _is_number(split[j][0], grid.numerals)]
     if len(places) < _FEWEST_TARGETS:
         return None
-    runs: list[Run] = []
-    ignored = [row[j] for j in range(after, len(row)) if row[j] and j not in places]
-    for i in range(at + 1, len(cells)):
-        texts = [cells[i][j] for j in labels if cells[i][j]]
-        run = _read_run(texts, [(lines[i], cells[i][j]) for j in places])
-        if run is not None:
-            runs.append(run)
-        elif any(cells[i]):
-            ignored.append(" ".join(texts) or f"line {lines[i]}")
-    if not runs:
-        return None
+    runs, ignored = _read_runs(
+        ([cells[i][j] for j in labels if cells[i][j]], [(lines[i], cells[i][j]) for j in places], f"line {lines[i]}")
+        for i in range(at + 1, len(cells))
+        if any(cells[i])
+    )
+    ignored = [row[j] for j in range(after, len(row)) if row[j] and j not in places] + ignored
     titles = [text for fields in cells[: at + 1] for text in fields]
     unit = next((split[j][1] for j in places if split[j][1]), None) or _position_unit(titles)
     positions = [(lines[at], split[j][0]) for j in places]
-    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored)
+    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
 
 
 def _fill(row: Sequence[str], start: int) -> list[str]:
@@ -738,6 +726,19 @@ def _read_run(texts: list[str], values: list[tuple[int, str]]) -> Run | None:
     direction, signed = next(iter(directions))
     unit = next((label[2] for label in found if label[2] is not None), None)
     return Run(" ".join(texts), next(iter(numbers), None), direction, signed, unit, values)
+
+
+def _read_runs(candidates: Iterable[tuple[list[str], list[tuple[int, str]], str]]) -> tuple[list[Run], list[str]]:
+    """Return the runs among columns or rows of headings and values, and what the others are called, by their headings or their place."""
+    runs: list[Run] = []
+    ignored: list[str] = []
+    for texts, values, place in candidates:
+        run = _read_run(texts, values)
+        if run is None:
+            ignored.append(" ".join(texts) or place)
+        else:
+            runs.append(run)
+    return runs, ignored
 
 
 def _deviation_unit(titles: Sequence[str]) -> str | None:
