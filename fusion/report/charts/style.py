@@ -283,20 +283,7 @@ def fix_range(drawn: figure, low: float, high: float) -> None:
 
 
 def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
-    """Return the smallest and the largest value in words, for text alternatives.
-
-    Parameters
-    ----------
-    values : array_like
-        NaN are left out.
-    unit : str
-        As it is printed.
-
-    Examples
-    --------
-    >>> span_words(np.array([-1.25, 3.0]), "µm")
-    '−1.25 to 3.00 µm'
-    """
+    """Return the smallest and the largest value, NaN left out, as "−1.25 to 3.00 µm", for text alternatives."""
     every = np.asarray(values, float)
     if not np.isfinite(every).any():
         return "without values"

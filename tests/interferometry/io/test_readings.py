@@ -430,9 +430,8 @@ def test_turned_directions_and_numbering_from_0_are_told(tmp_path):
     turned = DIALECTS["forward"].replace("Forward", "?").replace("Reverse", "Forward").replace("?", "Reverse")
     test = read(tmp_path, turned)
     assert test["deviation"].values.tolist() == EXPECTED.tolist()
-    assert json.loads(test.attrs["notes"]) == [
-        "the forward runs lead to smaller positions: they are the negative direction"
-    ]
+    (note,) = json.loads(test.attrs["notes"])
+    assert note.startswith("the forward runs lead to smaller positions")
     assert json.loads(read(tmp_path, DIALECTS["from 0"]).attrs["notes"]) == [
         "the file numbers its cycles from 0: 1 was added",
         "the file numbers its targets from 0: 1 was added",
@@ -536,12 +535,8 @@ def test_columns_that_are_no_runs_empty_cells_and_words_are_named(tmp_path):
 
 @pytest.mark.parametrize("kind", ["xlsx", "ods"])
 def test_a_sheet_with_merged_headings(tmp_path, kind):
-    rows = [
-        ["Deviations [um]"],
-        ["Position [mm]", "Cycle 1", "", "Cycle 2", ""],
-        ["", "+", "-", "+", "-"],
-        *map(list, ROWS),
-    ]
+    headings = [["Deviations [um]"], ["Position [mm]", "Cycle 1", "", "Cycle 2", ""], ["", "+", "-", "+", "-"]]
+    rows = [*headings, *map(list, ROWS)]
     path = tmp_path / f"wide.{kind}"
     if kind == "ods":
         write_ods(path, rows)
