@@ -807,8 +807,8 @@ def _cycles(table: WideTable) -> list[int]:
         )
     up, down = ({run.number for run in table.runs if run.direction == direction} for direction in DIRECTIONS)
     if None in numbers or (up and down and not up & down):
-        directions = [run.direction for run in table.runs]
-        return [directions[: i + 1].count(direction) for i, direction in enumerate(directions)]
+        counts = {direction: itertools.count(1) for direction in DIRECTIONS}
+        return [next(counts[run.direction]) for run in table.runs]
     first = min(number for number in numbers if number is not None)
     return [number + (1 if first == 0 else 0) for number in numbers if number is not None]
 
