@@ -19,9 +19,9 @@ from fusion.common import FusionError
 from fusion.report.charts.style import (
     CATEGORIES,
     Chart,
+    Courses,
     add_band,
     add_series,
-    add_zero_line,
     new_figure,
     of_rank,
     span_words,
@@ -68,9 +68,8 @@ def _plot_campaigns(
     line: bool,
 ) -> Chart | None:
     """Draw one quantity of every campaign with readings over position: as lines with bands about zero, or as points from zero."""
-    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", legend_columns=1)
-    columns: dict[str, np.ndarray] = {}
-    told = []
+    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", legend_columns=1, zero=line)
+    courses = Courses(drawn)
     for k, (campaign, name) in enumerate(zip(campaigns, names, strict=True)):
         if campaign.drift is None:
             continue
@@ -80,16 +79,14 @@ def _plot_campaigns(
         looks = of_rank(k)
         if line:
             add_band(drawn, x, value - half, value + half, looks["colour"])
-        add_series(drawn, x, value, name=name, half=half, marker=_MARKS[k % len(_MARKS)], line=line, **looks)
-        columns |= {f"position, {name} / mm": x, f"{quantity.split()[0]}, {name} / µm": value}
-        told.append(f"{name} {span_words(value, 'µm')}")
-    if not told:
+        courses.columns[f"position, {name} / mm"] = x
+        heading, marker = f"{quantity.split()[0]}, {name} / µm", _MARKS[k % len(_MARKS)]
+        courses.add(x, value, name, heading=heading, half=half, marker=marker, line=line, **looks)
+    if not courses.told:
         return None
-    if line:
-        add_zero_line(drawn)
-    else:
+    if not line:
         drawn.y_range.start = 0.0
-    return Chart(drawn, f"{seen}: {'; '.join(told)}.", columns)
+    return courses.chart(seen)
 
 
 def plot_remaining(pair: PairComparison) -> Chart | None:
@@ -97,8 +94,7 @@ def plot_remaining(pair: PairComparison) -> Chart | None:
     if pair.profile is None:
         return None
     x, value, half = pair.profile.position_mm, pair.profile.remaining_um, 2 * pair.profile.remaining_u_um
-    drawn = new_figure(x="position / mm", y="difference / µm")
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="difference / µm", zero=True)
     style: dict[str, Any] = {"colour": CATEGORIES[0], "line": False, "marker": "circle", "legend": False}
     add_series(drawn, x, value, name="after − before", half=half, **style)
     changed = [change.position_mm for change in pair.changes if change.group == "profile" and change.significant]

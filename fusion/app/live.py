@@ -17,7 +17,7 @@ from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
 from fusion.pipeline.check import BAD_INPUT
 from fusion.pipeline.watch import Enough, LiveState, follow
-from fusion.report.charts.style import CATEGORIES, Chart, add_series, add_zero_line, new_figure, palette, span_words
+from fusion.report.charts.style import CATEGORIES, Chart, Courses, add_series, new_figure, palette, span_words
 from fusion.report.wording import number
 from fusion.results.progress import counted
 from interferometry.plots import ACCENT, INK, MUTED
@@ -137,8 +137,7 @@ def plot_course(course: Course) -> Chart | None:
         ("drift at the last target / µm", course.far_drift_um, CATEGORIES[1], "square"),
         ("rise of the table / K", course.rise_K, ACCENT, "triangle"),
     )
-    drawn = new_figure(x="cycle", y="since the first cycle / µm or K", legend_columns=1)
-    add_zero_line(drawn)
+    drawn = new_figure(x="cycle", y="since the first cycle / µm or K", legend_columns=1, zero=True)
     columns: dict[str, np.ndarray] = {"cycle": cycle}
     for name, values, colour, marker in series:
         line = np.array(values, float)
@@ -154,17 +153,14 @@ def plot_standard(course: Course) -> Chart | None:
     if not course.iso230_cycle:
         return None
     cycle = np.array(course.iso230_cycle, float)
-    drawn = new_figure(x="cycle", y="A, R, B / µm")
-    columns: dict[str, np.ndarray] = {"cycle": cycle}
-    told = []
+    courses = Courses(new_figure(x="cycle", y="A, R, B / µm"), {"cycle": cycle})
     marks = (("A", INK, "circle"), ("R", ACCENT, "square"), ("B", MUTED, "diamond"))
     for symbol, colour, marker in marks:
         values = course.values(symbol)
         if np.isfinite(values).any():
-            add_series(drawn, cycle, values, name=symbol, colour=colour, marker=marker)
-            columns[f"{symbol} / µm"] = values
-            told.append(f"{symbol} {span_words(values[-1:], 'µm').partition(' to ')[0]} µm")
-    return Chart(drawn, f"By ISO 230-2, {course.window}: {', '.join(told)}.", columns)
+            latest = f"{span_words(values[-1:], 'µm').partition(' to ')[0]} µm"
+            courses.add(cycle, values, symbol, seen=latest, colour=colour, marker=marker)
+    return courses.chart(f"By ISO 230-2, {course.window}")
 
 
 _INTERVAL_MS = 1000

@@ -29,6 +29,7 @@ from fusion.report.wording import (
     decimals_of,
     effect_words,
     figures_of,
+    fixed,
     gain,
     in_words,
     join,
@@ -213,10 +214,6 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
     """Return the values of every target in the order of the axis; decimals by the uncertainty of a mean deviation."""
     spread = settled["standard_deviation"].values / np.sqrt(np.where(settled["count"] > 0, settled["count"], np.nan))
     places = decimals_of(float(np.nanmedian(spread)))
-
-    def shown(value: float) -> str:
-        return f"{value:.{places}f}".replace("-", "−") if np.isfinite(value) else "–"
-
     along = _along(position)
     of_both = ("mean_bidirectional", "reversal", "repeatability_bidirectional")
     of_each = ("mean_unidirectional", "standard_deviation", "repeatability")
@@ -224,7 +221,12 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
     values = np.hstack([*one_way, *(settled[name].sel(target=along).values[:, None] for name in of_both)])
     places_mm, counted = position.sel(target=along).values, by_approach(settled["count"], target=along)
     rows = [
-        [str(target), f"{place:g}", *(shown(value) for value in row), ", ".join(str(int(count)) for count in counts)]
+        [
+            str(target),
+            f"{place:g}",
+            *(fixed(value, places) for value in row),
+            ", ".join(str(int(count)) for count in counts),
+        ]
         for target, place, row, counts in zip(along, places_mm, values, counted, strict=True)
     ]
     titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in _ARROWS.values()]
@@ -265,8 +267,7 @@ def single_run_table(dataset: xr.Dataset) -> Table:
     values = by_approach(dataset["deviation"].isel(cycle=0), target=along)
     rows = []
     for target, at, readings in zip(along, dataset["position"].sel(target=along).values, values, strict=True):
-        cells = [f"{value:.2f}".replace("-", "−") if np.isfinite(value) else "–" for value in readings]
-        rows.append([str(target), f"{at:g}", *cells])
+        rows.append([str(target), f"{at:g}", *(fixed(value, 2) for value in readings)])
     return table(["Target", place, *(f"deviation{arrow} / {unit}" for arrow in _ARROWS.values())], rows)
 
 

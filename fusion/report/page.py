@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
-import io
 import json
 import os
 import shutil
@@ -15,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
 import rich.table
 import xarray as xr
 from markupsafe import Markup
@@ -302,7 +301,8 @@ def iso230_tables(part: Iso230Part | None, dataset: xr.Dataset, *, title: str) -
 def iso230_json(part: Iso230Part | None, dataset: xr.Dataset) -> dict[str, Any]:
     """Return the values of a test for programs: the part ``iso230`` of results.json, and the values per target."""
     _refuse_angles(dataset, "JSON")
-    rows = _rows(part, dataset)
+    records = _of_targets(part, dataset).astype(object).to_dict("records")
+    rows = [{name: None if value != value else value for name, value in record.items()} for record in records]
     return {"targets": rows} if part is None else {**part.model_dump(mode="json"), "targets": rows}
 
 
@@ -316,41 +316,26 @@ def _refuse_angles(dataset: xr.Dataset, kind: str) -> None:
 
 def iso230_csv(part: Iso230Part | None, dataset: xr.Dataset) -> str:
     """Return the values per target as CSV text, one line per target."""
-    rows = _rows(part, dataset)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return _of_targets(part, dataset).to_csv(index=False, lineterminator="\n")
 
 
-def _rows(part: Iso230Part | None, dataset: xr.Dataset) -> list[dict[str, Any]]:
+def _of_targets(part: Iso230Part | None, dataset: xr.Dataset) -> pd.DataFrame:
     """Return the values of each target; headings carry the units of the dataset."""
     unit, place = dataset["deviation"].attrs["units"], dataset["position"].attrs["units"]
-    settled = None if part is None else group(dataset, "settled")
-    rows = []
-    for target in dataset["target"].values:
-        at = float(dataset["position"].sel(target=target))
-        row: dict[str, Any] = {"target": int(target), f"position_{place}": at}
+    columns = {"target": dataset["target"].values, f"position_{place}": dataset["position"].values}
+    if part is None:
         for direction in dataset["direction"].values:
-            if settled is None:
-                reading = dataset["deviation"].sel(target=target, direction=direction).values
-                row |= {f"deviation_{direction}_{unit}": _finite(float(reading[0]))}
-                continue
-            here = settled.sel(target=target, direction=direction)
-            for symbol, name in (("mean", "mean_unidirectional"), ("s", "standard_deviation"), ("R", "repeatability")):
-                row[f"{symbol}_{direction}_{unit}"] = _finite(float(here[name]))
-            row[f"readings_{direction}"] = int(here["count"])
-        if settled is not None:
-            here = settled.sel(target=target)
-            names = (("mean", "mean_bidirectional"), ("B_i", "reversal"), ("R_i", "repeatability_bidirectional"))
-            row |= {f"{symbol}_{unit}": _finite(float(here[name])) for symbol, name in names}
-        rows.append(row)
-    return rows
-
-
-def _finite(value: float) -> float | None:
-    return value if value == value else None
+            columns[f"deviation_{direction}_{unit}"] = dataset["deviation"].sel(direction=direction).values[0]
+        return pd.DataFrame(columns)
+    settled = group(dataset, "settled").sel(target=dataset["target"].values)
+    for direction in dataset["direction"].values:
+        here = settled.sel(direction=direction)
+        for symbol, name in (("mean", "mean_unidirectional"), ("s", "standard_deviation"), ("R", "repeatability")):
+            columns[f"{symbol}_{direction}_{unit}"] = here[name].values
+        columns[f"readings_{direction}"] = here["count"].values.astype(int)
+    for symbol, name in (("mean", "mean_bidirectional"), ("B_i", "reversal"), ("R_i", "repeatability_bidirectional")):
+        columns[f"{symbol}_{unit}"] = settled[name].values
+    return pd.DataFrame(columns)
 
 
 # Two campaigns of one machine on a page of their own: which session is which, what both show, and what only one

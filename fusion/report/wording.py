@@ -118,10 +118,12 @@ def number(value: float | None, digits: int = 3) -> str:
     """Return a number with significant digits and a true minus sign."""
     if value is None or not math.isfinite(value):
         return "–"
-    if value == 0:
-        return "0"
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:.{decimals}f}".replace("-", "−")
+    return fixed(value, max(0, digits - 1 - math.floor(math.log10(abs(value))))) if value else "0"
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    """Return a number with so many decimals and a true minus sign; a dash where there is none."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")
 
 
 def decimals_of(u: float) -> int:
@@ -192,8 +194,7 @@ def alike(values: Sequence[float | None], *, distinct: bool = True) -> list[str]
     differ = len(set(known))
     while distinct and decimals < 4 and len({round(value, decimals) for value in known}) < differ:
         decimals += 1
-    shown = (math.nan if value is None else value for value in values)
-    return [f"{value:.{decimals}f}".replace("-", "−") if math.isfinite(value) else "–" for value in shown]
+    return [fixed(value, decimals) for value in values]
 
 
 def duration(seconds: float | None) -> str:

@@ -120,7 +120,13 @@ GROSS_LIMIT = 50.0
 #: A cell's own scatter replaces the common one in its uncertainty where it exceeds that at this level.
 EXCESS_LEVEL = 1e-3
 
-Variables = dict[str, tuple[tuple[str, ...], object, dict[str, str]]]
+Variable = tuple[tuple[str, ...], object, dict[str, str]]
+Variables = dict[str, Variable]
+
+
+def _um(dims: tuple[str, ...], values: object, long_name: str = "") -> Variable:
+    """Return a variable in um."""
+    return dims, values, {"units": "um", **({"long_name": long_name} if long_name else {})}
 
 
 class DriftDataError(InterferometryError):
@@ -244,11 +250,7 @@ class JointFit:
     def loadings(self, sign: Array, position_mm: Array) -> Array:
         """Share of every drift component in readings (n,) at positions of the test, (n, components)."""
         named = self.components[: len(self.components) - self.shapes.shape[1]]
-        positions = np.unique(self.readings["position"].values)
-        own = self.shapes[np.searchsorted(positions, position_mm)]
-        return np.hstack(
-            [component_loadings(sign, position_mm, components=named, span_mm=_span_mm(self.readings)), own]
-        )
+        return _loadings(self.readings, named, self.shapes, sign, position_mm)
 
 
 @one_thread
@@ -337,6 +339,12 @@ def _span_mm(readings: xr.Dataset) -> tuple[float, float]:
     return float(readings["position"].min()), float(readings["position"].max())
 
 
+def _loadings(readings: xr.Dataset, named: Sequence[str], shapes: Array, sign: Array, position_mm: Array) -> Array:
+    """Return the share of the named components and of the shapes at positions of the test, (n, components)."""
+    own = shapes[np.searchsorted(np.unique(readings["position"].values), position_mm)]
+    return np.hstack([component_loadings(sign, position_mm, components=named, span_mm=_span_mm(readings)), own])
+
+
 def _fit(
     readings: xr.Dataset,
     cells: NDArray[np.int64],
@@ -346,24 +354,14 @@ def _fit(
     order: Order | None,
     shapes: Array | None = None,
 ) -> JointFit:
-    sign = readings["sign"].values.astype(float)
     position = readings["position"].values
-    loadings = component_loadings(sign, position, components=components, span_mm=_span_mm(readings))
-    positions = np.unique(position)
     if shapes is None:
-        shapes = np.empty((positions.size, 0))
-    loadings = np.hstack([loadings, shapes[np.searchsorted(positions, position)]])
+        shapes = np.empty((np.unique(position).size, 0))
+    loadings = _loadings(readings, components, shapes, readings["sign"].values.astype(float), position)
     design = np.zeros((cell.size, len(cells)))
     design[np.arange(cell.size), cell] = 1.0
-    fit = estimate(
-        readings["seconds"].values,
-        loadings,
-        readings["deviation"].values,
-        design,
-        order=order,
-        robust=robust,
-        settling=True,
-    )
+    seconds, deviation = readings["seconds"].values, readings["deviation"].values
+    fit = estimate(seconds, loadings, deviation, design, order=order, robust=robust, settling=True)
     named = (*components, *(f"shape_{k + 1}" for k in range(shapes.shape[1])))
     return JointFit(readings, cells, cell, named, shapes, fit)
 
@@ -499,15 +497,11 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
         {
             **_profile_variables(grid, joint, deviations, at_state, excess),
             **_scatter_variables(grid, joint, scatter, freedom),
-            "drift": (
-                DIMS,
-                grid.per_reading(np.einsum("kc,kc->k", loadings, drift)),
-                {"units": "um", "long_name": "drift from the stated state"},
-            ),
-            "drift_u": (DIMS, grid.per_reading(np.sqrt(np.maximum(drift_variance, 0.0))), {"units": "um"}),
-            "noise": (DIMS, grid.per_reading(noise), {"units": "um", "long_name": "random part of the reading"}),
+            "drift": _um(DIMS, grid.per_reading(np.einsum("kc,kc->k", loadings, drift)), "drift from the stated state"),
+            "drift_u": _um(DIMS, grid.per_reading(np.sqrt(np.maximum(drift_variance, 0.0)))),
+            "noise": _um(DIMS, grid.per_reading(noise), "random part of the reading"),
             "standardised": (DIMS, standardised, {"units": "1"}),
-            "sigma": ((), fit.sigma, {"units": "um"}),
+            "sigma": _um((), fit.sigma),
             **_component_variables(grid, joint, drift, covariance),
         },
         coords={**{name: deviations[name].values for name in DIMS}, "component": list(joint.components)},
@@ -535,32 +529,28 @@ def _profile_variables(
     first_cell = {direction: cell for cell, (direction, _) in reversed(list(enumerate(joint.cells)))}
     contrast = np.eye(cells) - np.eye(cells)[[first_cell[direction] for direction in joint.cells[:, 0]]]
     relative_u = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", contrast, covariance, contrast), 0.0))
-    reversal, reversal_u = _reversal(joint.cells, profile, covariance, deviations.sizes["target"])
     dims = DIMS[1:]
+    reversal, reversal_u = _reversal(joint.cells, profile, covariance, grid.targets)
     return {
-        "profile": (dims, grid.per_cell(profile), {"units": "um"}),
-        "profile_u": (dims, grid.per_cell(np.sqrt(np.diag(covariance))), {"units": "um"}),
-        "profile_relative": (dims, grid.per_cell(contrast @ profile), {"units": "um"}),
-        "profile_relative_u": (dims, grid.per_cell(relative_u), {"units": "um"}),
+        "profile": _um(dims, grid.per_cell(profile)),
+        "profile_u": _um(dims, grid.per_cell(np.sqrt(np.diag(covariance)))),
+        "profile_relative": _um(dims, grid.per_cell(contrast @ profile)),
+        "profile_relative_u": _um(dims, grid.per_cell(relative_u)),
         "covariance": ((*dims, "other_direction", "other_target"), grid.per_pair(covariance), {"units": "um2"}),
-        "reversal": (("target",), reversal, {"units": "um", "long_name": "positive minus negative direction"}),
-        "reversal_u": (("target",), reversal_u, {"units": "um"}),
+        "reversal": _um(("target",), reversal, "positive minus negative direction"),
+        "reversal_u": _um(("target",), reversal_u),
     }
 
 
 def _reversal(cells: NDArray[np.int64], profile: Array, covariance: Array, targets: int) -> tuple[Array, Array]:
     """Return the reversal error B_i of each target and its standard uncertainty, NaN where a direction is missing."""
     index = {(int(direction), int(target)): cell for cell, (direction, target) in enumerate(cells)}
-    reversal, reversal_u = np.full(targets, np.nan), np.full(targets, np.nan)
-    for target in range(targets):
-        if (0, target) in index and (1, target) in index:
-            positive, negative = index[0, target], index[1, target]
-            reversal[target] = profile[positive] - profile[negative]
-            variance = (
-                covariance[positive, positive] + covariance[negative, negative] - 2 * covariance[positive, negative]
-            )
-            reversal_u[target] = np.sqrt(max(variance, 0.0))
-    return reversal, reversal_u
+    both = [target for target in range(targets) if (0, target) in index and (1, target) in index]
+    up, down = ([index[direction, target] for target in both] for direction in (0, 1))
+    reversal, variance = np.full((2, targets), np.nan)
+    reversal[both] = profile[up] - profile[down]
+    variance[both] = covariance[up, up] + covariance[down, down] - 2 * covariance[up, down]
+    return reversal, np.sqrt(np.maximum(variance, 0.0))
 
 
 def _smoothing_errors(joint: JointFit, smoothed: Smoothed) -> Array:
@@ -578,7 +568,9 @@ def _scatter(joint: JointFit, smoothed: Smoothed, standardised: Array) -> tuple[
         remaining = expected / D
         deletion = _smoothing_errors(joint, smoothed) / D
         square = deletion**2 / remaining - fit.sigma**2 * (1.0 / D - fit.system.variance)
-    typical = np.array([_normal_mad_about_zero(standardised[joint.cell == cell]) for cell in range(cells)])
+    # Median absolute deviation from zero, the expectation of a residual, as a normal standard deviation.
+    medians = [np.median(np.abs(standardised[joint.cell == cell])) for cell in range(cells)]
+    typical = np.array(medians) / special.ndtri(0.75)
     kept = (np.abs(standardised) <= OUTLIER_LIMIT * np.maximum(typical, 1.0)[joint.cell]) & (remaining > 1e-6)
     count = np.bincount(joint.cell[kept], minlength=cells)
     squares = np.bincount(joint.cell[kept], square[kept], minlength=cells)
@@ -588,11 +580,6 @@ def _scatter(joint: JointFit, smoothed: Smoothed, standardised: Array) -> tuple[
     usable = freedom > 0.5
     variance = np.where(usable, np.maximum(squares, 0.0) / np.maximum(count, 1), np.nan)
     return np.sqrt(variance), np.where(usable, freedom, 0.0)
-
-
-def _normal_mad_about_zero(values: Array) -> float:
-    """Return the median absolute deviation from zero, the expectation of a residual, as a normal standard deviation."""
-    return float(np.median(np.abs(values)) / special.ndtri(0.75))
 
 
 def _excess_variance(scatter: Array, freedom: Array, joint: JointFit) -> Array:
@@ -624,22 +611,18 @@ def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Ar
     scatter_u = typical / np.sqrt(2 * np.maximum(freedom, 1.0))
     dims = DIMS[1:]
     return {
-        "scatter": (dims, grid.per_cell(scatter), {"units": "um", "long_name": "random standard deviation"}),
-        "scatter_u": (dims, grid.per_cell(scatter_u), {"units": "um"}),
+        "scatter": _um(dims, grid.per_cell(scatter), "random standard deviation"),
+        "scatter_u": _um(dims, grid.per_cell(scatter_u)),
         "scatter_freedom": (dims, grid.per_cell(freedom), {"units": "1"}),
-        "scatter_position": (("target",), pooled, {"units": "um", "long_name": "scatter, both directions together"}),
+        "scatter_position": _um(("target",), pooled, "scatter, both directions together"),
     }
 
 
 def _component_variables(grid: _Grid, joint: JointFit, drift: Array, covariance: Array) -> Variables:
     component_u = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     variables: Variables = {
-        "drift_size": (("component",), drift.std(axis=0), {"units": "um"}),
-        "drift_rate": (
-            ("component",),
-            joint.fit.drift_rate,
-            {"units": "um", "long_name": "random change within an hour"},
-        ),
+        "drift_size": _um(("component",), drift.std(axis=0)),
+        "drift_rate": _um(("component",), joint.fit.drift_rate, "random change within an hour"),
     }
     sign = np.where(joint.cells[:, 0] == 0, 1.0, -1.0)
     position = np.full(len(joint.cells), np.nan)
@@ -647,8 +630,8 @@ def _component_variables(grid: _Grid, joint: JointFit, drift: Array, covariance:
     shares = [grid.per_cell(share) for share in joint.loadings(sign, position).T]
     variables["drift_share"] = (("component", *DIMS[1:]), np.array(shares), {"units": "1"})
     for column, name in enumerate(joint.components):
-        variables[f"drift_{name}"] = (DIMS, grid.per_reading(drift[:, column]), {"units": "um"})
-        variables[f"drift_{name}_u"] = (DIMS, grid.per_reading(component_u[:, column]), {"units": "um"})
+        variables[f"drift_{name}"] = _um(DIMS, grid.per_reading(drift[:, column]))
+        variables[f"drift_{name}_u"] = _um(DIMS, grid.per_reading(component_u[:, column]))
     return variables
 
 

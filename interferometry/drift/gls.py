@@ -202,8 +202,7 @@ class DriftFit:
     @property
     def drift_rate(self) -> Array:
         """Standard deviation of each drift component's increment over one hour (order 1), in the response's unit."""
-        power = 1.0 if self.system.order == 1 else 3.0
-        scale = 1.0 if self.system.order == 1 else 1.0 / 3.0
+        scale, power = (1.0, 1.0) if self.system.order == 1 else (1.0 / 3.0, 3.0)
         return self.sigma * np.sqrt(self.system.ratios * scale * 3600.0**power)
 
     def residual(self) -> Array:
@@ -285,9 +284,9 @@ def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
     log_normal += 2.0 * float(np.log(scale).sum())
     log_likelihood = -0.5 * (freedom * np.log(max(sigma2, 1e-300)) + log_determinant + log_normal)
     return DriftFit(
-        system=system,
-        response=problem.response,
-        design=problem.design,
+        system,
+        problem.response,
+        problem.design,
         coefficients=swept[1:, 0] / scale,
         covariance=sigma2 * swept[1:, 1:] / np.outer(scale, scale),
         sigma=float(np.sqrt(sigma2)),
@@ -309,8 +308,7 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
             swept[0, 0], swept[0, 1:], swept[1:, 1:] = gram[0, 0] - along @ along, 0.0, inverse
             swept[1:, 0] = linalg.solve_triangular(lower, along, lower=True, trans="T")
             return swept, float(np.log(pivots).sum()), -1
-    swept, log_determinant, dependent = kalman.sweep(gram, _DEPENDENCE_TOLERANCE)
-    return swept, log_determinant, dependent
+    return kalman.sweep(gram, _DEPENDENCE_TOLERANCE)
 
 
 def _maximise(system: DriftSystem, response: Array, design: Array, start: Array | None) -> DriftFit:
@@ -477,17 +475,8 @@ def estimate(
 def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[Array, Array, Array]:
     """Average the drift that columns imply over the readings, with the exact covariance of the average, in two passes."""
     weights = np.ascontiguousarray(weights, float)
-    state, covariance, predicted, gains = _filter_with_average(
-        system.seconds,
-        system.loadings,
-        system.order,
-        system.ratios,
-        system.step_scales,
-        system.variance,
-        system.observed,
-        weights,
-        np.ascontiguousarray(columns, float),
-    )
+    columns = np.ascontiguousarray(columns, float)
+    state, covariance, predicted, gains = _filter_with_average(*system.arrays, weights, columns)
     m = system.loadings.shape[1] * system.order
     with_drift = _covariance_with_average(system.seconds, system.loadings, system.order, weights, predicted, gains)
     return state[m:], covariance[m:, m:], with_drift

@@ -449,14 +449,14 @@ class DriftSystem:
         """Factor on the ratios in the step before each reading, (n,); ones where the process noise is constant."""
         return np.ones(self.seconds.size) if self.process_noise_scale is None else self.process_noise_scale
 
-    def _filter_covariance(self, keep: bool) -> tuple[Array, Array, Array]:
-        return filter_covariance(
-            self.seconds, self.loadings, self.order, self.ratios, self.step_scales, self.variance, self.observed, keep
-        )
+    @property
+    def arrays(self) -> tuple[Array, Array, Order, Array, Array, Array, NDArray[np.bool_]]:
+        """What the recursions take of the system, in their order."""
+        return self.seconds, self.loadings, self.order, self.ratios, self.step_scales, self.variance, self.observed
 
     def innovations(self, columns: Array) -> tuple[Array, Array]:
         """One-step prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
-        gains, innovation_variances, _ = self._filter_covariance(False)
+        gains, innovation_variances, _ = filter_covariance(*self.arrays, False)
         innovations, _ = filter_columns(
             self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), False
         )
@@ -464,7 +464,7 @@ class DriftSystem:
 
     def whitening(self, columns: int) -> Whitening:
         """Start to whiten so many columns, some readings after others."""
-        gains, innovation_variances, _ = self._filter_covariance(False)
+        gains, innovation_variances, _ = filter_covariance(*self.arrays, False)
         return Whitening(self, gains, np.sqrt(innovation_variances), np.zeros((gains.shape[1], columns)))
 
     def normal_equations(self, columns: Array) -> tuple[Array, float]:
@@ -477,16 +477,7 @@ class DriftSystem:
                 whitened = whitening.whiten(columns[rows].copy())[self.observed[rows]]
                 gram += whitened.T @ whitened
             return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
-        return normal_equations(
-            self.seconds,
-            self.loadings,
-            self.order,
-            self.ratios,
-            self.step_scales,
-            self.variance,
-            self.observed,
-            np.ascontiguousarray(columns),
-        )
+        return normal_equations(*self.arrays, np.ascontiguousarray(columns))
 
     def whiten(self, columns: Array) -> tuple[Array, float]:
         """Standardised innovations of the observed readings (n_observed, p), and the log-determinant of their covariance."""
@@ -496,7 +487,7 @@ class DriftSystem:
 
     def smooth(self, columns: Array) -> Smoothed:
         """Smooth the drift that columns (n, p) imply, and the noise of every reading."""
-        gains, innovation_variances, covariances = self._filter_covariance(True)
+        gains, innovation_variances, covariances = filter_covariance(*self.arrays, True)
         filtered = self.seconds, self.loadings, self.order, gains
         parts = []
         # The states of all columns at all readings are needed on the way back, not afterwards: some columns at a time.

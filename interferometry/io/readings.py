@@ -6,7 +6,7 @@ import itertools
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -221,15 +221,12 @@ def _drop_wrong_times(readings: list[Reading], left_out: LeftOut) -> list[Readin
     times: dict[int, list[int]] = defaultdict(list)
     for reading in readings:
         times[reading.cycle].append(int(reading.time.astype("i8")))
-    centres = {cycle: float(np.median(values)) for cycle, values in times.items()}
-    numbers = sorted(centres)
-    if len(numbers) < 2:
-        return readings
-    steps = np.diff([centres[number] for number in numbers])
-    if np.any(steps <= 0):
+    numbers = sorted(times)
+    middles = [float(np.median(times[number])) for number in numbers]
+    steps = np.diff(middles)
+    if not steps.size or np.any(steps <= 0):
         return readings
     typical = float(np.median(steps))
-    middles = [centres[number] for number in numbers]
     middles = [middles[0] - typical, *middles, middles[-1] + typical]
     bounds = dict(zip(numbers, zip(middles, middles[2:], strict=False), strict=True))
     kept = []
@@ -255,16 +252,15 @@ def _note_of_minutes(readings: list[Reading]) -> list[str]:
 
 def _check_cycles(path: Path, readings: list[Reading]) -> None:
     """Raise where cycles run backwards or overlap in time."""
-    ends: dict[int, tuple[Reading, Reading]] = {}
+    cycles: dict[int, list[Reading]] = defaultdict(list)
     for reading in readings:
-        low, high = ends.get(reading.cycle, (reading, reading))
-        ends[reading.cycle] = (min(low, reading, key=lambda r: r.time), max(high, reading, key=lambda r: r.time))
-    numbers = sorted(ends)
-    for number, following in itertools.pairwise(numbers):
-        last, first = ends[number][1], ends[following][0]
+        cycles[reading.cycle].append(reading)
+    for before, after in itertools.pairwise(sorted(cycles)):
+        last = max(cycles[before], key=lambda reading: reading.time)
+        first = min(cycles[after], key=lambda reading: reading.time)
         if first.time <= last.time:
             raise LaserFormatError(
-                f"{path}: cycle {following} begins at {first.time} (line {first.line}) before cycle {number} ends at {last.time} "
+                f"{path}: cycle {after} begins at {first.time} (line {first.line}) before cycle {before} ends at {last.time} "
                 f"(line {last.line}); cycles must follow each other in time: correct the cycle numbers or the clock"
             )
 
@@ -333,12 +329,7 @@ def find_long_table(grid: Grid) -> LongTable | None:
     for at, (line, fields) in enumerate(grid.rows):
         headings = [read_heading(text) for text in fields]
         roles = {heading.role for heading in headings}
-        if (
-            "position" in roles
-            and "direction" in roles
-            and roles & {"cycle", "run"}
-            and roles & {"deviation", "measured"}
-        ):
+        if {"position", "direction"} <= roles and roles & {"cycle", "run"} and roles & {"deviation", "measured"}:
             return _understand(grid, at, line, headings)
     return None
 
@@ -434,7 +425,9 @@ class _Label:
 def read_long_table(table: LongTable) -> Readings:
     """Read the lines of a table."""
     path, numerals, columns = table.grid.path, table.grid.numerals, table.columns
-    given = Readings(path, _kind(table), ignored=table.ignored)
+    stated = ", ".join(f"{role} in {unit}" for role, unit in table.units.items())
+    kind = _kind_of(table.units.values(), f"{table.grid.place}, line {table.line}: {stated}")
+    given = Readings(path, kind, ignored=table.ignored)
     role = "deviation" if "deviation" in columns else "measured"
     unit = UNITS[table.units[role]]
     labels: list[_Label] = []
@@ -464,15 +457,14 @@ def read_long_table(table: LongTable) -> Readings:
     return given
 
 
-def _kind(table: LongTable) -> Kind:
-    """Return whether the axis is linear or rotary."""
-    kinds = {role: UNITS[unit].kind for role, unit in table.units.items()}
-    if len(set(kinds.values())) > 1 or not set(kinds.values()) <= {"length", "angle"}:
-        given = ", ".join(f"{role} in {table.units[role]}" for role in kinds)
-        raise LaserFormatError(
-            f"{table.grid.place}, line {table.line}: {given}; give both as lengths (linear axis) or both as angles (rotary axis)"
-        )
-    return "angle" if "angle" in kinds.values() else "length"
+def _kind_of(units: Iterable[str], given: str) -> Kind:
+    """Return whether the units are those of a linear or of a rotary axis."""
+    kinds = {UNITS[unit].kind for unit in units}
+    if kinds == {"angle"}:
+        return "angle"
+    if kinds == {"length"}:
+        return "length"
+    raise LaserFormatError(f"{given}; give both as lengths (linear axis) or both as angles (rotary axis)")
 
 
 def _label(table: LongTable, line: int, fields: list[str], numerals: Numerals) -> _Label:
@@ -643,16 +635,8 @@ def _positions_below(
     grid: Grid, cells: list[list[str]], lines: list[int], at: int, column: int, heading: Heading
 ) -> WideTable | None:
     """Return the table whose positions stand below their heading, with one run per column to the right."""
-    first = next(
-        (
-            i
-            for i in range(at + 1, min(at + 1 + _ROWS_BELOW, len(cells)))
-            if _is_number(cells[i][column], grid.numerals)
-        ),
-        None,
-    )
-    if first is None:
-        return None
+    near = range(at + 1, min(at + 1 + _ROWS_BELOW, len(cells)))
+    first = next((i for i in near if _is_number(cells[i][column], grid.numerals)), len(cells))
     data = [i for i in range(first, len(cells)) if _is_number(cells[i][column], grid.numerals)]
     if len(data) < _FEWEST_TARGETS:
         return None
@@ -660,22 +644,15 @@ def _positions_below(
     block = [cells[i] for i in (*above, *range(at, first))]
     if len(block) > 1:
         block = [_fill(row, column + 1) for row in block]
-    runs: list[Run] = []
-    ignored: list[str] = []
-    for j in range(column + 1, len(cells[at])):
-        texts = [row[j] for row in block if row[j]]
-        values = [(lines[i], cells[i][j]) for i in data]
-        run = _read_run(texts, values)
-        if run is not None:
-            runs.append(run)
-        elif texts or any(text for _, text in values):
-            ignored.append(" ".join(texts) or f"column {j + 1}")
-    if not runs:
-        return None
+    candidates = [
+        ([row[j] for row in block if row[j]], [(lines[i], cells[i][j]) for i in data], f"column {j + 1}")
+        for j in range(column + 1, len(cells[at]))
+    ]
+    runs, ignored = _read_runs([one for one in candidates if one[0] or any(text for _, text in one[1])])
     titles = [text for row in cells[:first] for text in row]
     unit = heading.unit or find_unit(cells[first - 1][column].strip("[]() "))
     positions = [(lines[i], cells[i][column]) for i in data]
-    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored)
+    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
 
 
 def _positions_in_one_row(grid: Grid, cells: list[list[str]], lines: list[int], at: int) -> WideTable | None:
@@ -691,21 +668,16 @@ def _positions_in_one_row(grid: Grid, cells: list[list[str]], lines: list[int], 
     places = [j for j in range(after, len(row)) if _is_number(split[j][0], grid.numerals)]
     if len(places) < _FEWEST_TARGETS:
         return None
-    runs: list[Run] = []
-    ignored = [row[j] for j in range(after, len(row)) if row[j] and j not in places]
-    for i in range(at + 1, len(cells)):
-        texts = [cells[i][j] for j in labels if cells[i][j]]
-        run = _read_run(texts, [(lines[i], cells[i][j]) for j in places])
-        if run is not None:
-            runs.append(run)
-        elif any(cells[i]):
-            ignored.append(" ".join(texts) or f"line {lines[i]}")
-    if not runs:
-        return None
+    runs, ignored = _read_runs(
+        ([cells[i][j] for j in labels if cells[i][j]], [(lines[i], cells[i][j]) for j in places], f"line {lines[i]}")
+        for i in range(at + 1, len(cells))
+        if any(cells[i])
+    )
+    ignored = [row[j] for j in range(after, len(row)) if row[j] and j not in places] + ignored
     titles = [text for fields in cells[: at + 1] for text in fields]
     unit = next((split[j][1] for j in places if split[j][1]), None) or _position_unit(titles)
     positions = [(lines[at], split[j][0]) for j in places]
-    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored)
+    return WideTable(grid, lines[at], positions, unit, _deviation_unit(titles), runs, ignored) if runs else None
 
 
 def _fill(row: Sequence[str], start: int) -> list[str]:
@@ -736,10 +708,7 @@ def _wide_label(text: str) -> tuple[int | None, tuple[str, bool] | None, str | N
         found = find_direction(word)
         if found is not None and direction in (None, found):
             direction = found
-        elif read_heading(word).role not in ("run", "cycle", "deviation", "direction") and fold(word) not in (
-            "no",
-            "nr",
-        ):
+        elif not (read_heading(word).role in ("run", "cycle", "deviation", "direction") or fold(word) in ("no", "nr")):
             return None
     return (int(next(iter(numbers))) if numbers else None), direction, unit
 
@@ -757,6 +726,19 @@ def _read_run(texts: list[str], values: list[tuple[int, str]]) -> Run | None:
     direction, signed = next(iter(directions))
     unit = next((label[2] for label in found if label[2] is not None), None)
     return Run(" ".join(texts), next(iter(numbers), None), direction, signed, unit, values)
+
+
+def _read_runs(candidates: Iterable[tuple[list[str], list[tuple[int, str]], str]]) -> tuple[list[Run], list[str]]:
+    """Return the runs among columns or rows of headings and values, and what the others are called, by their headings or their place."""
+    runs: list[Run] = []
+    ignored: list[str] = []
+    for texts, values, place in candidates:
+        run = _read_run(texts, values)
+        if run is None:
+            ignored.append(" ".join(texts) or place)
+        else:
+            runs.append(run)
+    return runs, ignored
 
 
 def _deviation_unit(titles: Sequence[str]) -> str | None:
@@ -810,13 +792,9 @@ def _wide_kind(table: WideTable) -> Kind:
         raise LaserFormatError(
             f'{place}: the deviations have no unit; write it in the headings, for example "Run 1 + [um]", or above them as "Unit: um"'
         )
-    kinds = {UNITS[unit or ""].kind for unit in (*units, table.position_unit)}
-    if len(kinds) > 1 or not kinds <= {"length", "angle"}:
-        raise LaserFormatError(
-            f"{place}: positions in {table.position_unit}, deviations in {', '.join(sorted(map(str, units)))}; "
-            "give both as lengths (linear axis) or both as angles (rotary axis)"
-        )
-    return "angle" if kinds == {"angle"} else "length"
+    known = [unit or "" for unit in (*units, table.position_unit)]
+    stated = f"positions in {table.position_unit}, deviations in {', '.join(sorted(map(str, units)))}"
+    return _kind_of(known, f"{place}: {stated}")
 
 
 def _cycles(table: WideTable) -> list[int]:
@@ -827,18 +805,10 @@ def _cycles(table: WideTable) -> list[int]:
         raise LaserFormatError(
             f"{table.grid.place}, line {table.line}: {unnumbered!r} has no number, but other runs have; number every run"
         )
-    by_direction = {
-        direction: [run.number for run in table.runs if run.direction == direction]
-        for direction in ("positive", "negative")
-    }
-    shared = set(by_direction["positive"]) & set(by_direction["negative"])
-    if None in numbers or (not shared and all(by_direction.values())):
-        counted = {"positive": 0, "negative": 0}
-        cycles = []
-        for run in table.runs:
-            counted[run.direction] += 1
-            cycles.append(counted[run.direction])
-        return cycles
+    up, down = ({run.number for run in table.runs if run.direction == direction} for direction in DIRECTIONS)
+    if None in numbers or (up and down and not up & down):
+        counts = {direction: itertools.count(1) for direction in DIRECTIONS}
+        return [next(counts[run.direction]) for run in table.runs]
     first = min(number for number in numbers if number is not None)
     return [number + (1 if first == 0 else 0) for number in numbers if number is not None]
 

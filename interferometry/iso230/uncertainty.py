@@ -86,13 +86,8 @@ class Iso230Budget:
     @property
     def is_scatter_alone(self) -> bool:
         """Whether instrument, alignment and material contribute nothing."""
-        scales = (
-            self.device_ppm,
-            self.alignment_ppm,
-            self.material_temperature_K,
-            self.expansion_coefficient_ppm_per_K,
-        )
-        return not any(scales)
+        of_material = self.material_temperature_K or self.expansion_coefficient_ppm_per_K
+        return not (self.device_ppm or self.alignment_ppm or of_material)
 
 
 #: No error of instrument, alignment or material, as for a rotary axis: the budget is one of lengths.
@@ -185,16 +180,9 @@ class UncertainTest:
             * GTC.ureal(0, budget.expansion_coefficient_ppm_per_K, label="expansion_coefficient")
         )
         cells = [(int(direction), int(target)) for direction, target in np.argwhere(np.isfinite(self._mean))]
-        self._deviations = {cell: self._deviation(*cell) for cell in cells}
-        self._sigmas = {cell: self._sigma(*cell) for cell in cells}
-
-    def deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
-        """Mean deviation of one approach to one target: the same correlated number wherever it enters."""
-        return self._deviations[direction, target]
-
-    def sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
-        """Standard deviation of one approach to one target, likewise."""
-        return self._sigmas[direction, target]
+        # By approach and target: each is the same correlated number wherever it enters.
+        self.deviations = {cell: self._deviation(*cell) for cell in cells}
+        self.sigmas = {cell: self._sigma(*cell) for cell in cells}
 
     def _deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
         readings = int(self._count[direction, target])
@@ -216,19 +204,19 @@ class UncertainTest:
 
     def reversal(self, target: int) -> GTC.lib.UncertainReal:
         """Reversal error B_i, signed."""
-        return self.deviation(0, target) - self.deviation(1, target)
+        return self.deviations[0, target] - self.deviations[1, target]
 
     def bidirectional_mean(self, target: int) -> GTC.lib.UncertainReal:
         """Mean bidirectional positioning deviation."""
-        return (self.deviation(0, target) + self.deviation(1, target)) / 2
+        return (self.deviations[0, target] + self.deviations[1, target]) / 2
 
     def repeatability(self, target: int) -> GTC.lib.UncertainReal:
         """R_i by the term that decides it: both directions with the reversal error, or one of them."""
         unidirectional = 4 * self._s[:, target]
         best = int(np.argmax(unidirectional))
         if unidirectional[best] >= float(self._result["repeatability_bidirectional"][target]):
-            return 4 * self.sigma(best, target)
-        return 2 * self.sigma(0, target) + 2 * self.sigma(1, target) + _magnitude(self.reversal(target))
+            return 4 * self.sigmas[best, target]
+        return 2 * self.sigmas[0, target] + 2 * self.sigmas[1, target] + _magnitude(self.reversal(target))
 
     def axis(self) -> dict[str, GTC.lib.UncertainReal]:
         """Quantities of the axis by name; empty where a direction was not measured."""
@@ -241,7 +229,7 @@ class UncertainTest:
         extremes = {
             "B": _magnitude(self.reversal(int(np.nanargmax(np.abs(reversal))))),
             "R": self.repeatability(int(np.nanargmax(self._result["repeatability_bidirectional"].values))),
-            "E": self.deviation(*top) - self.deviation(*bottom),
+            "E": self.deviations[top] - self.deviations[bottom],
             "M": self.bidirectional_mean(int(np.nanargmax(middle)))
             - self.bidirectional_mean(int(np.nanargmin(middle))),
             "A": self._accuracy(range(2)),
@@ -258,8 +246,8 @@ class UncertainTest:
             return {}
         top, bottom, wide = int(np.nanargmax(mean)), int(np.nanargmin(mean)), int(np.nanargmax(self._s[direction]))
         extremes = {
-            "R_unidirectional": 4 * self.sigma(direction, wide),
-            "E_unidirectional": self.deviation(direction, top) - self.deviation(direction, bottom),
+            "R_unidirectional": 4 * self.sigmas[direction, wide],
+            "E_unidirectional": self.deviations[direction, top] - self.deviations[direction, bottom],
             "A_unidirectional": self._accuracy([direction]),
         }
         return {name: value + _bias(float(self._excess[name][direction])) for name, value in extremes.items()}
@@ -269,7 +257,7 @@ class UncertainTest:
         mean, s = self._mean[rows], self._s[rows]
         high, low = _cell_of(np.nanargmax, mean + 2 * s), _cell_of(np.nanargmin, mean - 2 * s)
         high, low = (rows[high[0]], high[1]), (rows[low[0]], low[1])
-        return self.deviation(*high) + 2 * self.sigma(*high) - (self.deviation(*low) - 2 * self.sigma(*low))
+        return self.deviations[high] + 2 * self.sigmas[high] - (self.deviations[low] - 2 * self.sigmas[low])
 
     def uncertainties(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
         """Standard uncertainty of every quantity in um, NaN where the quantity is, as variables ``<name>_u``, and ``contribution``."""
@@ -277,19 +265,19 @@ class UncertainTest:
         measured = np.isfinite(self._mean)
         both = measured.all(axis=0)
 
-        def per_cell(quantity: Callable[[int, int], GTC.lib.UncertainReal]) -> np.ndarray:
+        def per_cell(values: dict[tuple[int, int], GTC.lib.UncertainReal]) -> np.ndarray:
             u = np.full(self._mean.shape, np.nan)
-            for direction, target in np.argwhere(measured):
-                u[direction, target] = GTC.uncertainty(quantity(int(direction), int(target)))
+            for cell, value in values.items():
+                u[cell] = GTC.uncertainty(value)
             return u
 
         def per_target(quantity: Callable[[int], GTC.lib.UncertainReal]) -> np.ndarray:
             u = [GTC.uncertainty(quantity(int(target))) if both[target] else np.nan for target in range(targets)]
             return np.array(u, dtype=float)
 
-        s_u = per_cell(self.sigma)
+        s_u = per_cell(self.sigmas)
         variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {
-            "mean_unidirectional_u": (("direction", "target"), per_cell(self.deviation)),
+            "mean_unidirectional_u": (("direction", "target"), per_cell(self.deviations)),
             "standard_deviation_u": (("direction", "target"), s_u),
             "repeatability_u": (("direction", "target"), 4 * s_u),
             "mean_bidirectional_u": (("target",), per_target(self.bidirectional_mean)),

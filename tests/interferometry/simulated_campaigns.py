@@ -47,6 +47,14 @@ def schedule(cycles: int) -> np.ndarray:
     return np.arange(cycles)[:, None, None] * CYCLE_S + np.stack([forward, backward])
 
 
+def with_memory(noise: np.ndarray, share: float) -> np.ndarray:
+    """Return independent values (cycle, ...) with a correlation from cycle to cycle and the same scatter."""
+    made = noise.copy()
+    for k in range(1, len(made)):
+        made[k] = share * made[k - 1] + np.sqrt(1 - share**2) * made[k]
+    return made
+
+
 def simulate(
     rng: np.random.Generator,
     *,

@@ -1,5 +1,7 @@
 """Index of air against published vectors, real files, and compensation undone and redone."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -154,14 +156,8 @@ def test_temperature_seen_along_the_axis_replaces_the_probe(campaign):
 
 def test_uncertainty_follows_the_sensitivities(campaign):
     deviations, environment = campaign
-    only_temperature = SensorUncertainty(
-        air_temperature_K=1.0,
-        air_pressure_hPa=0,
-        relative_humidity_percent=0,
-        material_temperature_K=0,
-        expansion_coefficient_ppm_per_K=0,
-        formula_ppm=0,
-    )
+    none = dict.fromkeys((field.name for field in fields(SensorUncertainty)), 0.0)
+    only_temperature = SensorUncertainty(**{**none, "air_temperature_K": 1.0})
     u = compensate(deviations, environment, uncertainty=only_temperature)["compensation_u"].values
     # 0.93 ppm/K at 1000 hPa and 23 degC, over 300 mm.
     assert u[..., -1].mean() == pytest.approx(0.93e-6 * 300e3, rel=0.02)
@@ -213,12 +209,6 @@ def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign):
 )
 def test_a_number_that_has_no_meaning_is_refused(name, value, reason, rng):
     deviations = simulate(rng, cycles=2)[0]
-    conditions = {
-        "air_temperature": 20.0,
-        "air_pressure": 1013.25,
-        "relative_humidity": 50.0,
-        "material_temperature": 20.0,
-    }
-    environment = xr.Dataset({key: ("time", [number]) for key, number in conditions.items()}, {"time": [START]})
+    environment = conditions(np.array([20.0]), np.array([1013.25]), np.array([20.0]), np.zeros(1))
     with pytest.raises(CompensationError, match=f"{name}={value} {reason}"):
         compensate(deviations, environment, **{name: value})

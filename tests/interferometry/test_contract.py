@@ -51,15 +51,15 @@ ENTRIES = {
 def test_an_evaluation_refuses_what_is_no_dataset_of_deviations(entry, rng):
     good = simulate(rng, cycles=2)[0]
     faults = {
-        r"deviations is of type NoneType, not a Dataset; give what read_deviations or build_deviations returns": None,
-        r"deviations has no variable 'deviation' \(cycle, direction, target\); give what read_deviations": xr.Dataset(),
-        r"deviations has no variable 'position' \(target\); give": good.drop_vars("position"),
-        r"deviations has 'deviation' over \(target, cycle, direction\) instead of 'deviation' \(cycle,": good.transpose(
+        r"is of type NoneType, not a Dataset; give what read_deviations or build_deviations returns": None,
+        r"has no variable 'deviation' \(cycle, direction, target\); give what read_deviations": xr.Dataset(),
+        r"has no variable 'position' \(target\); give": good.drop_vars("position"),
+        r"has 'deviation' over \(target, cycle, direction\) instead of 'deviation' \(cycle,": good.transpose(
             "target", ...
         ),
     }
     for message, dataset in faults.items():
-        with pytest.raises(InterferometryError, match=message):
+        with pytest.raises(InterferometryError, match=f"deviations {message}"):
             ENTRIES[entry](dataset)
 
 

@@ -23,11 +23,10 @@ def test_inspection_holds_factor_air_and_material_against_each_other(tmp_path, r
     deviations, _ = simulate(rng, cycles=2)
     deviations["deviation"].values[:, 1] = np.nan
     deviations["deviation"].values[0, 0, 3] = np.nan
+    *air, material, _ = map(np.array, AIR.values())
     for coefficient, starts in ((11.7, "environment factor"), (10.7, "warning: environment factor")):
-        index = air_index(np.array([26.2, 26.3]), np.array([1011.4, 1011.6]), np.array([37.0, 38.0]))
-        factor = environment_factor(
-            index, material_temperature_degC=np.array([24.5, 24.6]), expansion_coefficient_ppm_per_K=coefficient
-        )
+        stated = {"material_temperature_degC": material, "expansion_coefficient_ppm_per_K": coefficient}
+        factor = environment_factor(air_index(*air), **stated)
         path = tmp_path / "t.rtl"
         write_rtl(path, deviations, environment={**AIR, "environment_factor_um": (factor[0], factor[1])})
         lines = describe_test(read_deviations(path))

@@ -26,10 +26,8 @@ from fusion.report.charts import readings
 from fusion.report.charts.plan import (
     Layer,
     add_cells,
-    draw_hotspots,
-    draw_line,
     draw_map,
-    draw_sensors,
+    draw_places,
     extent_of,
     new_plan,
 )
@@ -339,11 +337,9 @@ class ThermalView:
         values = self._products.map_of(self._layer, self._selection.cycle)
         scale, _ = self._products.scale(self._layer)
         drawn = draw_map(values, extent_of(fields), self._layer, scale, unit=self._unit)
-        if "target_x" in fields:
-            read = self._products.deviations
-            draw_line(drawn, fields, None if read is None else read["position"])
-        draw_hotspots(drawn, results.hotspots or (), self._unit)
-        draw_sensors(drawn, results.sensors or ())
+        read = self._products.deviations
+        position = None if read is None else read["position"]
+        draw_places(drawn, fields, position, results.hotspots or (), results.sensors or ())
         to_scale(drawn, drawn.select_one("cells"), downwards=self._unit == "px")
         draw_ring(drawn, self._chosen)
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
@@ -372,13 +368,11 @@ class ThermalView:
         if not np.isfinite(values).any():
             return head + "no cell is seen."
         at_row, at_column = np.unravel_index(np.nanargmax(values), values.shape)
-        unit = "" if layer.unit == "1" else f" {layer.unit}"
         _, whole = self._products.scale(layer)
         beyond = " The colour scale is that of evenly spaced cycles; a value beyond it is light blue."
-        return (
-            f"{head}{number(float(np.nanmin(values)))} to {number(float(np.nanmax(values)))}{unit}, largest at "
-            f"{place(float(fields['x'][at_column]), float(fields['y'][at_row]), self._unit)}.{'' if whole else beyond}"
-        )
+        low, high = number(float(np.nanmin(values))), number(float(np.nanmax(values)))
+        at = place(float(fields["x"][at_column]), float(fields["y"][at_row]), self._unit)
+        return f"{head}{f'{low} to {high} {layer.printed_unit}'.rstrip()}, largest at {at}.{'' if whole else beyond}"
 
     def _show_layer(self) -> None:
         """Show another quantity on its own scale."""
@@ -387,8 +381,7 @@ class ThermalView:
         mapper.update(palette=palette(layer.colours), low=scale["low"], high=scale["high"])
         self._map.select_one(ColorBar).title = f"{layer.words} / {layer.unit}"
         hover = self._map.select_one({"type": HoverTool, "name": "reading"})
-        tip = (layer.words, f"@image{{0.{'0' * layer.decimals}}} {'' if layer.unit == '1' else layer.unit}")
-        hover.tooltips = [*hover.tooltips[:2], tip]
+        hover.tooltips = [*hover.tooltips[:2], layer.tip]
         self._show_cycle()
         self._show_places()
 

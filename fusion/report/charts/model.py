@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from bokeh import palettes
@@ -16,10 +18,10 @@ from fusion.report.charts.style import (
     CATEGORIES,
     DIVERGING,
     Chart,
+    Courses,
     add_colour_bar,
     add_hold_out,
     add_series,
-    add_zero_line,
     fix_range,
     new_figure,
     of_direction,
@@ -169,8 +171,7 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
     """Draw the sensitivity of every target and direction to one region, each tested singly, with 95 % interval; filled where p <= 0.05."""
     chosen = targets.sel(region=region)
     step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
-    drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region))
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region), zero=True)
     place = position.sel(target=chosen["series_target"].values).values.astype(float)
     value, half = chosen["sensitivity"].values, 2 * chosen["sensitivity_u"].values
     side, passed = chosen["series_direction"].values, chosen["p_value"].values <= LEVEL
@@ -200,84 +201,79 @@ def rate_text(rate: float, checks: int = CHECKS) -> str:
     return f"{100 * rate:.1f} ± {200 * u:.1f} %"
 
 
-_TIME, _AFTER = "time since first reading / h", COLOURS["positive"]
+_TIME = "time since first reading / h"
 
 
-def _stages(loop: xr.Dataset) -> list[tuple[str, str, str, str]]:
-    """Return ending of the variables, colour, dash and name of what to draw: before and after, or one where nothing was added."""
+_DECLARED: dict[str, Any] = {"colour": BEFORE, "dash": "dashed"}
+_FINAL: dict[str, Any] = {"colour": COLOURS["positive"], "dash": "solid"}
+
+
+def _stages(loop: xr.Dataset) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return ending of the variables, name and looks of what to draw: before and after, or one where nothing was added."""
     before, after = loop["residual_declared"], loop["residual_final"]
     if np.allclose(before, after, atol=1e-9, equal_nan=True):
-        return [("final", _AFTER, "solid", "declared model, nothing added")]
-    return [("declared", BEFORE, "dashed", "declared model"), ("final", _AFTER, "solid", "with the added effects")]
+        return [("final", "declared model, nothing added", _FINAL)]
+    return [("declared", "declared model", _DECLARED), ("final", "with the added effects", _FINAL)]
 
 
 def plot_held_out_positions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     """Draw the error of predicting the held-out cycles at every position, both approaches together."""
     order = np.argsort(deviations["position"].values, kind="stable")
     place = deviations["position"].values[order].astype(float)
-    drawn = new_figure(x="position / mm", y="error of prediction, rms / µm")
-    columns: dict[str, np.ndarray] = {"position / mm": place}
-    parts = []
-    for (ending, colour, dash, text), marker in zip(_stages(loop), ("square", "circle"), strict=False):
+    courses = Courses(new_figure(x="position / mm", y="error of prediction, rms / µm"), {"position / mm": place})
+    highest = 0.0
+    for (ending, text, looks), marker in zip(_stages(loop), ("square", "circle"), strict=False):
         error = np.sqrt((loop[f"held_out_error_{ending}"] ** 2).mean(["cycle", "direction"]).values[order])
-        add_series(drawn, place, error, name=text, colour=colour, dash=dash, marker=marker)
-        columns[f"{text} / µm"] = error
-        parts.append(f"{text} {span_words(error, 'µm')}, largest at {place[int(np.nanargmax(error))]:g} mm")
-    fix_range(drawn, 0.0, 1.08 * float(np.nanmax([columns[name] for name in list(columns)[1:]])))
-    return Chart(drawn, f"Error of predicting the held-out cycles by position: {'; '.join(parts)}.", columns)
+        seen = f"{span_words(error, 'µm')}, largest at {place[int(np.nanargmax(error))]:g} mm"
+        courses.add(place, error, text, seen=seen, marker=marker, **looks)
+        highest = max(highest, float(np.nanmax(error)))
+    fix_range(courses.figure, 0.0, 1.08 * highest)
+    return courses.chart("Error of predicting the held-out cycles by position")
 
 
 def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     """Draw half the difference of the residuals of both approaches over time, before and after the loop."""
     hours = hours_since_start(deviations).mean(["direction", "target"]).values
-    drawn = new_figure(x=_TIME, y="(positive − negative) / 2 / µm")
-    add_zero_line(drawn)
-    columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: hours}
-    parts = []
-    for ending, colour, dash, text in _stages(loop):
+    drawn = new_figure(x=_TIME, y="(positive − negative) / 2 / µm", zero=True)
+    courses = Courses(drawn, {"cycle": loop["cycle"].values, _TIME: hours})
+    for ending, text, looks in _stages(loop):
         residual = loop[f"residual_{ending}"].mean("target")
-        odd = ((residual.sel(direction="positive") - residual.sel(direction="negative")) / 2).values
-        add_series(drawn, hours, odd, name=text, colour=colour, dash=dash)
-        columns[f"{text} / µm"] = odd
-        parts.append(f"{text} {span_words(odd, 'µm')}")
-    return Chart(drawn, f"Residual that changes sign with the approach, over time: {'; '.join(parts)}.", columns)
+        odd = (residual.sel(direction="positive") - residual.sel(direction="negative")) / 2
+        courses.add(hours, odd.values, text, **looks)
+    return courses.chart("Residual that changes sign with the approach, over time")
 
 
 def plot_residual_spectrum(loop: xr.Dataset) -> Chart:
     """Draw the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds."""
     drawn = new_figure(x="period / min", y="power over that of noise", x_type="log")
-    columns: dict[str, np.ndarray] = {"period / min": loop["period"].values}
-    highest, limit, parts = 0.0, float("nan"), []
-    for ending, colour, dash, text in _stages(loop):
+    courses = Courses(drawn, {"period / min": loop["period"].values})
+    highest, limit = 0.0, float("nan")
+    for ending, text, looks in _stages(loop):
         power = loop[f"periodogram_{ending}"]
-        limit = float(power.attrs["limit"])
-        add_series(drawn, power["period"].values, power.values, name=text, colour=colour, dash=dash)
-        columns[f"{text}, power over that of noise"] = power.values
-        at = int(np.nanargmax(power.values))
-        parts.append(f"{text} {number(float(power[at]), 2)} at {number(float(power['period'][at]), 2)} min")
+        limit, at = float(power.attrs["limit"]), int(np.nanargmax(power.values))
+        seen = f"{number(float(power[at]), 2)} at {number(float(power['period'][at]), 2)} min"
+        heading = f"{text}, power over that of noise"
+        courses.add(power["period"].values, power.values, text, heading=heading, seen=seen, **looks)
         highest = max(highest, float(power[at]))
     drawn.hspan(limit, line_color=MUTED, line_dash="dashed", line_width=1.5, legend_label="95 % limit of noise")
     fix_range(drawn, 0.0, 1.08 * max(highest, limit))
-    seen = f"Power of the innovations over period; strongest: {'; '.join(parts)}; noise alone stays below {number(limit, 2)}."
-    return Chart(drawn, seen, columns)
+    courses.told.append(f"noise alone stays below {number(limit, 2)}")
+    return courses.chart("Power of the innovations over period; strongest")
 
 
 def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     """Draw the cumulative sum of the innovations: without trend where nothing happens, with a kink at an event."""
     hours = hours_since_start(deviations).transpose("cycle", "direction", "target").values.ravel()
-    drawn = new_figure(x=_TIME, y="sum of innovations / √n")
-    add_zero_line(drawn)
-    columns: dict[str, np.ndarray] = {}
-    parts = []
-    for ending, colour, dash, text in _stages(loop):
+    courses = Courses(new_figure(x=_TIME, y="sum of innovations / √n", zero=True))
+    for ending, text, looks in _stages(loop):
         values = loop[f"innovation_{ending}"].transpose("cycle", "direction", "target").values.ravel()
         valid = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
         order = valid[np.argsort(hours[valid], kind="stable")]
         walk = np.cumsum(values[order]) / np.sqrt(order.size)
-        add_series(drawn, hours[order], walk, name=text, colour=colour, dash=dash)
-        columns = {_TIME: hours[order], **columns, f"{text}, sum of innovations / √n": walk}
-        parts.append(f"{text} {span_words(walk, '').strip()}")
-    return Chart(drawn, f"Running sum of the innovations over time: {'; '.join(parts)}.", columns)
+        courses.columns.setdefault(_TIME, hours[order])
+        heading, seen = f"{text}, sum of innovations / √n", span_words(walk, "").strip()
+        courses.add(hours[order], walk, text, heading=heading, seen=seen, **looks)
+    return courses.chart("Running sum of the innovations over time")
 
 
 def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
@@ -285,17 +281,13 @@ def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
     place = float(deviations["position"].sel(target=far))
     hours = hours_since_start(deviations).sel(target=far, direction="positive").values
-    drawn = new_figure(x=_TIME, y="contribution / µm", title=f"at {place:g} mm, positive approach", legend_columns=1)
-    add_zero_line(drawn)
-    columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: hours}
-    parts = []
+    title = f"at {place:g} mm, positive approach"
+    drawn = new_figure(x=_TIME, y="contribution / µm", title=title, legend_columns=1, zero=True)
+    courses = Courses(drawn, {"cycle": loop["cycle"].values, _TIME: hours})
     for at, effect in enumerate(str(name) for name in loop["effect"].values):
         line = loop["contribution"].sel(effect=effect, target=far, direction="positive").values
-        words = effect_words(effect).name
-        add_series(drawn, hours, line, name=words, **of_rank(at))
-        columns[f"{words} / µm"] = line
-        parts.append(f"{words} {span_words(line, 'µm')}")
-    return Chart(drawn, f"Contributions at {place:g} mm over time: {'; '.join(parts)}.", columns)
+        courses.add(hours, line, effect_words(effect).name, **of_rank(at))
+    return courses.chart(f"Contributions at {place:g} mm over time")
 
 
 def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
@@ -306,26 +298,24 @@ def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     raw = deviations["deviation"] - deviations["deviation"].isel(cycle=~held).mean("cycle")
     first, last = (float(end(hours.values[held])) for end in (np.nanmin, np.nanmax))
     times = (max(0.0, 2 * first - last), last + 0.02)
-    drawn = new_figure(x=_TIME, y="measured − predicted / µm", height=360, x_range=times)
-    add_zero_line(drawn)
+    drawn = new_figure(x=_TIME, y="measured − predicted / µm", height=360, x_range=times, zero=True)
     add_hold_out(drawn, first, last)
     columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: middle}
-    series = [
-        (raw, "drift as measured", CATEGORIES[3], "dotted"),
-        (loop["held_out_error_last_value"], "last value repeated", CATEGORIES[2], "dotdash"),
-        (loop["held_out_error_declared"], "declared model", BEFORE, "dashed"),
+    series: list[tuple[xr.DataArray, str, dict[str, Any]]] = [
+        (raw, "drift as measured", {"colour": CATEGORIES[3], "dash": "dotted"}),
+        (loop["held_out_error_last_value"], "last value repeated", {"colour": CATEGORIES[2], "dash": "dotdash"}),
+        (loop["held_out_error_declared"], "declared model", _DECLARED),
+        (loop["held_out_error_final"], "with the added effects", _FINAL),
     ]
-    if len(_stages(loop)) > 1:
-        series.append((loop["held_out_error_final"], "with the added effects", _AFTER, "solid"))
     parts = []
-    for values, text, colour, dash in series:
+    for values, text, looks in series if len(_stages(loop)) > 1 else series[:-1]:
         mean = values.mean(["direction", "target"]).values
-        add_series(drawn, middle, mean, name=text, colour=colour, dash=dash, width=2.2)
+        add_series(drawn, middle, mean, name=text, width=2.2, **looks)
         columns[f"{text}, mean of the cycle / µm"] = mean
         if values is raw:
             continue
-        looks = {"size": 2.5, "color": colour, "alpha": 0.45}
-        drawn.scatter(hours.values.ravel(), values.values.ravel(), legend_label=text, **looks)
+        dots = {"size": 2.5, "color": looks["colour"], "alpha": 0.45}
+        drawn.scatter(hours.values.ravel(), values.values.ravel(), legend_label=text, **dots)
         parts.append(f"{text} {number(float(np.sqrt(np.nanmean(values.values**2))))} µm rms")
     seen = (
         f"Errors of predicting the {int(held.sum())} cycles that were held out: {'; '.join(parts)}; the drift as measured moves over "
@@ -337,19 +327,18 @@ def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
 def plot_predicted_measured(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     """Draw predicted against measured deviations of the cycles that were held out, with the line on which both are equal."""
     measured = deviations["deviation"]
-    drawn = new_figure(x="measured deviation / µm", y="predicted deviation / µm", height=360)
-    columns: dict[str, np.ndarray] = {}
-    parts = []
-    for (ending, colour, _, text), marker in zip(_stages(loop), ("x", "circle"), strict=False):
+    courses = Courses(new_figure(x="measured deviation / µm", y="predicted deviation / µm", height=360))
+    for (ending, text, looks), marker in zip(_stages(loop), ("x", "circle"), strict=False):
         error = loop[f"held_out_error_{ending}"]
         here = error.notnull().values & measured.notnull().values
         read, predicted = measured.values[here], (measured - error).values[here]
-        add_series(drawn, read, predicted, name=text, colour=colour, line=False, marker=marker, size=4.5)
-        columns |= {"measured deviation / µm": read, f"predicted, {text} / µm": predicted}
-        parts.append(f"{text} {number(float(np.sqrt(np.mean((read - predicted) ** 2))))} µm rms from the line")
-    ends = [float(np.min(columns["measured deviation / µm"])), float(np.max(columns["measured deviation / µm"]))]
-    drawn.line(ends, ends, line_color=MUTED, line_dash="dashed", legend_label="predicted = measured")
-    return Chart(drawn, f"Predicted against measured deviation of the held-out cycles: {'; '.join(parts)}.", columns)
+        courses.columns["measured deviation / µm"] = read
+        heading = f"predicted, {text} / µm"
+        seen = f"{number(float(np.sqrt(np.mean((read - predicted) ** 2))))} µm rms from the line"
+        courses.add(read, predicted, text, heading=heading, seen=seen, line=False, marker=marker, size=4.5, **looks)
+    ends = [float(end(courses.columns["measured deviation / µm"])) for end in (np.min, np.max)]
+    courses.figure.line(ends, ends, line_color=MUTED, line_dash="dashed", legend_label="predicted = measured")
+    return courses.chart("Predicted against measured deviation of the held-out cycles")
 
 
 # Errors of predicting blocks of a test from the others, before and after an effect was added: what tells of every
@@ -362,11 +351,9 @@ def plot_block_errors(errors: xr.Dataset, hours: np.ndarray, along: str) -> Char
     x = "time since first reading / h" if along == "cycle" else "time since start / h"
     drawn = new_figure(x=x, y="prediction error, rms / µm", height=300)
     columns: dict[str, np.ndarray] = {along: errors[along].values, x: hours} if along == "cycle" else {x: hours}
-    stages = (("before", "without the effect", BEFORE, "dashed"), ("after", "with it", COLOURS["positive"], "solid"))
-    for name, text, colour, dash in stages:
+    for name, text, looks in (("before", "without the effect", _DECLARED), ("after", "with it", _FINAL)):
         size = np.sqrt((errors[name] ** 2).mean(others).values)
-        marker = "circle" if along == "cycle" else None
-        add_series(drawn, hours, size, name=text, colour=colour, dash=dash, marker=marker)
+        add_series(drawn, hours, size, name=text, marker="circle" if along == "cycle" else None, **looks)
         columns[f"{text} / µm"] = size
     highest = np.nanmax([columns["without the effect / µm"], columns["with it / µm"]])
     fix_range(drawn, 0.0, 1.05 * float(highest))

@@ -21,7 +21,6 @@ from fusion.report.charts.style import (
     add_hover,
     add_ordered_lines,
     add_series,
-    add_zero_line,
     new_figure,
     palette,
     span_words,
@@ -118,17 +117,12 @@ def _on_plan(fields: xr.Dataset, shape: tuple[int, ...]) -> np.ndarray:
     return (x / scale > left) & (x / scale < right) & (y / scale > bottom) & (y / scale < top)
 
 
-def _hours(fields: xr.Dataset) -> np.ndarray:
-    """Return the mean time of the frames of every cycle in hours since the first."""
-    return np.asarray((fields["cycle_time"] - fields["cycle_time"][0]) / np.timedelta64(1, "h"), float)
-
-
 def plot_rise_history(fields: xr.Dataset) -> Chart:
     """Draw the rise of the table over the test: mean over the plan, with its coolest and hottest tenth; a cycle
     without a field is a gap.
     """
     rise = fields["temperature_rise"]
-    hours = _hours(fields)
+    hours = _hours_since(fields["cycle_time"].values, fields["cycle_time"].values[0])
     low, high, mean, most = np.full((4, rise.sizes["cycle"]), np.nan)
     for some, piece in in_pieces(rise):
         flat = piece.reshape(len(piece), -1)
@@ -139,8 +133,7 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
         mean[some][shown], most[some][shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
     unit, scale = ("h", 1.0) if hours[-1] >= _LEAST_HOURS else ("s", 3600.0)
     hours = scale * hours
-    drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K")
-    add_zero_line(drawn)
+    drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K", zero=True)
     add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
     seen_part = "picture" if plan_unit(fields) == "px" else "table"
     add_series(drawn, hours, mean, name=f"mean of the {seen_part}", colour=ACCENT)
@@ -163,8 +156,7 @@ def plot_axis_temperature(fused: xr.Dataset) -> Chart:
     rise = fused["local_rise"].mean("direction").transpose("cycle", "target").values[:, order]
     shown = np.isfinite(rise).any(axis=1)
     cycle = fused["cycle"].values[shown]
-    drawn = new_figure(x="position / mm", y="rise / K")
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="rise / K", zero=True)
     add_ordered_lines(drawn, [place] * int(shown.sum()), list(rise[shown]), cycle, "cycle")
     last = rise[shown][-1]
     seen = (
@@ -181,8 +173,7 @@ def plot_drift_temperature(fused: xr.Dataset, drift: xr.Dataset) -> Chart:
     place = fused["position"].values[order].astype(float)
     rise = fused["local_rise"].mean("direction").transpose("target", "cycle").values[order]
     moved = drift["drift"].mean("direction").transpose("target", "cycle").values[order]
-    drawn = new_figure(x="rise at the position / K", y="drift / µm", height=360)
-    add_zero_line(drawn)
+    drawn = new_figure(x="rise at the position / K", y="drift / µm", height=360, zero=True)
     add_ordered_lines(drawn, list(rise), list(moved), place, "position / mm")
     valid = np.isfinite(rise) & np.isfinite(moved)
     related = float(np.corrcoef(rise[valid], moved[valid])[0, 1]) if valid.sum() > 2 else float("nan")
@@ -207,8 +198,7 @@ def plot_sensors(sensors: xr.Dataset) -> Chart:
     start = sensors["time"].values[0]
     if "camera_time" in sensors:
         start = min(start, sensors["camera_time"].values[0])
-    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340, legend_columns=5)
-    add_zero_line(drawn)
+    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340, legend_columns=5, zero=True)
     rows: list[tuple[str, str, np.ndarray, np.ndarray]] = []
     said = []
     for k, name in enumerate(sensors["sensor"].values):
@@ -272,6 +262,16 @@ class Layer(NamedTuple):
     decimals: int
     colours: str
 
+    @property
+    def printed_unit(self) -> str:
+        """Its unit as it stands behind a number; empty for a number without unit."""
+        return "" if self.unit == "1" else self.unit
+
+    @property
+    def tip(self) -> tuple[str, str]:
+        """What is shown of it under the pointer."""
+        return self.words, f"@image{{0.{'0' * self.decimals}}} {self.printed_unit}"
+
 
 #: Quantities of the map, the first one shown first.
 LAYERS = (
@@ -316,10 +316,7 @@ def plot_thermal_map(
     scales = [scale_of(kept[layer.variable].values, layer) for layer in shown]
     last = kept[shown[0].variable].values[-1]
     drawn = draw_map(last, extent_of(kept), shown[0], scales[0], unit=unit)
-    if "target_x" in fields:
-        draw_line(drawn, fields, position)
-    draw_hotspots(drawn, hotspots, unit)
-    draw_sensors(drawn, sensors)
+    draw_places(drawn, fields, position, hotspots, sensors)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
@@ -342,8 +339,7 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
     cells = drawn.image(
         [values.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
     )  # fmt: skip
-    tip = (layer.words, f"@image{{0.{'0' * layer.decimals}}} {layer.unit}")
-    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), tip], [cells])
+    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), layer.tip], [cells])
     drawn.select_one(HoverTool).name = "reading"
     add_colour_bar(drawn, mapper, f"{layer.words} / {layer.unit}")
     drawn.below[-1].name = "bar"
@@ -382,14 +378,27 @@ def scale_of(values: np.ndarray, layer: Layer) -> dict[str, Any]:
         low, high = float(inner_low), float(inner_high)
     if layer.colours == DIVERGING:
         low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
-    unit = "" if layer.unit == "1" else layer.unit
     return {
-        "name": layer.words, "unit": unit, "step": 10.0**-layer.decimals, "decimals": layer.decimals, "low": low,
+        "name": layer.words, "unit": layer.printed_unit, "step": 10.0**-layer.decimals, "decimals": layer.decimals, "low": low,
         "high": high if high > low else low + 1.0, "palette": palette(layer.colours),
     }  # fmt: skip
 
 
-def draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
+def draw_places(
+    drawn: figure,
+    fields: xr.Dataset,
+    position: xr.DataArray | None,
+    hotspots: Sequence[HotspotPart],
+    sensors: Sequence[ContactSensorPart],
+) -> None:
+    """Draw the measured line where it is known, the hotspots and the contact sensors over a map."""
+    if "target_x" in fields:
+        _draw_line(drawn, fields, position)
+    _draw_hotspots(drawn, hotspots, plan_unit(fields))
+    _draw_sensors(drawn, sensors)
+
+
+def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
     """Draw the measured line with an arrow to its positive end, its targets, and the numbers of the first and the last."""
     targets = fields["target"].values
     order = np.arange(targets.size)
@@ -409,7 +418,7 @@ def draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) 
     add_names(drawn, x[named], y[named], [f"{targets[order[k]]}" for k in named], y_offset=-7, text_align="center")
 
 
-def draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
+def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
     """Ring the peak of every hotspot and write its name."""
     if not hotspots:
         return
@@ -420,7 +429,7 @@ def draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> 
     add_names(drawn, x, y, names, y_offset=-13, text_align=["right" if at > middle else "left" for at in x])
 
 
-def draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
+def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
     """Mark the places of the contact sensors by squares with their names; faulty ones are crossed."""
     for marker, used in (("square", True), ("square_x", False)):
         shown = [sensor for sensor in sensors if sensor.used is used]

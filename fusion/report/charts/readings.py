@@ -22,7 +22,6 @@ from fusion.report.charts.style import (
     add_label,
     add_ordered_lines,
     add_series,
-    add_zero_line,
     fix_range,
     new_figure,
     of_direction,
@@ -48,8 +47,7 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
     # Room for names at the right.
     first_h, last_h = float(np.nanmin(hours)), float(np.nanmax(hours))
     times = (first_h - 0.02 * (last_h - first_h), last_h + 0.18 * (last_h - first_h))
-    drawn = new_figure(x="time since first reading / h", y="drift / µm", height=360, x_range=times)
-    add_zero_line(drawn)
+    drawn = new_figure(x="time since first reading / h", y="drift / µm", height=360, x_range=times, zero=True)
     ends = (0, position.size - 1)
     for rank in ends:
         line, half = lines[:, order[rank]], band[:, order[rank]]
@@ -80,8 +78,7 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
 
 def plot_profile(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     """Draw the drift-free profile of both approaches with its 95 % band."""
-    drawn = new_figure(x="position / mm", y="deviation / µm")
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="deviation / µm", zero=True)
     order = np.argsort(position.values, kind="stable")
     drift, x = drift.isel(target=order), position.values[order].astype(float)
     columns: dict[str, np.ndarray] = {"position / mm": x}
@@ -102,8 +99,7 @@ def plot_profile(drift: xr.Dataset, position: xr.DataArray) -> Chart:
 
 def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     """Draw the reversal (positive minus negative approach) of every position with its 95 % interval."""
-    drawn = new_figure(x="position / mm", y="positive − negative / µm")
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="positive − negative / µm", zero=True)
     x, value, half = position.values.astype(float), drift["reversal"].values, 2 * drift["reversal_u"].values
     add_series(drawn, x, value, name="reversal", colour=INK, line=False, marker="circle", half=half, legend=False)
     apart = int((np.abs(value) > half).sum())
@@ -199,8 +195,7 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
     settled, x = settled.isel(target=order), position.values[order].astype(float)
     room = 0.24 * (np.ptp(x) or 1.0)
     left = x[0] - 0.04 * room
-    drawn = new_figure(x="position / mm", y="deviation / µm", height=420, x_range=(left, x[-1] + room))
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="deviation / µm", height=420, x_range=(left, x[-1] + room), zero=True)
     columns: dict[str, np.ndarray] = {"target": settled["target"].values, "position / mm": x}
     for direction in settled["direction"].values:
         row = settled.sel(direction=direction)
@@ -265,8 +260,7 @@ def _seen(settled: xr.Dataset, x: np.ndarray) -> str:
 
 def plot_single_runs(deviations: xr.Dataset) -> Chart:
     """Draw the deviations of a test of one cycle, which has no standard deviation."""
-    drawn = new_figure(x="position / mm", y="deviation / µm", height=420)
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="deviation / µm", height=420, zero=True)
     ordered = deviations.sortby("position")
     x = ordered["position"].values
     columns: dict[str, np.ndarray] = {"target": ordered["target"].values, "position / mm": x}
@@ -316,8 +310,7 @@ def plot_mean_differences(neighbours: xr.Dataset, position: xr.DataArray) -> Cha
     """Draw the mean difference of neighbouring positions, nearer minus further, with its 95 % interval."""
     further, nearer = _links(neighbours["link"], position)
     middle, step = (further + nearer) / 2, float(np.median(further - nearer))
-    drawn = new_figure(x="middle of the pair / mm", y="nearer − further position, mean / µm")
-    add_zero_line(drawn)
+    drawn = new_figure(x="middle of the pair / mm", y="nearer − further position, mean / µm", zero=True)
     columns: dict[str, np.ndarray] = {"nearer position / mm": nearer, "further position / mm": further}
     for shift, direction in zip((-0.1, 0.1), neighbours["direction"].values, strict=False):
         value = neighbours["mean_difference"].sel(direction=direction).values
@@ -337,8 +330,7 @@ def plot_reference_chart(chart: xr.Dataset, position: xr.DataArray) -> Chart:
     order = np.argsort(position.sel(target=chart["target"]).values, kind="stable")
     chart = chart.isel(target=order)
     place = position.sel(target=chart["target"]).values.astype(float)
-    drawn = new_figure(x="position / mm", y="deviation / µm")
-    add_zero_line(drawn)
+    drawn = new_figure(x="position / mm", y="deviation / µm", zero=True)
     columns: dict[str, np.ndarray] = {"position / mm": place}
     for direction in chart["direction"].values:
         value, border = (chart[name].sel(direction=direction).values for name in ("chart", "border_s"))
@@ -358,10 +350,9 @@ def plot_cycles(deviations: xr.Dataset, direction: str, *, quantity: str = "devi
     lines = every.sel(direction=direction).values[:, order]
     place, cycles = deviations["position"].values[order].astype(float), deviations["cycle"].values
     drawn = new_figure(
-        x="position / mm", y=f"{quantity} / µm", title=ARROWS[direction], y_range=shared_range(every.values)
+        x="position / mm", y=f"{quantity} / µm", title=ARROWS[direction], y_range=shared_range(every.values), zero=True
     )
     add_ordered_lines(drawn, [place] * len(lines), list(lines), cycles, "cycle")
-    add_zero_line(drawn)
     mean = every.sel(direction=direction).mean("cycle").values[order]
     seen = (
         f"{quantity.capitalize()} of {len(lines)} cycles, {ARROWS[direction]}: {span_words(lines, 'µm')}; the mean over the cycles goes "

@@ -12,11 +12,11 @@ from fusion.report.charts.style import (
     BEFORE,
     CATEGORIES,
     Chart,
+    Courses,
     add_band,
     add_hold_out,
     add_hover,
     add_series,
-    add_zero_line,
     fix_range,
     new_figure,
     of_rank,
@@ -61,18 +61,14 @@ def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
 def plot_residuals(record: xr.Dataset, channel: str) -> Chart:
     """Draw the residuals of both models in one channel over time."""
     hours, chosen = hours_of(record), record.sel(channel=channel)
-    drawn = new_figure(x=_TIME, y="measured − predicted / µm", title=channel)
+    drawn = new_figure(x=_TIME, y="measured − predicted / µm", title=channel, zero=True)
     _shade_hold_out(record, drawn)
-    add_zero_line(drawn)
-    columns: dict[str, np.ndarray] = {_TIME: hours}
-    parts = []
+    courses = Courses(drawn, {_TIME: hours})
     stages = (("declared", "declared model", BEFORE, "dashed"), ("final", "final model", _AFTER, "solid"))
     for ending, name, colour, dash in stages:
         missed = (chosen["displacement"] - chosen[f"predicted_{ending}"]).values
-        add_series(drawn, hours, missed, name=name, colour=colour, dash=dash)
-        columns[f"measured − {name} / µm"] = missed
-        parts.append(f"{name} {span_words(missed, 'µm')}")
-    return Chart(drawn, f"What the models miss in {channel} over time: {'; '.join(parts)}.", columns)
+        courses.add(hours, missed, name, heading=f"measured − {name} / µm", colour=colour, dash=dash)
+    return courses.chart(f"What the models miss in {channel} over time")
 
 
 def plot_temperatures(record: xr.Dataset) -> Chart:
@@ -81,8 +77,7 @@ def plot_temperatures(record: xr.Dataset) -> Chart:
     rise = (record["temperature"] - record["temperature"].isel(time=0)).transpose("time", "sensor").values
     names = [str(name) for name in record["sensor"].values]
     order = np.argsort(-np.ptp(rise, axis=0))
-    drawn = new_figure(x=_TIME, y="rise / K", height=340)
-    add_zero_line(drawn)
+    drawn = new_figure(x=_TIME, y="rise / K", height=340, zero=True)
     others = order[_NAMED:]
     if others.size:
         lines = drawn.multi_line(
@@ -121,17 +116,13 @@ def plot_drivers(record: xr.Dataset) -> Chart:
 def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
     """Draw what each term of the final model contributes to one channel, about its mean."""
     hours = hours_of(record)
-    drawn = new_figure(x=_TIME, y="contribution / µm", title=channel)
+    drawn = new_figure(x=_TIME, y="contribution / µm", title=channel, zero=True)
     _shade_hold_out(record, drawn)
-    add_zero_line(drawn)
-    columns: dict[str, np.ndarray] = {_TIME: hours}
-    said = []
+    courses = Courses(drawn, {_TIME: hours})
     for k, effect in enumerate(str(name) for name in record["effect"].values):
-        values, words = record["contribution"].sel(channel=channel).isel(effect=k).values, effect_words(effect).name
-        add_series(drawn, hours, values, name=words, **of_rank(k))
-        columns[f"{words} / µm"] = values
-        said.append(f"{words} {span_words(values, 'µm')}")
-    return Chart(drawn, f"Contributions to {channel} over time: {'; '.join(said) or 'the model has no term'}.", columns)
+        values = record["contribution"].sel(channel=channel).isel(effect=k).values
+        courses.add(hours, values, effect_words(effect).name, **of_rank(k))
+    return courses.chart(f"Contributions to {channel} over time")
 
 
 def _shade_hold_out(record: xr.Dataset, drawn: figure) -> None:

@@ -89,8 +89,9 @@ def new_figure(
     x_type: str = "auto",
     y_type: str = "auto",
     legend_columns: int = 2,
+    zero: bool = False,
 ) -> figure:
-    """Return an empty figure in the common style: as wide as its place in the page, legend above the data."""
+    """Return an empty figure in the common style: as wide as its place in the page, legend above the data, on demand the line of zero."""
     ranges: dict[str, Any] = {"x_range": x_range, "y_range": y_range}
     drawn = figure(
         height=height, sizing_mode="stretch_width", tools="", toolbar_location=None, title=title or None,
@@ -119,6 +120,8 @@ def new_figure(
         ),
         "above",
     )  # fmt: skip
+    if zero:
+        drawn.hspan(0.0, line_color=MUTED, line_width=1, level="underlay")
     return drawn
 
 
@@ -161,6 +164,25 @@ def add_series(
     (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     shown = "@y{0.000}" + (" ± @half{0.000}" if half is not None else "")
     add_hover(drawn, [("", name), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {y_unit}")], parts[-1:])
+
+
+class Courses:
+    """Named series of one figure as they are drawn: what the reader can download of them, and what is seen of each, in words."""
+
+    def __init__(self, drawn: figure, columns: Mapping[str, np.ndarray] | None = None) -> None:
+        self.figure, self.columns, self.told = drawn, dict(columns or {}), list[str]()
+
+    def add(
+        self, x: np.ndarray, y: np.ndarray, name: str, *, heading: str = "", seen: str | None = None, **looks: Any
+    ) -> None:
+        """Draw a series of values in µm; `heading` and `seen` where they are not its name with the unit, and the span of its values."""
+        add_series(self.figure, x, y, name=name, **looks)
+        self.columns[heading or f"{name} / µm"] = y
+        self.told.append(f"{name} {span_words(y, 'µm') if seen is None else seen}")
+
+    def chart(self, subject: str) -> Chart:
+        """Return the chart, with what is seen of every series after the subject."""
+        return Chart(self.figure, f"{subject}: {'; '.join(self.told)}.", self.columns)
 
 
 def of_direction(direction: str) -> dict[str, Any]:
@@ -206,11 +228,6 @@ def add_ordered_lines(
 def add_hold_out(drawn: figure, low: float, high: float) -> None:
     """Shade the part of a test that took no part in any choice."""
     drawn.add_layout(BoxAnnotation(left=low, right=high, fill_color=ACCENT, fill_alpha=0.08, level="underlay"))
-
-
-def add_zero_line(drawn: figure) -> None:
-    """Draw the line of zero."""
-    drawn.hspan(0.0, line_color=MUTED, line_width=1, level="underlay")
 
 
 def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, **options: Any) -> None:
@@ -266,20 +283,7 @@ def fix_range(drawn: figure, low: float, high: float) -> None:
 
 
 def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
-    """Return the smallest and the largest value in words, for text alternatives.
-
-    Parameters
-    ----------
-    values : array_like
-        NaN are left out.
-    unit : str
-        As it is printed.
-
-    Examples
-    --------
-    >>> span_words(np.array([-1.25, 3.0]), "µm")
-    '−1.25 to 3.00 µm'
-    """
+    """Return the smallest and the largest value, NaN left out, as "−1.25 to 3.00 µm", for text alternatives."""
     every = np.asarray(values, float)
     if not np.isfinite(every).any():
         return "without values"

@@ -15,8 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from fusion.app.results.data import Products
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+from tests.browser import CHROMIUM, record_faults
 
 
 @contextmanager
@@ -100,19 +99,7 @@ def new_page():
             host = address.split("?")[0]
             page = browser.new_context(viewport={"width": width, "height": 900}, **options).new_page()
             page.set_default_timeout(60_000)
-            page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
-            page.on(
-                "console",
-                lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None,
-            )
-            page.on(
-                "request",
-                lambda request: (
-                    None
-                    if request.url.startswith((host, "data:", "blob:"))
-                    else faults.append(f"request: {request.url}")
-                ),
-            )
+            record_faults(page, faults, own=(host, "data:", "blob:"))
             page.goto(address)
             return page
 

@@ -13,14 +13,8 @@ from fusion.app.server import SCREENS, Credentials, MissingExtraError, serve
 from fusion.cli import app as command
 
 #: What opens the page, its connection, its scripts, and the data.
-PATHS = (
-    "/",
-    "/ws",
-    "/static/js/bokeh.min.js",
-    "/static/extensions/panel/panel.min.js",
-    "/report/results/report.html",
-    "/none",
-)
+STATIC = ("/static/js/bokeh.min.js", "/static/extensions/panel/panel.min.js")
+PATHS = ("/", "/ws", *STATIC, "/report/results/report.html", "/none")
 
 
 def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(app, ask):

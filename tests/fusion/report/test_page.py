@@ -22,9 +22,8 @@ from fusion.report.page import (
     sources_table,
 )
 from fusion.results.results import assemble
+from tests.browser import CHROMIUM, record_faults
 from tests.fusion.results_sample import PARTS
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +40,7 @@ def opened(report):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 900}, bypass_csp=True)
-        page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
-        page.on(
-            "console", lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None
-        )
-        page.on(
-            "request", lambda request: faults.append(f"request: {request.url}") if is_foreign(request.url) else None
-        )
+        record_faults(page, faults, own=("file://", "data:"))
         page.goto(report.as_uri())
         yield page, faults
         browser.close()
@@ -57,10 +50,6 @@ def opened(report):
 def made_anew(report):
     """The report once more, from its products."""
     return report_of(report.parent)
-
-
-def is_foreign(url: str) -> bool:
-    return not url.startswith(("file://", "data:"))
 
 
 def test_it_opens_offline_without_a_fault(opened, report):
@@ -101,20 +90,8 @@ def test_a_link_of_the_contents_opens_the_appendix(opened):
 def test_what_a_reader_acts_on_comes_before_the_statistics(opened):
     page, _ = opened
     order = page.evaluate("[...document.querySelectorAll('section[id]')].map(s => s.id)")
-    wanted = [
-        "summary",
-        "iso230",
-        "drift",
-        "anomalies",
-        "fields",
-        "cause",
-        "place",
-        "data",
-        "appendix",
-        "paper",
-        "loop",
-        "glossary",
-    ]
+    sections = "summary iso230 drift anomalies fields cause place data appendix paper loop glossary"
+    wanted = sections.split()
     assert [name for name in order if name in wanted] == wanted
 
 
@@ -156,10 +133,8 @@ def test_the_map_follows_slider_menu_and_play(opened):
 
 def test_tables_have_captions_and_charts_say_what_is_seen(opened):
     page, _ = opened
-    assert (
-        page.evaluate("[...document.querySelectorAll('table')].filter(t => !t.caption && t.closest('.scroll')).length")
-        == 0
-    )
+    bare = "[...document.querySelectorAll('table')].filter(t => !t.caption && t.closest('.scroll')).length"
+    assert page.evaluate(bare) == 0
     said = page.evaluate("[...document.querySelectorAll('.drawing')].map(d => d.getAttribute('aria-label'))")
     assert len(said) >= 25
     assert all(len(text) > 30 and text.endswith(".") for text in said), said
@@ -214,22 +189,16 @@ def test_no_link_of_the_contents_hides_behind_the_button(opened):
 
 RESULTS = [assemble(title, PARTS, []) for title in ("Monday <1>", "Tuesday")]
 SESSIONS = session_names(RESULTS)
-ALONE = SourceAgreement(
-    "joint",
-    405.0,
-    95.0,
-    (0,),
-    (0.002, 0.006),
-    (3.76, 7.8),
-    (0.08, 0.85),
-    (0.0, 600.0),
-    False,
-    True,
-    0.97,
-    (330.0, 90.0, 75.2),
-)
 AGREED = SourceAgreement(
     "joint", 330.0, 90.0, (0, 1), (0.004, 0.004), (4.04, 5.75), (0.5, 0.6), (0.0, 0.0), True, False
+)
+ALONE = replace(
+    replace(AGREED, x_mm=405.0, y_mm=95.0, shown_by=(0,), agrees=False, power=0.97, agreed_near_mm=(330.0, 90.0, 75.2)),
+    p_value=(0.002, 0.006),
+    sensitivity_um_per_K=(3.76, 7.8),
+    sensitivity_u_um_per_K=(0.08, 0.85),
+    lag_s=(0.0, 600.0),
+    separate=True,
 )
 CHANNEL = ChannelAgreement(
     "joint", "attributable", 330.0, 90.0, 0.004, (4.04, 5.75), (0.0, 0.0), "both sessions find this place"
@@ -244,26 +213,21 @@ def test_a_neighbouring_place_is_told_apart_and_reconciled():
     both = compared(ALONE, AGREED)
     first, second = describe_sources(both, SESSIONS)
     assert (first.name, second.name) == ("place 1", "place 2")
-    assert first.verdict.startswith(
-        "shown by A (Monday <1>) only; B (Tuesday) also shows a source there, but a different one: 3.8 and 7.8"
+    assert (
+        first.verdict.startswith("shown by A (Monday <1>) only; ") and "a different one: 3.8 and 7.8" in first.verdict
     )
     assert "75 mm both agree (place 2)" in first.verdict
     assert second.verdict.startswith("both sessions agree here, but it is not a separate source")
     told = conclude_sessions(both, [first, second], SESSIONS)
     assert told[0] == "The two sessions show no cause in common."
-    assert (
-        told[1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
-        and told[2] == "Only A (Monday <1>) shows place 1."
-    )
+    assert told[1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
+    assert told[2] == "Only A (Monday <1>) shows place 1."
 
 
 def test_what_one_session_shows_alone_has_the_chance_of_the_other():
     missed = replace(ALONE, p_value=(0.002, 0.6), agreed_near_mm=None, shown_by=(0,), power=0.31)
     (one,) = describe_sources(compared(missed), SESSIONS)
-    assert (
-        one.verdict
-        == "shown by A (Monday <1>) only; B (Tuesday) would have shown the same size with a probability of 31 %"
-    )
+    assert one.verdict.startswith("shown by A (Monday <1>) only; ") and one.verdict.endswith("a probability of 31 %")
     assert one.shown[1] == "p 0.6, 7.8 ± 1.7 µm/K, lag 10 min"
 
 

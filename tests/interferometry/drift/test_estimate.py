@@ -17,7 +17,7 @@ from interferometry.drift.estimate import (
 )
 from interferometry.drift.gls import AirNoise, drift_covariance, estimate_air_noise
 from interferometry.drift.kalman import drift_system
-from tests.interferometry.simulated_campaigns import SIGMA_UM, schedule, simulate
+from tests.interferometry.simulated_campaigns import SIGMA_UM, schedule, simulate, with_memory
 
 pytestmark = pytest.mark.long
 
@@ -223,12 +223,10 @@ def test_a_hot_zone_of_the_screw_gets_a_shape_of_its_own(rng):
 
 
 def test_noise_with_memory_over_the_cycles_widens_the_profile(rng):
-    noise = rng.standard_normal((100, 2, 16))
-    for k in range(1, 100):
-        noise[k] = 0.5 * noise[k - 1] + np.sqrt(0.75) * noise[k]
+    noise = with_memory(rng.standard_normal((100, 2, 16)), 0.5)
     plain, _ = simulate(np.random.default_rng(1))
-    with_memory, _ = simulate(np.random.default_rng(1), noise=SIGMA_UM * noise)
-    ratio = estimate_drift(with_memory)["profile_relative_u"] / estimate_drift(plain)["profile_relative_u"]
+    remembering, _ = simulate(np.random.default_rng(1), noise=SIGMA_UM * noise)
+    ratio = estimate_drift(remembering)["profile_relative_u"] / estimate_drift(plain)["profile_relative_u"]
     # The variance of a mean grows by (1 + 0.5) / (1 - 0.5) = 3; the fit takes a part of the memory for drift.
     assert 1.4 < float(ratio[:, 1:].mean()) < 2.0
 
@@ -310,12 +308,9 @@ def test_correlated_noise_is_estimated(rng):
     assert air.variance_um2 == pytest.approx(0.16, rel=0.5)
 
 
-def test_independent_noise_is_not_called_correlated(rng):
+def test_independent_noise_and_too_few_passes_are_not_called_correlated(rng):
     seconds = schedule(100)
     assert all(estimate(rng.normal(0, 0.4, seconds.shape), seconds) is None for _ in range(10))
-
-
-def test_too_few_passes_give_none(rng):
     seconds = schedule(5)
     assert estimate(correlated(rng, seconds, 20.0), seconds) is None
 
@@ -375,19 +370,10 @@ def test_noise_has_no_shape(rng):
     assert sum(shape is not None for shape in shapes) <= 2
 
 
-def test_a_single_position_is_no_shape(rng):
+def test_a_single_position_memory_of_all_and_too_few_cycles_or_targets_give_no_shape(rng):
     residual = rng.normal(0, 0.3, (80, 16))
     residual[40:, 6] += 2.0
     assert common_shape(residual, KNOWN) is None
-
-
-def test_memory_that_all_positions_have_is_no_shape(rng):
-    residual = rng.normal(0, 0.3, (100, 16))
-    for k in range(1, 100):
-        residual[k] = 0.5 * residual[k - 1] + np.sqrt(0.75) * residual[k]
-    assert common_shape(residual, KNOWN) is None
-
-
-def test_too_few_cycles_or_targets_give_none(rng):
+    assert common_shape(with_memory(rng.normal(0, 0.3, (100, 16)), 0.5), KNOWN) is None
     assert common_shape(rng.normal(size=(14, 16)), KNOWN) is None
     assert common_shape(rng.normal(size=(80, 3)), KNOWN[:3]) is None

@@ -15,6 +15,7 @@ from interferometry.drift.gls import (
     von_neumann_p_value,
 )
 from interferometry.drift.kalman import DriftModelError, drift_system, start_columns
+from tests.interferometry.simulated_campaigns import with_memory
 
 POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
 
@@ -339,18 +340,18 @@ def drift_and_columns(rng):
 
 
 def series(rng: np.random.Generator, correlation: float, *, rows: int = 32, cycles: int = 100) -> np.ndarray:
-    values = rng.standard_normal((rows, cycles))
-    for k in range(1, cycles):
-        values[:, k] = correlation * values[:, k - 1] + np.sqrt(1 - correlation**2) * values[:, k]
+    values = with_memory(rng.standard_normal((rows, cycles)).T, correlation).T
     return values - values.mean(axis=1, keepdims=True)
 
 
-def test_independent_noise_has_no_memory_and_stays_as_it_is(rng):
+def test_noise_without_memory_and_a_position_that_moves_by_itself_have_none(rng):
     values = series(rng, 0.0)
     memory = typical_memory(values)
     assert memory.weights.size == 0
     assert memory.long_run == 1.0
     assert memory.innovations(values) is values
+    values[4:6] += 3.0 * np.sin(np.linspace(0, 6, 100))
+    assert typical_memory(values).weights.size == 0
 
 
 def test_memory_is_recognised_and_taken_out(rng):
@@ -364,12 +365,6 @@ def test_memory_is_recognised_and_taken_out(rng):
     lag_one = (innovations[:, 1:] * innovations[:, :-1]).sum() / (innovations**2).sum()
     assert abs(lag_one) < 0.06
     assert innovations[:, 0].std() == pytest.approx(innovations.std(), rel=0.5)
-
-
-def test_a_position_that_moves_by_itself_is_no_memory_of_all(rng):
-    values = series(rng, 0.0)
-    values[4:6] += 3.0 * np.sin(np.linspace(0, 6, 100))
-    assert typical_memory(values).weights.size == 0
 
 
 def test_series_without_values_or_too_few_cycles_have_no_memory():

@@ -222,17 +222,30 @@ def test_environment_is_sorted_and_its_faults_are_listed(tmp_path):
     assert "is outside -9 .. 80" in str(reasons[6])
 
 
-def test_environment_in_another_unit_or_as_a_fraction_is_refused(tmp_path):
+OTHER_UNITS = "time,air_temperature_degF,pressure (kPa),humidity (%),sample temperature [K]"
+
+
+@pytest.mark.parametrize(
+    ("header", "line", "message"),
+    [
+        (
+            ENVIRONMENT,
+            "23.7,101.3,42,23.8",
+            r"1 of 1 lines .* line 2: '101\.3' is outside 500 \.\. 1200, .* air_pressure_hP",
+        ),
+        (ENVIRONMENT, "23.7,1000.1,0.45,23.8", r"'0.45' is outside 1 .. 100, the range of relative_humidity_percent"),
+        (
+            OTHER_UNITS.replace("kPa", "mm"),
+            "68,101.3,42,293.15",
+            "line 1: the unit of 'pressure .mm.' is none of a pressure",
+        ),
+        ("time,air_temperature_degC", "20", "line 1 lacks air_pressure_hPa, relative_humidity_percent, material"),
+    ],
+)
+def test_environment_in_another_unit_or_without_a_column_is_refused(tmp_path, header, line, message):
     path = tmp_path / "environment.csv"
-    path.write_text(ENVIRONMENT + "\n2026-03-09T06:32:00Z,23.7,101.3,42,23.8\n", encoding="utf-8")
-    with pytest.raises(
-        LaserFormatError,
-        match=r"1 of 1 lines cannot be used, the first is line 2: '101\.3' is outside 500 \.\. 1200, the range of air_pressure_hP",
-    ):
-        read_environment(path)
-    path = tmp_path / "environment.csv"
-    path.write_text(ENVIRONMENT + "\n2026-03-09T06:32:00Z,23.7,1000.1,0.45,23.8\n", encoding="utf-8")
-    with pytest.raises(LaserFormatError, match=r"'0.45' is outside 1 .. 100, the range of relative_humidity_percent"):
+    path.write_text(f"{header}\n2026-03-09T06:32:00Z,{line}\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match=message):
         read_environment(path)
 
 
@@ -269,17 +282,10 @@ def test_environment_headings_in_five_languages(tmp_path, language):
 
 def test_environment_in_other_units_is_converted(tmp_path):
     path = tmp_path / "environment.csv"
-    head = "time,air_temperature_degF,pressure (kPa),humidity (%),sample temperature [K]"
-    path.write_text(head + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
+    path.write_text(OTHER_UNITS + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
     environment = read_environment(path)
     values = [float(environment[name][0]) for name in ("air_temperature", "air_pressure", "material_temperature")]
     assert values == pytest.approx([20.0, 1013.0, 20.0], abs=1e-9)
-    path.write_text(head.replace("kPa", "mm") + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
-    with pytest.raises(LaserFormatError, match=r"line 1: the unit of 'pressure .mm.' is none of a pressure"):
-        read_environment(path)
-    path.write_text("time,air_temperature_degC\n2026-03-09T06:32:00Z,20\n", encoding="utf-8")
-    with pytest.raises(LaserFormatError, match="line 1 lacks air_pressure_hPa, relative_humidity_percent, material"):
-        read_environment(path)
 
 
 def test_a_report_of_averages_is_no_test(tmp_path):
@@ -291,17 +297,10 @@ def test_a_report_of_averages_is_no_test(tmp_path):
 
 #: Cycle, sign, target, position in mm, second and deviation in um of a small test.
 TEST = [
-    (
-        cycle,
-        sign,
-        target,
-        20.0 * (target - 1),
-        60 * cycle + (6 * target if sign > 0 else 40 - 6 * target),
-        cycle + 0.25 * target * sign,
-    )
-    for cycle in (1, 2)
+    (c, sign, t, 20.0 * (t - 1), 60 * c + (6 * t if sign > 0 else 40 - 6 * t), c + 0.25 * t * sign)
+    for c in (1, 2)
     for sign in (1, -1)
-    for target in (1, 2, 3)
+    for t in (1, 2, 3)
 ]
 EXPECTED = np.array([[[c + 0.25 * t * s for t in (1, 2, 3)] for s in (1, -1)] for c in (1, 2)])
 LINE = "{c},{d},{t},{p},2026-03-09T{clock},{e}"
@@ -432,9 +431,8 @@ def test_turned_directions_and_numbering_from_0_are_told(tmp_path):
     turned = DIALECTS["forward"].replace("Forward", "?").replace("Reverse", "Forward").replace("?", "Reverse")
     test = read(tmp_path, turned)
     assert test["deviation"].values.tolist() == EXPECTED.tolist()
-    assert json.loads(test.attrs["notes"]) == [
-        "the forward runs lead to smaller positions: they are the negative direction"
-    ]
+    (note,) = json.loads(test.attrs["notes"])
+    assert note.startswith("the forward runs lead to smaller positions")
     assert json.loads(read(tmp_path, DIALECTS["from 0"]).attrs["notes"]) == [
         "the file numbers its cycles from 0: 1 was added",
         "the file numbers its targets from 0: 1 was added",
@@ -524,26 +522,22 @@ def test_every_dialect_of_a_wide_table_gives_the_same_test(tmp_path, dialect):
 
 
 def test_columns_that_are_no_runs_empty_cells_and_words_are_named(tmp_path):
-    assert json.loads(read_wide(tmp_path, WIDE_DIALECTS["summary columns"]).attrs["columns_ignored"]) == [
-        "Mean + [um]",
-        "s",
-    ]
+    ignored = read_wide(tmp_path, WIDE_DIALECTS["summary columns"]).attrs["columns_ignored"]
+    assert json.loads(ignored) == ["Mean + [um]", "s"]
     text = WIDE_DIALECTS["signs"].replace("0,1.25,", "0,,").replace("20,1.5", "20,fail")
     test = read_wide(tmp_path, text + "\nMean,1,1,1,1\n")
     assert np.isnan(test["deviation"].values[0, 0, :2]).all()
     assert test.attrs["missing"] == 2
     (line,) = json.loads(test.attrs["left_out"])
     assert (line["line"], line["value"], line["reason"]) == (3, "fail", "is not a number")
+    twice = read_wide(tmp_path, "Position [mm],1+ [um],1- [um]\n0,1,2\n0,1,2\n20,1,2\n")
+    assert "cycle 1 positive target 1" in twice.attrs["left_out"]
 
 
 @pytest.mark.parametrize("kind", ["xlsx", "ods"])
 def test_a_sheet_with_merged_headings(tmp_path, kind):
-    rows = [
-        ["Deviations [um]"],
-        ["Position [mm]", "Cycle 1", "", "Cycle 2", ""],
-        ["", "+", "-", "+", "-"],
-        *map(list, ROWS),
-    ]
+    headings = [["Deviations [um]"], ["Position [mm]", "Cycle 1", "", "Cycle 2", ""], ["", "+", "-", "+", "-"]]
+    rows = [*headings, *map(list, ROWS)]
     path = tmp_path / f"wide.{kind}"
     if kind == "ods":
         write_ods(path, rows)
@@ -572,13 +566,9 @@ def test_a_rotary_axis_in_degrees_and_arcseconds(tmp_path):
         (f"Position [deg],1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", "positions in deg, deviations in um; give both as"),
         (f"Position [mm],1+ [um],1- [um],2+ [um],- [um]\n{DATA}", "'- .um.' has no number, but other runs have"),
         (f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}", "no table of deviations; line 1 has columns of"),
-        ("Position [mm],1+ [um],1- [um]\n0,1,2\n0,1,2\n20,1,2\n", r"cycle 1 positive target 1|targets .* both stand"),
     ],
 )
 def test_what_a_wide_table_lacks_is_named(tmp_path, text, message):
-    if "0,1,2\n0,1,2" in text:
-        assert message.split("|")[0] in read_wide(tmp_path, text).attrs["left_out"]
-        return
     with pytest.raises(LaserFormatError, match=message):
         read_wide(tmp_path, text)
 

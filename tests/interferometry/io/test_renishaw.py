@@ -47,35 +47,17 @@ def test_genuine_file_gets_times_with_their_uncertainty(real_file):
     assert np.isnat(test["time"].sel(direction="negative").values).all()
 
 
+TIMES = '"2014-10-08 10:00:00" "2014-10-08 10:02:00"'
+
+
 def rtl(folder: Path, old: str = "", new: str = "", *, line_end: str = "\n") -> Path:
-    text = "\n".join(
-        [
-            "HEADER::",
-            "File type  : rtl",
-            "",
-            "TARGET DATA::",
-            "Filetype  : ISO",
-            "Target-count: 3",
-            "Targets :",
-            "-10.000000  0.000000 ",
-            "10.000000 ",
-            "Flags: 0 0 2 1",
-            "",
-            "RUNS::",
-            "Run-count:4",
-            "",
-            "DEVIATIONS::",
-            "Run Target Data:",
-            *[f"{run} {target} {run + target / 10}" for run in (1, 3) for target in (1, 2, 3)],
-            *[f"{run} {target} {-run - target / 10}" for run in (2, 4) for target in (3, 2, 1)],
-            "",
-            "ENVIRONMENT::",
-            'DateTime : "2014-10-08 10:00:00" "2014-10-08 10:02:00"',
-            "",
-            "EOF::",
-            "",
-        ]
-    )
+    lines = ["HEADER::", "File type  : rtl", "", "TARGET DATA::", "Filetype  : ISO", "Target-count: 3", "Targets :"]
+    lines += ["-10.000000  0.000000 ", "10.000000 ", "Flags: 0 0 2 1", "", "RUNS::", "Run-count:4", ""]
+    lines += ["DEVIATIONS::", "Run Target Data:"]
+    lines += [f"{run} {target} {run + target / 10}" for run in (1, 3) for target in (1, 2, 3)]
+    lines += [f"{run} {target} {-run - target / 10}" for run in (2, 4) for target in (3, 2, 1)]
+    lines += ["", "ENVIRONMENT::", f"DateTime : {TIMES}", "", "EOF::", ""]
+    text = "\n".join(lines)
     assert old in text
     path = folder / "test.rtl"
     path.write_bytes(text.replace(old, new, 1).replace("\n", line_end).encode("latin-1"))
@@ -94,11 +76,8 @@ def test_a_test_measured_in_one_direction_has_one_direction(tmp_path):
     reverse = "\n".join(f"2 {target} {-2 - target / 10}" for target in (3, 2, 1))
     forward = "\n".join(f"2 {target} {-2 - target / 10}" for target in (1, 2, 3))
     path = tmp_path / "one.rtl"
-    text = (
-        text.replace(reverse, forward)
-        .replace("4 3 -4.3\n4 2 -4.2\n4 1 -4.1\n", "")
-        .replace("Run-count:4", "Run-count:3")
-    )
+    text = text.replace(reverse, forward).replace("4 3 -4.3\n4 2 -4.2\n4 1 -4.1\n", "")
+    text = text.replace("Run-count:4", "Run-count:3")
     path.write_text(text, encoding="latin-1")
     test = read_deviations(path)
     assert test.sizes["cycle"] == 3
@@ -156,8 +135,7 @@ def test_missing_readings_and_times_are_said_and_the_second_spelling_has_no_seco
     test = read_deviations(rtl(tmp_path, "DateTime", "Nothing"))
     assert test["time"].attrs["origin"] == "none"
     assert np.isnat(test["time"].values).all()
-    old = '"2014-10-08 10:00:00" "2014-10-08 10:02:00"'
-    test = read_deviations(rtl(tmp_path, old, '"10:46 Dec 12 2016" "11:01 Dec 12 2016"'))
+    test = read_deviations(rtl(tmp_path, TIMES, '"10:46 Dec 12 2016" "11:01 Dec 12 2016"'))
     assert test["time"].attrs["origin"] == "reconstructed"
     assert test["time"].values.max() == np.datetime64("2016-12-12T11:01:30")
     # Start and end are known to the minute: each adds 60 s / sqrt(12).
@@ -168,7 +146,7 @@ def test_missing_readings_and_times_are_said_and_the_second_spelling_has_no_seco
     "times", ['"2014-13-08 10:00:00" "2014-10-08 10:02:00"', '"10:46 Foo 12 2016" "11:01 Dec 12 2016"']
 )
 def test_times_that_do_not_exist_are_no_times(tmp_path, times):
-    test = read_deviations(rtl(tmp_path, '"2014-10-08 10:00:00" "2014-10-08 10:02:00"', times))
+    test = read_deviations(rtl(tmp_path, TIMES, times))
     assert test["time"].attrs["origin"] == "none"
 
 

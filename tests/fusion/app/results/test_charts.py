@@ -61,9 +61,8 @@ def test_without_a_laser_it_says_so(results_folder, tmp_path):
     (folder / "deviations.nc").unlink()
     camera, selection = Products(folder), Selection(cycle=1)
     assert reading_hours(camera) is None
-    assert "no readings of a laser" in texts(
-        laser_charts(camera, selection, Linker(selection, [], camera.cycles, None))
-    )
+    linker = Linker(selection, [], camera.cycles, None)
+    assert "no readings of a laser" in texts(laser_charts(camera, selection, linker))
 
 
 def parts_of(products):
@@ -76,13 +75,8 @@ def test_every_round_has_residual_scores_and_effect(products):
     assert isinstance(loop, AxisLoop) and loop.steps
     for turn in range(1, len(loop.steps) + 1):
         assert f"Round {turn}" in told
-    named = (
-        "Residual before this round",
-        "Best candidate of every effect in round 1",
-        "Entered",
-        "What the final model leaves",
-    )
-    for words in (*named, "What to do next"):
+    of_round = ("Residual before this round", "Best candidate of every effect in round 1", "Entered")
+    for words in (*of_round, "What the final model leaves", "What to do next"):
         assert words in told
 
 

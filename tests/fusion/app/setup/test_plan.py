@@ -122,9 +122,8 @@ def test_a_dragged_fiducial_tells_its_residual_on_the_way(view):
     view._on_start(SimpleNamespace(x=41.0, y=40.0))
     view._on_drag(SimpleNamespace(x=60.0, y=40.0))
     assert view.placed.residual_mm["F0"] == pytest.approx(10.0, abs=0.5), "20 px at 2 px/mm"
-    assert (
-        "F0 10.00 mm" in view._points.data["label"] and "F0 lies 10.00 mm from where the others" in view._message.object
-    )
+    assert "F0 10.00 mm" in view._points.data["label"]
+    assert "F0 lies 10.00 mm from where the others" in view._message.object
     view._on_end(SimpleNamespace(x=40.0, y=40.0))
     assert view.placed.residual_mm["F0"] < 1e-6 and view._chosen.value == "F0"
 

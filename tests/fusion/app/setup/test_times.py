@@ -6,15 +6,12 @@ import pytest
 from fusion.app.setup.times import Bar, TimesView, coverage, estimate, recordings_of, shifted
 from fusion.pipeline.inspect import Recording, scan_folder
 
+MINUTES = np.datetime64("2026-03-09T06:00", "ns") + np.timedelta64(1, "m") * np.arange(121)
+
 
 @pytest.fixture
 def recordings():
-    start = np.datetime64("2026-03-09T06:00", "ns")
-    minutes = np.timedelta64(1, "m") * np.arange(121)
-    return [
-        Recording("frames", start + np.timedelta64(2, "h") + minutes),
-        Recording("readings", start + minutes[5:110]),
-    ]
+    return [Recording("frames", MINUTES + np.timedelta64(2, "h")), Recording("readings", MINUTES[5:110])]
 
 
 def test_every_recording_of_a_folder_is_there(campaign_folder):
@@ -30,9 +27,6 @@ def test_two_time_zones_are_estimated_and_the_offset_moves_the_frames_alone(reco
     assert moved == Bar("frames", frames.start - np.timedelta64(2, "h"), frames.end - np.timedelta64(2, "h"))
     assert same == readings
     assert coverage(recordings[:1], 0.0) == "" and estimate(recordings[1:]) is None
-
-
-MINUTES = np.datetime64("2026-03-09T06:00", "ns") + np.timedelta64(1, "m") * np.arange(121)
 
 
 def test_the_slider_moves_the_frames_and_the_estimate_is_offered():

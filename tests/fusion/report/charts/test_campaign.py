@@ -1,7 +1,6 @@
 """What all charts share, and charts in a page: readable, comparable, drawn offline, their data saved."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from fusion.report.charts.style import Chart, chart_scripts, embed, new_figure
 from fusion.report.wording import alike, number
 from fusion.results.results import read_results
 from fusion.results.store import group, read_fusion, read_product
+from tests.browser import CHROMIUM, record_faults
 
 
 def contrast_with_white(colour: str) -> float:
@@ -53,12 +53,8 @@ def test_a_chart_lets_the_page_scroll_and_names_axes_bands_and_colours():
     assert (low, high) == pytest.approx((-1.16, 3.16))
     assert style.shared_range(np.array([-1.0, 3.0]), symmetrical=True) == pytest.approx((-3.24, 3.24))
     assert style.shared_range(np.array([np.nan])) == pytest.approx((-0.04, 1.04))
-    drawn = style.new_figure(x="x", y="y")
     style.fix_range(drawn, low, high)
     assert (drawn.y_range.start, drawn.y_range.end) == (low, high)
-
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def small_chart() -> Chart:
@@ -105,8 +101,7 @@ def test_a_small_page_draws_saves_and_prints(tmp_path):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page()
         faults = []
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.on("request", lambda request: None if request.url.startswith("file:") else faults.append(request.url))
+        record_faults(page, faults, own=("file:",))
         page.goto((tmp_path / "small.html").as_uri())
         page.wait_for_selector("html[data-charts=drawn]")
         drawing = page.get_by_role("img", name='Falls from 1.5 to −2.0 µm over "10" mm.')

@@ -54,9 +54,7 @@ def test_drift_of_every_position(still_readings):
     assert [line.tolist() for line in lines.data_source.data["ys"]] == [[0.0, 0.5, 1.0], [0.0, 1.0, 2.0]]
     assert lines.data_source.data["xs"][0].tolist() == [0.0, 1.0, 2.0]
     assert chart.figure.yaxis.axis_label == "drift / µm"
-    assert all(part in chart.seen for part in ("2 positions", "2.0 h: 0.00 to 2.00 µm", "by 1.5 µm", "at 100 mm")), (
-        chart.seen
-    )
+    assert all(part in chart.seen for part in ("2 positions", "2.0 h: 0.00 to 2.00 µm", "by 1.5 µm", "at 100 mm"))
     assert chart.columns["cycle"].tolist() == [1, 1, 2, 2, 3, 3]
     np.testing.assert_allclose(chart.columns["95 % band ± / µm"], 0.2)
 
@@ -111,7 +109,7 @@ def test_both_approaches_have_one_scale_and_every_cycle_a_line(deviations):
     charts = [plot_cycles(deviations, side) for side in ("positive", "negative")]
     ends = {(chart.figure.y_range.start, chart.figure.y_range.end) for chart in charts}
     assert len(ends) == 1
-    lines = charts[1].figure.renderers[0].data_source.data
+    lines = charts[1].figure.renderers[1].data_source.data
     assert lines["order"].tolist() == deviations["cycle"].values.tolist()
     first = deviations["deviation"].sel(direction="negative").isel(cycle=0)
     np.testing.assert_array_equal(lines["ys"][0], first)
@@ -155,12 +153,11 @@ def test_neighbours_side_by_side_with_sign_and_borders(deviations):
     assert (chart.columns["nearer position / mm"][0], chart.columns["further position / mm"][0]) == (0.0, 50.0)
     found = group(deviations, "chart")
     chart = neighbours.plot_reference_chart(found, deviations["position"])
-    np.testing.assert_array_equal(
-        chart.columns["deviation, positive approach / µm"], found["chart"].sel(direction="positive")
-    )
-    np.testing.assert_array_equal(
-        chart.columns["border ±, positive approach / µm"], found["border_s"].sel(direction="positive")
-    )
+    for heading, name in (
+        ("deviation, positive approach / µm", "chart"),
+        ("border ±, positive approach / µm", "border_s"),
+    ):
+        np.testing.assert_array_equal(chart.columns[heading], found[name].sel(direction="positive"))
     assert "Deviation from the reference at 0 mm" in chart.seen
 
 
@@ -193,10 +190,8 @@ def test_a_single_run_shows_its_readings():
 
 def test_the_labels_of_both_spans_stand_apart():
     test = test_made(np.random.default_rng(5).normal(0, 0.1, (5, 2, 6)) + 3.0 * np.arange(6))
-    labels = {
-        label.text[0]: label
-        for label in plot_test(evaluate_iso230(test), test["position"]).figure.select({"type": Label})
-    }
+    chart = plot_test(evaluate_iso230(test), test["position"])
+    labels = {label.text[0]: label for label in chart.figure.select({"type": Label})}
     # Text of 12 px is a fifteenth of the chart's height.
     assert labels["E"].y - labels["A"].y > 15.0 / 15
     assert labels["A"].x < labels["E"].x

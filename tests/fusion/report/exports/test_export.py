@@ -138,9 +138,8 @@ def anomaly(kind: str, cause: str) -> dict[str, Any]:
 def test_a_sound_run_has_no_objection(verdict):
     found = results(loop=loop(verdict=verdict))
     assert objections(found) == []
-    assert remarks(found) == [
-        "position 3, both approaches, stands out (scatter of the structure, scatter 0.70 um): a table does not correct that"
-    ]
+    (remark,) = remarks(found)
+    assert remark.startswith("position 3, both approaches, stands out (scatter of the structure, scatter 0.70 um)")
 
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained", "no_skill"])
@@ -156,9 +155,8 @@ def test_doubts_a_missing_model_and_unlike_positions_are_objections():
     unchecked = assemble("A", {name: part for name, part in PARTS.items() if name != "inputs"}, [])
     assert objections(unchecked) == ["the inputs were not checked against each other"]
     parts = {name: part for name, part in PARTS.items() if name != "loop"}
-    assert objections(assemble("A", {**parts, "inputs": SOUND}, [])) == [
-        "the drift was not modelled, so that nothing says whether the profile is free of it"
-    ]
+    (reason,) = objections(assemble("A", {**parts, "inputs": SOUND}, []))
+    assert reason.startswith("the drift was not modelled")
     found = results(anomalies=[anomaly("slow", "local_temperature")])
     assert objections(found) == [] and "local temperature" in remarks(found)[0]
 
@@ -181,13 +179,8 @@ def test_the_header_names_source_state_and_trial_line_by_line(small_run):
     assert lines[0] == "Compensation table for A control, by thermofuse"
     digest = hashlib.sha256((small_run / "results.json").read_bytes()).hexdigest()
     assert lines[-1] == f"source: results.json, SHA-256 {digest}"
-    assert {
-        "machine: Mill 5, serial number 77",
-        "axis: X",
-        "verdict on the drift: explained",
-        "exported: 2026-11-22 09:30 UTC",
-        "sign: plus",
-    } <= set(lines)
+    stated = {"machine: Mill 5, serial number 77", "axis: X", "verdict on the drift: explained", "sign: plus"}
+    assert stated | {"exported: 2026-11-22 09:30 UTC"} <= set(lines)
     assert any(line.startswith("How to try it: ") and "one value of 0.010 mm" in line for line in lines)
     assert not any(line.startswith("FORCED") for line in lines)
     # The title holds a line break and a command; a control would run what stands on a line of its own.
@@ -196,10 +189,8 @@ def test_the_header_names_source_state_and_trial_line_by_line(small_run):
     assert lines[1] == "FORCED, although the verdict is partial"
     assert all(line.isascii() and line.isprintable() for line in lines)
     lines = lines_of(small_run)
-    assert (
-        "thermal state: mean of cycles 1 to 12: material 22.04 degC (20.04 to 23.99), air 21.04 degC (19.04 to 22.99)"
-        in lines
-    )
+    state = "mean of cycles 1 to 12: material 22.04 degC (20.04 to 23.99), air 21.04 degC (19.04 to 22.99)"
+    assert f"thermal state: {state}" in lines
     assert "measured: 2026-03-09 06:30 UTC to 2026-03-09 07:26 UTC" in lines
 
 
