@@ -137,6 +137,7 @@ def test_five_cycles_give_all_but_causes_and_say_what_those_need(folder, tmp_pat
     assert "mean_rise" in read_tree(out / "fusion.nc").to_dataset()
 
 
+@pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize(
     ("cycles", "targets", "directions"), [(2, 2, BOTH), (5, 11, ("negative",)), (12, 3, BOTH), (12, 3, ("positive",))]
 )
@@ -178,6 +179,7 @@ def write_sensors(campaign: Path, fields: Path, *, gain: float = 1.0) -> None:
 SENSORS = '\n[sensors]\nfile = "sensors.csv"\nplaces = "places.csv"\ntemperature_u = "0.05 K"\n'
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
     write_sensors(folder, results_folder / "fields.nc")
     path = without(folder / "campaign.toml", "thermography", name="sensors.toml", added=SENSORS)
@@ -200,6 +202,7 @@ def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
     assert codes["plan_sensors"] and codes["sensors_coverage"] and "sensors_rise" not in codes
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(folder, results_folder, tmp_path):
     write_sensors(folder, results_folder / "fields.nc", gain=1.5)
     path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
@@ -245,6 +248,7 @@ def test_readings_without_times_are_evaluated_by_the_standard(untimed):
     assert not {"drift", "anomalies", "loop"} & sections(untimed)
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_products_of_an_instrument_that_is_gone_do_not_stay(untimed, tmp_path):
     shutil.copytree(untimed.parent, tmp_path, dirs_exist_ok=True)
     folder, campaign = tmp_path / "results", change(tmp_path / "campaign.toml", '"wide"', '"the laser alone"')

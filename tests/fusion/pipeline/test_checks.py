@@ -145,6 +145,7 @@ def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(copied, tmp_pa
     assert ("only if" in sizes.lower()) is ("positions" in conditional)
 
 
+@pytest.mark.usefixtures("no_charts")
 @pytest.mark.chain
 def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied, tmp_path):
     lies.copied_cycle(copied)
@@ -159,6 +160,7 @@ def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied, tmp_path)
         run_campaign(change(path, "copied_cycles", "weather"), tmp_path / "other")
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_one_error_of_reading_changes_neither_the_verdict_on_the_field_nor_the_causes(copied, tmp_path, results_folder):
     lies.one_gross_reading(copied)
     sound, spoilt = read_results(results_folder), run_campaign(copied / "campaign.toml", tmp_path / "out")

@@ -187,6 +187,7 @@ def run(folder: Path, effect: str = "") -> tuple[dict[str, Any], Path]:
     return json.loads((folder / "results" / "results.json").read_text()), folder / "results"
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_a_camera_step_is_taken_out_of_the_fields(tmp_path):
     results, folder = run(tmp_path, '[[effect]]\nname = "camera_offset"\namplitude_K = 0.6\nat_cycle = 14\n')
     # It shows beside the table, before any drift is looked at: the loop has nothing left to find.
