@@ -123,7 +123,7 @@ def test_damaged_pixels_are_not_shown(tmp_path):
     path.write_bytes(data)
     inspection = inspect_file(path)
     (warning,) = inspection.warnings
-    assert warning.code == "frame_left_out" and "the samples are damaged" in warning.message
+    assert warning.code == "frame_left_out" and "damaged samples" in warning.message
     assert inspection.frames_read == 1
 
 
@@ -185,7 +185,7 @@ def test_what_no_camera_writes_is_told_and_not_made(tmp_path):
     for name, told in [
         ("pixels", "20000 x 20000 pixels are not a thermal frame"),
         ("nothing", "5 x 0 pixels are not a thermal frame"),
-        ("frames", r"2,000,000 frames, 1 to 1,000,000 in a file can be read; export them in parts"),
+        ("frames", r"2,000,000 frames; export parts of 1 to 1,000,000"),
     ]:
         with pytest.raises(ThermographyError, match=told):
             describe_stack(tmp_path / f"{name}.npy")

@@ -112,9 +112,7 @@ def make_frame_series(
     times = _check_frames(references, shape)
     correction = np.zeros(len(times)) if correction_K is None else np.asarray(correction_K, float)
     if correction.shape != times.shape or not np.isfinite(correction).all():
-        raise ReductionError(
-            f"correction_K has shape {correction.shape}; it needs one finite value for each of {len(times)} frames"
-        )
+        raise ReductionError(f"correction_K has shape {correction.shape}; give a finite value per frame, {len(times)}")
     index = np.searchsorted(bounds[:, 0], times, side="right") - 1
     inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
     return FrameSeries(references, times, bounds, np.where(inside, index, NO_CYCLE), correction, override)
@@ -134,9 +132,7 @@ def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) 
     frame = references[i]
     where = f"{frame.path}: frame {frame.index}"
     if tuple(frame.shape) != tuple(shape):
-        raise ReductionError(
-            f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce one size at a time"
-        )
+        raise ReductionError(f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce each size alone")
     if np.isnat(times[i]):
         raise ReductionError(f"{where} has no time; leave it out")
     raise ReductionError(f"{where} has the time {frame.time}, not after {references[i - 1].time}; sort the frames")

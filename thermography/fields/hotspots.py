@@ -90,9 +90,7 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     (150, 70, 2.0)
     """
     if rise.dims != ("y", "x") or min(rise.shape) < 3:
-        raise ThermographyError(
-            f"rise has dims {rise.dims} and shape {rise.shape}; give one field (y, x) of at least 3 x 3 cells"
-        )
+        raise ThermographyError(f"rise has dims {rise.dims} and shape {rise.shape}; give (y, x) of 3 x 3 cells or more")
     values = rise.values.astype(float)
     seen = np.isfinite(values)
     if not seen.any():
@@ -252,9 +250,7 @@ def region_series(
         weight = np.where(seen, shares, 0.0)
         total = weight.sum(axis=(1, 2))
         if not total.any():
-            raise PolygonError(
-                f"{name}: all its cells are masked or out of view; move it away from fiducials and edges"
-            )
+            raise PolygonError(f"{name}: all its cells are masked or out of view; move it off fiducials and edges")
         mean = _weighted_mean(values, seen, shares)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean_noise_u = noise * np.sqrt((weight**2).sum(axis=(1, 2))) / total

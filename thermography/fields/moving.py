@@ -522,9 +522,7 @@ def _assemble(
     """Fields per cycle, the frame stack, and the positions of the table, as one Dataset."""
     discs = np.concatenate([result.discs for result in results])
     if not discs.any():
-        raise ReductionError(
-            "the table is found in no frame; check the fiducials, and [plan.axis] direction, along which it is searched"
-        )
+        raise ReductionError("the table is found in no frame; check the fiducials and [plan.axis] direction")
     parts = _cycle_parts(frames, blocks, results, samples, grid)
     if not parts:
         times, bounds = frames.times, frames.bounds

@@ -951,9 +951,7 @@ class StillReduction:
         self.close()
         frames, displacement = self.frames, self.displacement
         if not self.finished:
-            raise ReductionError(
-                "no frame within a cycle shows the table where it is registered; check that nothing is in front of the table"
-            )
+            raise ReductionError("no frame of a cycle shows the table where it is registered; clear the view of it")
         kept = [self.kept(block) for block in self.blocks]
         fields = assemble_fields(
             self.finished,

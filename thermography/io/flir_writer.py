@@ -186,9 +186,7 @@ def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     """Return one FFF record: directory at 0x40 big-endian, records little-endian, the raw image last."""
     counts = frame.counts
     if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
-        raise ThermographyError(
-            f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}"
-        )
+        raise ThermographyError(f"counts: expected uint16 (row, column), got {counts.dtype} of shape {counts.shape}")
     if not all(0 < length < 65536 for length in counts.shape):
         raise ThermographyError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
     info = _camera_info(frame)
@@ -237,9 +235,7 @@ def _camera_info(frame: Frame) -> bytes:
         raise ThermographyError(f"housekeeping: a FLIR file stores {room} readings, not {len(frame.housekeeping)}")
     for slot, (name, value) in enumerate(frame.housekeeping.items()):
         if not (name.isascii() and 0 < len(name) < 16 and 150 < value < 450):
-            raise ThermographyError(
-                f"housekeeping {name!r} = {value}: expected an ASCII name of 1 to 15 letters and 150 to 450 K"
-            )
+            raise ThermographyError(f"housekeeping {name!r} = {value}: expected 1 to 15 ASCII letters and 150 to 450 K")
         struct.pack_into("<f16s2I", info, 0x47C + 28 * slot, value, name.encode(), seconds, milliseconds)
     return bytes(info)
 

@@ -159,9 +159,7 @@ class TemperatureReader(ABC):
         if contents.shape[0] * contents.shape[1] > _MOST_PIXELS or 0 in contents.shape:
             raise ThermographyError(f"{path}: {contents.shape[1]} x {contents.shape[0]} pixels are not a thermal frame")
         if not 0 < contents.frames <= _MOST_FRAMES:
-            raise ThermographyError(
-                f"{path}: {contents.frames:,} frames, 1 to {_MOST_FRAMES:,} in a file can be read; export them in parts"
-            )
+            raise ThermographyError(f"{path}: {contents.frames:,} frames; export parts of 1 to {_MOST_FRAMES:,}")
         return contents
 
     def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | RejectedFrame]:
@@ -169,9 +167,7 @@ class TemperatureReader(ABC):
         contents = self.frame_contents(path, options)
         unit = options.unit or contents.unit
         if unit not in ("degC", "K"):
-            raise StackError(
-                f'{path}: nothing says whether its values are degC or K; write unit = "degC" or unit = "K"'
-            )
+            raise StackError(f'{path}: nothing says whether values are degC or K; write unit = "degC" or unit = "K"')
         for index, time in enumerate(_times(path, contents, options)):
             yield TemperatureFrame(
                 parameters=options.parameters,
@@ -240,9 +236,7 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
     if options.times is not None:
         times = [options.times.get((path.name, index), np.datetime64("NaT", "ns")) for index in range(count)]
         if all(np.isnat(time) for time in times):
-            raise StackError(
-                f"{path}: the table of times has no line for {path.name}; add one per frame: file,frame,time"
-            )
+            raise StackError(f"{path}: the table of times has no line for it; add one per frame: file,frame,time")
         return times
     if options.time_in_name is not None:
         first = _time_in_name(path, options)
@@ -263,9 +257,7 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
 
 def _spaced(path: Path, first: np.datetime64, count: int, options: StackOptions) -> list[np.datetime64]:
     if options.interval_s is None:
-        raise StackError(
-            f'{path}: {count} frames and one time; write interval = "10 s", the time from one frame to the next'
-        )
+        raise StackError(f'{path}: {count} frames and one time; write interval = "10 s", from frame to frame')
     return [first + np.timedelta64(round(index * options.interval_s * 1e9), "ns") for index in range(count)]
 
 
@@ -295,9 +287,7 @@ def to_utc(path: Path, stamp: datetime, zone: str) -> np.datetime64:
     """Return a time of a zone as UTC."""
     placed = stamp.replace(tzinfo=ZoneInfo(zone))
     if placed.utcoffset() != placed.replace(fold=1).utcoffset():
-        raise StackError(
-            f"{path}: {stamp} occurs twice or not at all in {zone}, where clocks are changed for summer; give the times in UTC"
-        )
+        raise StackError(f"{path}: {stamp} occurs twice or not at all in {zone} (summer time); give times in UTC")
     return np.datetime64(placed.astimezone(UTC).replace(tzinfo=None), "ns")
 
 
@@ -338,14 +328,9 @@ class TiffReader(TemperatureReader):
         except Exception as error:
             raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
         if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
-            raise ThermographyError(
-                f"{path}: pixels of shape {shape}: a colour image contains no temperatures; export the radiometric TIFF"
-            )
+            raise ThermographyError(f"{path}: pixels of shape {shape} hold no temperatures; export radiometric TIFF")
         if kind is None or kind.kind not in _NUMBERS:
-            stored = "an unknown type" if kind is None else f"type {kind}"
-            raise ThermographyError(
-                f"{path}: values of {stored} are not temperatures; export floating-point or whole numbers"
-            )
+            raise ThermographyError(f"{path}: values of type {kind} are not temperatures; export real numbers")
         _require_scale(path, kind, options)
         return StackContents(count, (shape[0], shape[1]), times=_stamp(stamp) if count == 1 else None)
 
@@ -443,9 +428,7 @@ class NetcdfReader(TemperatureReader):
                 )
             kind = dataset[name].dtype
             if kind.kind not in _NUMBERS:
-                raise ThermographyError(
-                    f"{path}: values of type {kind} are not temperatures; write floating-point or whole numbers"
-                )
+                raise ThermographyError(f"{path}: values of type {kind} are not temperatures; write real numbers")
             yield dataset[name]
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
@@ -525,9 +508,7 @@ class TextReader(TemperatureReader):
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the numbers of a file, (row, column); NaN where a field is no number."""
         if path.stat().st_size > _MOST_BYTES:
-            raise ThermographyError(
-                f"{path}: {path.stat().st_size} bytes of text are more than one frame; export every frame to a file of its own"
-            )
+            raise ThermographyError(f"{path}: {path.stat().st_size} bytes exceed a frame of text; export one per file")
         content = path.read_bytes()
         utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
@@ -636,9 +617,7 @@ def plug_ins() -> tuple[FrameReader, ...]:
                 f"the plug-in {entry.name} = {entry.value} cannot be loaded ({error}); update its package or remove it"
             ) from error
         if not isinstance(reader, FrameReader):
-            raise FrameReaderError(
-                f"the plug-in {entry.name} = {entry.value} lacks name, recognises or index; it must keep FrameReader"
-            )
+            raise FrameReaderError(f"the plug-in {entry.name} = {entry.value} lacks name, recognises or index; add it")
         found.append(reader)
     return tuple(found)
 

@@ -144,9 +144,7 @@ class FlirAccessor:
         dataset, changes = self._dataset, _parameter_changes(overrides)
         lacking = [name for name in ("counts", *(name for name, _ in _PARAMETERS.values())) if name not in dataset]
         if lacking:
-            raise RadiometryError(
-                f"the Dataset has no {', '.join(lacking)}; open the file with engine='flir' and keep them"
-            )
+            raise RadiometryError(f"the Dataset has no {', '.join(lacking)}; open it with engine='flir' and keep them")
         parameters = [override(each, **changes) if changes else each for each in _stored_parameters(dataset)]
         index = xr.DataArray(np.arange(len(parameters)), dims="time") if len(parameters) > 1 else xr.DataArray(0)
         temperature: xr.DataArray = xr.apply_ufunc(

@@ -146,9 +146,7 @@ def _seconds(times: ArrayLike, origin: np.datetime64 | None = None) -> tuple[Arr
 
 def _check_travel(table: Array, table_u: Array, target: Array) -> None:
     if len(table) < 20:
-        raise ClockError(
-            f"the table is found in {len(table)} frames; 20 are needed for a clock offset, or give clock_offset"
-        )
+        raise ClockError(f"the table is found in {len(table)} frames; 20 are needed, or give clock_offset")
     if len(target) < 3:
         raise ClockError(f"{len(target)} readings have a time; a clock offset needs at least 3, or give clock_offset")
     observed, commanded = float(np.ptp(table)), float(np.ptp(target))

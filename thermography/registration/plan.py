@@ -261,9 +261,7 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
     marker = (row.get(_MARKER_COLUMN) or "").strip()
     if marker:
         if not marker.isdecimal() or int(marker) >= _MARKER_COUNT:
-            raise FiducialError(
-                f"{path}:{line}: marker = {marker!r}; give the number of an ArUco marker, 0 to {_MARKER_COUNT - 1}"
-            )
+            raise FiducialError(f"{path}:{line}: marker = {marker!r}; give an ArUco number, 0 to {_MARKER_COUNT - 1}")
         if point:
             raise FiducialError(f"{path}:{line}: diameter_mm is empty; give the circle that contains the marker")
         return Fiducial(name, x_mm, y_mm, diameter_mm, marker=int(marker))
@@ -288,9 +286,7 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise FiducialError(
-            f"{path}:{line}: {column} = {text!r} is not a number; write it with a decimal point and no unit"
-        )
+        raise FiducialError(f"{path}:{line}: {column} = {text!r} is not a number; write it with a point and no unit")
     return value
 
 
@@ -326,9 +322,7 @@ class Polygon:
     def __post_init__(self) -> None:
         corners = np.asarray(self.corners_mm, float)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-            raise PolygonError(
-                f"{self.name}: corners have shape {corners.shape}; a polygon needs at least three (x, y) in mm"
-            )
+            raise PolygonError(f"{self.name}: corners have shape {corners.shape}; give at least three (x, y) in mm")
         object.__setattr__(self, "corners_mm", corners)
 
     def contains(self, points_mm: ArrayLike) -> NDArray[np.bool_]:

@@ -119,9 +119,7 @@ def _read_entries(path: Path) -> dict[str, Any]:
             # OpenCV writes the version of YAML as no other does.
             entries = yaml.load(text.removeprefix("%YAML:1.0"), _MatrixLoader)
     except (ValueError, TypeError, RecursionError, yaml.YAMLError, ElementTree.ParseError) as error:
-        raise LensError(
-            f"{path}: cannot be parsed ({error}); write the calibration as OpenCV's YAML, XML or JSON"
-        ) from None
+        raise LensError(f"{path}: cannot be parsed ({error}); write it as OpenCV's YAML, XML or JSON") from None
     if not isinstance(entries, dict):
         raise LensError(f"{path}: holds no named entries; write the calibration as OpenCV's YAML, XML or JSON")
     return entries
@@ -364,9 +362,7 @@ def fit_homography(observations: DiscObservations, ideal: Projection) -> Project
     undistorted_px = ideal.undistort(observations.points_px).astype(float)
     matrix, _ = cv2.findHomography(observations.centres_mm.astype(float), undistorted_px, 0)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
-        raise ThermographyError(
-            "the fiducials are collinear or coincide; spread at least four over both sides of the plan"
-        )
+        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return replace(ideal, plan_to_sensor=matrix)
 
 

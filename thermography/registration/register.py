@@ -182,9 +182,7 @@ def _starts(observations: DiscObservations, ideal: Projection, wanted: int, *, c
             candidates.append((float(quantile[i]), replace(lens, plan_to_sensor=matrices[i])))
     candidates.sort(key=lambda item: item[0])
     if not candidates or not np.isfinite(candidates[0][0]):
-        raise ThermographyError(
-            "the fiducials are collinear or coincide; spread at least four over both sides of the plan"
-        )
+        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return [projection for _, projection in candidates[:_REFINED]]
 
 
@@ -768,9 +766,7 @@ def register(
     """
     frame = np.asarray(temperature, float)
     if frame.ndim not in (2, 3) or frame.size == 0:
-        raise RegistrationError(
-            f"temperature has shape {frame.shape}; give one frame (row, column) or a stack (time, row, column)"
-        )
+        raise RegistrationError(f"temperature has shape {frame.shape}; give one frame or a stack (time, row, column)")
     frame = frame.mean(axis=0) if frame.ndim == 3 else frame
     shape = frame.shape[0], frame.shape[1]
     if any(fiducial.is_point for fiducial in fiducials):
@@ -855,9 +851,7 @@ def register_points(
         points_px = {disc.name: disc.hint_px for disc in listed if disc.hint_px is not None}
     unknown = sorted(set(points_px) - {disc.name for disc in listed})
     if unknown:
-        raise RegistrationError(
-            f"picked points {', '.join(unknown)} are not in the list of fiducials; use the names of its first column"
-        )
+        raise RegistrationError(f"picked points {', '.join(unknown)} are not in the list of fiducials; use its names")
     discs = [disc for disc in listed if disc.name in points_px]
     if len(discs) < 4:
         raise RegistrationError(f"{len(discs)} points are picked; a plan needs at least 4")
@@ -1056,9 +1050,7 @@ def picture_grid(shape: tuple[int, int], cell_px: int | None = None) -> PlanGrid
     size = usual_cell_px(shape) if cell_px is None else cell_px
     if size not in _dividing(shape):
         choice = ", ".join(str(one) for one in _dividing(shape) if 2 * one <= min(shape))
-        raise ThermographyError(
-            f'cell_px = "{size} px" does not divide frames of {columns} x {rows} pixels; choose one of {choice} px'
-        )
+        raise ThermographyError(f'cell_px = "{size} px" does not divide {columns} x {rows} pixels; choose {choice} px')
     return PlanGrid(columns, rows, size)
 
 

@@ -121,7 +121,7 @@ def test_a_file_that_became_shorter_is_named(frames, tmp_path):
     short = tmp_path / "short.seq"
     short.write_bytes(frames[0].path.read_bytes()[:-10])
     last = pickle.loads(pickle.dumps(FrameRun(frames)))[-1]
-    with pytest.raises(OSError, match=r"short\.seq: frame 39 ends early; the file has become shorter"):
+    with pytest.raises(OSError, match=r"short\.seq: frame 39 ends early; the file was cut"):
         PlainFrame(short, 39, last.shape, last.plain_samples).read_counts()
 
 

@@ -91,7 +91,7 @@ def test_damage_is_found_with_and_without_a_checksum(tmp_path, film, registratio
     survey = survey_frames(index_frames([path])[0])
     if checksum:
         (found,) = survey.damaged
-        assert found.index == damaged and "the samples are damaged" in found.reason
+        assert found.index == damaged and "damaged samples" in found.reason
         assert len(survey.frames) == len(survey.levels) == FRAMES - 1
     else:
         assert survey.damaged == []

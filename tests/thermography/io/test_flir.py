@@ -435,10 +435,13 @@ def test_writing_leaves_its_input_alone_and_streams(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"counts": np.zeros((3, 3))}, r"counts: expected uint16 with dims \(row, column\), got float64 of shape"),
+        ({"counts": np.zeros((3, 3))}, r"counts: expected uint16 \(row, column\), got float64 of shape"),
         ({"counts": np.zeros(3, np.uint16)}, r"got uint16 of shape \(3,\)"),
         ({"time": "1965-01-01"}, "a FLIR file stores times from 1970 to 2106 only"),
-        ({"housekeeping": {"TSLens": 20.0}}, r"housekeeping 'TSLens' = 20\.0: expected an ASCII name .* and 150 to"),
+        (
+            {"housekeeping": {"TSLens": 20.0}},
+            r"housekeeping 'TSLens' = 20\.0: expected 1 to 15 ASCII letters and 150 to",
+        ),
         ({"housekeeping": {f"T{i}": 300.0 for i in range(60)}}, "a FLIR file stores 47 readings, not 60"),
         ({"encoding": "tiff"}, "encoding 'tiff': expected 'raw', 'png' or 'jpegls'"),
     ],

@@ -107,7 +107,7 @@ def test_what_is_no_stack_is_refused(tmp_path):
     with pytest.raises(ThermographyError, match=r"an array of shape \(3,\) and type float64; save numbers as"):
         NumpyReader().contents(tmp_path / "a.npy", EVERY_10_S)
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 8, 3), np.uint8), photometric="rgb")
-    with pytest.raises(ThermographyError, match="a colour image contains no temperatures; export the"):
+    with pytest.raises(ThermographyError, match="hold no temperatures; export radiometric TIFF"):
         TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
     (tmp_path / "a.nc").write_bytes(b"\x89HDF\r\n\x1a\n")
     with pytest.raises(ThermographyError, match=r"cannot be opened .* write it again"):
@@ -129,7 +129,7 @@ def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_ta
 @pytest.mark.parametrize("kind", ["complex64", "bool"])
 def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path, kind):
     tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(kind), photometric="minisblack")
-    message = rf"a\.tif: values of type {kind} are not temperatures; export floating-point or whole numbers"
+    message = rf"a\.tif: values of type {kind} are not temperatures; export real numbers"
     with pytest.raises(ThermographyError, match=message):
         TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
 
@@ -140,7 +140,7 @@ def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path, kind)
 def test_a_variable_of_no_numbers_is_refused(tmp_path, kind):
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file.create_dataset("temperature", (3, 4, 5), kind)
-    with pytest.raises(ThermographyError, match="are not temperatures; write floating-point or whole numbers"):
+    with pytest.raises(ThermographyError, match="are not temperatures; write real numbers"):
         describe_stack(tmp_path / "a.nc")
 
 
@@ -284,7 +284,7 @@ def test_times_from_the_name_a_table_or_a_start(tmp_path):
         frames(tmp_path, options, name="20261025_023000.npy")
     listed = {("IR_20260309_063000.npy", 1): START}
     assert frames(tmp_path, StackOptions(unit="degC", times=listed), count=2) == ["2026-03-09T06:30:00.000", "NaT"]
-    with pytest.raises(StackError, match=r"the table of times has no line for c.npy; add one per frame"):
+    with pytest.raises(StackError, match=r"the table of times has no line for it; add one per frame"):
         frames(tmp_path, StackOptions(unit="degC", times=listed), name="c.npy")
     with pytest.raises(StackError, match='2 frames and one time; write interval = "10 s"'):
         frames(tmp_path, StackOptions(unit="degC", start=START), count=2)
@@ -425,7 +425,7 @@ def test_damaged_files_raise_no_foreign_error(tmp_path):
 
 def test_what_the_options_must_say_is_asked_for(tmp_path):
     np.save(tmp_path / "a.npy", SMALL_IMAGE)
-    with pytest.raises(StackError, match='nothing says whether its values are degC or K; write unit = "degC"'):
+    with pytest.raises(StackError, match='nothing says whether values are degC or K; write unit = "degC"'):
         index_recordings([tmp_path / "a.npy"])
     with pytest.raises(StackError, match=r"the file holds no times; write time_in_name = .* times = .* or start = "):
         index_recordings([tmp_path / "a.npy"], StackOptions(unit="K"))

@@ -505,7 +505,7 @@ def test_file_that_became_shorter_is_named(tmp_path, length):
     os.truncate(references[0].path, length)
     with (
         WindowReader(WINDOW) as reader,
-        pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file has become shorter since it was indexed"),
+        pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file was cut after it was indexed"),
     ):
         reader.read(references, np.empty((12, 164, 320), np.uint16))
 

@@ -163,7 +163,7 @@ def test_the_accessor_calibrates_anew(tmp_path, chunks):
     np.testing.assert_array_equal(
         dataset.isel(time=1, row=slice(2, 4)).flir.temperature(), dataset["temperature"][1, 2:4]
     )
-    with pytest.raises(RadiometryError, match="the Dataset has no counts; open the file with engine='flir'"):
+    with pytest.raises(RadiometryError, match="the Dataset has no counts; open it with engine='flir'"):
         dataset.drop_vars("counts").flir.temperature()
     assert dataset.flir.visible_light(2) is None
 

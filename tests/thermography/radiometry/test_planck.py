@@ -273,9 +273,9 @@ def test_constants_and_logs_replace_what_the_file_says():
     ("times", "values", "message"),
     [
         (TIMES, [1.0, 2.0], r"expected as many times as values, got \(3,\) and \(2,\)"),
-        (TIMES[::-1], [1.0, 2.0, 3.0], "expected increasing times and finite values; sort the log and remove gaps"),
-        (TIMES, [1.0, np.nan, 3.0], "expected increasing times and finite values"),
-        (TIMES[[0, 1, 1]], [1.0, 2.0, 3.0], "expected increasing times and finite values"),
+        (TIMES[::-1], [1.0, 2.0, 3.0], "expected rising times and finite values; sort it and drop gaps"),
+        (TIMES, [1.0, np.nan, 3.0], "expected rising times and finite values"),
+        (TIMES[[0, 1, 1]], [1.0, 2.0, 3.0], "expected rising times and finite values"),
         (TIMES[:2], [1.0, 2.0, 3.0], r"expected as many times as values, got \(2,\) and \(3,\)"),
         (TIMES[None], [[1.0, 2.0, 3.0]], r"expected as many times as values, got \(1, 3\) and \(1, 3\)"),
         (TIMES[:0], [], r"expected as many times as values, got \(0,\) and \(0,\)"),

@@ -83,7 +83,7 @@ def test_marker_column_of_the_fiducial_file(tmp_path):
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,7"]))
     assert [one.marker for one in read_fiducials(path)] == [None] * 4 + [7]
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,50"]))
-    with pytest.raises(FiducialError, match=r"fiducials\.csv:6: marker = '50'; give the number of an ArUco marker"):
+    with pytest.raises(FiducialError, match=r"fiducials\.csv:6: marker = '50'; give an ArUco number"):
         read_fiducials(path)
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows[1:], "M7,120,40,52,7"]))
     with pytest.raises(FiducialError, match="lists 3 fiducials; a plan is located by at least 4"):
@@ -162,5 +162,5 @@ def test_shares_of_cells_in_a_polygon_are_areas():
 
 @pytest.mark.parametrize("corners", [[(0, 0), (1, 1)], [(0, 0, 0), (1, 1, 1), (2, 0, 0)], []])
 def test_what_is_no_polygon_is_refused(corners):
-    with pytest.raises(PolygonError, match=r"r: corners have shape .*; a polygon needs at least three \(x, y\) in mm"):
+    with pytest.raises(PolygonError, match=r"r: corners have shape .*; give at least three \(x, y\) in mm"):
         Polygon("r", corners)
