@@ -298,10 +298,7 @@ def stray_frames(levels: Array, *, ends: bool) -> dict[int, float]:
 def _beyond(levels: Array, *, ends: bool) -> tuple[Array, Array]:
     """By how much every frame lies beyond its two neighbours, and by how much these differ, (n,) K root mean square over the blocks."""
     n = len(levels)
-    before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
-    before[-1], after[0] = n - 3, 2
-    before[0] = 1
-    after[-1] = n - 2
+    before, after = np.r_[1, : n - 2, n - 3], np.r_[2, 2:n, n - 2]
     lower, upper = np.minimum(levels[before], levels[after]), np.maximum(levels[before], levels[after])
     # The change between the two others goes on beyond the ends of the series.
     stretch = np.zeros((n, 1))
@@ -326,12 +323,8 @@ def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int
         (off, "{} pixels of the table differ from the frames before and after it"),
     ):
         limit = max(_LEAST_PIXELS, _ORDINARY_MULTIPLE * float(np.quantile(numbers, 0.75)))
-        found.update(
-            {
-                int(i): f"{text.format(numbers[i])}: damaged, covered, or from another series"
-                for i in np.flatnonzero(numbers >= limit)
-            }
-        )
+        for i in np.flatnonzero(numbers >= limit).tolist():
+            found[i] = f"{text.format(numbers[i])}: damaged, covered, or from another series"
     if still:
         found.update(_strays(survey, blocks, np.array([i for i in range(n) if i not in found], int)))
     return dict(sorted(found.items()))

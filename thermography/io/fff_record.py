@@ -435,11 +435,7 @@ def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDA
     rows, columns = samples.shape
     if samples.encoding == "raw":
         if len(data) < samples.length:
-            raise source.error(
-                samples.offset,
-                f"{columns} x {rows} samples of {samples.length} bytes",
-                f"{len(data)} bytes before the end",
-            )
+            raise source.error(samples.offset, f"{samples.length} bytes of samples", f"{len(data)} before the end")
         counts = np.frombuffer(data, "<u2" if samples.little_endian else ">u2").reshape(rows, columns)
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
     # Writers pad the stream to a multiple of 8 bytes; after the last frame of a file the padding may be missing.

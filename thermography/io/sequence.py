@@ -29,12 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography.common import Array, usable_processors
-from thermography.io.fff_record import (
-    FffSource,
-    damaged_records,
-    read_counts,
-    read_directory,
-)
+from thermography.io.fff_record import FffSource, damaged_records, read_counts, read_directory
 from thermography.io.frame import (
     CameraParameters,
     Frame,

@@ -64,8 +64,7 @@ class PlanGrid:
             cells = getattr(self, name) / self.cell_size_mm
             if abs(cells - round(cells)) > 1e-6:
                 raise ThermographyError(
-                    f"{name} = {getattr(self, name)} mm is not a whole number of cells of {self.cell_size_mm} mm; "
-                    "choose a cell size that divides both sides of the plan"
+                    f"{name} = {getattr(self, name)} mm is not a whole number of cells of {self.cell_size_mm} mm; choose one that divides both"
                 )
 
     @property

@@ -74,9 +74,7 @@ def read_lens(path: str | Path) -> Lens:
     if {"image_width", "image_height"} <= entries.keys():
         width, height = (_entry(entries, path, (name,), 1)[0] for name in ("image_width", "image_height"))
         if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
-            raise LensError(
-                f"{path}: image_width {width:g} and image_height {height:g} px are not the size of a frame; correct them"
-            )
+            raise LensError(f"{path}: image_width {width:g}, image_height {height:g} px: no frame size; correct them")
         size = (int(width), int(height))
     along, across = float(matrix[0, 0]), float(matrix[1, 1])
     if not (np.isfinite(matrix).all() and min(along, across) > 0 and abs(along / across - 1) < _SQUARE):
@@ -86,8 +84,7 @@ def read_lens(path: str | Path) -> Lens:
         )
     if len(coefficients) < 4 or not np.isfinite(coefficients).all() or coefficients[4:].any():
         raise LensError(
-            f"{path}: distortion_coefficients = {coefficients.tolist()}; give k1, k2, p1, p2, and calibrate without more "
-            "(flag CALIB_FIX_K3)"
+            f"{path}: distortion_coefficients = {coefficients.tolist()}; give k1, k2, p1, p2, and calibrate without more (CALIB_FIX_K3)"
         )
     k1, k2, p1, p2 = coefficients[:4].tolist()
     return Lens(float(np.sqrt(along * across)), (float(matrix[0, 2]), float(matrix[1, 2])), (k1, k2, p1, p2), size)

@@ -8,18 +8,22 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, registered, smooth_field
+from tests.thermography.plan_scene import (
+    DISCS,
+    GRID,
+    SC660,
+    START,
+    Scene,
+    assert_equal_bits,
+    cell_truth,
+    edges,
+    record,
+    registered,
+    smooth_field,
+)
 from thermography.common import FIELDS
 from thermography.fields import still
-from thermography.fields import still as stretches
-from thermography.fields.blocks import (
-    NO_CYCLE,
-    FrameSeries,
-    ReductionError,
-    RegisteredSensor,
-    cut_blocks,
-    make_frame_series,
-)
+from thermography.fields.blocks import NO_CYCLE, ReductionError, RegisteredSensor, cut_blocks, make_frame_series
 from thermography.fields.resampling import plan_weights
 from thermography.fields.still import (
     STRETCH_FRAMES,
@@ -49,10 +53,6 @@ def scene():
     still = Scene(disc_K=-4.0)
     image = still.render()
     return image, registered(), still
-
-
-def edges(*seconds):
-    return START + np.array(seconds, int) * SECOND
 
 
 def test_field_of_one_frame_per_cycle_is_true_within_its_noise(scene, rng, tmp_path):
@@ -169,12 +169,9 @@ def test_changing_parameters_and_corrections_are_applied_frame_by_frame(scene, t
     def dim(frame):
         return override(frame.parameters, emissivity=0.97 if frame.index < 2 else 0.90)
 
-    fields = reduce_frames(
-        frames, registration, GRID, edges(0, 4), override=dim, correction_K=np.array([0, 0, 1.0, 1.0])
-    )
-    one_by_one = reduce_frames(
-        frames, registration, GRID, edges(0, 4), override=dim, correction_K=np.array([0, 0, 1.0, 1.0]), block_s=0
-    )
+    options = {"override": dim, "correction_K": np.array([0, 0, 1.0, 1.0])}
+    fields = reduce_frames(frames, registration, GRID, edges(0, 4), **options)
+    one_by_one = reduce_frames(frames, registration, GRID, edges(0, 4), block_s=0, **options)
     assert fields.sizes["time"] == 2
     assert one_by_one.sizes["time"] == 4
     np.testing.assert_allclose(fields["temperature"], one_by_one["temperature"], atol=1e-5)
@@ -264,7 +261,7 @@ def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(scene, rng, 
     assert json.loads(fields.attrs["frames_unchecked"]) == ["a.seq#0"]
 
 
-BOUNDS = START + np.array([0, 4, 8, 11, 14]) * np.timedelta64(1, "s")
+BOUNDS = edges(0, 4, 8, 11, 14)
 
 
 @pytest.fixture(scope="module")
@@ -281,70 +278,49 @@ class BrokenOffError(Exception):
     pass
 
 
-def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
-    frames, registration = film
-    whole = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2)
+def broken_off(film, bounds, checkpoint, frames_done):
+    """A whole reduction, one that goes on where another broke off, and the numbers of frames that it reported."""
     done, seen = [], []
 
     def break_off(count):
         done.append(count)
-        if sum(done) >= 11:
+        if sum(done) >= frames_done:
             raise BrokenOffError
 
+    whole = reduce_frames(*film, GRID, bounds, block_s=2)
     with pytest.raises(BrokenOffError):
-        reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=break_off)
-    again = reduce_frames(
-        frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=seen.append
-    )
+        reduce_frames(*film, GRID, bounds, block_s=2, checkpoint=checkpoint, progress=break_off)
+    return whole, reduce_frames(*film, GRID, bounds, block_s=2, checkpoint=checkpoint, progress=seen.append), seen
+
+
+def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
+    whole, again, seen = broken_off(film, BOUNDS, tmp_path / "cp", 11)
     # Two cycles, and both parts of the third, before the knock and after it, were finished.
     assert seen[0] == 11
-    assert sum(seen) == len(frames)
-    for name in whole.variables:
-        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
-    assert whole.attrs == again.attrs
+    assert sum(seen) == 14
+    assert_equal_bits(whole, again)
     # A third run finds everything done but the last cycle's end, and reads no block.
     monkeypatch.setattr(still, "reduce_stretch", None)
-    third = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
+    third = reduce_frames(*film, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
     assert whole["temperature"].values.tobytes() == third["temperature"].values.tobytes()
 
 
 def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
     """One cycle over all frames: what was done of it is kept whenever it has grown by some frames."""
-    frames, registration = film
     monkeypatch.setattr(still, "STORED_FRAMES", 4)
-    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 4)
-    whole = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], block_s=2)
-    done, seen = [], []
-
-    def break_off(count):
-        done.append(count)
-        if sum(done) >= 6:
-            raise BrokenOffError
-
-    options = {"block_s": 2, "checkpoint": tmp_path / "cp"}
-    with pytest.raises(BrokenOffError):
-        reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=break_off, **options)
-    again = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=seen.append, **options)
+    monkeypatch.setattr(still, "STRETCH_FRAMES", 4)
+    whole, again, seen = broken_off(film, BOUNDS[[0, -1]], tmp_path / "cp", 6)
     assert seen[0] == 8
-    for name in whole.variables:
-        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
-    assert whole.attrs == again.attrs
+    assert_equal_bits(whole, again)
 
 
 def test_a_checkpoint_of_another_reduction_is_refused(film, tmp_path):
-    frames, registration = film
-    reduce_frames(frames[:4], registration, GRID, BOUNDS, checkpoint=tmp_path)
+    arguments = (film[0][:4], film[1], GRID, BOUNDS)
+    reduce_frames(*arguments, checkpoint=tmp_path)
     with pytest.raises(CheckpointError, match=r"holds cycles of another reduction \(other frames\); remove the folder"):
-        reduce_frames(
-            frames[:4],
-            registration,
-            GRID,
-            BOUNDS,
-            checkpoint=tmp_path,
-            override=lambda f: override(f.parameters, emissivity=0.9),
-        )
+        reduce_frames(*arguments, checkpoint=tmp_path, override=lambda f: override(f.parameters, emissivity=0.9))
     with pytest.raises(CheckpointError, match=r"other block_s"):
-        reduce_frames(frames[:4], registration, GRID, BOUNDS, checkpoint=tmp_path, block_s=1)
+        reduce_frames(*arguments, checkpoint=tmp_path, block_s=1)
 
 
 SCENE = Scene(disc_K=-4.0)
@@ -355,8 +331,8 @@ ZOOM = 1.05
 def reduced(tmp_path, rng, images, *, interval_s=60.0, cycles=None):
     noisy = [image + rng.normal(0.0, 0.05, image.shape) for image in images]
     frames = record(tmp_path / "a.seq", noisy, interval_s=interval_s)
-    edges = np.linspace(0.0, interval_s * len(images), (cycles or len(images)) + 1)
-    return reduce_frames(frames, registered(), GRID, START + np.round(1e3 * edges).astype("m8[ms]"))
+    seconds = np.linspace(0.0, interval_s * len(images), (cycles or len(images)) + 1)
+    return reduce_frames(frames, registered(), GRID, START + np.round(1e3 * seconds).astype("m8[ms]"))
 
 
 def rms_K(fields) -> float:
@@ -503,14 +479,7 @@ def test_stretches_divide_short_and_long_recordings_and_end_at_registrations():
 
 def test_what_a_resumed_run_has_to_find_is_described_the_same_for_equal_parameters():
     series = simulated(50, cycles=2)
-    copies = FrameSeries(
-        series.references,
-        series.times,
-        series.bounds,
-        series.cycles,
-        series.correction_K,
-        lambda frame: replace(frame.parameters),
-    )
+    copies = replace(series, override=lambda frame: replace(frame.parameters))
     assert describe_reduction(series, GRID, [], block_s=10) == describe_reduction(copies, GRID, [], block_s=10)
 
 
@@ -526,23 +495,20 @@ def short_film(tmp_path_factory):
     return frames, sensor
 
 
+def series_until(stop_s, frames, **options):
+    return make_frame_series(frames, edges(0, stop_s), shape=(480, 640), override=lambda f: f.parameters, **options)
+
+
 def test_a_portion_is_the_mean_of_its_frames(short_film):
     frames, sensor = short_film
-    series = make_frame_series(
-        frames,
-        START + np.array([0, 6]) * np.timedelta64(1, "s"),
-        shape=(480, 640),
-        override=lambda frame: frame.parameters,
-        correction_K=np.full(9, 0.25),
-    )
+    series = series_until(6, frames, correction_K=np.full(9, 0.25))
     blocks = cut_blocks(series, WHOLE, block_s=2)
     [stretch] = cut_stretches(blocks, total=len(series))[:1]
     tasks = [(gather_frames(series, portion.blocks), portion.whole) for portion in stretch]
     [result, *_] = reduce_stretch(tasks, sensor)
     assert stretch[0].whole
-    truth = sensor.weights.resample(
-        np.mean([calibrate(f.read_counts(), SC660)[sensor.weights.window] for f in frames[:6]], 0)
-    )
+    images = [calibrate(frame.read_counts(), SC660)[sensor.weights.window] for frame in frames[:6]]
+    truth = sensor.weights.resample(np.mean(images, 0))
     np.testing.assert_allclose(result.part.mean, truth + 0.25, atol=1e-4)
     assert result.part.frames == 6
     assert result.part.seconds == pytest.approx(15.0)
@@ -554,9 +520,7 @@ def test_a_portion_is_the_mean_of_its_frames(short_film):
 
 def test_frames_left_out_take_no_part(short_film):
     frames, sensor = short_film
-    series = make_frame_series(
-        frames, START + np.array([0, 9]) * np.timedelta64(1, "s"), shape=(480, 640), override=lambda f: f.parameters
-    )
+    series = series_until(9, frames)
     [block] = cut_blocks(series, WHOLE, block_s=60)
     some = reduce_portion([choose_frames(series, block, np.array([0, 2]))], sensor, whole=False)
     assert some.part.frames == 2

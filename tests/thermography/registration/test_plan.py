@@ -139,7 +139,7 @@ def test_the_picture_as_the_plan():
     assert not registration.position_u(picture_grid((6, 8), 1).centres_mm).any()
     assert usual_cell_px((512, 640)) == 4 and usual_cell_px((7, 11)) == 1
     assert picture_grid((480, 640)).shape == (120, 160)
-    with pytest.raises(ThermographyError, match=r"7 px.* 640 x 480 pixels; choose one of 1, 2, 4, 5, 8"):
+    with pytest.raises(ThermographyError, match=r"7 px.* 640 x 480 pixels; choose 1, 2, 4, 5, 8"):
         picture_grid((480, 640), 7)
 
 
