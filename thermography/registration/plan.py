@@ -60,11 +60,11 @@ class PlanGrid:
         for name in ("width_mm", "height_mm", "cell_size_mm"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ThermographyError(f"{name} = {getattr(self, name)} mm; the plan needs a positive length")
-        for name in ("width_mm", "height_mm"):
-            cells = getattr(self, name) / self.cell_size_mm
+        for name, side in (("width_mm", self.width_mm), ("height_mm", self.height_mm)):
+            cells = side / self.cell_size_mm
             if abs(cells - round(cells)) > 1e-6:
                 raise ThermographyError(
-                    f"{name} = {getattr(self, name)} mm is not a whole number of cells of {self.cell_size_mm} mm; choose one that divides both"
+                    f"{name} = {side} mm is not a whole number of cells of {self.cell_size_mm} mm; choose one that divides both"
                 )
 
     @property

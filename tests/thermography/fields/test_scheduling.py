@@ -34,9 +34,8 @@ ends_late = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytes
 @pytest.fixture(scope="module")
 def cluster():
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as started:
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    with distributed.LocalCluster(**options) as started:
         yield started
 
 
@@ -50,6 +49,7 @@ def film(tmp_path_factory):
 
 
 BOUNDS = edges(0, 9, 17, 24)
+in_memory_or_not = pytest.mark.parametrize("in_memory", [1 << 24, 10])
 
 
 @pytest.mark.parametrize("cores", [1, 3, 64])
@@ -135,10 +135,8 @@ def test_the_pieces_are_the_array(monkeypatch, tmp_path, rng):
     assert len(list(piece_slices((5, 1000)))) == 5
 
 
-@pytest.mark.parametrize("in_memory", [1 << 24, 10])
-def test_what_is_filled_or_copied_piece_by_piece_is_the_same_on_disk_and_in_memory(
-    monkeypatch, tmp_path, in_memory, rng
-):
+@in_memory_or_not
+def test_what_is_filled_or_copied_in_pieces_is_the_same_on_disk_and_in_memory(monkeypatch, tmp_path, in_memory, rng):
     monkeypatch.setattr(large_arrays, "PIECE_BYTES", 2 * 3 * 8)
     monkeypatch.setattr(large_arrays, "IN_MEMORY_BYTES", in_memory)
     values = rng.normal(size=(7, 3))
@@ -164,9 +162,6 @@ def test_the_median_of_pieces_is_that_of_all_at_once(count, rng):
 def test_the_median_of_nothing_is_no_number():
     assert np.isnan(median_of_pieces(lambda: [np.array([np.nan]), np.empty(0)]))
     assert np.isnan(median_of_pieces(list))
-
-
-in_memory_or_not = pytest.mark.parametrize("in_memory", [1 << 24, 100])
 
 
 @in_memory_or_not
@@ -196,9 +191,8 @@ def test_arrays_are_apart_and_last_as_long_as_they_are_used(monkeypatch, tmp_pat
             give_back(part)
         assert [part.shape for part in parts] == shapes
         view = parts[1][2:4]
-        assert all(
-            type(part) is np.ndarray and part.flags.c_contiguous and (part == k).all() for k, part in enumerate(parts)
-        )
+        assert all(type(part) is np.ndarray and part.flags.c_contiguous for part in parts)
+        assert all((part == k).all() for k, part in enumerate(parts))
         del parts, part
         assert type(view) is np.ndarray and (view == 1).all()
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, FOCAL_PX, Scene
-from thermography.common import ThermographyError
 from thermography.registration.projection import (
     LENS_SPREAD,
     DiscObservations,
@@ -108,13 +107,6 @@ def test_where_discs_are_few_the_spread_among_lenses_is_the_uncertainty():
     assert (coefficients, fitted.distortion[0]) == (1, pytest.approx(0.0, abs=1e-6))
     covariance = parameter_covariance(observations, fitted, 4, factor=1.0)
     np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)[8:]), LENS_SPREAD, rtol=1e-3)
-
-
-def test_discs_on_a_line_determine_no_homography():
-    line = np.column_stack([np.arange(5) * 100.0, np.full(5, 90.0)])
-    observations = DiscObservations(line, line, np.full(5, 8.0), np.full(5, 0.01))
-    with pytest.raises(ThermographyError, match="are collinear or coincide; spread at least four"):
-        fit_homography(observations, Projection(np.eye(3), np.zeros(4), 640.0, (319.5, 239.5)))
 
 
 @pytest.mark.parametrize("coefficients", [0, 1, 4])
