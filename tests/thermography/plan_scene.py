@@ -83,17 +83,13 @@ class Scene:
 @cache
 def _rendered(scene):
     edge = np.linspace(0, 1, 40)
-    along, across = (
-        np.concatenate([edge, edge, 0 * edge, 0 * edge + 1]),
-        np.concatenate([0 * edge, 0 * edge + 1, edge, edge]),
-    )
+    along = np.concatenate([edge, edge, 0 * edge, 0 * edge + 1])
+    across = np.concatenate([0 * edge, 0 * edge + 1, edge, edge])
     outline = scene.to_pixels(np.column_stack([700 * along, 180 * across]))
     frame = np.full(scene.shape, float(scene.outside))
     # Beyond the outline of the table there is nothing to trace.
-    (left, top), (right, bottom) = (
-        np.maximum(np.floor(outline.min(0)) - 2, 0).astype(int),
-        np.ceil(outline.max(0) + 3).astype(int),
-    )
+    left, top = np.maximum(np.floor(outline.min(0)) - 2, 0).astype(int)
+    right, bottom = np.ceil(outline.max(0) + 3).astype(int)
     seen = frame[top:bottom, left:right]
     rows, columns = seen.shape
     steps = (np.arange(scene.rays) + 0.5) / scene.rays - 0.5

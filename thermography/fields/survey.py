@@ -332,14 +332,12 @@ def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int
 
 def _strays(survey: Survey, blocks: Blocks, kept: NDArray[np.int64]) -> dict[int, str]:
     """Reason by index for those of the kept frames whose table is warmer or colder than in the frames before and after."""
-    table, surroundings = (
-        survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.surroundings)
-    )
-    table, surroundings = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, surroundings))
+    table, around = (survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.surroundings))
+    table, around = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, around))
     if table.shape[1] == 0:
         return {}
-    examined = surroundings.shape[1] >= LEAST_SURROUNDING_BLOCKS
+    examined = around.shape[1] >= LEAST_SURROUNDING_BLOCKS
     if examined:
-        table = table - np.median(surroundings - np.median(surroundings, axis=0), axis=1, keepdims=True)
+        table = table - np.median(around - np.median(around, axis=0), axis=1, keepdims=True)
     reason = "the table differs by {:.2g} K from the frames before and after it: from another series, or with another setting"
     return {int(kept[i]): reason.format(beyond) for i, beyond in stray_frames(table, ends=examined).items()}

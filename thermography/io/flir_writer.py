@@ -202,11 +202,9 @@ def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     struct.pack_into(">I", head, 0x20, 3)
     struct.pack_into(">I", head, 0x34, total)
     entries = ((CAMERA_RECORD, 1, 1, info_offset, info), (RAW_RECORD, _SUBTYPES[encoding], 2, raw_offset, raw))
-    for slot, (kind, subtype, identifier, offset, data) in enumerate(entries):
+    for slot, (kind, subtype, number, offset, data) in enumerate(entries):
         entry = HEADER_SIZE + slot * ENTRY_SIZE
-        struct.pack_into(
-            ">2H7I", head, entry, kind, subtype, 100, identifier, offset, len(data), 0, 0, zlib.crc32(data)
-        )
+        struct.pack_into(">2H7I", head, entry, kind, subtype, 100, number, offset, len(data), 0, 0, zlib.crc32(data))
     return bytes(head) + info + raw
 
 
@@ -240,12 +238,10 @@ def _camera_info(frame: Frame) -> bytes:
     room = (_CAMERA_INFO_SIZE - FIRST_SENSOR) // SENSOR_SIZE
     if len(frame.housekeeping) > room:
         raise ThermographyError(f"housekeeping: a FLIR file stores {room} readings, not {len(frame.housekeeping)}")
-    for slot, (name, value) in enumerate(frame.housekeeping.items()):
+    for i, (name, value) in enumerate(frame.housekeeping.items()):
         if not (name.isascii() and 0 < len(name) < 16 and 150 < value < 450):
             raise ThermographyError(f"housekeeping {name!r} = {value}: expected 1 to 15 ASCII letters and 150 to 450 K")
-        struct.pack_into(
-            "<f16s2I", info, FIRST_SENSOR + SENSOR_SIZE * slot, value, name.encode(), seconds, milliseconds
-        )
+        struct.pack_into("<f16s2I", info, FIRST_SENSOR + SENSOR_SIZE * i, value, name.encode(), seconds, milliseconds)
     return bytes(info)
 
 

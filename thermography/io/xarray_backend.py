@@ -176,9 +176,7 @@ class FlirAccessor:
         """
         place = self._dataset.isel(time=frame) if "time" in self._dataset.dims else self._dataset
         references, rejected = index_frames([str(place["source"].values)])
-        found = [
-            each for each in references if each.index == int(place["frame"]) and isinstance(each, FlirFrameReference)
-        ]
+        found = [one for one in references if one.index == int(place["frame"]) and isinstance(one, FlirFrameReference)]
         if not found:
             raise FlirFormatError(rejected[0].reason if rejected else f"{place['source'].values}: the frame is gone")
         picture = read_visible_picture(found[0])

@@ -222,9 +222,7 @@ def air_transmission(
     celsius = atmospheric_temperature_K - ZERO_CELSIUS_K
     # Damaged constants may lead anywhere; `check_parameters` judges the transmission that they give.
     with np.errstate(over="ignore", invalid="ignore"):
-        water = relative_humidity * np.exp(
-            1.5587 + 0.06939 * celsius - 0.00027816 * celsius**2 + 0.00000068455 * celsius**3
-        )
+        water = relative_humidity * np.exp(1.5587 + 0.06939 * celsius - 2.7816e-4 * celsius**2 + 6.8455e-7 * celsius**3)
         root_distance, root_water = np.sqrt(object_distance_m), np.sqrt(water)
         first = np.exp(-root_distance * (p.atmosphere_alpha1 + p.atmosphere_beta1 * root_water))
         second = np.exp(-root_distance * (p.atmosphere_alpha2 + p.atmosphere_beta2 * root_water))

@@ -266,9 +266,7 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
         return Fiducial(name, x_mm, y_mm, diameter_mm, marker=int(marker))
     hints = [(row.get(column) or "").strip() for column in _HINT_COLUMNS]
     if all(hints):
-        column_px, row_px = (
-            _number(path, line, column, text) for column, text in zip(_HINT_COLUMNS, hints, strict=True)
-        )
+        column_px, row_px = (_number(path, line, key, text) for key, text in zip(_HINT_COLUMNS, hints, strict=True))
         return Fiducial(name, x_mm, y_mm, diameter_mm, column_px, row_px)
     if any(hints):
         raise FiducialError(f"{path}:{line}: {name} has one of column_px, row_px; give both or neither")

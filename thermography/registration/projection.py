@@ -341,9 +341,7 @@ class DiscObservations:
 
     def select(self, chosen: NDArray[np.bool_]) -> DiscObservations:
         """The observations that are True in `chosen`, (n,)."""
-        return DiscObservations(
-            self.points_px[chosen], self.centres_mm[chosen], self.radii_mm[chosen], self.u_px[chosen]
-        )
+        return DiscObservations(**{name: values[chosen] for name, values in vars(self).items()})
 
     def residuals_px(self, projection: Projection) -> Array:
         """Observed minus projected centroids, (n, 2) px."""
@@ -365,14 +363,13 @@ def fit_homography(observations: DiscObservations, ideal: Projection) -> Project
 
 def fit_projection(observations: DiscObservations, start: Projection, coefficients: int) -> Projection:
     """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt)."""
-    pack, unpack = _parameters(start, observations.centres_mm, coefficients)
+    centres_mm = observations.centres_mm
+    pack, unpack = _parameters(start, centres_mm, coefficients)
     # The perspective shift of the centroids hardly changes during the fit and is held fixed.
-    shift = start.disc_centroids(observations.centres_mm, observations.radii_mm) - start.to_sensor(
-        observations.centres_mm
-    )
+    shift = start.disc_centroids(centres_mm, observations.radii_mm) - start.to_sensor(centres_mm)
 
     def residuals(parameters: Array) -> Array:
-        residuals_px = unpack(parameters).to_sensor(observations.centres_mm) + shift - observations.points_px
+        residuals_px = unpack(parameters).to_sensor(centres_mm) + shift - observations.points_px
         weighted = (residuals_px / observations.u_px[:, None]).ravel()
         return np.concatenate([weighted, parameters[8:] / LENS_SPREAD[:coefficients]])
 

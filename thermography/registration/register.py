@@ -134,9 +134,8 @@ def _passes(
     others = np.where(agreeing, np.maximum((factor * freedom - squares) / max(freedom - 2, 1), 1.0), factor)
     degrees = np.where(agreeing, max(freedom - 2, 1), max(freedom, 1))
     unlikely = squares / 2 / others > special.fdtri(2, degrees, 1.0 - _FALSE_ALARM / len(squares))
-    missed_mm = np.linalg.norm(
-        np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0], axis=1
-    )
+    missed = np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0]
+    missed_mm = np.linalg.norm(missed, axis=1)
     # Where the others alone determine the fit and no more, nothing tells whether an agreeing disc is wrong.
     untold = agreeing & (freedom - 2 < _LEAST_FREEDOM)
     return np.asarray(~unlikely | (missed_mm < _MISPLACED_MM) | untold)
@@ -315,9 +314,8 @@ def size_contradiction(spots: Sequence[LocatedDisc], fiducials: Sequence[Fiducia
     if len(hinted) < 4:
         return ""
     plan = np.array([(disc.x_mm, disc.y_mm) for disc in hinted])
-    homography, _ = cv2.findHomography(
-        plan, np.array([disc.hint_px for disc in hinted], float), cv2.RANSAC, _EVIDENCE_REACH_PX
-    )
+    hints = np.array([disc.hint_px for disc in hinted], float)
+    homography, _ = cv2.findHomography(plan, hints, cv2.RANSAC, _EVIDENCE_REACH_PX)
     if homography is None:
         return ""
     projection = Projection(homography, np.zeros(4), 1.0, (0.0, 0.0))
@@ -550,10 +548,8 @@ def _chance(
         return np.inf
     distance = np.linalg.norm(projection.to_sensor(plan) - image, axis=1)[agreeing]
     misfit = max(float(np.sqrt(np.mean(distance**2))), _LEAST_MISFIT_PX)
-    missed_px, area_px = np.full(len(distance), misfit), float(shape[0] * shape[1])
-    return chance_of_arrangement(
-        len(fiducials), spots, missed_px, hypotheses=1, coefficients=coefficients, area_px=area_px
-    )
+    missed, area = np.full(len(distance), misfit), float(shape[0] * shape[1])
+    return chance_of_arrangement(len(fiducials), spots, missed, hypotheses=1, coefficients=coefficients, area_px=area)
 
 
 def _pairs(matched: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> tuple[Array, Array]:

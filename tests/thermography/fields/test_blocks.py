@@ -122,14 +122,12 @@ def test_a_file_that_became_shorter_is_named(frames, tmp_path):
 
 
 def test_cycles_names_times_and_temperatures_of_frames(tmp_path):
-    references = record(tmp_path / "a.seq", [np.full((8, 8), 20.0 + i) for i in range(6)])
-    assert series(references, [[0, 2], [3, 5]]).cycles.tolist() == [0, 0, NO_CYCLE, 1, 1, NO_CYCLE]
-    assert series(references, [1, 3, 4]).cycles.tolist() == [-1, 0, 0, 1, -1, -1]
-    frames = series(references, [0, 6])
+    stored = record(tmp_path / "a.seq", [np.full((8, 8), 20.0 + i) for i in range(6)])
+    assert series(stored, [[0, 2], [3, 5]]).cycles.tolist() == [0, 0, NO_CYCLE, 1, 1, NO_CYCLE]
+    assert series(stored, [1, 3, 4]).cycles.tolist() == [-1, 0, 0, 1, -1, -1]
+    frames = series(stored, [0, 6])
     assert len(frames) == 6
     assert frames.names(np.array([False, True, False, False, False, True])) == ["a.seq#1", "a.seq#5"]
     assert frames.mean_time(slice(1, 5)) == START + 2.5 * np.timedelta64(1000, "ms")
-    np.testing.assert_array_equal(
-        frames.temperature(3), calibrate(references[3].read_counts(), references[3].parameters)
-    )
+    np.testing.assert_array_equal(frames.temperature(3), calibrate(stored[3].read_counts(), stored[3].parameters))
     assert frames.correction_K.tolist() == [0.0] * 6

@@ -97,10 +97,8 @@ def test_a_file_that_workers_do_not_see_is_named(cluster, film):
 
 def test_a_scheduler_that_does_not_answer_is_named():
     pytest.importorskip("distributed")
-    with (
-        pytest.raises(SchedulerError, match=r"scheduler nowhere does not answer \(.*\); check or omit its address"),
-        open_pool("nowhere"),
-    ):
+    message = r"scheduler nowhere does not answer \(.*\); check or omit its address"
+    with pytest.raises(SchedulerError, match=message), open_pool("nowhere"):
         pass
 
 

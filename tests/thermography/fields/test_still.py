@@ -47,18 +47,14 @@ from thermography.registration.plan import mask_discs
 SECOND = np.timedelta64(1, "s")
 
 
-@pytest.fixture(scope="module")
-def scene():
-    """A still table with 4 K colder discs, its frame without noise, and its registration."""
-    still = Scene(disc_K=-4.0)
-    image = still.render()
-    return image, registered(), still
+#: A still table with 4 K colder discs, and its frame without noise.
+SCENE = Scene(disc_K=-4.0)
+STILL = SCENE.render()
 
 
-def test_field_of_one_frame_per_cycle_is_true_within_its_noise(scene, rng, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", (image + rng.normal(0, 0.05, image.shape) for _ in range(6)))
-    fields = reduce_frames(frames, registration, GRID, edges(*range(7)))
+def test_field_of_one_frame_per_cycle_is_true_within_its_noise(rng, tmp_path):
+    frames = record(tmp_path / "a.seq", (STILL + rng.normal(0, 0.05, STILL.shape) for _ in range(6)))
+    fields = reduce_frames(frames, registered(), GRID, edges(*range(7)))
     error = fields["temperature"].values - cell_truth()
     # A cell holds about 22 pixels of 50 mK: 10.7 mK; partly seen cells a little more.
     assert np.sqrt(np.nanmean(error**2)) < 0.012
@@ -68,34 +64,29 @@ def test_field_of_one_frame_per_cycle_is_true_within_its_noise(scene, rng, tmp_p
     assert ratio == pytest.approx(1, abs=0.15)
 
 
-def test_field_without_noise_shows_no_bias_anywhere(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image])
-    fields = reduce_frames(frames, registration, GRID, edges(0, 1))
+def test_field_without_noise_shows_no_bias_anywhere(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL])
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 1))
     error = fields["temperature"].values[0] - cell_truth()
     # Counts are whole numbers of 6 mK; a cell averages 22 of them. Its field is curved by 0.3 mK over a cell.
     assert np.nanmax(np.abs(error)) < 0.010
     assert np.sqrt(np.nanmean(error**2)) < 0.002
 
 
-def test_discs_do_not_leak_into_their_neighbours(scene, tmp_path):
+def test_discs_do_not_leak_into_their_neighbours(tmp_path):
     """The same table with discs 20 K colder gives the same field."""
-    _, registration, _ = scene
     images = [Scene(disc_K=disc_K).render() for disc_K in (-4.0, -24.0)]
     frames = record(tmp_path / "a.seq", images)
-    fields = reduce_frames(frames, registration, GRID, edges(0, 1, 2))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 1, 2))
     assert np.nanmax(np.abs(np.diff(fields["temperature"].values, axis=0))) < 1e-3
-    x, y = np.meshgrid(GRID.x_mm, GRID.y_mm)
-    centres = mask_discs(np.stack([x, y], axis=-1), DISCS, margin_mm=0.0)
+    centres = mask_discs(GRID.centres_mm, DISCS, margin_mm=0.0)
     assert np.isnan(fields["temperature"].values[0][centres]).mean() > 0.9
 
 
-def test_dataset_keeps_its_contract(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 3)
-    fields = evaluate_uncertainty(
-        reduce_frames(frames, registration, GRID, edges(0, 1, 2, 3)), [frames[0].parameters] * 3
-    )
+def test_dataset_keeps_its_contract(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL] * 3)
+    reduced_alone = reduce_frames(frames, registered(), GRID, edges(0, 1, 2, 3))
+    fields = evaluate_uncertainty(reduced_alone, [frames[0].parameters] * 3)
     for name, (dims, units, kind) in FIELDS.items():
         assert fields[name].dims == dims
         assert fields[name].dtype.kind == kind
@@ -105,10 +96,9 @@ def test_dataset_keeps_its_contract(scene, tmp_path):
     assert (fields["temperature_rise"].values[0][np.isfinite(fields["temperature"].values[0])] == 0).all()
 
 
-def test_spread_and_rate_follow_a_known_ramp(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image + 0.1 * i for i in range(12)])
-    fields = reduce_frames(frames, registration, GRID, edges(0, 4, 8, 12))
+def test_spread_and_rate_follow_a_known_ramp(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL + 0.1 * i for i in range(12)])
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 4, 8, 12))
     # Four frames 0.1 K apart: standard deviation 0.1291 K; rounding to 6 mK counts adds 2 mK of noise.
     assert np.nanmedian(fields["temperature_spread"].values) == pytest.approx(0.1 * np.std(range(4), ddof=1), abs=1e-3)
     assert np.nanmedian(fields["temperature_rate"].values) == pytest.approx(0.1 * 3600, rel=1e-3)
@@ -116,16 +106,15 @@ def test_spread_and_rate_follow_a_known_ramp(scene, tmp_path):
     assert np.unique(fields["count"].values).tolist() == [0, 4]
 
 
-def test_guard_calibrates_a_transient_frame_by_frame(scene, tmp_path):
+def test_guard_calibrates_a_transient_frame_by_frame(tmp_path):
     """A spark of 40 K in one of ten frames: the sums alone would err by tens of millikelvin."""
-    image, registration, _ = scene
 
     def spark(x, y):
         return smooth_field(x, y) + 40.0 * ((np.abs(x - 250) < 15) & (np.abs(y - 90) < 15))
 
-    images = [Scene(disc_K=-4.0, field=spark).render() if i == 4 else image for i in range(10)]
+    images = [Scene(disc_K=-4.0, field=spark).render() if i == 4 else STILL for i in range(10)]
     frames = record(tmp_path / "a.seq", images)
-    fields = reduce_frames(frames, registration, GRID, edges(0, 10))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 10))
     hot = fields.sel(x=slice(240, 260), y=slice(80, 100))
     truth = smooth_field(*np.meshgrid(hot["x"], hot["y"])) + 4.0
     np.testing.assert_allclose(hot["temperature"].values[0], truth, atol=0.010)
@@ -142,18 +131,17 @@ def test_guard_calibrates_a_transient_frame_by_frame(scene, tmp_path):
 
 @pytest.mark.parametrize("block_s", [0.0, 10.0])
 @pytest.mark.parametrize("per_cycle", [1, 4])
-def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(scene, rng, tmp_path, per_cycle, block_s):
+def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(rng, tmp_path, per_cycle, block_s):
     """A count of zero lies below any temperature."""
-    image, registration, _ = scene
     path = tmp_path / "a.seq"
-    frames = record(path, (image + rng.normal(0, 0.05, image.shape) for _ in range(2 * per_cycle)))
-    whole = reduce_frames(frames, registration, GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
-    column, row = np.rint(registration.to_sensor(np.array([[302.0, 92.0]]))[0]).astype(int)
+    frames = record(path, (STILL + rng.normal(0, 0.05, STILL.shape) for _ in range(2 * per_cycle)))
+    whole = reduce_frames(frames, registered(), GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
+    column, row = np.rint(registered().to_sensor(np.array([[302.0, 92.0]]))[0]).astype(int)
     data = bytearray(path.read_bytes())
-    place = frames[-1].segments[0][0] + frames[-1].samples.offset + 2 * (row * image.shape[1] + column)
+    place = frames[-1].segments[0][0] + frames[-1].samples.offset + 2 * (row * STILL.shape[1] + column)
     data[place : place + 2] = bytes(2)
     path.write_bytes(data)
-    fields = reduce_frames(frames, registration, GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
+    fields = reduce_frames(frames, registered(), GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
     for name in ("temperature", "temperature_rise", "temperature_noise_u", "count"):
         np.testing.assert_array_equal(np.isfinite(fields[name]), np.isfinite(whole[name]))
     difference = (fields["temperature"] - whole["temperature"]).values
@@ -162,33 +150,31 @@ def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(scene, rng, 
     assert np.count_nonzero(np.nan_to_num(difference)) <= 9
 
 
-def test_changing_parameters_and_corrections_are_applied_frame_by_frame(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 4, interval_s=1)
+def test_changing_parameters_and_corrections_are_applied_frame_by_frame(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL] * 4, interval_s=1)
 
     def dim(frame):
         return override(frame.parameters, emissivity=0.97 if frame.index < 2 else 0.90)
 
     options = {"override": dim, "correction_K": np.array([0, 0, 1.0, 1.0])}
-    fields = reduce_frames(frames, registration, GRID, edges(0, 4), **options)
-    one_by_one = reduce_frames(frames, registration, GRID, edges(0, 4), block_s=0, **options)
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 4), **options)
+    one_by_one = reduce_frames(frames, registered(), GRID, edges(0, 4), block_s=0, **options)
     assert fields.sizes["time"] == 2
     assert one_by_one.sizes["time"] == 4
     np.testing.assert_allclose(fields["temperature"], one_by_one["temperature"], atol=1e-5)
     step = fields["frame_temperature"].isel(time=1) - fields["frame_temperature"].isel(time=0)
     bright = reduce_frames(
-        frames[:1], registration, GRID, edges(0, 4), override=lambda f: replace(f.parameters, emissivity=0.9)
+        frames[:1], registered(), GRID, edges(0, 4), override=lambda f: replace(f.parameters, emissivity=0.9)
     )
     expected = bright["frame_temperature"].values[0] + 1.0 - fields["frame_temperature"].values[0]
     np.testing.assert_allclose(step, expected, atol=1e-4)
 
 
-def test_knocked_camera_keeps_the_field_in_place(scene, tmp_path):
-    image, registration, still = scene
-    knocked = replace(still, shift_px=(3.0, -2.0))
+def test_knocked_camera_keeps_the_field_in_place(tmp_path):
+    knocked = replace(SCENE, shift_px=(3.0, -2.0))
     after = knocked.render()
-    frames = record(tmp_path / "a.seq", [image, image, after, after])
-    spans = [RegistrationSpan(0, registration), RegistrationSpan(2, registered(knocked))]
+    frames = record(tmp_path / "a.seq", [STILL, STILL, after, after])
+    spans = [RegistrationSpan(0, registered()), RegistrationSpan(2, registered(knocked))]
     fields = reduce_frames(frames, spans, GRID, edges(0, 1, 3, 4))
     assert (fields["count"].max(("x", "y")) == [1, 2, 1]).all()
     assert (fields["quality_flag"].values[1] & 4 == 4).all()
@@ -196,11 +182,10 @@ def test_knocked_camera_keeps_the_field_in_place(scene, tmp_path):
     assert np.nanmax(np.abs(error)) < 0.010
 
 
-def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 3, interval_s=10)
+def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL] * 3, interval_s=10)
     bounds = np.array([[0, 5], [8, 9], [18, 22]]) * SECOND + START
-    fields = reduce_frames(frames, registration, GRID, bounds)
+    fields = reduce_frames(frames, registered(), GRID, bounds)
     assert json.loads(fields.attrs["frames_outside_cycles"]) == ["a.seq#1"]
     assert fields["frame_cycle"].values.tolist() == [1, 0, 3]
     assert np.isnat(fields["cycle_time"].values[1])
@@ -223,40 +208,37 @@ def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(s
         ({"registration": "late"}, r"registrations start at frames \[1\]; they must start at 0 and rise"),
     ],
 )
-def test_faults_are_named(scene, tmp_path, change, message):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 2)
-    arguments = {"references": frames, "registration": registration, "cycle_bounds": edges(0, 1, 2)} | change
+def test_faults_are_named(tmp_path, change, message):
+    frames = record(tmp_path / "a.seq", [STILL] * 2)
+    arguments = {"references": frames, "registration": registered(), "cycle_bounds": edges(0, 1, 2)} | change
     if change.get("references") == "reversed":
         arguments["references"] = frames[::-1]
     if change.get("references") == "small":
-        arguments["references"] = record(tmp_path / "b.seq", [image[:8, :8]])
+        arguments["references"] = record(tmp_path / "b.seq", [STILL[:8, :8]])
     if change.get("registration") == "late":
-        arguments["registration"] = [RegistrationSpan(1, registration)]
+        arguments["registration"] = [RegistrationSpan(1, registered())]
     with pytest.raises(ReductionError, match=message):
         reduce_frames(arguments.pop("references"), arguments.pop("registration"), GRID, **arguments)
 
 
-def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(scene, rng, tmp_path):
-    image, registration, still = scene
-    shaken = replace(still, shift_px=(1.5, 0.0)).render()
+def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(rng, tmp_path):
+    shaken = replace(SCENE, shift_px=(1.5, 0.0)).render()
 
     hot = Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.015 * x).render()
 
     def warm(n):
-        return (shaken if n == 3 else image + (hot - image) * n / 7) + rng.normal(0, 0.05, image.shape)
+        return (shaken if n == 3 else STILL + (hot - STILL) * n / 7) + rng.normal(0, 0.05, STILL.shape)
 
     frames = record(tmp_path / "a.seq", (warm(n) for n in range(7)))
-    fields = reduce_frames(frames, registration, GRID, edges(0, 7))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 7))
     assert json.loads(fields.attrs["knocks"]) == []
     assert json.loads(fields.attrs["frames_shaken"]) == ["a.seq#3"]
 
 
-def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(scene, rng, tmp_path):
-    _, registration, _ = scene
+def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(rng, tmp_path):
     plain = Scene(discs=()).render() + rng.normal(0, 0.05, (480, 640))
     frames = record(tmp_path / "a.seq", [plain] * 2)
-    fields = reduce_frames(frames, registration, GRID, edges(0, 2))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 2))
     # The first one is what the others' picture of the table is compared with.
     assert json.loads(fields.attrs["frames_unchecked"]) == ["a.seq#0"]
 
@@ -323,8 +305,6 @@ def test_a_checkpoint_of_another_reduction_is_refused(film, tmp_path):
         reduce_frames(*arguments, checkpoint=tmp_path, block_s=1)
 
 
-SCENE = Scene(disc_K=-4.0)
-STILL = SCENE.render()
 ZOOM = 1.05
 
 

@@ -74,14 +74,12 @@ def test_a_temporary_name_tells_the_file_and_is_of_one_writer(name):
 def test_machines_that_share_a_folder_do_not_write_under_one_name(monkeypatch):
     """Threads of two containers may have the same number."""
     monkeypatch.setattr(threading, "get_native_id", lambda: 1)
-    program = (
+    code = (
         "import threading; from pathlib import Path; threading.get_native_id = lambda: 1\n"
         "from thermography.io.files import partial_path; print(partial_path(Path('maps/fields.nc')))"
     )
     path = Path("maps", "fields.nc")
-    other = Path(
-        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout[:-1]
-    )
+    other = Path(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout[:-1])
     assert other != partial_path(path)
     # A name that an earlier version left, without the random number, is known too.
     assert finished_path(other) == finished_path(Path("maps", ".fields.partial4711.nc")) == path

@@ -61,10 +61,7 @@ def test_sequence_is_walked_by_record_ends_not_by_magic(real_file):
     # The pixels of this file hold the bytes of the magic, at which splitters cut it.
     assert path.read_bytes().count(b"FFF\0") > 2
     frames, rejected = index_frames([path])
-    assert [frame.time for frame in frames] == [
-        np.datetime64("2012-06-13T19:52:08.699"),
-        np.datetime64("2012-06-13T19:52:12.666"),
-    ]
+    assert [str(frame.time) for frame in frames] == ["2012-06-13T19:52:08.699", "2012-06-13T19:52:12.666"]
     assert rejected == []
 
 

@@ -71,9 +71,7 @@ def test_mean_of_two_counts_is_that_of_the_expansion():
 
 def test_merged_temperatures_are_those_of_all_frames(rng):
     values = rng.normal(25, 2, (12, 5))
-    parts = [
-        MeanTemperature(len(part), part.mean(0), part.var(0), np.full(5, 1e-4)) for part in np.split(values, [3, 4])
-    ]
+    parts = [MeanTemperature(len(one), one.mean(0), one.var(0), np.full(5, 1e-4)) for one in np.split(values, [3, 4])]
     merged = parts[0].merge(parts[1]).merge(parts[2])
     assert merged.frames == 12
     np.testing.assert_allclose(merged.mean, values.mean(axis=0), rtol=1e-14)

@@ -227,9 +227,7 @@ def test_constants_of_the_air_that_give_no_transmission_are_refused_unless_one_i
 def test_unknown_names_averages_and_wild_emissivities_are_refused():
     with pytest.raises(RadiometryError, match="parameter 'distance' is unknown; use one of emissivity"):
         override(PARAMETERS, distance=2.0)
-    with pytest.raises(
-        RadiometryError, match="counts: expected uint16, got float64; for means use temperature_from_counts"
-    ):
+    with pytest.raises(RadiometryError, match="counts: expected uint16, got float64; for means use"):
         calibrate(np.array([18000.5]), PARAMETERS)
     with pytest.raises(RadiometryError, match=r"emissivity from 0 to 0\.5: expected fractions above 0 and up to 1"):
         temperature_from_counts(18000, PARAMETERS, emissivity=[0.0, 0.5])

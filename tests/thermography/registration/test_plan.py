@@ -50,12 +50,10 @@ def test_points_near_discs_are_those_nearer_than_the_margin(rng):
     points = np.round(rng.uniform(0, 30, (40, 50, 2)) * 4) / 4
     margin = rng.uniform(0, 3, (40, 50))
     points[0, 0], margin[1, 1], margin[2, 2] = np.nan, np.inf, np.nan
-    for margin_mm in (0.0, 1.0, margin):
-        near = [
-            np.hypot(points[..., 0] - d.x_mm, points[..., 1] - d.y_mm) < d.diameter_mm / 2 + margin_mm for d in discs
-        ]
+    for reach in (0.0, 1.0, margin):
+        near = [np.hypot(points[..., 0] - d.x_mm, points[..., 1] - d.y_mm) < d.diameter_mm / 2 + reach for d in discs]
         assert 100 < np.sum(near) < 2000
-        np.testing.assert_array_equal(mask_discs(points, discs, margin_mm=margin_mm), near[0] | near[1])
+        np.testing.assert_array_equal(mask_discs(points, discs, margin_mm=reach), near[0] | near[1])
 
 
 @pytest.mark.parametrize(

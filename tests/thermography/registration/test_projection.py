@@ -49,17 +49,15 @@ def test_a_point_is_located_where_it_was_projected_from():
 
 def test_centroid_of_a_disc_is_the_centre_of_its_conic():
     """The image of a circle under a homography is an ellipse; its centre follows from the conic matrix."""
-    tilted = Projection(
-        np.array([[1.0, 0.1, 20], [0.05, 0.9, 30], [4e-4, 2e-4, 1]]), np.zeros(4), 640.0, (319.5, 239.5)
-    )
+    tilt = Projection(np.array([[1.0, 0.1, 20], [0.05, 0.9, 30], [4e-4, 2e-4, 1]]), np.zeros(4), 640.0, (319.5, 239.5))
     x, y, radius = 300.0, 120.0, 40.0
     circle = np.array([[1, 0, -x], [0, 1, -y], [-x, -y, x * x + y * y - radius**2]])
-    inverse = np.linalg.inv(tilted.plan_to_sensor)
+    inverse = np.linalg.inv(tilt.plan_to_sensor)
     conic = inverse.T @ circle @ inverse
     centre = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
-    shift = centre - tilted.to_sensor(np.array([x, y]))
+    shift = centre - tilt.to_sensor(np.array([x, y]))
     assert np.hypot(*shift) > 0.3
-    centroid = tilted.disc_centroids(np.array([[x, y]]), np.array([radius]))[0]
+    centroid = tilt.disc_centroids(np.array([[x, y]]), np.array([radius]))[0]
     # The inscribed polygon of 24 corners has (2 + cos 15 deg) / 3 of the circle's second moment, to which the shift is proportional.
     share = (2 + np.cos(2 * np.pi / 24)) / 3
     np.testing.assert_allclose(centroid, centre - (1 - share) * shift, atol=1e-3 * np.hypot(*shift))

@@ -130,10 +130,8 @@ def test_picked_points_register_without_an_image():
     # The image of a disc's centre is not the centroid of its image, by up to 0.03 px here.
     assert scene.registration_rms_mm(registration) < 0.1
     assert registration.left_out["F9"] == "was not picked"
-    pairs = [
-        replace(d, column_px=picked[d.name][0], row_px=picked[d.name][1]) if d.name in picked else d for d in DISCS
-    ]
-    assert register_points(None, pairs, (480, 640)).located == registration.located
+    both = [replace(d, column_px=picked[d.name][0], row_px=picked[d.name][1]) if d.name in picked else d for d in DISCS]
+    assert register_points(None, both, (480, 640)).located == registration.located
     with pytest.raises(RegistrationError, match="picked points G1 are not in the list of fiducials"):
         register_points({"G1": (1.0, 1.0)}, DISCS, (480, 640))
 
@@ -328,9 +326,8 @@ def test_wrong_places_are_told_from_right_ones(rng, count, error_mm):
 @pytest.mark.parametrize("places_u_mm", [0.0, 0.2])
 def test_right_places_are_not_called_wrong(rng, places_u_mm):
     # The test is meant to lose a disc in one list of a thousand; of 30 more than one would be a wrong scale.
-    lost = sum(
-        not fit_agreeing(observed(rng, places_u_mm=places_u_mm), IDEAL, calibrated=False)[2].all() for _ in range(30)
-    )
+    lists = (observed(rng, places_u_mm=places_u_mm) for _ in range(30))
+    lost = sum(not fit_agreeing(each, IDEAL, calibrated=False)[2].all() for each in lists)
     assert lost <= 1
 
 
