@@ -119,10 +119,8 @@ class FlirInspection:
             f"  temperature {self.lowest_degC:.2f} to {self.highest_degC:.2f} degC, mean {self.mean_degC:.2f} degC "
             f"({self.frames_read} of {len(self.frames)} frames read)",
         ]
-        if first.settings.frame_rate_Hz:
-            lines.append(
-                f"  frame rate {first.settings.frame_rate_Hz:g} Hz, focus {first.settings.focus_distance_m:.3g} m"
-            )
+        if rate_Hz := first.settings.frame_rate_Hz:
+            lines.append(f"  frame rate {rate_Hz:g} Hz, focus {first.settings.focus_distance_m:.3g} m")
         if housekeeping:
             lines.append(f"  inside the camera, degC: {housekeeping}")
         lines += [f"  note: {note}" for note in dict.fromkeys(note for frame in self.frames for note in frame.notes)]

@@ -20,29 +20,18 @@ from thermography.io.frame import (
 
 #: The constants of an SC660, as its files store them (float32).
 PARAMETERS = CameraParameters(
-    emissivity=0.949999988079071,
-    object_distance_m=1.0,
-    reflected_temperature_K=293.1499938964844,
-    atmospheric_temperature_K=293.1499938964844,
-    window_temperature_K=293.1499938964844,
-    window_transmission=1.0,
-    stored_transmission=0.0,
-    relative_humidity=0.5,
-    planck_r1=21106.76953125,
-    planck_b=1501.0,
-    planck_f=1.0,
-    planck_o=-7340.0,
-    planck_r2=0.012545257806777954,
-    atmosphere_alpha1=0.006568999961018562,
-    atmosphere_alpha2=0.012620000168681145,
-    atmosphere_beta1=-0.00227600010111928,
-    atmosphere_beta2=-0.006670000031590462,
-    atmosphere_x=1.899999976158142,
-)
+    emissivity=0.949999988079071, object_distance_m=1.0, reflected_temperature_K=293.1499938964844,
+    atmospheric_temperature_K=293.1499938964844, window_temperature_K=293.1499938964844, window_transmission=1.0,
+    stored_transmission=0.0, relative_humidity=0.5, planck_r1=21106.76953125, planck_b=1501.0, planck_f=1.0,
+    planck_o=-7340.0, planck_r2=0.012545257806777954, atmosphere_alpha1=0.006568999961018562,
+    atmosphere_alpha2=0.012620000168681145, atmosphere_beta1=-0.00227600010111928,
+    atmosphere_beta2=-0.006670000031590462, atmosphere_x=1.899999976158142,
+)  # fmt: skip
 CAMERA = CameraIdentity("FLIR SC660", "40402-3502", "404003980", "15.0.14", "FOL38", "T197089", "407803816", 24.0)
 LIMITS = CalibratedRange(233.25, 393.25, 8812, 57240)
 SETTINGS = CameraSettings(1.5, 30.0, 423.25, 213.25, 393.25, 233.25, 423.25, 213.5, 18604, 1304)
 HOUSEKEEPING = {"TSLens": 299.25, "TSShutter": 300.5}
+HEADER = {"camera": CAMERA, "limits": LIMITS, "housekeeping": HOUSEKEEPING, "utc_offset_minutes": 60}
 TIME = np.datetime64("2026-03-09T06:33:47.125", "ms")
 
 
@@ -50,32 +39,14 @@ def frame(rows: int = 12, columns: int = 16, *, seed: int = 1, seconds: int = 0)
     """A frame of smooth temperature with noise, as counts."""
     rng = np.random.default_rng(seed)
     counts = 18000 + 40 * np.arange(columns) + rng.normal(0, 8, (rows, columns))
-    return Frame(
-        counts=counts.astype(np.uint16),
-        parameters=PARAMETERS,
-        time=TIME + np.timedelta64(seconds, "s"),
-        camera=CAMERA,
-        limits=LIMITS,
-        settings=SETTINGS,
-        housekeeping=dict(HOUSEKEEPING),
-        utc_offset_minutes=60,
-    )
+    time = TIME + np.timedelta64(seconds, "s")
+    return Frame(counts=counts.astype(np.uint16), parameters=PARAMETERS, time=time, settings=SETTINGS, **HEADER)
 
 
 def jpeg(path: Path, encoding: str = "raw", **size: int) -> Frame:
     """Write one frame as a radiometric JPEG and return it."""
     written = frame(**size)
-    write_jpeg(
-        path,
-        written.counts,
-        written.parameters,
-        written.time,
-        camera=CAMERA,
-        limits=LIMITS,
-        housekeeping=HOUSEKEEPING,
-        utc_offset_minutes=60,
-        encoding=encoding,
-    )
+    write_jpeg(path, written.counts, written.parameters, written.time, encoding=encoding, **HEADER)
     return written
 
 
@@ -84,6 +55,16 @@ def sequence(path: Path, encoding: str = "raw", *, frames: int = 3, padding: int
     written = [replace(frame(seed=index, seconds=index, **size), index=index) for index in range(frames)]
     write_sequence(path, written, encoding=encoding, padding=padding)
     return written
+
+
+def patch(path: Path, *changes: tuple[int, bytes]) -> Path:
+    """Overwrite bytes of a file from some offsets on, negative ones from its end."""
+    data = bytearray(path.read_bytes())
+    for offset, value in changes:
+        start = offset % len(data)
+        data[start : start + len(value)] = value
+    path.write_bytes(data)
+    return path
 
 
 def without_checksums(data: bytes) -> bytes:

@@ -16,19 +16,9 @@ from thermography.registration.register import Registration, register, register_
 
 GRID = PlanGrid(700, 180, 5)
 PLACES = [
-    (40, 20),
-    (200, 18),
-    (360, 16),
-    (520, 18),
-    (665, 22),
-    (40, 160),
-    (200, 163),
-    (360, 165),
-    (520, 162),
-    (665, 158),
-    (120, 90),
-    (600, 88),
-]
+    (40, 20), (200, 18), (360, 16), (520, 18), (665, 22), (40, 160), (200, 163), (360, 165), (520, 162), (665, 158),
+    (120, 90), (600, 88),
+]  # fmt: skip
 DISCS = [Fiducial(f"F{i}", x, y, 16.0) for i, (x, y) in enumerate(PLACES, 1)]
 FOCAL_PX = 1530.0
 
@@ -64,32 +54,19 @@ class Scene:
 
     def to_plan(self, points_px):
         """True plan place of sensor points (n, 2)."""
-        points = np.ascontiguousarray(points_px, float) - self.shift_px
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-7)
-        ideal = (
-            cv2.undistortPoints(
-                points.reshape(-1, 1, 2),
-                self.camera_matrix,
-                np.array([self.k1, 0, 0, 0]),
-                None,
-                None,
-                self.camera_matrix,
-                criteria,
-            )
-            if self.k1
-            else points.reshape(-1, 1, 2)
-        )
+        ideal = (np.ascontiguousarray(points_px, float) - self.shift_px).reshape(-1, 1, 2)
+        if self.k1:
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-7)
+            camera, distortion = self.camera_matrix, np.array([self.k1, 0, 0, 0])
+            ideal = cv2.undistortPoints(ideal, camera, distortion, None, None, camera, criteria)
         return cv2.perspectiveTransform(ideal, np.linalg.inv(self.plan_to_pixel)).reshape(-1, 2) - self.shift_mm
 
     def to_pixels(self, points_mm):
         """True place on the sensor of plan points (n, 2)."""
         ideal = cv2.perspectiveTransform((np.asarray(points_mm, float) + self.shift_mm)[None], self.plan_to_pixel)[0]
-        rays = (ideal - self.camera_matrix[:2, 2]) / FOCAL_PX
-        return (
-            self.camera_matrix[:2, 2]
-            + FOCAL_PX * rays * (1 + self.k1 * (rays**2).sum(axis=1, keepdims=True))
-            + self.shift_px
-        )
+        middle = self.camera_matrix[:2, 2]
+        rays = (ideal - middle) / FOCAL_PX
+        return middle + FOCAL_PX * rays * (1 + self.k1 * (rays**2).sum(axis=1, keepdims=True)) + self.shift_px
 
     def render(self, rng=None, noise_K=0.05):
         """One frame in degC, float64 (row, column)."""
@@ -98,8 +75,7 @@ class Scene:
 
     def registration_rms_mm(self, registration):
         """Root mean square distance over the plan between the registration and the truth, mm."""
-        x, y = np.meshgrid(GRID.x_mm, GRID.y_mm)
-        plan = np.stack([x, y], axis=-1).reshape(-1, 2)
+        plan = GRID.centres_mm.reshape(-1, 2)
         error = self.to_plan(registration.to_sensor(plan)) - plan
         return float(np.sqrt((error**2).sum(axis=1).mean()))
 
@@ -107,17 +83,13 @@ class Scene:
 @cache
 def _rendered(scene):
     edge = np.linspace(0, 1, 40)
-    along, across = (
-        np.concatenate([edge, edge, 0 * edge, 0 * edge + 1]),
-        np.concatenate([0 * edge, 0 * edge + 1, edge, edge]),
-    )
+    along = np.concatenate([edge, edge, 0 * edge, 0 * edge + 1])
+    across = np.concatenate([0 * edge, 0 * edge + 1, edge, edge])
     outline = scene.to_pixels(np.column_stack([700 * along, 180 * across]))
     frame = np.full(scene.shape, float(scene.outside))
     # Beyond the outline of the table there is nothing to trace.
-    (left, top), (right, bottom) = (
-        np.maximum(np.floor(outline.min(0)) - 2, 0).astype(int),
-        np.ceil(outline.max(0) + 3).astype(int),
-    )
+    left, top = np.maximum(np.floor(outline.min(0)) - 2, 0).astype(int)
+    right, bottom = np.ceil(outline.max(0) + 3).astype(int)
     seen = frame[top:bottom, left:right]
     rows, columns = seen.shape
     steps = (np.arange(scene.rays) + 0.5) / scene.rays - 0.5
@@ -148,25 +120,12 @@ def registered(scene=None):
 
 #: SC660 constants as in the vendor's own files; air and surroundings as in a workshop.
 SC660 = CameraParameters(
-    emissivity=0.97,
-    object_distance_m=1.2,
-    reflected_temperature_K=295.15,
-    atmospheric_temperature_K=297.15,
-    window_temperature_K=297.15,
-    window_transmission=1.0,
-    stored_transmission=0.0,
-    relative_humidity=0.45,
-    planck_r1=21106.77,
-    planck_b=1501.0,
-    planck_f=1.0,
-    planck_o=-7340.0,
-    planck_r2=0.012545258,
-    atmosphere_alpha1=0.006569,
-    atmosphere_alpha2=0.012620,
-    atmosphere_beta1=-0.002276,
-    atmosphere_beta2=-0.006670,
+    emissivity=0.97, object_distance_m=1.2, reflected_temperature_K=295.15, atmospheric_temperature_K=297.15,
+    window_temperature_K=297.15, window_transmission=1.0, stored_transmission=0.0, relative_humidity=0.45,
+    planck_r1=21106.77, planck_b=1501.0, planck_f=1.0, planck_o=-7340.0, planck_r2=0.012545258,
+    atmosphere_alpha1=0.006569, atmosphere_alpha2=0.012620, atmosphere_beta1=-0.002276, atmosphere_beta2=-0.006670,
     atmosphere_x=1.9,
-)
+)  # fmt: skip
 START = np.datetime64("2026-03-09T06:30:00.000", "ms")
 
 
@@ -183,6 +142,18 @@ def record(path, images, *, interval_s=1.0, parameters=SC660, start=START):
     references, rejected = index_frames([path])
     assert not rejected
     return references
+
+
+def edges(*seconds):
+    """Edges of cycles, seconds after the first frame."""
+    return START + np.array(seconds, int) * np.timedelta64(1, "s")
+
+
+def assert_equal_bits(one, other):
+    """Hold two Datasets against each other bit by bit."""
+    for name in one.variables:
+        assert one[name].values.tobytes() == other[name].values.tobytes(), name
+    assert one.attrs == other.attrs
 
 
 def cell_truth(field=smooth_field, grid=GRID):

@@ -81,6 +81,13 @@ class FrameSeries:
         reference = self.references[index]
         return calibrate(reference.read().counts, self.override(reference))
 
+    def outside_cycles(self, what: str) -> ReductionError:
+        """Return the error where `what` ("no frame", ...) lies within a cycle."""
+        return ReductionError(
+            f"{what} is within a cycle: frames {self.times[0]} to {self.times[-1]}, cycles {self.bounds[0, 0]} to "
+            f"{self.bounds[-1, 1]}; check the time zones and the clock offset"
+        )
+
     def mean_time(self, chosen: slice | Array) -> np.datetime64:
         """Mean time of the frames with the indices `chosen`."""
         times = self.times[chosen]
@@ -101,20 +108,14 @@ def make_frame_series(
     bounds = np.stack([bounds[:-1], bounds[1:]], axis=-1) if bounds.ndim == 1 else bounds
     if len(bounds) == 0:
         raise ReductionError("cycle_bounds is empty; give the start and end of at least one cycle")
-    reversed_cycles = np.flatnonzero(~(bounds[:, 0] < bounds[:, 1]))
-    if reversed_cycles.size:
-        n = int(reversed_cycles[0])
+    for n in np.flatnonzero(~(bounds[:, 0] < bounds[:, 1])):
         raise ReductionError(f"cycle {n + 1} ends at {bounds[n, 1]}, before it starts at {bounds[n, 0]}")
-    overlaps = np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1])
-    if overlaps.size:
-        n = int(overlaps[0])
+    for n in np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1]):
         raise ReductionError(f"cycle {n + 2} starts at {bounds[n + 1, 0]}, before cycle {n + 1} ends at {bounds[n, 1]}")
     times = _check_frames(references, shape)
     correction = np.zeros(len(times)) if correction_K is None else np.asarray(correction_K, float)
     if correction.shape != times.shape or not np.isfinite(correction).all():
-        raise ReductionError(
-            f"correction_K has shape {correction.shape}; it needs one finite value for each of {len(times)} frames"
-        )
+        raise ReductionError(f"correction_K has shape {correction.shape}; give a finite value per frame, {len(times)}")
     index = np.searchsorted(bounds[:, 0], times, side="right") - 1
     inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
     return FrameSeries(references, times, bounds, np.where(inside, index, NO_CYCLE), correction, override)
@@ -134,9 +135,7 @@ def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) 
     frame = references[i]
     where = f"{frame.path}: frame {frame.index}"
     if tuple(frame.shape) != tuple(shape):
-        raise ReductionError(
-            f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce one size at a time"
-        )
+        raise ReductionError(f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce each size alone")
     if np.isnat(times[i]):
         raise ReductionError(f"{where} has no time; leave it out")
     raise ReductionError(f"{where} has the time {frame.time}, not after {references[i - 1].time}; sort the frames")
@@ -278,13 +277,8 @@ def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, s
     # Slope of the calibration at the middle of the samples.
     middle = np.uint16(np.median(sampled[0])) if sampled[0].size else np.uint16(0)
     low, high = calibrate(np.array([middle, middle + np.uint16(1)]), parameters)
-    return BlockResult(
-        weights.resample(mean.mean),
-        np.concatenate(displacements),
-        calibrate(sampled, parameters),
-        noise * float(high - low),
-        mean,
-    )
+    cells, noise_K = weights.resample(mean.mean), noise * float(high - low)
+    return BlockResult(cells, np.concatenate(displacements), calibrate(sampled, parameters), noise_K, mean)
 
 
 def _calibrate_per_frame(

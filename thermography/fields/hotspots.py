@@ -90,9 +90,7 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     (150, 70, 2.0)
     """
     if rise.dims != ("y", "x") or min(rise.shape) < 3:
-        raise ThermographyError(
-            f"rise has dims {rise.dims} and shape {rise.shape}; give one field (y, x) of at least 3 x 3 cells"
-        )
+        raise ThermographyError(f"rise has dims {rise.dims} and shape {rise.shape}; give (y, x) of 3 x 3 cells or more")
     values = rise.values.astype(float)
     seen = np.isfinite(values)
     if not seen.any():
@@ -136,6 +134,8 @@ def _hotspot(
     rows, columns = np.nonzero(zone)
     outside = ~ndimage.binary_erosion(np.pad(ndimage.binary_fill_holes(seen), 1), np.ones((3, 3)))[1:-1, 1:-1]
     column, row, peak = _vertex(values, field, place)
+    left, lower = float(x[columns].min() - cell / 2), float(y[rows].min() - cell / 2)
+    right, upper = float(x[columns].max() + cell / 2), float(y[rows].max() + cell / 2)
     return Hotspot(
         x_mm=float(x[0] + column * cell),
         y_mm=float(y[0] + row * cell),
@@ -145,12 +145,7 @@ def _hotspot(
         centroid_x_mm=float(x[columns].mean()),
         centroid_y_mm=float(y[rows].mean()),
         mean_rise_K=float(values[zone].mean()),
-        extent_mm=(
-            float(x[columns].min() - cell / 2),
-            float(x[columns].max() + cell / 2),
-            float(y[rows].min() - cell / 2),
-            float(y[rows].max() + cell / 2),
-        ),
+        extent_mm=(left, right, lower, upper),
         at_edge=bool((zone & outside).any()),
     )
 
@@ -252,9 +247,7 @@ def region_series(
         weight = np.where(seen, shares, 0.0)
         total = weight.sum(axis=(1, 2))
         if not total.any():
-            raise PolygonError(
-                f"{name}: all its cells are masked or out of view; move it away from fiducials and edges"
-            )
+            raise PolygonError(f"{name}: all its cells are masked or out of view; move it off fiducials and edges")
         mean = _weighted_mean(values, seen, shares)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean_noise_u = noise * np.sqrt((weight**2).sum(axis=(1, 2))) / total
@@ -262,26 +255,17 @@ def region_series(
         empty = np.asarray(~np.isfinite(cells).any(axis=1))
         filled = np.where(empty[:, None], 0.0, cells)
         order = {key: np.where(empty, np.nan, reduce(filled, axis=1)) for key, reduce in _ORDER_STATISTICS.items()}
-        series.append({"mean": mean, "mean_noise_u": mean_noise_u, "n": total, **order})
+        series.append({"mean": mean, "mean_noise_u": mean_noise_u, **order, "n": total})
         if common_u is not None:
             common = _weighted_mean(common_u.values.astype(float), seen, shares)
             series[-1]["mean_u"] = np.hypot(series[-1]["mean_noise_u"], common)
     units = {key: stack.attrs[key] for key in ("units", "units_metadata") if key in stack.attrs}
     difference = {"units": "K", "units_metadata": "temperature: difference"}
-    attributes = {
-        "mean": units,
-        "mean_noise_u": difference,
-        "median": units,
-        "min": units,
-        "max": units,
-        "n": {"units": "1"},
-    }
-    if common_u is not None:
-        attributes["mean_u"] = difference
+    attributes = {"n": {"units": "1"}, "mean_noise_u": difference, "mean_u": difference}
     return xr.Dataset(
         {
-            name: (("region", along), np.stack([region[name] for region in series]), attrs)
-            for name, attrs in attributes.items()
+            name: (("region", along), np.stack([region[name] for region in series]), attributes.get(name, units))
+            for name in series[0]
         },
         coords={"region": list(regions), along: stack[along]},
     )

@@ -28,14 +28,7 @@ from thermography.fields.blocks import (
 from thermography.fields.cycle_fields import CyclePart, assemble_fields, pixel_noise
 from thermography.fields.resampling import LEAST_COVERAGE, centring_matrix
 from thermography.fields.scheduling import in_order, open_pool
-from thermography.fields.still import (
-    BLOCK_S,
-    BlockFrames,
-    Checkpoint,
-    cut_stretches,
-    describe_reduction,
-    gather_frames,
-)
+from thermography.fields.still import BLOCK_S, BlockFrames, Checkpoint, cut_stretches, describe_reduction, gather_frames
 from thermography.io.frame import FrameReference
 from thermography.io.sequence import WindowReader
 from thermography.radiometry.averaging import CHUNK_FRAMES
@@ -117,19 +110,6 @@ def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: floa
     return Samples(points, valid, coverage, centring_matrix(offset, coverage, grid))
 
 
-class _CellView(NamedTuple):
-    """A cell on the sensor, as affine map about one of its points: to a thousandth of a pixel for cells of 5 mm."""
-
-    x_mm: float
-    y_mm: float
-    column: float
-    row: float
-    column_by_x: float
-    column_by_y: float
-    row_by_x: float
-    row_by_y: float
-
-
 class CellWeights(NamedTuple):
     """Weights of the pixels in the mean of every cell, for one place of the table.
 
@@ -185,12 +165,16 @@ def _place_points(
     windows = np.zeros((len(points), 5), np.uint64)
     pixels = 0
     for cell in range(len(points)):
-        view = _cell_view(points, cell, shift, lens)
+        # An affine map about the middle one of the cell's points is exact to a thousandth of a pixel for cells of 5 mm.
+        x_mm, y_mm = points[cell, points.shape[1] // 2]
+        column_0, row_0 = project_point(x_mm + shift[0], y_mm + shift[1], lens)
+        column_x, row_x = project_point(x_mm + shift[0] + 1.0, y_mm + shift[1], lens)
+        column_y, row_y = project_point(x_mm + shift[0], y_mm + shift[1] + 1.0, lens)
         left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
         for k in range(points.shape[1]):
-            x, y = points[cell, k, 0] - view.x_mm, points[cell, k, 1] - view.y_mm
-            column = view.column + x * view.column_by_x + y * view.column_by_y
-            row = view.row + x * view.row_by_x + y * view.row_by_y
+            x, y = points[cell, k, 0] - x_mm, points[cell, k, 1] - y_mm
+            column = column_0 + x * (column_x - column_0) + y * (column_y - column_0)
+            row = row_0 + x * (row_x - row_0) + y * (row_y - row_0)
             places[cell, k, 0], places[cell, k, 1] = column, row
             if valid[cell, k]:
                 left, right, top, bottom = min(left, column), max(right, column), min(top, row), max(bottom, row)
@@ -200,18 +184,6 @@ def _place_points(
             windows[cell, 3], windows[cell, 4] = rows, pixels
             pixels += columns * rows
     return places, windows, pixels
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _cell_view(points: Array, cell: int, shift: Array, lens: Array) -> _CellView:
-    """The affine map about the middle one of a cell's points, of a table displaced by `shift`."""
-    middle = points.shape[1] // 2
-    x_mm, y_mm = points[cell, middle, 0], points[cell, middle, 1]
-    x, y = x_mm + shift[0], y_mm + shift[1]
-    c0, r0 = project_point(x, y, lens)
-    c1, r1 = project_point(x + 1.0, y, lens)
-    c2, r2 = project_point(x, y + 1.0, lens)
-    return _CellView(x_mm, y_mm, c0, r0, c1 - c0, c2 - c0, r1 - r0, r2 - r0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -522,16 +494,10 @@ def _assemble(
     """Fields per cycle, the frame stack, and the positions of the table, as one Dataset."""
     discs = np.concatenate([result.discs for result in results])
     if not discs.any():
-        raise ReductionError(
-            "the table is found in no frame; check the fiducials, and [plan.axis] direction, along which it is searched"
-        )
+        raise ReductionError("the table is found in no frame; check the fiducials and [plan.axis] direction")
     parts = _cycle_parts(frames, blocks, results, samples, grid)
     if not parts:
-        times, bounds = frames.times, frames.bounds
-        raise ReductionError(
-            f"no frame in which the table is found is within a cycle: frames {times[0]} to {times[-1]}, "
-            f"cycles {bounds[0, 0]} to {bounds[-1, 1]}; check the time zones and the clock offset"
-        )
+        raise frames.outside_cycles("no frame in which the table is found")
     block_times = np.array([frames.mean_time(slice(block.first, block.stop)) for block in blocks])
     fields = assemble_fields(
         parts,

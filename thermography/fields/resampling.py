@@ -97,9 +97,8 @@ class PlanWeights:
 
 def _row_squares(matrix: sparse.csr_array) -> Array:
     """Sum of the squares of every row."""
-    return sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape) @ np.ones(
-        matrix.shape[1]
-    )
+    squares = sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape)
+    return squares @ np.ones(matrix.shape[1])
 
 
 def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slice]:

@@ -67,16 +67,12 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
         return
     try:
         from distributed import Client
-    except ImportError as error:
-        raise SchedulerError(
-            f"scheduler {scheduler}: dask.distributed is not installed; pip install thermofuse[cluster]"
-        ) from error
+    except ImportError:
+        raise SchedulerError(f"scheduler {scheduler} needs dask.distributed: pip install thermofuse[cluster]") from None
     try:
         client = Client(scheduler, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:
-        raise SchedulerError(
-            f"scheduler {scheduler} does not answer ({error}); check the address, or leave it out"
-        ) from error
+        raise SchedulerError(f"scheduler {scheduler} does not answer ({error}); check or omit its address") from error
     try:
         workers = client.scheduler_info(n_workers=-1)["workers"]
         if not workers:
@@ -115,9 +111,7 @@ def _cluster_pool(client: Client, scheduler: str, workers: int) -> Pool:
                 "give each worker 1 GB or more, and check its log"
             ) from error
         except CancelledError as error:
-            raise SchedulerError(
-                f"scheduler {scheduler}: the connection was lost; start the same command again with --resume"
-            ) from error
+            raise SchedulerError(f"scheduler {scheduler}: connection lost; start again with --resume") from error
 
     return Pool(submit, share, 2 * workers + 1, result)
 

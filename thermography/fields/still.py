@@ -133,8 +133,7 @@ class Checkpoint:
             before = json.loads(path.read_text(encoding="utf-8"))
             differs = sorted(key for key in description if json.loads(text).get(key) != before.get(key))
             raise CheckpointError(
-                f"{self.folder}: holds cycles of another reduction (other {', '.join(differs) or 'content'}); "
-                "remove the folder to start again"
+                f"{self.folder}: holds cycles of another reduction (other {', '.join(differs) or 'content'}); remove the folder to restart"
             )
         write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
@@ -191,15 +190,12 @@ def describe_reduction(
             texts[camera] = str(camera)
         digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{texts[camera]}".encode())
     digest.update(np.ascontiguousarray(frames.correction_K, float).tobytes())
-    registrations = [
-        {"first": span.first_frame, "plan_to_sensor": span.registration.projection.plan_to_sensor.tolist()}
-        for span in spans
-    ]
+    matrices = [(span.first_frame, span.registration.projection.plan_to_sensor.tolist()) for span in spans]
     return {
         "frames": digest.hexdigest(),
         "cycles": frames.bounds.astype(str).tolist(),
         "plan": asdict(grid),
-        "registrations": registrations,
+        "registrations": [{"first": first, "plan_to_sensor": matrix} for first, matrix in matrices],
         "block_s": block_s,
     }
 
@@ -220,10 +216,10 @@ def _write(path: Path, header: dict[str, Any], arrays: dict[str, Array]) -> None
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
     with path.open("rb") as file:
         header = json.loads(file.readline())
-        arrays = {}
-        for name, (kind, shape) in header["arrays"].items():
-            arrays[name] = np.fromfile(file, kind, int(np.prod(shape))).reshape(shape)
-    return header, arrays
+        layout = header["arrays"].items()
+        return header, {
+            name: np.fromfile(file, kind, int(np.prod(shape))).reshape(shape) for name, (kind, shape) in layout
+        }
 
 
 def _load(path: Path) -> StoredCycle:
@@ -383,11 +379,8 @@ class Displacements:
         else:
             # The next few frames, up to the next span, that share the displacement.
             stop = min(knock.frame + _MEAN_FRAMES, self.registrations.stop_frame(knock.span) or len(self.frames))
-            displaced = [
-                i
-                for i in range(knock.frame + 1, stop)
-                if _alike(self._measure(i, knock.span)[0], knock.displacement_px)
-            ]
+            later = range(knock.frame + 1, stop)
+            displaced = [i for i in later if _alike(self._measure(i, knock.span)[0], knock.displacement_px)]
             temperature = self._mean([knock.frame, *displaced])
             name = self.frames.name(knock.frame)
             registration = register_after_knock(temperature, old, knock.displacement_px, grid, frame_name=name)
@@ -443,10 +436,8 @@ class Displacements:
 
 def _alike(displacement_px: Array, other_px: Array) -> bool:
     """Whether a displacement is a knock, and the same as another one."""
-    size, other, difference = (
-        float(np.linalg.norm(vector)) for vector in (displacement_px, other_px, displacement_px - other_px)
-    )
-    return size > KNOCK_PX and difference < max(KNOCK_PX, 0.3 * other)
+    size, other, difference = map(np.linalg.norm, (displacement_px, other_px, displacement_px - other_px))
+    return bool(size > KNOCK_PX and difference < max(KNOCK_PX, 0.3 * float(other)))
 
 
 def pixels_off(values: Array, lowest: Array, highest: Array, noise_K: float) -> Array:
@@ -730,10 +721,7 @@ def reduce_frames(
         references, cycle_bounds, shape=spans[0].registration.shape, override=override, correction_K=correction_K
     )
     if (frames.cycles == NO_CYCLE).all():
-        raise ReductionError(
-            f"no frame is within a cycle: frames {frames.times[0]} to {frames.times[-1]}, "
-            f"cycles {frames.bounds[0, 0]} to {frames.bounds[-1, 1]}; check the time zones and the clock offset"
-        )
+        raise frames.outside_cycles("no frame")
     store = None
     if checkpoint is not None:
         store = Checkpoint(checkpoint, describe_reduction(frames, grid, spans, block_s=block_s))
@@ -951,9 +939,7 @@ class StillReduction:
         self.close()
         frames, displacement = self.frames, self.displacement
         if not self.finished:
-            raise ReductionError(
-                "no frame within a cycle shows the table where it is registered; check that nothing is in front of the table"
-            )
+            raise ReductionError("no frame of a cycle shows the table where it is registered; clear the view of it")
         kept = [self.kept(block) for block in self.blocks]
         fields = assemble_fields(
             self.finished,

@@ -298,10 +298,7 @@ def stray_frames(levels: Array, *, ends: bool) -> dict[int, float]:
 def _beyond(levels: Array, *, ends: bool) -> tuple[Array, Array]:
     """By how much every frame lies beyond its two neighbours, and by how much these differ, (n,) K root mean square over the blocks."""
     n = len(levels)
-    before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
-    before[-1], after[0] = n - 3, 2
-    before[0] = 1
-    after[-1] = n - 2
+    before, after = np.r_[1, : n - 2, n - 3], np.r_[2, 2:n, n - 2]
     lower, upper = np.minimum(levels[before], levels[after]), np.maximum(levels[before], levels[after])
     # The change between the two others goes on beyond the ends of the series.
     stretch = np.zeros((n, 1))
@@ -326,12 +323,8 @@ def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int
         (off, "{} pixels of the table differ from the frames before and after it"),
     ):
         limit = max(_LEAST_PIXELS, _ORDINARY_MULTIPLE * float(np.quantile(numbers, 0.75)))
-        found.update(
-            {
-                int(i): f"{text.format(numbers[i])}: damaged, covered, or from another series"
-                for i in np.flatnonzero(numbers >= limit)
-            }
-        )
+        for i in np.flatnonzero(numbers >= limit).tolist():
+            found[i] = f"{text.format(numbers[i])}: damaged, covered, or from another series"
     if still:
         found.update(_strays(survey, blocks, np.array([i for i in range(n) if i not in found], int)))
     return dict(sorted(found.items()))
@@ -339,14 +332,12 @@ def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int
 
 def _strays(survey: Survey, blocks: Blocks, kept: NDArray[np.int64]) -> dict[int, str]:
     """Reason by index for those of the kept frames whose table is warmer or colder than in the frames before and after."""
-    table, surroundings = (
-        survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.surroundings)
-    )
-    table, surroundings = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, surroundings))
+    table, around = (survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.surroundings))
+    table, around = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, around))
     if table.shape[1] == 0:
         return {}
-    examined = surroundings.shape[1] >= LEAST_SURROUNDING_BLOCKS
+    examined = around.shape[1] >= LEAST_SURROUNDING_BLOCKS
     if examined:
-        table = table - np.median(surroundings - np.median(surroundings, axis=0), axis=1, keepdims=True)
+        table = table - np.median(around - np.median(around, axis=0), axis=1, keepdims=True)
     reason = "the table differs by {:.2g} K from the frames before and after it: from another series, or with another setting"
     return {int(kept[i]): reason.format(beyond) for i, beyond in stray_frames(table, ends=examined).items()}

@@ -236,9 +236,8 @@ def find_range(fields: xr.Dataset, cells: NDArray[np.bool_]) -> ShownRange | Non
 
 def _pieces(fields: xr.Dataset) -> Iterator[tuple[slice, Array, Array]]:
     """Temperature and rise of some cycles at a time, in double precision, the rise 0 where the first cycle does not show the cell."""
-    for (some, temperature), (_, rise) in zip(
-        in_pieces(fields["temperature"]), in_pieces(fields["temperature_rise"]), strict=True
-    ):
+    both = (in_pieces(fields[name]) for name in ("temperature", "temperature_rise"))
+    for (some, temperature), (_, rise) in zip(*both, strict=True):
         yield some, temperature.astype(float), np.where(np.isfinite(rise), rise, 0.0).astype(float)
 
 

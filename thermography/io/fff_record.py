@@ -387,9 +387,7 @@ def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
         raise source.error(offset, "a raw image longer than its header", f"{length} bytes")
     head = source.read(offset, RAW_HEADER_SIZE + 8)
     if len(head) < RAW_HEADER_SIZE:
-        raise source.error(
-            offset, f"the {RAW_HEADER_SIZE} bytes of a raw image's header", f"{len(head)} before the end"
-        )
+        raise source.error(offset, f"{RAW_HEADER_SIZE} bytes of a raw image's header", f"{len(head)} before the end")
     order = _order_of_record(source, offset, head, "a raw image")
     columns, rows = struct.unpack_from(order + "2H", head, 2)
     if not 0 < rows * columns <= _MAX_PIXELS:
@@ -427,9 +425,7 @@ def _read_samples(source: FffSource, samples: SampleLocation) -> memoryview:
     record = source.read_once(offset, length, kept=kept)
     # A record without its last padding bytes cannot be compared.
     if len(record) == length and _differs(record, samples.checksum):
-        raise source.error(
-            offset, f"a raw image with the CRC-32 {samples.checksum:08X}", "another one: the samples are damaged"
-        )
+        raise source.error(offset, f"a raw image with the CRC-32 {samples.checksum:08X}", "another: damaged samples")
     start = samples.offset - offset
     return record[start : start + samples.length]
 
@@ -439,11 +435,7 @@ def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDA
     rows, columns = samples.shape
     if samples.encoding == "raw":
         if len(data) < samples.length:
-            raise source.error(
-                samples.offset,
-                f"{columns} x {rows} samples of {samples.length} bytes",
-                f"{len(data)} bytes before the end",
-            )
+            raise source.error(samples.offset, f"{samples.length} bytes of samples", f"{len(data)} before the end")
         counts = np.frombuffer(data, "<u2" if samples.little_endian else ">u2").reshape(rows, columns)
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
     # Writers pad the stream to a multiple of 8 bytes; after the last frame of a file the padding may be missing.

@@ -97,9 +97,7 @@ def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.float
         stored = read_maps(temporary)
         for name, values in parts.items():
             if name not in stored or stored[name].tobytes() != values.tobytes():
-                raise ExrError(
-                    f"{path}: {name} does not read back as it was written; the disk or the OpenEXR library is at fault"
-                )
+                raise ExrError(f"{path}: {name} does not read back as written; the disk or OpenEXR is at fault")
 
     write_atomically(path, write_parts)
 
@@ -127,7 +125,5 @@ def _as_float32(path: Path, name: str, values: NDArray[np.floating]) -> NDArray[
     with np.errstate(over="ignore"):
         single = np.ascontiguousarray(values, np.float32)
     if (np.isinf(single) & ~np.isinf(values)).any():
-        raise ExrError(
-            f"{path}: {name} holds {np.nanmax(np.abs(values)):g}, which float32 cannot represent; give it in another unit"
-        )
+        raise ExrError(f"{path}: {name} holds {np.nanmax(np.abs(values)):g}, beyond float32; give it in another unit")
     return single

@@ -344,8 +344,7 @@ def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
     missing = [index for index in range(last + 1) if index not in pieces]
     if not pieces:
         raise FlirFormatError(
-            f"{path}: at 0x{offset:X}: expected FLIR APP1 segments, found none: the JPEG is not radiometric "
-            "(export it from the camera, not from an image program)"
+            f"{path}: at 0x{offset:X}: expected FLIR APP1 segments, found none: the JPEG is not radiometric (export it from the camera)"
         )
     if missing:
         raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segments 0 to {last}, found no {missing}")

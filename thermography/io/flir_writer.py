@@ -19,6 +19,7 @@ from thermography.io.fff_record import (
     CAMERA_RECORD,
     ENTRY_SIZE,
     FIELD_OF_VIEW,
+    FIRST_SENSOR,
     HEADER_SIZE,
     IDENTITY_TEXTS,
     LIMIT_BYTES,
@@ -26,7 +27,9 @@ from thermography.io.fff_record import (
     PARAMETER_BYTES,
     RAW_HEADER_SIZE,
     RAW_RECORD,
+    SENSOR_SIZE,
     SETTING_BYTES,
+    TIME_BYTES,
 )
 from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Encoding, Frame
 
@@ -186,9 +189,7 @@ def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     """Return one FFF record: directory at 0x40 big-endian, records little-endian, the raw image last."""
     counts = frame.counts
     if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
-        raise ThermographyError(
-            f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}"
-        )
+        raise ThermographyError(f"counts: expected uint16 (row, column), got {counts.dtype} of shape {counts.shape}")
     if not all(0 < length < 65536 for length in counts.shape):
         raise ThermographyError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
     info = _camera_info(frame)
@@ -201,11 +202,9 @@ def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     struct.pack_into(">I", head, 0x20, 3)
     struct.pack_into(">I", head, 0x34, total)
     entries = ((CAMERA_RECORD, 1, 1, info_offset, info), (RAW_RECORD, _SUBTYPES[encoding], 2, raw_offset, raw))
-    for slot, (kind, subtype, identifier, offset, data) in enumerate(entries):
+    for slot, (kind, subtype, number, offset, data) in enumerate(entries):
         entry = HEADER_SIZE + slot * ENTRY_SIZE
-        struct.pack_into(
-            ">2H7I", head, entry, kind, subtype, 100, identifier, offset, len(data), 0, 0, zlib.crc32(data)
-        )
+        struct.pack_into(">2H7I", head, entry, kind, subtype, 100, number, offset, len(data), 0, 0, zlib.crc32(data))
     return bytes(head) + info + raw
 
 
@@ -213,14 +212,14 @@ def _camera_info(frame: Frame) -> bytes:
     """Return the camera-information record; values that the frame does not hold are 0."""
     info = bytearray(_CAMERA_INFO_SIZE)
     rows, columns = frame.counts.shape
-    p, limits, settings = frame.parameters, frame.limits, frame.settings
+    p = frame.parameters
     struct.pack_into("<3H", info, 0, 2, columns, rows)
     values = astuple(p)
     stored = struct.pack("<16fif", *values[:11], *values[13:], round(p.planck_o), p.planck_r2)
     _put(info, PARAMETER_BYTES, stored)
-    stored = struct.pack("<2f2H", limits.maximum_K, limits.minimum_K, limits.raw_minimum, limits.raw_maximum)
-    _put(info, LIMIT_BYTES, stored)
-    focus, frame_rate, *temperatures, median, width = astuple(settings)
+    minimum, maximum, *raw_limits = astuple(frame.limits)
+    _put(info, LIMIT_BYTES, struct.pack("<2f2H", maximum, minimum, *raw_limits))
+    focus, frame_rate, *temperatures, median, width = astuple(frame.settings)
     if not width:
         low, high = int(frame.counts.min()), int(frame.counts.max())
         median, width = (low + high) // 2, high - low
@@ -229,18 +228,20 @@ def _camera_info(frame: Frame) -> bytes:
         # One byte less than the field: readers expect the terminating zero.
         struct.pack_into(f"{room - 1}s", info, offset, getattr(frame.camera, name).encode("latin-1", "replace"))
     struct.pack_into("<f", info, FIELD_OF_VIEW, frame.camera.field_of_view_deg)
-    _pack_time(info, frame)
-    # Write the camera temperatures with the frame's time.
-    seconds, milliseconds = struct.unpack_from("<2I", info, 0x384)
-    room = (_CAMERA_INFO_SIZE - 0x47C) // 28
+    seconds = milliseconds = 0
+    if not np.isnat(frame.time):
+        seconds, milliseconds = divmod(int(frame.time.astype("datetime64[ms]").astype(np.int64)), 1000)
+        if not 1 <= seconds < 2**32:
+            raise ThermographyError(f"time {frame.time}: a FLIR file stores times from 1970 to 2106 only")
+        struct.pack_into("<2Ih", info, TIME_BYTES[0], seconds, milliseconds, -frame.utc_offset_minutes)
+    # The temperatures inside the camera carry the frame's time.
+    room = (_CAMERA_INFO_SIZE - FIRST_SENSOR) // SENSOR_SIZE
     if len(frame.housekeeping) > room:
         raise ThermographyError(f"housekeeping: a FLIR file stores {room} readings, not {len(frame.housekeeping)}")
-    for slot, (name, value) in enumerate(frame.housekeeping.items()):
+    for i, (name, value) in enumerate(frame.housekeeping.items()):
         if not (name.isascii() and 0 < len(name) < 16 and 150 < value < 450):
-            raise ThermographyError(
-                f"housekeeping {name!r} = {value}: expected an ASCII name of 1 to 15 letters and 150 to 450 K"
-            )
-        struct.pack_into("<f16s2I", info, 0x47C + 28 * slot, value, name.encode(), seconds, milliseconds)
+            raise ThermographyError(f"housekeeping {name!r} = {value}: expected 1 to 15 ASCII letters and 150 to 450 K")
+        struct.pack_into("<f16s2I", info, FIRST_SENSOR + SENSOR_SIZE * i, value, name.encode(), seconds, milliseconds)
     return bytes(info)
 
 
@@ -248,16 +249,6 @@ def _put(info: bytearray, places: tuple[tuple[int, int], ...], data: bytes) -> N
     """Write bytes to several places of the camera information, one after the other."""
     for start, stop in places:
         info[start:stop], data = data[: stop - start], data[stop - start :]
-
-
-def _pack_time(info: bytearray, frame: Frame) -> None:
-    """Write UTC seconds, milliseconds and minutes west; nothing for NaT."""
-    if np.isnat(frame.time):
-        return
-    milliseconds = int(frame.time.astype("datetime64[ms]").astype(np.int64))
-    if not 1000 <= milliseconds < 2**32 * 1000:
-        raise ThermographyError(f"time {frame.time}: a FLIR file stores times from 1970 to 2106 only")
-    struct.pack_into("<2Ih", info, 0x384, milliseconds // 1000, milliseconds % 1000, -frame.utc_offset_minutes)
 
 
 def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:

@@ -308,9 +308,7 @@ class PlainFrame:
         rows, columns = self.shape
         counts = np.fromfile(self.path, kind, rows * columns, offset=self.plain_samples.offset)
         if counts.size < rows * columns:
-            raise OSError(
-                f"{self.path}: frame {self.index} ends early; the file has become shorter since it was indexed"
-            )
+            raise OSError(f"{self.path}: frame {self.index} ends early; the file was cut after it was indexed")
         return counts.astype(np.uint16).reshape(self.shape)
 
 

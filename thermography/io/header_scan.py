@@ -41,10 +41,7 @@ from thermography.io.fff_record import (
     sensor_names,
 )
 from thermography.io.files import write_atomically
-from thermography.io.frame import (
-    CameraParameters,
-    SampleLocation,
-)
+from thermography.io.frame import CameraParameters, SampleLocation
 from thermography.io.sequence import FlirFrameReference, FrameTable
 
 #: Names a folder that keeps what can be made again; left out, that of the user's cache.

@@ -159,9 +159,7 @@ class TemperatureReader(ABC):
         if contents.shape[0] * contents.shape[1] > _MOST_PIXELS or 0 in contents.shape:
             raise ThermographyError(f"{path}: {contents.shape[1]} x {contents.shape[0]} pixels are not a thermal frame")
         if not 0 < contents.frames <= _MOST_FRAMES:
-            raise ThermographyError(
-                f"{path}: {contents.frames:,} frames, 1 to {_MOST_FRAMES:,} in a file can be read; export them in parts"
-            )
+            raise ThermographyError(f"{path}: {contents.frames:,} frames; export parts of 1 to {_MOST_FRAMES:,}")
         return contents
 
     def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | RejectedFrame]:
@@ -169,9 +167,7 @@ class TemperatureReader(ABC):
         contents = self.frame_contents(path, options)
         unit = options.unit or contents.unit
         if unit not in ("degC", "K"):
-            raise StackError(
-                f'{path}: nothing says whether its values are degC or K; write unit = "degC" or unit = "K"'
-            )
+            raise StackError(f'{path}: nothing says whether values are degC or K; write unit = "degC" or unit = "K"')
         for index, time in enumerate(_times(path, contents, options)):
             yield TemperatureFrame(
                 parameters=options.parameters,
@@ -240,9 +236,7 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
     if options.times is not None:
         times = [options.times.get((path.name, index), np.datetime64("NaT", "ns")) for index in range(count)]
         if all(np.isnat(time) for time in times):
-            raise StackError(
-                f"{path}: the table of times has no line for {path.name}; add one per frame: file,frame,time"
-            )
+            raise StackError(f"{path}: the table of times has no line for it; add one per frame: file,frame,time")
         return times
     if options.time_in_name is not None:
         first = _time_in_name(path, options)
@@ -263,9 +257,7 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
 
 def _spaced(path: Path, first: np.datetime64, count: int, options: StackOptions) -> list[np.datetime64]:
     if options.interval_s is None:
-        raise StackError(
-            f'{path}: {count} frames and one time; write interval = "10 s", the time from one frame to the next'
-        )
+        raise StackError(f'{path}: {count} frames and one time; write interval = "10 s", from frame to frame')
     return [first + np.timedelta64(round(index * options.interval_s * 1e9), "ns") for index in range(count)]
 
 
@@ -295,9 +287,7 @@ def to_utc(path: Path, stamp: datetime, zone: str) -> np.datetime64:
     """Return a time of a zone as UTC."""
     placed = stamp.replace(tzinfo=ZoneInfo(zone))
     if placed.utcoffset() != placed.replace(fold=1).utcoffset():
-        raise StackError(
-            f"{path}: {stamp} occurs twice or not at all in {zone}, where clocks are changed for summer; give the times in UTC"
-        )
+        raise StackError(f"{path}: {stamp} occurs twice or not at all in {zone} (summer time); give times in UTC")
     return np.datetime64(placed.astimezone(UTC).replace(tzinfo=None), "ns")
 
 
@@ -316,6 +306,17 @@ _MOST_LETTERS = 500
 _ZARR_METADATA = ("zarr.json", ".zgroup")
 
 
+@contextmanager
+def _refused(fault: str, remedy: str) -> Iterator[None]:
+    """Give what a library raises on a file, errors of any kind, as one that names the fault and the remedy."""
+    try:
+        yield
+    except ThermographyError:
+        raise
+    except Exception as error:
+        raise ThermographyError(f"{fault} ({shorten(str(error), _MOST_LETTERS)}); {remedy}") from None
+
+
 class TiffReader(TemperatureReader):
     """Reader of TIFF with one grey value per pixel and one page per frame: float temperatures, or 16 bits with a stated scale."""
 
@@ -327,41 +328,30 @@ class TiffReader(TemperatureReader):
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds."""
-        try:
-            import tifffile
+        import tifffile
 
-            with tifffile.TiffFile(path) as file:
-                first: Any = file.pages[0]
-                shape, kind = first.shape, first.dtype
-                count = len(file.pages)
-                stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
-        except Exception as error:
-            raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
+        with _refused(f"{path}: damaged TIFF", "export it again"), tifffile.TiffFile(path) as file:
+            first: Any = file.pages[0]
+            shape, kind = first.shape, first.dtype
+            count = len(file.pages)
+            stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
         if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
-            raise ThermographyError(
-                f"{path}: pixels of shape {shape}: a colour image contains no temperatures; export the radiometric TIFF"
-            )
+            raise ThermographyError(f"{path}: pixels of shape {shape} hold no temperatures; export radiometric TIFF")
         if kind is None or kind.kind not in _NUMBERS:
-            stored = "an unknown type" if kind is None else f"type {kind}"
-            raise ThermographyError(
-                f"{path}: values of {stored} are not temperatures; export floating-point or whole numbers"
-            )
+            raise ThermographyError(f"{path}: values of type {kind} are not temperatures; export real numbers")
         _require_scale(path, kind, options)
         return StackContents(count, (shape[0], shape[1]), times=_stamp(stamp) if count == 1 else None)
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a page, (row, column)."""
-        try:
-            import tifffile
+        import tifffile
 
-            with tifffile.TiffFile(path) as file:
-                page: Any = file.pages[index]
-                # Read as they are, a million strips that the file does not hold take the memory of a million strips.
-                if page.dtype is None or page.dtype.kind not in _NUMBERS or prod(page.chunked) != len(page.dataoffsets):
-                    raise ValueError("its size, its kind of values and its list of strips contradict one another")
-                return np.asarray(page.asarray())
-        except Exception as error:
-            raise ThermographyError(f"{path}: page {index} is damaged ({error}); export it again") from None
+        with _refused(f"{path}: page {index} is damaged", "export it again"), tifffile.TiffFile(path) as file:
+            page: Any = file.pages[index]
+            # Read as they are, a million strips that the file does not hold take the memory of a million strips.
+            if page.dtype is None or page.dtype.kind not in _NUMBERS or prod(page.chunked) != len(page.dataoffsets):
+                raise ValueError("its size, its kind of values and its list of strips contradict one another")
+            return np.asarray(page.asarray())
 
 
 class NumpyReader(TemperatureReader):
@@ -374,11 +364,9 @@ class NumpyReader(TemperatureReader):
         return start[:6] == b"\x93NUMPY"
 
     def _open(self, path: Path) -> NDArray[np.floating]:
-        try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
         # The header is text that NumPy parses as Python: a damaged one raises errors of many kinds.
-        except Exception as error:
-            raise ThermographyError(f"{path}: damaged NumPy file ({error}); save it again with numpy.save") from None
+        with _refused(f"{path}: damaged NumPy file", "save it again with numpy.save"):
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
         if array.ndim not in (2, 3) or array.dtype.kind not in _NUMBERS:
             raise ThermographyError(
                 f"{path}: an array of shape {array.shape} and type {array.dtype}; save numbers as (row, column) or (frame, row, column)"
@@ -411,11 +399,11 @@ class NetcdfReader(TemperatureReader):
         """Open the store for as long as its variable is read."""
         import xarray as xr  # the libraries of other files load with the first of them: a FLIR file is read without
 
-        try:
-            store = path.parent if path.name in _ZARR_METADATA else path
-            zarr = store.is_dir()
-            if zarr and not find_spec("zarr"):
-                raise ThermographyError(f"{path}: a Zarr store needs the package zarr: pip install thermofuse[zarr]")
+        store = path.parent if path.name in _ZARR_METADATA else path
+        zarr = store.is_dir()
+        if zarr and not find_spec("zarr"):
+            raise ThermographyError(f"{path}: a Zarr store needs the package zarr: pip install thermofuse[zarr]")
+        with _refused(f"{path}: cannot be opened", "write it again"):
             # Each array of a store costs the library milliseconds whenever it is opened.
             if zarr and sum(entry.is_dir() for entry in store.iterdir()) > MOST_OBJECTS:
                 raise ValueError(f"it holds more than {MOST_OBJECTS} arrays and groups")
@@ -426,26 +414,17 @@ class NetcdfReader(TemperatureReader):
                 if zarr
                 else xr.open_dataset(store, engine="h5netcdf", phony_dims="access")
             )
-        except ThermographyError:
-            raise
-        except Exception as error:
-            raise ThermographyError(
-                f"{path}: cannot be opened ({shorten(str(error), _MOST_LETTERS)}); write it again"
-            ) from None
         with dataset:
             stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
             name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
             if name not in dataset.data_vars or dataset[name].ndim != 3:
                 names = shorten(", ".join(map(str, stacks)) or "none", _MOST_LETTERS)
                 raise StackError(
-                    f'{path}: holds the variables {names} over three dimensions; write variable = "..." '
-                    "for the one with the temperatures (time, row, column)"
+                    f'{path}: holds the variables {names} over three dimensions; write variable = "..." for the one with the temperatures'
                 )
             kind = dataset[name].dtype
             if kind.kind not in _NUMBERS:
-                raise ThermographyError(
-                    f"{path}: values of type {kind} are not temperatures; write floating-point or whole numbers"
-                )
+                raise ThermographyError(f"{path}: values of type {kind} are not temperatures; write real numbers")
             yield dataset[name]
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
@@ -459,13 +438,8 @@ class NetcdfReader(TemperatureReader):
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a time, (row, column)."""
-        with self._variable(path, options) as values:
-            try:
-                return np.asarray(values[index].values)
-            except Exception as error:
-                raise ThermographyError(
-                    f"{path}: frame {index} is damaged ({shorten(str(error), _MOST_LETTERS)}); write it again"
-                ) from None
+        with self._variable(path, options) as values, _refused(f"{path}: frame {index} is damaged", "write it again"):
+            return np.asarray(values[index].values)
 
 
 def _require_scale(path: Path, kind: np.dtype[Any], options: StackOptions) -> None:
@@ -525,9 +499,7 @@ class TextReader(TemperatureReader):
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the numbers of a file, (row, column); NaN where a field is no number."""
         if path.stat().st_size > _MOST_BYTES:
-            raise ThermographyError(
-                f"{path}: {path.stat().st_size} bytes of text are more than one frame; export every frame to a file of its own"
-            )
+            raise ThermographyError(f"{path}: {path.stat().st_size} bytes exceed a frame of text; export one per file")
         content = path.read_bytes()
         utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
@@ -536,8 +508,7 @@ class TextReader(TemperatureReader):
             if _is_a_frame(block):
                 return np.array(block)
         raise ThermographyError(
-            f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; "
-            "export the temperatures of the frame as CSV, one line per row"
+            f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; export it as CSV, a line per row"
         )
 
 
@@ -636,9 +607,7 @@ def plug_ins() -> tuple[FrameReader, ...]:
                 f"the plug-in {entry.name} = {entry.value} cannot be loaded ({error}); update its package or remove it"
             ) from error
         if not isinstance(reader, FrameReader):
-            raise FrameReaderError(
-                f"the plug-in {entry.name} = {entry.value} lacks name, recognises or index; it must keep FrameReader"
-            )
+            raise FrameReaderError(f"the plug-in {entry.name} = {entry.value} lacks name, recognises or index; add it")
         found.append(reader)
     return tuple(found)
 

@@ -29,12 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography.common import Array, usable_processors
-from thermography.io.fff_record import (
-    FffSource,
-    damaged_records,
-    read_counts,
-    read_directory,
-)
+from thermography.io.fff_record import FffSource, damaged_records, read_counts, read_directory
 from thermography.io.frame import (
     CameraParameters,
     Frame,
@@ -108,9 +103,7 @@ class WindowReader:
                     file.read_together(place, self._end_of_neighbours(frames[number:], rows_read.nbytes))
                 checked = file
             if file.read(place, rows_read.view(np.uint8)) < rows_read.nbytes:
-                raise OSError(
-                    f"{frame.path}: frame {frame.index} ends early; the file has become shorter since it was indexed"
-                )
+                raise OSError(f"{frame.path}: frame {frame.index} ends early; the file was cut after it was indexed")
             if samples.little_endian != (sys.byteorder == "little"):
                 rows_read.byteswap(inplace=True)
             if not whole:

@@ -9,9 +9,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
 from thermography.io.flir import FlirFrameReference, index_frames, read_measurement_regions, read_visible_picture
-from thermography.io.frame import CameraParameters, FlirFormatError, FrameReference
+from thermography.io.frame import CameraParameters, FlirFormatError
 from thermography.io.sequence import FrameList, call_by_threads, frame_times, usable_threads
 from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
 
@@ -144,9 +143,7 @@ class FlirAccessor:
         dataset, changes = self._dataset, _parameter_changes(overrides)
         lacking = [name for name in ("counts", *(name for name, _ in _PARAMETERS.values())) if name not in dataset]
         if lacking:
-            raise RadiometryError(
-                f"the Dataset has no {', '.join(lacking)}; open the file with engine='flir' and keep them"
-            )
+            raise RadiometryError(f"the Dataset has no {', '.join(lacking)}; open it with engine='flir' and keep them")
         parameters = [override(each, **changes) if changes else each for each in _stored_parameters(dataset)]
         index = xr.DataArray(np.arange(len(parameters)), dims="time") if len(parameters) > 1 else xr.DataArray(0)
         temperature: xr.DataArray = xr.apply_ufunc(
@@ -179,9 +176,7 @@ class FlirAccessor:
         """
         place = self._dataset.isel(time=frame) if "time" in self._dataset.dims else self._dataset
         references, rejected = index_frames([str(place["source"].values)])
-        found = [
-            each for each in references if each.index == int(place["frame"]) and isinstance(each, FlirFrameReference)
-        ]
+        found = [one for one in references if one.index == int(place["frame"]) and isinstance(one, FlirFrameReference)]
         if not found:
             raise FlirFormatError(rejected[0].reason if rejected else f"{place['source'].values}: the frame is gone")
         picture = read_visible_picture(found[0])
@@ -250,8 +245,8 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, flo
     counts, temperature = (
         xr.Variable(("time", "row", "column"), indexing.LazilyIndexedArray(stack), attrs, chunks)
         for stack, attrs in (
-            (_FrameStack(frames, np.uint16, _read_counts), {"long_name": "counts of the detector", "units": "1"}),
-            (_FrameStack(frames, np.float32, partial(_read_temperature, sets=sets, which=which)), _TEMPERATURE),
+            (_FrameStack(frames), {"long_name": "counts of the detector", "units": "1"}),
+            (_FrameStack(frames, sets, which), _TEMPERATURE),
         )
     )
     inside = np.stack(list(readings.values()), axis=-1) if readings else np.empty((len(frames), 0))
@@ -295,14 +290,17 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, flo
 
 
 class _FrameStack(BackendArray):
-    """Frames as one array (time, row, column); it holds only paths and offsets, so it can be pickled and keeps no file open."""
+    """Counts of frames as one array (time, row, column), or temperatures where sets of parameters, and which of them each has, are given.
+
+    It holds only paths and offsets, so it can be pickled and keeps no file open.
+    """
 
     def __init__(
-        self, frames: FrameList, kind: type[np.generic], read: Callable[[FrameReference, int], np.ndarray]
+        self, frames: FrameList, sets: Sequence[CameraParameters] = (), which: np.ndarray | None = None
     ) -> None:
-        self.frames, self.read = frames, read
+        self.frames, self.sets, self.which = frames, sets, which
         self.shape = (len(frames), *frames[0].shape)
-        self.dtype = np.dtype(kind)
+        self.dtype = np.dtype(np.uint16 if which is None else np.float32)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
@@ -310,27 +308,18 @@ class _FrameStack(BackendArray):
     def _read(self, key: tuple[Any, ...]) -> np.ndarray:
         time, row, column = key
         if isinstance(time, (int, np.integer)):
-            return self.read(self.frames[int(time)], int(time))[row][..., column]
+            return self._frame(int(time))[row][..., column]
         chosen = range(len(self.frames))[time] if isinstance(time, slice) else time
         first = np.empty(self.shape[1:], self.dtype)[row][..., column]
         stack = np.empty((len(chosen), *first.shape), self.dtype)
 
         def fill(place: int) -> None:
-            index = int(chosen[place])
-            stack[place] = self.read(self.frames[index], index)[row][..., column]
+            stack[place] = self._frame(int(chosen[place]))[row][..., column]
 
         for _ in call_by_threads(fill, range(len(chosen)), usable_threads()):
             pass
         return stack
 
-
-def _read_counts(frame: FrameReference, index: int) -> np.ndarray:
-    """Return (row, column) uint16."""
-    return frame.read_counts()
-
-
-def _read_temperature(
-    frame: FrameReference, index: int, *, sets: Sequence[CameraParameters], which: np.ndarray
-) -> np.ndarray:
-    """Return (row, column) float32, degC, with one of several sets of parameters."""
-    return calibrate(frame.read_counts(), sets[which[index]])
+    def _frame(self, index: int) -> np.ndarray:
+        counts = self.frames[index].read_counts()
+        return counts if self.which is None else calibrate(counts, self.sets[self.which[index]])

@@ -56,9 +56,7 @@ class Accumulator:
         pixels = int(np.prod(shape))
         self.frames = 0
         self.first, self.lowest, self.highest = (np.empty(pixels, np.uint16) for _ in range(3))
-        self.deviations, self.squares, self.far_squares = (
-            np.zeros(pixels, kind) for kind in (np.int32, np.uint32, np.uint64)
-        )
+        self.deviations, self.squares, self.far_squares = (np.zeros(pixels, kind) for kind in ("i4", "u4", "u8"))
 
     def add(self, counts: NDArray[np.uint16]) -> None:
         """Add frames."""
@@ -72,14 +70,8 @@ class Accumulator:
     def statistics(self) -> CountStatistics:
         """Return the statistics of the frames added so far."""
         total, squares = _sums(self.frames, self.first, self.deviations, self.squares, self.far_squares)
-        shape = self.shape
-        return CountStatistics(
-            self.frames,
-            total.reshape(shape),
-            squares.reshape(shape),
-            self.lowest.reshape(shape).copy(),
-            self.highest.reshape(shape).copy(),
-        )
+        arrays: tuple[Array, ...] = (total, squares, self.lowest.copy(), self.highest.copy())
+        return CountStatistics(self.frames, *(values.reshape(self.shape) for values in arrays))
 
 
 @numba.njit(cache=True, nogil=True)

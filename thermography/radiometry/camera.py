@@ -125,9 +125,7 @@ class LevelSeries:
 
     def thinned(self, kept: NDArray[np.intp]) -> LevelSeries:
         """The series of some frames."""
-        return LevelSeries(
-            self.seconds[kept], self.background[kept], self.table[kept], self.housing[kept], self.room[kept]
-        )
+        return LevelSeries(**{name: values[kept] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True)

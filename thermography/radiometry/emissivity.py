@@ -56,9 +56,7 @@ def estimate_emissivity(first: KnownState, second: KnownState, parameters: Camer
     signals = black_body_signal(kelvin, parameters)
     contrast = signals[1] - signals[0]
     if contrast == 0:
-        raise RadiometryError(
-            f"both states have {first.temperature_degC:g} degC: heat the surface between them, 10 K or more"
-        )
+        raise RadiometryError(f"both states have {first.temperature_degC:g} degC: heat it between them, 10 K or more")
     emissivity = (second.counts - first.counts) / (path * contrast)
     slopes = signal_slope(kelvin, parameters)
     relative_to_temperature = emissivity * slopes / contrast

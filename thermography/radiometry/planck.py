@@ -75,9 +75,7 @@ def calibrate(counts: NDArray[np.uint16], parameters: CameraParameters) -> NDArr
     """
     counts = np.asarray(counts)
     if counts.dtype != np.uint16:
-        raise RadiometryError(
-            f"counts: expected uint16, got {counts.dtype}; use temperature_from_counts for averaged counts"
-        )
+        raise RadiometryError(f"counts: expected uint16, got {counts.dtype}; for means use temperature_from_counts")
     if counts.size == 0:
         return np.empty(counts.shape, np.float32)
     table = _table(parameters).covering(int(counts.min()), int(counts.max()))
@@ -224,9 +222,7 @@ def air_transmission(
     celsius = atmospheric_temperature_K - ZERO_CELSIUS_K
     # Damaged constants may lead anywhere; `check_parameters` judges the transmission that they give.
     with np.errstate(over="ignore", invalid="ignore"):
-        water = relative_humidity * np.exp(
-            1.5587 + 0.06939 * celsius - 0.00027816 * celsius**2 + 0.00000068455 * celsius**3
-        )
+        water = relative_humidity * np.exp(1.5587 + 0.06939 * celsius - 2.7816e-4 * celsius**2 + 6.8455e-7 * celsius**3)
         root_distance, root_water = np.sqrt(object_distance_m), np.sqrt(water)
         first = np.exp(-root_distance * (p.atmosphere_alpha1 + p.atmosphere_beta1 * root_water))
         second = np.exp(-root_distance * (p.atmosphere_alpha2 + p.atmosphere_beta2 * root_water))
@@ -302,13 +298,9 @@ class ParameterLog:
     def __post_init__(self) -> None:
         times, values = np.asarray(self.times), np.asarray(self.values, np.float64)
         if times.shape != values.shape or times.ndim != 1 or times.size == 0:
-            raise RadiometryError(
-                f"log of a parameter: expected as many times as values, got {times.shape} and {values.shape}"
-            )
+            raise RadiometryError(f"log: expected as many times as values, got {times.shape} and {values.shape}")
         if not (np.diff(times) > np.timedelta64(0)).all() or not np.isfinite(values).all():
-            raise RadiometryError(
-                "log of a parameter: expected increasing times and finite values; sort the log and remove gaps"
-            )
+            raise RadiometryError("log of a parameter: expected rising times and finite values; sort it and drop gaps")
 
     def interpolate(self, time: np.datetime64) -> float:
         """Interpolate linearly to a time."""

@@ -185,8 +185,7 @@ def temperature_uncertainty(
     too_few = np.isfinite(kelvin) & ~(np.asarray(frames) >= 1)
     if too_few.any():
         raise RadiometryError(
-            f"frames={np.broadcast_to(frames, too_few.shape)[too_few][0]} for a temperature; give the number of frames that "
-            "were averaged, 1 or more"
+            f"frames={np.broadcast_to(frames, too_few.shape)[too_few][0]} for a temperature; give the number of frames averaged, 1 or more"
         )
     common = common_contributions(temperature, parameters, inputs)
     gain, _ = count_line(parameters)

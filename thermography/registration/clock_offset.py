@@ -128,11 +128,9 @@ def commanded_position(
     dwell = np.maximum(interval - np.abs(np.diff(target_mm)) / feed_mm_s, 0.0)
     leave = reading_s[:-1] + (1 - reading_phase) * dwell
     arrive = reading_s[1:] - reading_phase * dwell
-    path_s = np.concatenate([[reading_s[0]], np.column_stack([leave, arrive]).ravel(), [reading_s[-1]]])
-    path_mm = np.concatenate(
-        [[target_mm[0]], np.column_stack([target_mm[:-1], target_mm[1:]]).ravel(), [target_mm[-1]]]
-    )
-    return np.interp(time_s, path_s, path_mm, left=np.nan, right=np.nan)
+    way_s = np.concatenate([[reading_s[0]], np.column_stack([leave, arrive]).ravel(), [reading_s[-1]]])
+    way_mm = np.concatenate([[target_mm[0]], np.column_stack([target_mm[:-1], target_mm[1:]]).ravel(), [target_mm[-1]]])
+    return np.interp(time_s, way_s, way_mm, left=np.nan, right=np.nan)
 
 
 def _seconds(times: ArrayLike, origin: np.datetime64 | None = None) -> tuple[Array, np.datetime64]:
@@ -146,9 +144,7 @@ def _seconds(times: ArrayLike, origin: np.datetime64 | None = None) -> tuple[Arr
 
 def _check_travel(table: Array, table_u: Array, target: Array) -> None:
     if len(table) < 20:
-        raise ClockError(
-            f"the table is found in {len(table)} frames; 20 are needed for a clock offset, or give clock_offset"
-        )
+        raise ClockError(f"the table is found in {len(table)} frames; 20 are needed, or give clock_offset")
     if len(target) < 3:
         raise ClockError(f"{len(target)} readings have a time; a clock offset needs at least 3, or give clock_offset")
     observed, commanded = float(np.ptp(table)), float(np.ptp(target))
@@ -200,10 +196,8 @@ class _Motion:
     def residual(self, parameters: Array) -> Array:
         """Observed minus commanded position, mm; NaN where the commanded one is unknown."""
         offset, zero, feed, rate = parameters
-        machine_s = self.frame_s - offset - rate * (self.frame_s - self.middle_s)
-        commanded = commanded_position(
-            machine_s, self.reading_s, self.target_mm, feed, reading_phase=self.reading_phase
-        )
+        at_s = self.frame_s - offset - rate * (self.frame_s - self.middle_s)
+        commanded = commanded_position(at_s, self.reading_s, self.target_mm, feed, reading_phase=self.reading_phase)
         return self.table_mm - zero - commanded
 
     def misfit(self, parameters: Array) -> float:

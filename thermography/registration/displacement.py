@@ -299,15 +299,13 @@ def _band_pass(frame: Array) -> NDArray[np.float32]:
 def image_displacement(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
     """Displacement of the image of the table between two frames, as a shift."""
     mask = _table_mask(registration, grid)
-    images = [_band_pass(frame) for frame in (temperature, reference)]
+    displaced, fixed = (_band_pass(frame) for frame in (temperature, reference))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
     for start in (np.zeros(2), _coarse_shift(reference, temperature)):
         # From the displaced frame back to the reference, on whose pixels the mask is.
         back = np.column_stack([np.eye(2), -start]).astype(np.float32)
         try:
-            correlation, warp = cv2.findTransformECC(
-                images[0], images[1], back, cv2.MOTION_TRANSLATION, criteria, mask, 5
-            )
+            correlation, warp = cv2.findTransformECC(displaced, fixed, back, cv2.MOTION_TRANSLATION, criteria, mask, 5)
         except cv2.error:
             # The iteration diverged: from here, the images have nothing in common.
             continue

@@ -60,12 +60,11 @@ class PlanGrid:
         for name in ("width_mm", "height_mm", "cell_size_mm"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ThermographyError(f"{name} = {getattr(self, name)} mm; the plan needs a positive length")
-        for name in ("width_mm", "height_mm"):
-            cells = getattr(self, name) / self.cell_size_mm
+        for name, side in (("width_mm", self.width_mm), ("height_mm", self.height_mm)):
+            cells = side / self.cell_size_mm
             if abs(cells - round(cells)) > 1e-6:
                 raise ThermographyError(
-                    f"{name} = {getattr(self, name)} mm is not a whole number of cells of {self.cell_size_mm} mm; "
-                    "choose a cell size that divides both sides of the plan"
+                    f"{name} = {side} mm is not a whole number of cells of {self.cell_size_mm} mm; choose one that divides both"
                 )
 
     @property
@@ -261,17 +260,13 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
     marker = (row.get(_MARKER_COLUMN) or "").strip()
     if marker:
         if not marker.isdecimal() or int(marker) >= _MARKER_COUNT:
-            raise FiducialError(
-                f"{path}:{line}: marker = {marker!r}; give the number of an ArUco marker, 0 to {_MARKER_COUNT - 1}"
-            )
+            raise FiducialError(f"{path}:{line}: marker = {marker!r}; give an ArUco number, 0 to {_MARKER_COUNT - 1}")
         if point:
             raise FiducialError(f"{path}:{line}: diameter_mm is empty; give the circle that contains the marker")
         return Fiducial(name, x_mm, y_mm, diameter_mm, marker=int(marker))
     hints = [(row.get(column) or "").strip() for column in _HINT_COLUMNS]
     if all(hints):
-        column_px, row_px = (
-            _number(path, line, column, text) for column, text in zip(_HINT_COLUMNS, hints, strict=True)
-        )
+        column_px, row_px = (_number(path, line, key, text) for key, text in zip(_HINT_COLUMNS, hints, strict=True))
         return Fiducial(name, x_mm, y_mm, diameter_mm, column_px, row_px)
     if any(hints):
         raise FiducialError(f"{path}:{line}: {name} has one of column_px, row_px; give both or neither")
@@ -288,9 +283,7 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise FiducialError(
-            f"{path}:{line}: {column} = {text!r} is not a number; write it with a decimal point and no unit"
-        )
+        raise FiducialError(f"{path}:{line}: {column} = {text!r} is not a number; write it with a point and no unit")
     return value
 
 
@@ -326,9 +319,7 @@ class Polygon:
     def __post_init__(self) -> None:
         corners = np.asarray(self.corners_mm, float)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-            raise PolygonError(
-                f"{self.name}: corners have shape {corners.shape}; a polygon needs at least three (x, y) in mm"
-            )
+            raise PolygonError(f"{self.name}: corners have shape {corners.shape}; give at least three (x, y) in mm")
         object.__setattr__(self, "corners_mm", corners)
 
     def contains(self, points_mm: ArrayLike) -> NDArray[np.bool_]:

@@ -74,9 +74,7 @@ def read_lens(path: str | Path) -> Lens:
     if {"image_width", "image_height"} <= entries.keys():
         width, height = (_entry(entries, path, (name,), 1)[0] for name in ("image_width", "image_height"))
         if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
-            raise LensError(
-                f"{path}: image_width {width:g} and image_height {height:g} px are not the size of a frame; correct them"
-            )
+            raise LensError(f"{path}: image_width {width:g}, image_height {height:g} px: no frame size; correct them")
         size = (int(width), int(height))
     along, across = float(matrix[0, 0]), float(matrix[1, 1])
     if not (np.isfinite(matrix).all() and min(along, across) > 0 and abs(along / across - 1) < _SQUARE):
@@ -86,8 +84,7 @@ def read_lens(path: str | Path) -> Lens:
         )
     if len(coefficients) < 4 or not np.isfinite(coefficients).all() or coefficients[4:].any():
         raise LensError(
-            f"{path}: distortion_coefficients = {coefficients.tolist()}; give k1, k2, p1, p2, and calibrate without more "
-            "(flag CALIB_FIX_K3)"
+            f"{path}: distortion_coefficients = {coefficients.tolist()}; give k1, k2, p1, p2, and calibrate without more (CALIB_FIX_K3)"
         )
     k1, k2, p1, p2 = coefficients[:4].tolist()
     return Lens(float(np.sqrt(along * across)), (float(matrix[0, 2]), float(matrix[1, 2])), (k1, k2, p1, p2), size)
@@ -119,9 +116,7 @@ def _read_entries(path: Path) -> dict[str, Any]:
             # OpenCV writes the version of YAML as no other does.
             entries = yaml.load(text.removeprefix("%YAML:1.0"), _MatrixLoader)
     except (ValueError, TypeError, RecursionError, yaml.YAMLError, ElementTree.ParseError) as error:
-        raise LensError(
-            f"{path}: cannot be parsed ({error}); write the calibration as OpenCV's YAML, XML or JSON"
-        ) from None
+        raise LensError(f"{path}: cannot be parsed ({error}); write it as OpenCV's YAML, XML or JSON") from None
     if not isinstance(entries, dict):
         raise LensError(f"{path}: holds no named entries; write the calibration as OpenCV's YAML, XML or JSON")
     return entries
@@ -346,9 +341,7 @@ class DiscObservations:
 
     def select(self, chosen: NDArray[np.bool_]) -> DiscObservations:
         """The observations that are True in `chosen`, (n,)."""
-        return DiscObservations(
-            self.points_px[chosen], self.centres_mm[chosen], self.radii_mm[chosen], self.u_px[chosen]
-        )
+        return DiscObservations(**{name: values[chosen] for name, values in vars(self).items()})
 
     def residuals_px(self, projection: Projection) -> Array:
         """Observed minus projected centroids, (n, 2) px."""
@@ -364,22 +357,19 @@ def fit_homography(observations: DiscObservations, ideal: Projection) -> Project
     undistorted_px = ideal.undistort(observations.points_px).astype(float)
     matrix, _ = cv2.findHomography(observations.centres_mm.astype(float), undistorted_px, 0)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
-        raise ThermographyError(
-            "the fiducials are collinear or coincide; spread at least four over both sides of the plan"
-        )
+        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return replace(ideal, plan_to_sensor=matrix)
 
 
 def fit_projection(observations: DiscObservations, start: Projection, coefficients: int) -> Projection:
     """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt)."""
-    pack, unpack = _parameters(start, observations.centres_mm, coefficients)
+    centres_mm = observations.centres_mm
+    pack, unpack = _parameters(start, centres_mm, coefficients)
     # The perspective shift of the centroids hardly changes during the fit and is held fixed.
-    shift = start.disc_centroids(observations.centres_mm, observations.radii_mm) - start.to_sensor(
-        observations.centres_mm
-    )
+    shift = start.disc_centroids(centres_mm, observations.radii_mm) - start.to_sensor(centres_mm)
 
     def residuals(parameters: Array) -> Array:
-        residuals_px = unpack(parameters).to_sensor(observations.centres_mm) + shift - observations.points_px
+        residuals_px = unpack(parameters).to_sensor(centres_mm) + shift - observations.points_px
         weighted = (residuals_px / observations.u_px[:, None]).ravel()
         return np.concatenate([weighted, parameters[8:] / LENS_SPREAD[:coefficients]])
 

@@ -134,9 +134,8 @@ def _passes(
     others = np.where(agreeing, np.maximum((factor * freedom - squares) / max(freedom - 2, 1), 1.0), factor)
     degrees = np.where(agreeing, max(freedom - 2, 1), max(freedom, 1))
     unlikely = squares / 2 / others > special.fdtri(2, degrees, 1.0 - _FALSE_ALARM / len(squares))
-    missed_mm = np.linalg.norm(
-        np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0], axis=1
-    )
+    missed = np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0]
+    missed_mm = np.linalg.norm(missed, axis=1)
     # Where the others alone determine the fit and no more, nothing tells whether an agreeing disc is wrong.
     untold = agreeing & (freedom - 2 < _LEAST_FREEDOM)
     return np.asarray(~unlikely | (missed_mm < _MISPLACED_MM) | untold)
@@ -182,9 +181,7 @@ def _starts(observations: DiscObservations, ideal: Projection, wanted: int, *, c
             candidates.append((float(quantile[i]), replace(lens, plan_to_sensor=matrices[i])))
     candidates.sort(key=lambda item: item[0])
     if not candidates or not np.isfinite(candidates[0][0]):
-        raise ThermographyError(
-            "the fiducials are collinear or coincide; spread at least four over both sides of the plan"
-        )
+        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return [projection for _, projection in candidates[:_REFINED]]
 
 
@@ -256,17 +253,13 @@ def refuse_chance(
     typical = float(np.median([place.area_px for place in located.values()]))
     fitting = sum(typical / 2 < spot.area_px < 2 * typical for spot in spots)
     by_hints = chance_of_hints(distances, len(hinted), fitting, area_px=area)
-    if min(by_arrangement, by_hints) <= _LARGEST_CHANCE:
+    if (expected := min(by_arrangement, by_hints)) <= _LARGEST_CHANCE:
         return
-    expected = min(by_arrangement, by_hints)
-    chance = (
-        "nothing else confirms them" if expected == inf else f"chance alone would do so 10^{log10(expected):.1f} times"
-    )
-    hints = (
-        f"; {int((distances > WRONG_HINT_PX).sum())} of their {len(distances)} hints contradict them"
-        if len(distances)
-        else ""
-    )
+    chance, hints = "nothing else confirms them", ""
+    if expected < inf:
+        chance = f"chance alone would do so 10^{log10(expected):.1f} times"
+    if len(distances):
+        hints = f"; {int((distances > WRONG_HINT_PX).sum())} of their {len(distances)} hints contradict them"
     raise RegistrationError(
         f"{len(located)} of {len(listed)} fiducials fit the spots in view, and {chance}{hints}; check that this is the list of "
         "this table, that all its discs are in view with contrast, and give column_px,row_px for at least 4"
@@ -309,7 +302,7 @@ def area_ratio(located: Mapping[str, LocatedDisc], fiducials: Sequence[Fiducial]
     """Median ratio of the imaged to the listed area of the discs."""
     if any(disc.is_point for disc in fiducials):
         return np.nan
-    centres = np.array([(disc.x_mm, disc.y_mm) for disc in fiducials])
+    centres, _ = _geometry(fiducials)
     listed_mm2 = np.pi / 4 * np.array([disc.diameter_mm**2 for disc in fiducials])
     listed_px = listed_mm2 * np.abs(np.linalg.det(projection.jacobian(centres)))
     return float(np.median([located[disc.name].area_px for disc in fiducials] / listed_px))
@@ -321,9 +314,8 @@ def size_contradiction(spots: Sequence[LocatedDisc], fiducials: Sequence[Fiducia
     if len(hinted) < 4:
         return ""
     plan = np.array([(disc.x_mm, disc.y_mm) for disc in hinted])
-    homography, _ = cv2.findHomography(
-        plan, np.array([disc.hint_px for disc in hinted], float), cv2.RANSAC, _EVIDENCE_REACH_PX
-    )
+    hints = np.array([disc.hint_px for disc in hinted], float)
+    homography, _ = cv2.findHomography(plan, hints, cv2.RANSAC, _EVIDENCE_REACH_PX)
     if homography is None:
         return ""
     projection = Projection(homography, np.zeros(4), 1.0, (0.0, 0.0))
@@ -382,6 +374,8 @@ _ARRANGEMENT_TOLERANCE_PX = 16.0
 _LARGEST_ARRANGEMENT = 22
 #: Quadruples of fiducials that are tried.
 _QUADRUPLES = 8
+#: What tells spots apart that their arrangement does not.
+_REMEDY = "give column_px,row_px for at least 4"
 #: Hypotheses compared at once: all distances of all hypotheses would take gigabytes.
 _HYPOTHESES_AT_ONCE = 4096
 
@@ -412,9 +406,7 @@ def match_by_arrangement(
     The number of assignments of four spots of fitting size that were tried goes with it: each might have met the others by chance.
     """
     if len(fiducials) < 6:
-        raise MatchError(
-            f"{len(fiducials)} fiducials cannot be distinguished by their arrangement, which needs 6; give column_px,row_px for at least 4"
-        )
+        raise MatchError(f"{len(fiducials)} fiducials cannot be told apart by arrangement, which needs 6; {_REMEDY}")
     tried = list(spots)[:_LARGEST_ARRANGEMENT]
     if len(tried) < 6:
         raise MatchError(
@@ -437,9 +429,7 @@ def match_by_arrangement(
         if best >= min(len(fiducials), len(tried)) - 1:
             break
     if not solutions:
-        raise MatchError(
-            f"no arrangement of the {len(tried)} spots in view fits the {len(fiducials)} fiducials; give column_px,row_px for at least 4"
-        )
+        raise MatchError(f"no arrangement of {len(tried)} spots in view fits the {len(fiducials)} fiducials; {_REMEDY}")
     ranked = sorted(solutions.items(), key=lambda item: item[1])
     best_match, chance = ranked[0]
     for match, rival in ranked[1:]:
@@ -451,12 +441,10 @@ def match_by_arrangement(
 def _ambiguity(best: dict[str, LocatedDisc], rival: dict[str, LocatedDisc], count: int) -> str:
     """Why two assignments cannot be distinguished: the plan maps to itself, or too few of its discs are in view."""
     if {id(spot) for spot in best.values()} == {id(spot) for spot in rival.values()}:
-        return (
-            "the arrangement of the fiducials is symmetric and fits in two ways; give column_px,row_px for at least 4"
-        )
+        return f"the arrangement of the fiducials is symmetric and fits in two ways; {_REMEDY}"
     return (
         f"{len(best)} of {count} fiducials fit the spots in view in two ways, and neither need be right; check that this is the "
-        "list of this table, and give column_px,row_px for at least 4"
+        f"list of this table, and {_REMEDY}"
     )
 
 
@@ -522,15 +510,11 @@ def _nearest(
             distance = np.hypot(spot.column_px - places[i, 0], spot.row_px - places[i, 1])
             if distance < tolerance_px and expected / 2 < spot.area_px < 2 * expected:
                 pairs.append((distance, i, j))
-    matched: dict[str, LocatedDisc] = {}
-    used_discs: set[int] = set()
-    used_spots: set[int] = set()
+    spot_of: dict[int, int] = {}
     for _, i, j in sorted(pairs):
-        if i not in used_discs and j not in used_spots:
-            matched[fiducials[i].name] = spots[j]
-            used_discs.add(i)
-            used_spots.add(j)
-    return matched
+        if i not in spot_of and j not in spot_of.values():
+            spot_of[i] = j
+    return {fiducials[i].name: spots[j] for i, j in spot_of.items()}
 
 
 def _grow(
@@ -564,14 +548,8 @@ def _chance(
         return np.inf
     distance = np.linalg.norm(projection.to_sensor(plan) - image, axis=1)[agreeing]
     misfit = max(float(np.sqrt(np.mean(distance**2))), _LEAST_MISFIT_PX)
-    return chance_of_arrangement(
-        len(fiducials),
-        spots,
-        np.full(len(distance), misfit),
-        hypotheses=1,
-        coefficients=coefficients,
-        area_px=float(shape[0] * shape[1]),
-    )
+    missed, area = np.full(len(distance), misfit), float(shape[0] * shape[1])
+    return chance_of_arrangement(len(fiducials), spots, missed, hypotheses=1, coefficients=coefficients, area_px=area)
 
 
 def _pairs(matched: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> tuple[Array, Array]:
@@ -645,20 +623,20 @@ class Registration:
     distortion: Array
     model: str
     projection: Projection
-    fiducials: dict[str, Fiducial]
-    located: dict[str, LocatedDisc]
-    residual_mm: dict[str, float]
-    leave_one_out_mm: dict[str, float]
-    rms_mm: float
-    scatter_mm: float
-    scatter_px: float
-    area_ratio: float
-    unchecked: tuple[str, ...]
-    left_out: dict[str, str]
-    masked: tuple[Fiducial, ...]
     shape: tuple[int, int]
-    lens: Lens | None
     covariance: Array = field(repr=False)
+    fiducials: dict[str, Fiducial] = field(default_factory=dict)
+    located: dict[str, LocatedDisc] = field(default_factory=dict)
+    residual_mm: dict[str, float] = field(default_factory=dict)
+    leave_one_out_mm: dict[str, float] = field(default_factory=dict)
+    rms_mm: float = math.nan
+    scatter_mm: float = math.nan
+    scatter_px: float = math.nan
+    area_ratio: float = math.nan
+    unchecked: tuple[str, ...] = ()
+    left_out: dict[str, str] = field(default_factory=dict)
+    masked: tuple[Fiducial, ...] = ()
+    lens: Lens | None = None
 
     def __str__(self) -> str:
         """Return in one line how well the plan was located."""
@@ -768,19 +746,15 @@ def register(
     """
     frame = np.asarray(temperature, float)
     if frame.ndim not in (2, 3) or frame.size == 0:
-        raise RegistrationError(
-            f"temperature has shape {frame.shape}; give one frame (row, column) or a stack (time, row, column)"
-        )
+        raise RegistrationError(f"temperature has shape {frame.shape}; give one frame or a stack (time, row, column)")
     frame = frame.mean(axis=0) if frame.ndim == 3 else frame
     shape = frame.shape[0], frame.shape[1]
     if any(fiducial.is_point for fiducial in fiducials):
         return register_points(None, fiducials, shape, lens=lens)
     listed, left_out = _without_duplicates(identify_plan(frame, fiducials))
     if len(listed) < 4:
-        raise RegistrationError(
-            f"fiducials lists {len(listed)} different discs; a plan is located by at least 4"
-            + (f" ({_reasons(left_out)})" if left_out else "")
-        )
+        reasons = f" ({_reasons(left_out)})" if left_out else ""
+        raise RegistrationError(f"fiducials lists {len(listed)} different discs; a plan needs at least 4{reasons}")
     if not use_hints:
         listed = [replace(disc, column_px=None, row_px=None) for disc in listed]
     spots = detect_discs(frame)
@@ -855,9 +829,7 @@ def register_points(
         points_px = {disc.name: disc.hint_px for disc in listed if disc.hint_px is not None}
     unknown = sorted(set(points_px) - {disc.name for disc in listed})
     if unknown:
-        raise RegistrationError(
-            f"picked points {', '.join(unknown)} are not in the list of fiducials; use the names of its first column"
-        )
+        raise RegistrationError(f"picked points {', '.join(unknown)} are not in the list of fiducials; use its names")
     discs = [disc for disc in listed if disc.name in points_px]
     if len(discs) < 4:
         raise RegistrationError(f"{len(discs)} points are picked; a plan needs at least 4")
@@ -983,11 +955,8 @@ def _fit(
     """Projection fitted to the discs that agree, its number of distortion coefficients, and which discs agree."""
     if lens is not None:
         if lens.size_px is not None and lens.size_px != shape[::-1]:
-            raise RegistrationError(
-                "the lens was calibrated with frames of {} x {} pixels, these have {} x {}; calibrate with frames of this size".format(
-                    *lens.size_px, *shape[::-1]
-                )
-            )
+            sizes = "calibrated with frames of {} x {} pixels, these have {} x {}".format(*lens.size_px, *shape[::-1])
+            raise RegistrationError(f"the lens was {sizes}; calibrate with frames of this size")
         ideal = Projection(np.eye(3), np.array(lens.distortion), lens.focal_length_px, lens.principal_point_px)
     else:
         # Only k1 over the squared focal length is determined: the frame's width serves as focal length, its middle as centre.
@@ -1011,10 +980,8 @@ def _without_duplicates(fiducials: Sequence[Fiducial]) -> tuple[list[Fiducial], 
     left_out: dict[str, str] = {}
     for disc in fiducials:
         for other in kept:
-            if (
-                disc.name == other.name
-                or np.hypot(disc.x_mm - other.x_mm, disc.y_mm - other.y_mm) <= disc.diameter_mm / 2
-            ):
+            apart_mm = np.hypot(disc.x_mm - other.x_mm, disc.y_mm - other.y_mm)
+            if disc.name == other.name or apart_mm <= disc.diameter_mm / 2:
                 again = disc.name if disc.name != other.name else f"{disc.name} (second)"
                 left_out[again] = (
                     f"listed twice: ({disc.x_mm:g}, {disc.y_mm:g}) mm, also as {other.name} ({other.x_mm:g}, {other.y_mm:g}) mm"
@@ -1056,9 +1023,7 @@ def picture_grid(shape: tuple[int, int], cell_px: int | None = None) -> PlanGrid
     size = usual_cell_px(shape) if cell_px is None else cell_px
     if size not in _dividing(shape):
         choice = ", ".join(str(one) for one in _dividing(shape) if 2 * one <= min(shape))
-        raise ThermographyError(
-            f'cell_px = "{size} px" does not divide frames of {columns} x {rows} pixels; choose one of {choice} px'
-        )
+        raise ThermographyError(f'cell_px = "{size} px" does not divide {columns} x {rows} pixels; choose {choice} px')
     return PlanGrid(columns, rows, size)
 
 
@@ -1072,19 +1037,7 @@ def register_picture(shape: tuple[int, int]) -> Registration:
         distortion=np.zeros(4),
         model=PICTURE,
         projection=Projection(to_sensor, np.zeros(4), float(max(shape)), centre),
-        fiducials={},
-        located={},
-        residual_mm={},
-        leave_one_out_mm={},
-        rms_mm=math.nan,
-        scatter_mm=math.nan,
-        scatter_px=math.nan,
-        area_ratio=math.nan,
-        unchecked=(),
-        left_out={},
-        masked=(),
         shape=shape,
-        lens=None,
         covariance=np.zeros((8, 8)),
     )
 

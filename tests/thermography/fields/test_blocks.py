@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import GRID, SC660, START, Scene, record, registered
+from tests.thermography.plan_scene import GRID, SC660, START, Scene, edges, record, registered
 from thermography.fields import blocks as blocks_module
 from thermography.fields.blocks import (
     NO_CYCLE,
@@ -22,8 +22,6 @@ from thermography.io.sequence import WindowReader
 from thermography.radiometry.planck import calibrate, override
 from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
 
-SECOND = np.timedelta64(1, "s")
-
 
 @pytest.fixture(scope="module")
 def registration():
@@ -37,9 +35,7 @@ def small(tmp_path_factory):
 
 
 def series(references, bounds, parameters=lambda frame: frame.parameters, **options):
-    return make_frame_series(
-        references, START + np.array(bounds) * SECOND, shape=(8, 8), override=parameters, **options
-    )
+    return make_frame_series(references, edges(*bounds), shape=(8, 8), override=parameters, **options)
 
 
 def cuts(blocks):
@@ -121,28 +117,17 @@ def test_a_file_that_became_shorter_is_named(frames, tmp_path):
     short = tmp_path / "short.seq"
     short.write_bytes(frames[0].path.read_bytes()[:-10])
     last = pickle.loads(pickle.dumps(FrameRun(frames)))[-1]
-    with pytest.raises(OSError, match=r"short\.seq: frame 39 ends early; the file has become shorter"):
+    with pytest.raises(OSError, match=r"short\.seq: frame 39 ends early; the file was cut"):
         PlainFrame(short, 39, last.shape, last.plain_samples).read_counts()
 
 
-@pytest.fixture(scope="module")
-def references(tmp_path_factory):
-    return record(tmp_path_factory.mktemp("inputs") / "a.seq", [np.full((8, 8), 20.0 + i) for i in range(6)])
-
-
-def plain_series(references, bounds, **options):
-    return make_frame_series(references, bounds, shape=(8, 8), override=lambda frame: frame.parameters, **options)
-
-
-def test_cycles_names_times_and_temperatures_of_frames(references):
-    bounds = START + np.array([[0, 2], [3, 5]]) * SECOND
-    assert plain_series(references, bounds).cycles.tolist() == [0, 0, NO_CYCLE, 1, 1, NO_CYCLE]
-    assert plain_series(references, START + np.array([1, 3, 4]) * SECOND).cycles.tolist() == [-1, 0, 0, 1, -1, -1]
-    frames = plain_series(references, START + np.array([0, 6]) * SECOND)
+def test_cycles_names_times_and_temperatures_of_frames(tmp_path):
+    stored = record(tmp_path / "a.seq", [np.full((8, 8), 20.0 + i) for i in range(6)])
+    assert series(stored, [[0, 2], [3, 5]]).cycles.tolist() == [0, 0, NO_CYCLE, 1, 1, NO_CYCLE]
+    assert series(stored, [1, 3, 4]).cycles.tolist() == [-1, 0, 0, 1, -1, -1]
+    frames = series(stored, [0, 6])
     assert len(frames) == 6
     assert frames.names(np.array([False, True, False, False, False, True])) == ["a.seq#1", "a.seq#5"]
     assert frames.mean_time(slice(1, 5)) == START + 2.5 * np.timedelta64(1000, "ms")
-    np.testing.assert_array_equal(
-        frames.temperature(3), calibrate(references[3].read().counts, references[3].parameters)
-    )
+    np.testing.assert_array_equal(frames.temperature(3), calibrate(stored[3].read_counts(), stored[3].parameters))
     assert frames.correction_K.tolist() == [0.0] * 6

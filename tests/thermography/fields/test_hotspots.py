@@ -113,6 +113,7 @@ def test_a_zone_that_reaches_any_edge_is_marked(place, at_edge):
     assert spot.at_edge is at_edge
 
 
+SQUARE = {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]}
 TIMES = np.datetime64("2026-03-09T06:00:00", "ns") + np.arange(4) * np.timedelta64(60, "s")
 
 
@@ -139,10 +140,8 @@ def test_rectangle_and_triangle_of_a_plane_have_the_mean_of_their_centroid():
 def test_stated_uncertainty_of_a_region_mean_is_its_scatter(rng):
     fields = xr.concat([stack(grow=0.0)] * 50, "time")
     noisy = fields + rng.normal(0, 0.014, fields.shape)
-    series = region_series(noisy, {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]})
-    scatter = (
-        series["mean"] - region_series(fields, {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]})["mean"]
-    ).std()
+    series = region_series(noisy, SQUARE)
+    scatter = (series["mean"] - region_series(fields, SQUARE)["mean"]).std()
     # 200 means give their standard deviation to 5 %.
     assert float(scatter) == pytest.approx(0.014 / 10, rel=0.15)
     assert float(series["mean_noise_u"].mean()) == pytest.approx(0.014 / 10, rel=0.05)
@@ -157,10 +156,9 @@ def test_what_all_cells_share_does_not_average_out(rng):
             "temperature_rise_u": rise * 0.0 + np.hypot(0.014, 0.05),
         }
     )
-    square = {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]}
-    series = region_series(rise, square, common_u=common_part(fields, "temperature_rise"))
+    series = region_series(rise, SQUARE, common_u=common_part(fields, "temperature_rise"))
     np.testing.assert_allclose(series["mean_u"], np.hypot(0.05, 0.0014), rtol=0.002)
-    assert "mean_u" not in region_series(rise, square)
+    assert "mean_u" not in region_series(rise, SQUARE)
 
 
 def test_masked_cells_take_no_part():

@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.thermography.plan_scene import GRID, START, Scene, record, registered
-from thermography.fields import large_arrays as pieces
-from thermography.fields import large_arrays as spool
-from thermography.fields import large_arrays as spool_module
-from thermography.fields import still as stretches
+from tests.thermography.plan_scene import GRID, Scene, assert_equal_bits, edges, record, registered
+from thermography.fields import large_arrays, still
 from thermography.fields.large_arrays import (
     Spool,
     copy_to_disk,
@@ -39,9 +36,8 @@ ends_late = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytes
 @pytest.fixture(scope="module")
 def cluster():
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as started:
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
+    with distributed.LocalCluster(**options) as started:
         yield started
 
 
@@ -54,19 +50,14 @@ def film(tmp_path_factory):
     return record(tmp_path_factory.mktemp("film") / "a.seq", images), registration
 
 
-BOUNDS = START + np.array([0, 9, 17, 24]) * np.timedelta64(1, "s")
-
-
-def assert_equal_bits(one, other):
-    for name in one.variables:
-        assert one[name].values.tobytes() == other[name].values.tobytes(), name
-    assert one.attrs == other.attrs
+BOUNDS = edges(0, 9, 17, 24)
+in_memory_or_not = pytest.mark.parametrize("in_memory", [1 << 24, 10])
 
 
 @pytest.mark.parametrize("cores", [1, 3, 64])
 def test_any_number_of_threads_gives_the_same_fields_bit_for_bit(cores, film, monkeypatch):
     frames, registration = film
-    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 2)
+    monkeypatch.setattr(still, "STRETCH_FRAMES", 2)
     alone = reduce_frames(frames, registration, GRID, BOUNDS, block_s=1)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(cores)), raising=False)
     assert_equal_bits(alone, reduce_frames(frames, registration, GRID, BOUNDS, block_s=1))
@@ -83,7 +74,7 @@ def test_a_cluster_of_two_workers_gives_the_same_fields_bit_for_bit(cluster, fil
 @ends_late
 def test_a_worker_that_is_killed_in_the_middle_loses_nothing(cluster, film, monkeypatch, tmp_path):
     frames, registration = film
-    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 2)
+    monkeypatch.setattr(still, "STRETCH_FRAMES", 2)
     alone = reduce_frames(frames, registration, GRID, BOUNDS, block_s=1)
     killed = []
 
@@ -108,12 +99,8 @@ def test_a_file_that_workers_do_not_see_is_named(cluster, film):
 
 def test_a_scheduler_that_does_not_answer_is_named():
     pytest.importorskip("distributed")
-    with (
-        pytest.raises(
-            SchedulerError, match=r"scheduler nowhere does not answer \(.*\); check the address, or leave it out"
-        ),
-        open_pool("nowhere"),
-    ):
+    message = r"scheduler nowhere does not answer \(.*\); check or omit its address"
+    with pytest.raises(SchedulerError, match=message), open_pool("nowhere"):
         pass
 
 
@@ -134,7 +121,7 @@ def test_results_come_in_order_and_leaving_early_cancels_the_rest():
 
 
 def test_the_pieces_are_the_array(monkeypatch, tmp_path, rng):
-    monkeypatch.setattr(pieces, "PIECE_BYTES", 3 * 4 * 8)
+    monkeypatch.setattr(large_arrays, "PIECE_BYTES", 3 * 4 * 8)
     array = rng.normal(size=(8, 2, 2)).astype("f4")
     mapped = np.memmap(tmp_path / "array", "f4", "w+", shape=array.shape)
     mapped[:] = array
@@ -148,12 +135,10 @@ def test_the_pieces_are_the_array(monkeypatch, tmp_path, rng):
     assert len(list(piece_slices((5, 1000)))) == 5
 
 
-@pytest.mark.parametrize("in_memory", [1 << 24, 10])
-def test_what_is_filled_or_copied_piece_by_piece_is_the_same_on_disk_and_in_memory(
-    monkeypatch, tmp_path, in_memory, rng
-):
-    monkeypatch.setattr(pieces, "PIECE_BYTES", 2 * 3 * 8)
-    monkeypatch.setattr(spool, "IN_MEMORY_BYTES", in_memory)
+@in_memory_or_not
+def test_what_is_filled_or_copied_in_pieces_is_the_same_on_disk_and_in_memory(monkeypatch, tmp_path, in_memory, rng):
+    monkeypatch.setattr(large_arrays, "PIECE_BYTES", 2 * 3 * 8)
+    monkeypatch.setattr(large_arrays, "IN_MEMORY_BYTES", in_memory)
     values = rng.normal(size=(7, 3))
     filled = fill_array(values.shape, float, lambda some: values[some], tmp_path)
     assert filled.tobytes() == values.tobytes() and (fill_array((4, 2), np.uint8, lambda _: 5) == 5).all()
@@ -179,12 +164,9 @@ def test_the_median_of_nothing_is_no_number():
     assert np.isnan(median_of_pieces(list))
 
 
-in_memory_or_not = pytest.mark.parametrize("in_memory", [1 << 24, 100])
-
-
 @in_memory_or_not
 def test_a_spool_gives_back_what_was_appended(monkeypatch, tmp_path, in_memory):
-    monkeypatch.setattr(spool_module, "IN_MEMORY_BYTES", in_memory)
+    monkeypatch.setattr(large_arrays, "IN_MEMORY_BYTES", in_memory)
     spool = Spool(tmp_path)
     arrays = [np.arange(6, dtype="f4").reshape(2, 3) + 10 * i for i in range(11)]
     for number, array in enumerate(arrays, 1):
@@ -201,7 +183,7 @@ def test_a_spool_gives_back_what_was_appended(monkeypatch, tmp_path, in_memory):
 
 @in_memory_or_not
 def test_arrays_are_apart_and_last_as_long_as_they_are_used(monkeypatch, tmp_path, in_memory):
-    monkeypatch.setattr(spool_module, "IN_MEMORY_BYTES", in_memory)
+    monkeypatch.setattr(large_arrays, "IN_MEMORY_BYTES", in_memory)
     shapes = [(40, 3), (40, 2), (7,)]
     for parts in (empty_arrays(shapes, np.float32), [empty_array(shape, np.float32, tmp_path) for shape in shapes]):
         for number, part in enumerate(parts):
@@ -209,21 +191,20 @@ def test_arrays_are_apart_and_last_as_long_as_they_are_used(monkeypatch, tmp_pat
             give_back(part)
         assert [part.shape for part in parts] == shapes
         view = parts[1][2:4]
-        assert all(
-            type(part) is np.ndarray and part.flags.c_contiguous and (part == k).all() for k, part in enumerate(parts)
-        )
+        assert all(type(part) is np.ndarray and part.flags.c_contiguous for part in parts)
+        assert all((part == k).all() for k, part in enumerate(parts))
         del parts, part
         assert type(view) is np.ndarray and (view == 1).all()
 
 
 def test_a_disk_that_is_too_small_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(spool_module, "IN_MEMORY_BYTES", 100)
+    monkeypatch.setattr(large_arrays, "IN_MEMORY_BYTES", 100)
 
     def full(*arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(spool_module, "_take_room", full)
-    monkeypatch.setattr(spool_module.pickle, "dump", full)
+    monkeypatch.setattr(large_arrays, "_take_room", full)
+    monkeypatch.setattr(large_arrays.pickle, "dump", full)
     for fill in (lambda: empty_array((100, 100), np.float64, tmp_path), lambda: Spool(tmp_path).append(0)):
         with pytest.raises(OSError, match=str(tmp_path)) as refused:
             fill()

@@ -8,18 +8,22 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, registered, smooth_field
+from tests.thermography.plan_scene import (
+    DISCS,
+    GRID,
+    SC660,
+    START,
+    Scene,
+    assert_equal_bits,
+    cell_truth,
+    edges,
+    record,
+    registered,
+    smooth_field,
+)
 from thermography.common import FIELDS
 from thermography.fields import still
-from thermography.fields import still as stretches
-from thermography.fields.blocks import (
-    NO_CYCLE,
-    FrameSeries,
-    ReductionError,
-    RegisteredSensor,
-    cut_blocks,
-    make_frame_series,
-)
+from thermography.fields.blocks import NO_CYCLE, ReductionError, RegisteredSensor, cut_blocks, make_frame_series
 from thermography.fields.resampling import plan_weights
 from thermography.fields.still import (
     STRETCH_FRAMES,
@@ -45,22 +49,14 @@ pytestmark = pytest.mark.long
 SECOND = np.timedelta64(1, "s")
 
 
-@pytest.fixture(scope="module")
-def scene():
-    """A still table with 4 K colder discs, its frame without noise, and its registration."""
-    still = Scene(disc_K=-4.0)
-    image = still.render()
-    return image, registered(), still
+#: A still table with 4 K colder discs, and its frame without noise.
+SCENE = Scene(disc_K=-4.0)
+STILL = SCENE.render()
 
 
-def edges(*seconds):
-    return START + np.array(seconds, int) * SECOND
-
-
-def test_field_of_one_frame_per_cycle_is_true_within_its_noise(scene, rng, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", (image + rng.normal(0, 0.05, image.shape) for _ in range(6)))
-    fields = reduce_frames(frames, registration, GRID, edges(*range(7)))
+def test_field_of_one_frame_per_cycle_is_true_within_its_noise(rng, tmp_path):
+    frames = record(tmp_path / "a.seq", (STILL + rng.normal(0, 0.05, STILL.shape) for _ in range(6)))
+    fields = reduce_frames(frames, registered(), GRID, edges(*range(7)))
     error = fields["temperature"].values - cell_truth()
     # A cell holds about 22 pixels of 50 mK: 10.7 mK; partly seen cells a little more.
     assert np.sqrt(np.nanmean(error**2)) < 0.012
@@ -70,34 +66,29 @@ def test_field_of_one_frame_per_cycle_is_true_within_its_noise(scene, rng, tmp_p
     assert ratio == pytest.approx(1, abs=0.15)
 
 
-def test_field_without_noise_shows_no_bias_anywhere(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image])
-    fields = reduce_frames(frames, registration, GRID, edges(0, 1))
+def test_field_without_noise_shows_no_bias_anywhere(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL])
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 1))
     error = fields["temperature"].values[0] - cell_truth()
     # Counts are whole numbers of 6 mK; a cell averages 22 of them. Its field is curved by 0.3 mK over a cell.
     assert np.nanmax(np.abs(error)) < 0.010
     assert np.sqrt(np.nanmean(error**2)) < 0.002
 
 
-def test_discs_do_not_leak_into_their_neighbours(scene, tmp_path):
+def test_discs_do_not_leak_into_their_neighbours(tmp_path):
     """The same table with discs 20 K colder gives the same field."""
-    _, registration, _ = scene
     images = [Scene(disc_K=disc_K).render() for disc_K in (-4.0, -24.0)]
     frames = record(tmp_path / "a.seq", images)
-    fields = reduce_frames(frames, registration, GRID, edges(0, 1, 2))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 1, 2))
     assert np.nanmax(np.abs(np.diff(fields["temperature"].values, axis=0))) < 1e-3
-    x, y = np.meshgrid(GRID.x_mm, GRID.y_mm)
-    centres = mask_discs(np.stack([x, y], axis=-1), DISCS, margin_mm=0.0)
+    centres = mask_discs(GRID.centres_mm, DISCS, margin_mm=0.0)
     assert np.isnan(fields["temperature"].values[0][centres]).mean() > 0.9
 
 
-def test_dataset_keeps_its_contract(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 3)
-    fields = evaluate_uncertainty(
-        reduce_frames(frames, registration, GRID, edges(0, 1, 2, 3)), [frames[0].parameters] * 3
-    )
+def test_dataset_keeps_its_contract(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL] * 3)
+    reduced_alone = reduce_frames(frames, registered(), GRID, edges(0, 1, 2, 3))
+    fields = evaluate_uncertainty(reduced_alone, [frames[0].parameters] * 3)
     for name, (dims, units, kind) in FIELDS.items():
         assert fields[name].dims == dims
         assert fields[name].dtype.kind == kind
@@ -107,10 +98,9 @@ def test_dataset_keeps_its_contract(scene, tmp_path):
     assert (fields["temperature_rise"].values[0][np.isfinite(fields["temperature"].values[0])] == 0).all()
 
 
-def test_spread_and_rate_follow_a_known_ramp(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image + 0.1 * i for i in range(12)])
-    fields = reduce_frames(frames, registration, GRID, edges(0, 4, 8, 12))
+def test_spread_and_rate_follow_a_known_ramp(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL + 0.1 * i for i in range(12)])
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 4, 8, 12))
     # Four frames 0.1 K apart: standard deviation 0.1291 K; rounding to 6 mK counts adds 2 mK of noise.
     assert np.nanmedian(fields["temperature_spread"].values) == pytest.approx(0.1 * np.std(range(4), ddof=1), abs=1e-3)
     assert np.nanmedian(fields["temperature_rate"].values) == pytest.approx(0.1 * 3600, rel=1e-3)
@@ -118,16 +108,15 @@ def test_spread_and_rate_follow_a_known_ramp(scene, tmp_path):
     assert np.unique(fields["count"].values).tolist() == [0, 4]
 
 
-def test_guard_calibrates_a_transient_frame_by_frame(scene, tmp_path):
+def test_guard_calibrates_a_transient_frame_by_frame(tmp_path):
     """A spark of 40 K in one of ten frames: the sums alone would err by tens of millikelvin."""
-    image, registration, _ = scene
 
     def spark(x, y):
         return smooth_field(x, y) + 40.0 * ((np.abs(x - 250) < 15) & (np.abs(y - 90) < 15))
 
-    images = [Scene(disc_K=-4.0, field=spark).render() if i == 4 else image for i in range(10)]
+    images = [Scene(disc_K=-4.0, field=spark).render() if i == 4 else STILL for i in range(10)]
     frames = record(tmp_path / "a.seq", images)
-    fields = reduce_frames(frames, registration, GRID, edges(0, 10))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 10))
     hot = fields.sel(x=slice(240, 260), y=slice(80, 100))
     truth = smooth_field(*np.meshgrid(hot["x"], hot["y"])) + 4.0
     np.testing.assert_allclose(hot["temperature"].values[0], truth, atol=0.010)
@@ -144,18 +133,17 @@ def test_guard_calibrates_a_transient_frame_by_frame(scene, tmp_path):
 
 @pytest.mark.parametrize("block_s", [0.0, 10.0])
 @pytest.mark.parametrize("per_cycle", [1, 4])
-def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(scene, rng, tmp_path, per_cycle, block_s):
+def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(rng, tmp_path, per_cycle, block_s):
     """A count of zero lies below any temperature."""
-    image, registration, _ = scene
     path = tmp_path / "a.seq"
-    frames = record(path, (image + rng.normal(0, 0.05, image.shape) for _ in range(2 * per_cycle)))
-    whole = reduce_frames(frames, registration, GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
-    column, row = np.rint(registration.to_sensor(np.array([[302.0, 92.0]]))[0]).astype(int)
+    frames = record(path, (STILL + rng.normal(0, 0.05, STILL.shape) for _ in range(2 * per_cycle)))
+    whole = reduce_frames(frames, registered(), GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
+    column, row = np.rint(registered().to_sensor(np.array([[302.0, 92.0]]))[0]).astype(int)
     data = bytearray(path.read_bytes())
-    place = frames[-1].segments[0][0] + frames[-1].samples.offset + 2 * (row * image.shape[1] + column)
+    place = frames[-1].segments[0][0] + frames[-1].samples.offset + 2 * (row * STILL.shape[1] + column)
     data[place : place + 2] = bytes(2)
     path.write_bytes(data)
-    fields = reduce_frames(frames, registration, GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
+    fields = reduce_frames(frames, registered(), GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
     for name in ("temperature", "temperature_rise", "temperature_noise_u", "count"):
         np.testing.assert_array_equal(np.isfinite(fields[name]), np.isfinite(whole[name]))
     difference = (fields["temperature"] - whole["temperature"]).values
@@ -164,36 +152,31 @@ def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(scene, rng, 
     assert np.count_nonzero(np.nan_to_num(difference)) <= 9
 
 
-def test_changing_parameters_and_corrections_are_applied_frame_by_frame(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 4, interval_s=1)
+def test_changing_parameters_and_corrections_are_applied_frame_by_frame(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL] * 4, interval_s=1)
 
     def dim(frame):
         return override(frame.parameters, emissivity=0.97 if frame.index < 2 else 0.90)
 
-    fields = reduce_frames(
-        frames, registration, GRID, edges(0, 4), override=dim, correction_K=np.array([0, 0, 1.0, 1.0])
-    )
-    one_by_one = reduce_frames(
-        frames, registration, GRID, edges(0, 4), override=dim, correction_K=np.array([0, 0, 1.0, 1.0]), block_s=0
-    )
+    options = {"override": dim, "correction_K": np.array([0, 0, 1.0, 1.0])}
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 4), **options)
+    one_by_one = reduce_frames(frames, registered(), GRID, edges(0, 4), block_s=0, **options)
     assert fields.sizes["time"] == 2
     assert one_by_one.sizes["time"] == 4
     np.testing.assert_allclose(fields["temperature"], one_by_one["temperature"], atol=1e-5)
     step = fields["frame_temperature"].isel(time=1) - fields["frame_temperature"].isel(time=0)
     bright = reduce_frames(
-        frames[:1], registration, GRID, edges(0, 4), override=lambda f: replace(f.parameters, emissivity=0.9)
+        frames[:1], registered(), GRID, edges(0, 4), override=lambda f: replace(f.parameters, emissivity=0.9)
     )
     expected = bright["frame_temperature"].values[0] + 1.0 - fields["frame_temperature"].values[0]
     np.testing.assert_allclose(step, expected, atol=1e-4)
 
 
-def test_knocked_camera_keeps_the_field_in_place(scene, tmp_path):
-    image, registration, still = scene
-    knocked = replace(still, shift_px=(3.0, -2.0))
+def test_knocked_camera_keeps_the_field_in_place(tmp_path):
+    knocked = replace(SCENE, shift_px=(3.0, -2.0))
     after = knocked.render()
-    frames = record(tmp_path / "a.seq", [image, image, after, after])
-    spans = [RegistrationSpan(0, registration), RegistrationSpan(2, registered(knocked))]
+    frames = record(tmp_path / "a.seq", [STILL, STILL, after, after])
+    spans = [RegistrationSpan(0, registered()), RegistrationSpan(2, registered(knocked))]
     fields = reduce_frames(frames, spans, GRID, edges(0, 1, 3, 4))
     assert (fields["count"].max(("x", "y")) == [1, 2, 1]).all()
     assert (fields["quality_flag"].values[1] & 4 == 4).all()
@@ -201,11 +184,10 @@ def test_knocked_camera_keeps_the_field_in_place(scene, tmp_path):
     assert np.nanmax(np.abs(error)) < 0.010
 
 
-def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(scene, tmp_path):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 3, interval_s=10)
+def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(tmp_path):
+    frames = record(tmp_path / "a.seq", [STILL] * 3, interval_s=10)
     bounds = np.array([[0, 5], [8, 9], [18, 22]]) * SECOND + START
-    fields = reduce_frames(frames, registration, GRID, bounds)
+    fields = reduce_frames(frames, registered(), GRID, bounds)
     assert json.loads(fields.attrs["frames_outside_cycles"]) == ["a.seq#1"]
     assert fields["frame_cycle"].values.tolist() == [1, 0, 3]
     assert np.isnat(fields["cycle_time"].values[1])
@@ -219,54 +201,51 @@ def test_frames_outside_cycles_are_named_and_cycles_without_frames_are_flagged(s
         ({"cycle_bounds": edges(0, 5, 3)}, r"cycle 2 ends at .*, before it starts"),
         ({"cycle_bounds": np.stack([edges(0, 2), edges(1, 3)])}, r"cycle 2 starts at .*, before cycle 1 ends"),
         ({"cycle_bounds": edges(100, 200)}, r"no frame is within a cycle: frames 2026-03-09T06:30:00\.000000000 to 20"),
-        ({"correction_K": np.zeros(3)}, r"correction_K has shape \(3,\); it needs one finite value for each of 2"),
+        ({"correction_K": np.zeros(3)}, r"correction_K has shape \(3,\); give a finite value per frame, 2"),
         ({"cycle_bounds": edges()}, "cycle_bounds is empty; give the start and end of at least one cycle"),
-        ({"correction_K": np.full(2, np.nan)}, "it needs one finite value for each of 2 frames"),
+        ({"correction_K": np.full(2, np.nan)}, "give a finite value per frame, 2"),
         ({"references": []}, "there is no frame to reduce"),
         ({"references": "reversed"}, r"frame 0 has the time .*, not after .*; sort the frames"),
         ({"references": "small"}, r"has \(8, 8\) pixels, the registered frames \(480, 640\)"),
         ({"registration": "late"}, r"registrations start at frames \[1\]; they must start at 0 and rise"),
     ],
 )
-def test_faults_are_named(scene, tmp_path, change, message):
-    image, registration, _ = scene
-    frames = record(tmp_path / "a.seq", [image] * 2)
-    arguments = {"references": frames, "registration": registration, "cycle_bounds": edges(0, 1, 2)} | change
+def test_faults_are_named(tmp_path, change, message):
+    frames = record(tmp_path / "a.seq", [STILL] * 2)
+    arguments = {"references": frames, "registration": registered(), "cycle_bounds": edges(0, 1, 2)} | change
     if change.get("references") == "reversed":
         arguments["references"] = frames[::-1]
     if change.get("references") == "small":
-        arguments["references"] = record(tmp_path / "b.seq", [image[:8, :8]])
+        arguments["references"] = record(tmp_path / "b.seq", [STILL[:8, :8]])
     if change.get("registration") == "late":
-        arguments["registration"] = [RegistrationSpan(1, registration)]
+        arguments["registration"] = [RegistrationSpan(1, registered())]
     with pytest.raises(ReductionError, match=message):
         reduce_frames(arguments.pop("references"), arguments.pop("registration"), GRID, **arguments)
 
 
-def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(scene, rng, tmp_path):
-    image, registration, still = scene
-    shaken = replace(still, shift_px=(1.5, 0.0)).render()
+def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(rng, tmp_path):
+    shaken = replace(SCENE, shift_px=(1.5, 0.0)).render()
 
     hot = Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.015 * x).render()
 
     def warm(n):
-        return (shaken if n == 3 else image + (hot - image) * n / 7) + rng.normal(0, 0.05, image.shape)
+        return (shaken if n == 3 else STILL + (hot - STILL) * n / 7) + rng.normal(0, 0.05, STILL.shape)
 
     frames = record(tmp_path / "a.seq", (warm(n) for n in range(7)))
-    fields = reduce_frames(frames, registration, GRID, edges(0, 7))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 7))
     assert json.loads(fields.attrs["knocks"]) == []
     assert json.loads(fields.attrs["frames_shaken"]) == ["a.seq#3"]
 
 
-def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(scene, rng, tmp_path):
-    _, registration, _ = scene
+def test_the_first_frame_is_unchecked_if_its_discs_have_no_contrast(rng, tmp_path):
     plain = Scene(discs=()).render() + rng.normal(0, 0.05, (480, 640))
     frames = record(tmp_path / "a.seq", [plain] * 2)
-    fields = reduce_frames(frames, registration, GRID, edges(0, 2))
+    fields = reduce_frames(frames, registered(), GRID, edges(0, 2))
     # The first one is what the others' picture of the table is compared with.
     assert json.loads(fields.attrs["frames_unchecked"]) == ["a.seq#0"]
 
 
-BOUNDS = START + np.array([0, 4, 8, 11, 14]) * np.timedelta64(1, "s")
+BOUNDS = edges(0, 4, 8, 11, 14)
 
 
 @pytest.fixture(scope="module")
@@ -283,82 +262,59 @@ class BrokenOffError(Exception):
     pass
 
 
-def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
-    frames, registration = film
-    whole = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2)
+def broken_off(film, bounds, checkpoint, frames_done):
+    """A whole reduction, one that goes on where another broke off, and the numbers of frames that it reported."""
     done, seen = [], []
 
     def break_off(count):
         done.append(count)
-        if sum(done) >= 11:
+        if sum(done) >= frames_done:
             raise BrokenOffError
 
+    whole = reduce_frames(*film, GRID, bounds, block_s=2)
     with pytest.raises(BrokenOffError):
-        reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=break_off)
-    again = reduce_frames(
-        frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=seen.append
-    )
+        reduce_frames(*film, GRID, bounds, block_s=2, checkpoint=checkpoint, progress=break_off)
+    return whole, reduce_frames(*film, GRID, bounds, block_s=2, checkpoint=checkpoint, progress=seen.append), seen
+
+
+def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
+    whole, again, seen = broken_off(film, BOUNDS, tmp_path / "cp", 11)
     # Two cycles, and both parts of the third, before the knock and after it, were finished.
     assert seen[0] == 11
-    assert sum(seen) == len(frames)
-    for name in whole.variables:
-        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
-    assert whole.attrs == again.attrs
+    assert sum(seen) == 14
+    assert_equal_bits(whole, again)
     # A third run finds everything done but the last cycle's end, and reads no block.
     monkeypatch.setattr(still, "reduce_stretch", None)
-    third = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
+    third = reduce_frames(*film, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
     assert whole["temperature"].values.tobytes() == third["temperature"].values.tobytes()
 
 
 def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
     """One cycle over all frames: what was done of it is kept whenever it has grown by some frames."""
-    frames, registration = film
     monkeypatch.setattr(still, "STORED_FRAMES", 4)
-    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 4)
-    whole = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], block_s=2)
-    done, seen = [], []
-
-    def break_off(count):
-        done.append(count)
-        if sum(done) >= 6:
-            raise BrokenOffError
-
-    options = {"block_s": 2, "checkpoint": tmp_path / "cp"}
-    with pytest.raises(BrokenOffError):
-        reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=break_off, **options)
-    again = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=seen.append, **options)
+    monkeypatch.setattr(still, "STRETCH_FRAMES", 4)
+    whole, again, seen = broken_off(film, BOUNDS[[0, -1]], tmp_path / "cp", 6)
     assert seen[0] == 8
-    for name in whole.variables:
-        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
-    assert whole.attrs == again.attrs
+    assert_equal_bits(whole, again)
 
 
 def test_a_checkpoint_of_another_reduction_is_refused(film, tmp_path):
-    frames, registration = film
-    reduce_frames(frames[:4], registration, GRID, BOUNDS, checkpoint=tmp_path)
+    arguments = (film[0][:4], film[1], GRID, BOUNDS)
+    reduce_frames(*arguments, checkpoint=tmp_path)
     with pytest.raises(CheckpointError, match=r"holds cycles of another reduction \(other frames\); remove the folder"):
-        reduce_frames(
-            frames[:4],
-            registration,
-            GRID,
-            BOUNDS,
-            checkpoint=tmp_path,
-            override=lambda f: override(f.parameters, emissivity=0.9),
-        )
+        reduce_frames(*arguments, checkpoint=tmp_path, override=lambda f: override(f.parameters, emissivity=0.9))
     with pytest.raises(CheckpointError, match=r"other block_s"):
-        reduce_frames(frames[:4], registration, GRID, BOUNDS, checkpoint=tmp_path, block_s=1)
+        reduce_frames(*arguments, checkpoint=tmp_path, block_s=1)
 
 
-SCENE = Scene(disc_K=-4.0)
-STILL = SCENE.render()
 ZOOM = 1.05
 
 
 def reduced(tmp_path, rng, images, *, interval_s=60.0, cycles=None):
     noisy = [image + rng.normal(0.0, 0.05, image.shape) for image in images]
     frames = record(tmp_path / "a.seq", noisy, interval_s=interval_s)
-    edges = np.linspace(0.0, interval_s * len(images), (cycles or len(images)) + 1)
-    return reduce_frames(frames, registered(), GRID, START + np.round(1e3 * edges).astype("m8[ms]"))
+    seconds = np.linspace(0.0, interval_s * len(images), (cycles or len(images)) + 1)
+    return reduce_frames(frames, registered(), GRID, START + np.round(1e3 * seconds).astype("m8[ms]"))
 
 
 def rms_K(fields) -> float:
@@ -505,14 +461,7 @@ def test_stretches_divide_short_and_long_recordings_and_end_at_registrations():
 
 def test_what_a_resumed_run_has_to_find_is_described_the_same_for_equal_parameters():
     series = simulated(50, cycles=2)
-    copies = FrameSeries(
-        series.references,
-        series.times,
-        series.bounds,
-        series.cycles,
-        series.correction_K,
-        lambda frame: replace(frame.parameters),
-    )
+    copies = replace(series, override=lambda frame: replace(frame.parameters))
     assert describe_reduction(series, GRID, [], block_s=10) == describe_reduction(copies, GRID, [], block_s=10)
 
 
@@ -528,23 +477,20 @@ def short_film(tmp_path_factory):
     return frames, sensor
 
 
+def series_until(stop_s, frames, **options):
+    return make_frame_series(frames, edges(0, stop_s), shape=(480, 640), override=lambda f: f.parameters, **options)
+
+
 def test_a_portion_is_the_mean_of_its_frames(short_film):
     frames, sensor = short_film
-    series = make_frame_series(
-        frames,
-        START + np.array([0, 6]) * np.timedelta64(1, "s"),
-        shape=(480, 640),
-        override=lambda frame: frame.parameters,
-        correction_K=np.full(9, 0.25),
-    )
+    series = series_until(6, frames, correction_K=np.full(9, 0.25))
     blocks = cut_blocks(series, WHOLE, block_s=2)
     [stretch] = cut_stretches(blocks, total=len(series))[:1]
     tasks = [(gather_frames(series, portion.blocks), portion.whole) for portion in stretch]
     [result, *_] = reduce_stretch(tasks, sensor)
     assert stretch[0].whole
-    truth = sensor.weights.resample(
-        np.mean([calibrate(f.read_counts(), SC660)[sensor.weights.window] for f in frames[:6]], 0)
-    )
+    images = [calibrate(frame.read_counts(), SC660)[sensor.weights.window] for frame in frames[:6]]
+    truth = sensor.weights.resample(np.mean(images, 0))
     np.testing.assert_allclose(result.part.mean, truth + 0.25, atol=1e-4)
     assert result.part.frames == 6
     assert result.part.seconds == pytest.approx(15.0)
@@ -556,9 +502,7 @@ def test_a_portion_is_the_mean_of_its_frames(short_film):
 
 def test_frames_left_out_take_no_part(short_film):
     frames, sensor = short_film
-    series = make_frame_series(
-        frames, START + np.array([0, 9]) * np.timedelta64(1, "s"), shape=(480, 640), override=lambda f: f.parameters
-    )
+    series = series_until(9, frames)
     [block] = cut_blocks(series, WHOLE, block_s=60)
     some = reduce_portion([choose_frames(series, block, np.array([0, 2]))], sensor, whole=False)
     assert some.part.frames == 2

@@ -49,8 +49,8 @@ def test_levels_and_blocks(tmp_path, image, registration, rng):
     np.testing.assert_allclose(survey.patch, image[10:30, 20:60].mean() + 0.1 * np.arange(FRAMES), atol=0.01)
     edge = survey.edge_px
     rows, columns = survey.levels.shape[1:]
-    expected = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).mean(axis=(1, 3))
-    smooth = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).std(axis=(1, 3)) < 0.2
+    blocks = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge)
+    expected, smooth = blocks.mean(axis=(1, 3)), blocks.std(axis=(1, 3)) < 0.2
     # 50 mK over several hundred pixels, and the curvature of the calibration within a block.
     np.testing.assert_allclose(survey.levels[3][smooth], expected[smooth] + 0.3, atol=0.015)
     blocks = locate_blocks(survey, registration, GRID, np.zeros((0, 2)))
@@ -91,7 +91,7 @@ def test_damage_is_found_with_and_without_a_checksum(tmp_path, film, registratio
     survey = survey_frames(index_frames([path])[0])
     if checksum:
         (found,) = survey.damaged
-        assert found.index == damaged and "the samples are damaged" in found.reason
+        assert found.index == damaged and "damaged samples" in found.reason
         assert len(survey.frames) == len(survey.levels) == FRAMES - 1
     else:
         assert survey.damaged == []
@@ -111,10 +111,7 @@ def _with_hand(image: np.ndarray) -> np.ndarray:
     [
         (_with_hand, "pixels of the table differ from the frames before and after it"),
         # Less than ten times the noise of a pixel.
-        (
-            lambda _: Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.35).render(),
-            "the table differs by 0.3",
-        ),
+        (lambda _: Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.35).render(), "table differs by 0.3"),
     ],
     ids=["a hand over the table", "a uniform other level"],
 )

@@ -3,7 +3,6 @@
 import struct
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from tests.thermography.flir_mutations import (
     TIME,
     frame,
     jpeg,
+    patch,
     sequence,
     without_checksums,
 )
@@ -25,6 +25,13 @@ from thermography.io.frame import FlirFormatError
 
 SC660_JPEG = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
 SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
+
+
+@pytest.fixture
+def one(tmp_path):
+    """A sequence of one frame."""
+    sequence(tmp_path / "a.seq", frames=1)
+    return tmp_path / "a.seq"
 
 
 # Bytes and directory -------------------------------------------------------------------------------------------------
@@ -47,15 +54,12 @@ def test_a_record_in_several_segments_reads_as_one(tmp_path):
             source.take(30, 11, "a table")
 
 
-def test_directory_names_records_and_their_checksums(tmp_path):
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
-    data = bytearray(path.read_bytes())
+def test_directory_names_records_and_their_checksums(one):
+    data = one.read_bytes()
     # The last sample: any change of the raw image shows in its checksum and nowhere else.
-    data[-1] ^= 1
-    path.write_bytes(data)
-    with path.open("rb", buffering=0) as file:
-        source = FffSource(file, path, ((0, len(data)),))
+    patch(one, (-1, bytes([data[-1] ^ 1])))
+    with one.open("rb", buffering=0) as file:
+        source = FffSource(file, one, ((0, len(data)),))
         directory = read_directory(source)
         assert directory.order == ">" and set(directory.records) == {0x20, 0x01}
         assert directory.records[0x20] == (0x200, 2476)
@@ -63,9 +67,8 @@ def test_directory_names_records_and_their_checksums(tmp_path):
         assert damaged_records(source, directory) == [0x01]
 
 
-def test_a_header_is_recognised_by_version_and_directory_and_not_by_its_magic_alone(tmp_path):
-    sequence(tmp_path / "a.seq", frames=1)
-    header = (tmp_path / "a.seq").read_bytes()[:64]
+def test_a_header_is_recognised_by_version_and_directory_and_not_by_its_magic_alone(one):
+    header = one.read_bytes()[:64]
     assert is_fff_header(header)
     assert not is_fff_header(header[:63])
     assert not is_fff_header(b"FFF\0" + bytes(60))
@@ -133,24 +136,14 @@ def test_humidity_in_percent_is_converted_and_noted(tmp_path):
     assert frame.notes == ("relative humidity 45 was stored in percent",)
 
 
-def test_a_camera_info_of_the_shortest_kind_has_no_housekeeping(tmp_path):
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
-    data = bytearray(path.read_bytes())
-    struct.pack_into(">I", data, 0x40 + 16, 0x47C)
-    path.write_bytes(data)
-    frame = read_frame(path)
+def test_a_camera_info_of_the_shortest_kind_has_no_housekeeping(one):
+    frame = read_frame(patch(one, (0x40 + 16, struct.pack(">I", 0x47C))))
     assert frame.housekeeping == {} and frame.time == TIME and len(frame.camera_info) == 0x47C
     assert frame.settings == SETTINGS
 
 
-def test_a_camera_info_that_ends_after_the_calibration_has_no_time(tmp_path):
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
-    data = bytearray(path.read_bytes())
-    struct.pack_into(">I", data, 0x40 + 16, 0x314)
-    path.write_bytes(data)
-    frame = read_frame(path)
+def test_a_camera_info_that_ends_after_the_calibration_has_no_time(one):
+    frame = read_frame(patch(one, (0x40 + 16, struct.pack(">I", 0x314))))
     assert np.isnat(frame.time) and frame.settings.raw_range == 0 and frame.settings.clip_maximum_K == 423.25
     assert frame.parameters == PARAMETERS and frame.camera == CAMERA
 
@@ -188,22 +181,13 @@ def test_big_endian_samples_are_read_by_their_own_mark(tmp_path):
 # Violations ----------------------------------------------------------------------------------------------------------
 
 
-def test_truncation_at_every_byte_of_the_headers_is_refused_with_its_place(tmp_path):
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
-    data = path.read_bytes()
+def test_truncation_at_every_byte_of_the_headers_is_refused_with_its_place(one):
+    data = one.read_bytes()
     boundaries = [*range(0x60), 0x200, 0x201, 0x200 + 2475, 0x200 + 2476, 0x200 + 2476 + 0x20, len(data) - 1]
     for length in boundaries:
-        path.write_bytes(data[:length])
+        one.write_bytes(data[:length])
         with pytest.raises(FlirFormatError, match=r"a\.seq: at 0x[0-9A-F]+: expected .*, found"):
-            read_frame(path)
-
-
-def _patched(path: Path, offset: int, value: bytes) -> Path:
-    data = bytearray(path.read_bytes())
-    data[offset : offset + len(value)] = value
-    path.write_bytes(data)
-    return path
+            read_frame(one)
 
 
 @pytest.mark.parametrize(
@@ -216,6 +200,8 @@ def _patched(path: Path, offset: int, value: bytes) -> Path:
         (0x1C, b"\xff\xff\xff\xff", r"expected 1 to 1024 directory slots, found 4294967295"),
         (0x40, b"\0\x99", r"expected camera information \(type 0x20\) in the directory, found types 0x99, 0x01"),
         (0x60, b"\0\x99", r"expected a raw image \(type 0x01\) in the directory, found types 0x20, 0x99"),
+        # A directory that points to itself.
+        (0x4C, b"\0\0\0\x40", "byte-order mark"),
         (0x4C, b"\x7f\0\0\0", r"at 0x7F000000: expected camera information of 2476 bytes, found 0 bytes before the"),
         (0x50, b"\0\0\0\x20", r"at 0x200: expected camera information of at least 788 bytes, found 32 bytes"),
         (0x70, b"\0\0\0\x10", r"expected a raw image longer than its header, found 16 bytes"),
@@ -226,32 +212,21 @@ def _patched(path: Path, offset: int, value: bytes) -> Path:
         (0xBAE, b"\xff\xff\xff\xff", r"expected 1 to 16777216 pixels, found 65535 x 65535"),
     ],
 )
-def test_a_violation_is_named_with_file_and_place(tmp_path, offset, value, message):
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
+def test_a_violation_is_named_with_file_and_place(one, offset, value, message):
     with pytest.raises(FlirFormatError, match=message):
-        read_frame(_patched(path, offset, value))
+        read_frame(patch(one, (offset, value)))
 
 
 @pytest.mark.parametrize("encoding", ["raw", "png", "jpegls"])
 def test_samples_that_differ_from_their_checksum_are_refused(tmp_path, encoding):
     path = tmp_path / "a.seq"
     sequence(path, encoding, frames=1)
-    data = bytearray(path.read_bytes())
-    data[-9] ^= 0x10
-    path.write_bytes(data)
+    patch(path, (-9, bytes([path.read_bytes()[-9] ^ 0x10])))
     with pytest.raises(FlirFormatError, match=r"at 0xBAC: expected a raw image with the CRC-32 [0-9A-F]{8}, found"):
         read_frame(path)
-    path.write_bytes(without_checksums(bytes(data)))
+    path.write_bytes(without_checksums(path.read_bytes()))
     if encoding == "raw":
         assert read_frame(path).counts.shape == (12, 16)
-
-
-def test_a_directory_that_points_to_itself_is_refused(tmp_path):
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
-    with pytest.raises(FlirFormatError, match="byte-order mark"):
-        read_frame(_patched(path, 0x4C, struct.pack(">I", 0x40)))
 
 
 @pytest.mark.parametrize(
@@ -293,17 +268,14 @@ def test_thousands_of_damaged_frames_leave_the_interpreter_intact(tmp_path):
     assert sys.getrefcount(None) > before - 1000
 
 
-def test_reading_a_small_file_that_claims_much_costs_little(tmp_path):
+def test_reading_a_small_file_that_claims_much_costs_little(one):
     import tracemalloc
 
-    path = tmp_path / "a.seq"
-    sequence(path, frames=1)
     claim = struct.pack(">I", 0xFFFFFFF0)
-    _patched(_patched(path, 0x50, claim), 0x70, claim)
-    _patched(path, 0xBAE, struct.pack("<2H", 4096, 4096))
+    patch(one, (0x50, claim), (0x70, claim), (0xBAE, struct.pack("<2H", 4096, 4096)))
     tracemalloc.start()
     with pytest.raises(FlirFormatError, match=r"bytes fewer: the frame is truncated|before the end"):
-        read_frame(path)
+        read_frame(one)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1e6

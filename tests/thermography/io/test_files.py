@@ -74,14 +74,12 @@ def test_a_temporary_name_tells_the_file_and_is_of_one_writer(name):
 def test_machines_that_share_a_folder_do_not_write_under_one_name(monkeypatch):
     """Threads of two containers may have the same number."""
     monkeypatch.setattr(threading, "get_native_id", lambda: 1)
-    program = (
+    code = (
         "import threading; from pathlib import Path; threading.get_native_id = lambda: 1\n"
         "from thermography.io.files import partial_path; print(partial_path(Path('maps/fields.nc')))"
     )
     path = Path("maps", "fields.nc")
-    other = Path(
-        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout[:-1]
-    )
+    other = Path(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout[:-1])
     assert other != partial_path(path)
     # A name that an earlier version left, without the random number, is known too.
     assert finished_path(other) == finished_path(Path("maps", ".fields.partial4711.nc")) == path
@@ -139,7 +137,7 @@ def test_every_quantity_is_a_part_with_one_channel(tmp_path):
         ({}, r"there are no maps to"),
         ({"a": np.ones((2, 3)), "b": np.ones((3, 2))}, "the maps differ in shape"),
         ({"a": np.ones(3)}, r"a has shape \(3,\); a map is \(y, x\)"),
-        ({"a": np.full((2, 2), 1e300)}, "a holds 1e\\+300, which float32 cannot represent"),
+        ({"a": np.full((2, 2), 1e300)}, "a holds 1e\\+300, beyond float32"),
     ],
 )
 def test_what_cannot_be_written_is_refused(tmp_path, maps, message):
@@ -158,7 +156,7 @@ def test_what_is_not_a_map_file_is_refused(tmp_path):
 
 def test_a_file_that_does_not_read_back_is_not_left_behind(tmp_path, monkeypatch):
     monkeypatch.setattr("thermography.io.files.read_maps", lambda path: {"a": np.zeros((2, 2), np.float32)})
-    with pytest.raises(ExrError, match="a does not read back as it was written"):
+    with pytest.raises(ExrError, match="a does not read back as written"):
         write_maps(tmp_path / "x.exr", {"a": np.ones((2, 2))})
     assert not list(tmp_path.iterdir())
 

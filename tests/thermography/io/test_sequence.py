@@ -17,16 +17,7 @@ from thermography.io import sequence as module
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraIdentity
-from thermography.io.sequence import (
-    FrameTable,
-    WindowReader,
-    call_by_threads,
-    frame_times,
-    in_memory,
-    opening_threads,
-    order_by_time,
-    usable_threads,
-)
+from thermography.io.sequence import FrameTable, WindowReader, call_by_threads, frame_times, in_memory, order_by_time
 
 pytestmark = pytest.mark.long
 
@@ -81,9 +72,7 @@ def test_a_second_frame_of_a_time_is_taken_out_and_those_without_come_last(tmp_p
     assert [each.index for each in frames] == [0, 1, 5, 4]
     assert [each.index for each in rejected] == [2, 3]
     assert all("the same time" in each.reason and "as frame 1 of" in each.reason for each in rejected)
-    written = [
-        replace(frame(seconds=second), time=time) for second, time in enumerate([np.datetime64("NaT", "ms")] * 2)
-    ]
+    written = [replace(frame(seconds=second), time=np.datetime64("NaT", "ms")) for second in range(2)]
     write_sequence(tmp_path / "a.seq", [*written, frame(seconds=7), frame(seconds=5)])
     frames, rejected = index_frames(tmp_path / "a.seq")
     assert [each.index for each in frames] == [3, 2, 0, 1] and not rejected
@@ -131,23 +120,23 @@ def test_the_first_item_that_fails_is_told_and_the_last_ones_are_not_called():
 @pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (3, 3), (64, 8)])
 def test_threads_that_compute_follow_the_cores_of_the_process(cores, threads, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(cores)), raising=False)
-    assert usable_threads() == threads
+    assert module.usable_threads() == threads
 
 
 def test_systems_without_affinity_are_asked_for_their_cores(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert usable_threads() == 1
+    assert module.usable_threads() == 1
 
 
 def test_files_are_opened_by_threads_only_where_the_disk_is_awaited(tmp_path, monkeypatch):
     paths = [tmp_path / name for name in "ab"]
     for path in paths:
         path.write_bytes(b"a")
-    assert opening_threads(paths) == 1
+    assert module.opening_threads(paths) == 1
     monkeypatch.setattr(module, "in_memory", lambda path: False)
-    assert opening_threads(paths) == 8
-    assert opening_threads(paths[:1]) == opening_threads([]) == 1
+    assert module.opening_threads(paths) == 8
+    assert module.opening_threads(paths[:1]) == module.opening_threads([]) == 1
 
 
 ENCODINGS = ("raw", "png", "jpegls")
@@ -445,7 +434,7 @@ WINDOW = (slice(37, 201), slice(0, 320))
 
 def film(path, **options):
     """Twelve frames of 240 x 320 pixels, 1.8 MB: more than the system reads ahead."""
-    frames = [replace(frame(240, 320, seed=i), time=frame(seconds=i).time) for i in range(12)]
+    frames = [frame(240, 320, seed=i, seconds=i) for i in range(12)]
     write_sequence(path, frames, **options)
     references, rejected = index_frames([path])
     assert not rejected
@@ -493,10 +482,9 @@ def test_frames_of_several_files_and_a_system_without_direct_reading(tmp_path, m
     monkeypatch.delattr(os, "O_DIRECT", raising=False)
     for path in (first_film[0].path, second_film[0].path):
         forget(path)
+    frames = [first_film[2], second_film[3], second_film[4], first_film[5]]
     with WindowReader(WINDOW) as reader:
-        counts = reader.read(
-            [first_film[2], second_film[3], second_film[4], first_film[5]], np.empty((4, 164, 320), np.uint16)
-        )
+        counts = reader.read(frames, np.empty((4, 164, 320), np.uint16))
     expected = np.stack([first[2], second[3], second[4], first[5]])
     assert (counts == expected[(slice(None), *WINDOW)]).all()
 
@@ -507,7 +495,7 @@ def test_file_that_became_shorter_is_named(tmp_path, length):
     os.truncate(references[0].path, length)
     with (
         WindowReader(WINDOW) as reader,
-        pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file has become shorter since it was indexed"),
+        pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file was cut after it was indexed"),
     ):
         reader.read(references, np.empty((12, 164, 320), np.uint16))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.thermography.flir_mutations import PARAMETERS, TIME, frame, jpeg, sequence
+from tests.thermography.flir_mutations import PARAMETERS, TIME, frame, jpeg, patch, sequence
 from thermography.io import xarray_backend
 from thermography.io.flir import FlirFrameReference, index_frames, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
@@ -95,9 +95,7 @@ def test_a_dataset_survives_netcdf(tmp_path):
 def test_what_is_left_out_is_warned_of_and_listed(tmp_path):
     jpeg(tmp_path / "a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"nothing")
-    with pytest.warns(
-        UserWarning, match=r"1 files or frames could not be used, the first: .*b\.jpg: at 0x0: expected a JPEG"
-    ):
+    with pytest.warns(UserWarning, match=r"1 files or frames could not be used, the first: .*b\.jpg: at 0x0: expected"):
         dataset = _open(sorted(tmp_path.iterdir()))
     (rejected,) = json.loads(dataset.attrs["rejected"])
     assert rejected["path"].endswith("b.jpg") and "expected a JPEG" in rejected["reason"]
@@ -135,13 +133,8 @@ def test_files_are_recognised_by_their_start(tmp_path):
 
 def test_temperature_is_calibrated_on_access_with_the_given_parameters(tmp_path):
     written = sequence(tmp_path / "a.seq", frames=3)
-    for options, parameters in (
-        ({}, PARAMETERS),
-        (
-            {"emissivity": 0.8, "reflected_temperature_degC": 22.0},
-            override(PARAMETERS, emissivity=0.8, reflected_temperature_K=295.15),
-        ),
-    ):
+    warmer = override(PARAMETERS, emissivity=0.8, reflected_temperature_K=295.15)
+    for options, parameters in (({}, PARAMETERS), ({"emissivity": 0.8, "reflected_temperature_degC": 22.0}, warmer)):
         dataset = _open(tmp_path / "a.seq", **options)
         assert dataset["temperature"].attrs["units"] == "degC" and dataset["temperature"].dtype == np.float32
         np.testing.assert_array_equal(dataset["temperature"][1, 2:5], calibrate(written[1].counts, parameters)[2:5])
@@ -160,10 +153,9 @@ def test_the_accessor_calibrates_anew(tmp_path, chunks):
     anew = dataset.flir.temperature(emissivity=0.8)
     assert (anew.chunks is None) is (chunks is None)
     np.testing.assert_array_equal(anew, _open(sorted(tmp_path.iterdir()), emissivity=0.8)["temperature"])
-    np.testing.assert_array_equal(
-        dataset.isel(time=1, row=slice(2, 4)).flir.temperature(), dataset["temperature"][1, 2:4]
-    )
-    with pytest.raises(RadiometryError, match="the Dataset has no counts; open the file with engine='flir'"):
+    part = dataset.isel(time=1, row=slice(2, 4))
+    np.testing.assert_array_equal(part.flir.temperature(), dataset["temperature"][1, 2:4])
+    with pytest.raises(RadiometryError, match="the Dataset has no counts; open it with engine='flir'"):
         dataset.drop_vars("counts").flir.temperature()
     assert dataset.flir.visible_light(2) is None
 
@@ -205,9 +197,8 @@ def test_a_folder_read_by_threads_has_the_values_of_one_thread_and_tells_the_fir
     assert values[0] == values[1]
     dataset = _open(paths)
     for number in (11, 12, 25):
-        data = bytearray(Path(paths[number]).read_bytes())
         reference = index_frames(paths[number])[0][0]
-        data[reference.segments[0][0] + reference.samples.offset + 200] ^= 255
-        Path(paths[number]).write_bytes(data)
+        place = reference.segments[0][0] + reference.samples.offset + 200
+        patch(reference.path, (place, bytes([reference.path.read_bytes()[place] ^ 255])))
     with pytest.raises(FlirFormatError, match=r"11\.jpg"):
         dataset["temperature"].load()

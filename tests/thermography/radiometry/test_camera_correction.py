@@ -82,9 +82,8 @@ def test_a_step_has_its_place_size_and_uncertainty_and_one_beside_the_table_is_t
     assert 0.001 < step.u_K < 0.03
     # A door opens: what lies beside the table changes, the table does not.
     series = _sound(2)
-    found = estimate_correction(
-        replace(series, background=series.background + np.where(np.arange(FRAMES) >= 30, 0.4, 0.0))
-    )
+    beside = series.background + np.where(np.arange(FRAMES) >= 30, 0.4, 0.0)
+    found = estimate_correction(replace(series, background=beside))
     assert found.steps == () and not found.corrects
 
 
@@ -174,9 +173,8 @@ def test_repeated_and_frozen_frames_are_told_apart():
 def test_planted_bad_pixels_are_found_and_edges_are_not(rng):
     row, column = np.mgrid[:60, :80]
     # A hot block with sharp edges and a disc: what a table with fiducials looks like.
-    scene = (
-        18000 + 3000.0 * ((row > 20) & (row < 40) & (column > 30)) - 800.0 * ((row - 30) ** 2 + (column - 15) ** 2 < 36)
-    )
+    block, disc = (row > 20) & (row < 40) & (column > 30), (row - 30) ** 2 + (column - 15) ** 2 < 36
+    scene = 18000 + 3000.0 * block - 800.0 * disc
     stack = scene + rng.normal(0, 8, (32, 60, 80))
     stack[:, 5, 5] = 16000
     stack[:, 50, 70] += 400

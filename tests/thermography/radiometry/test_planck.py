@@ -28,11 +28,17 @@ from thermography.radiometry.planck import (
 )
 
 
-@pytest.mark.real_data
-def test_e40bx_equals_the_vendors_export_to_half_a_printed_digit(real_file):
+@pytest.fixture
+def exported(real_file):
+    """A frame of an E40bx, and the temperatures that the vendor's program makes of it, degC."""
     folder = "gpereyrairujo__IRimage/Windows/IRimage/test/"
-    frame = read_frame(real_file(folder + "test_image.jpg"))
     vendor = np.genfromtxt(real_file(folder + "csv/test_image.csv"), delimiter=",", encoding="utf-8-sig")
+    return read_frame(real_file(folder + "test_image.jpg")), vendor
+
+
+@pytest.mark.real_data
+def test_e40bx_equals_the_vendors_export_to_half_a_printed_digit(exported):
+    frame, vendor = exported
     difference = calibrate(frame.counts, frame.parameters).astype(float) - vendor
     # Half of the last printed digit, plus the resolution of the float32 kelvins on both sides (300 K: 1.5e-5 K).
     assert np.abs(difference).max() <= 0.0005 + 1.5e-5
@@ -53,10 +59,8 @@ def test_sc660_sequence_stores_the_transmission_that_the_formula_gives(real_file
 
 
 @pytest.mark.real_data
-def test_half_the_path_taken_twice_is_not_what_the_vendor_calculates(real_file):
-    folder = "gpereyrairujo__IRimage/Windows/IRimage/test/"
-    frame = read_frame(real_file(folder + "test_image.jpg"))
-    vendor = np.genfromtxt(real_file(folder + "csv/test_image.csv"), delimiter=",", encoding="utf-8-sig")
+def test_half_the_path_taken_twice_is_not_what_the_vendor_calculates(exported):
+    frame, vendor = exported
     half = path_transmission(override(frame.parameters, object_distance_m=frame.parameters.object_distance_m / 2))
     assert (path_transmission(frame.parameters), half**2) == pytest.approx((0.98640, 0.98090), abs=5e-6)
     twice = override(frame.parameters, stored_transmission=half**2)
@@ -129,27 +133,14 @@ kelvins = st.floats(250.0, 350.0)
 @settings(max_examples=200, deadline=None)
 @given(
     temperature=st.floats(-20, 120),
-    emissivity=fractions,
-    distance=st.floats(0, 20),
-    reflected=kelvins,
-    air=kelvins,
-    window=kelvins,
-    window_transmission=fractions,
-    humidity=st.floats(0, 1),
+    changes=st.fixed_dictionaries(
+        {f"{name}_temperature_K": kelvins for name in ("reflected", "atmospheric", "window")}
+        | {"emissivity": fractions, "window_transmission": fractions}
+        | {"object_distance_m": st.floats(0, 20), "relative_humidity": st.floats(0, 1)}
+    ),
 )
-def test_temperature_to_counts_and_back(
-    temperature, emissivity, distance, reflected, air, window, window_transmission, humidity
-):
-    parameters = override(
-        PARAMETERS,
-        emissivity=emissivity,
-        object_distance_m=distance,
-        reflected_temperature_K=reflected,
-        atmospheric_temperature_K=air,
-        window_temperature_K=window,
-        window_transmission=window_transmission,
-        relative_humidity=humidity,
-    )
+def test_temperature_to_counts_and_back(temperature, changes):
+    parameters = override(PARAMETERS, **changes)
     counts = counts_from_temperature(temperature, parameters)
     assert float(temperature_from_counts(counts, parameters)) == pytest.approx(temperature, abs=1e-8)
 
@@ -236,7 +227,7 @@ def test_constants_of_the_air_that_give_no_transmission_are_refused_unless_one_i
 def test_unknown_names_averages_and_wild_emissivities_are_refused():
     with pytest.raises(RadiometryError, match="parameter 'distance' is unknown; use one of emissivity"):
         override(PARAMETERS, distance=2.0)
-    with pytest.raises(RadiometryError, match="counts: expected uint16, got float64; use temperature_from_counts"):
+    with pytest.raises(RadiometryError, match="counts: expected uint16, got float64; for means use"):
         calibrate(np.array([18000.5]), PARAMETERS)
     with pytest.raises(RadiometryError, match=r"emissivity from 0 to 0\.5: expected fractions above 0 and up to 1"):
         temperature_from_counts(18000, PARAMETERS, emissivity=[0.0, 0.5])
@@ -273,9 +264,9 @@ def test_constants_and_logs_replace_what_the_file_says():
     ("times", "values", "message"),
     [
         (TIMES, [1.0, 2.0], r"expected as many times as values, got \(3,\) and \(2,\)"),
-        (TIMES[::-1], [1.0, 2.0, 3.0], "expected increasing times and finite values; sort the log and remove gaps"),
-        (TIMES, [1.0, np.nan, 3.0], "expected increasing times and finite values"),
-        (TIMES[[0, 1, 1]], [1.0, 2.0, 3.0], "expected increasing times and finite values"),
+        (TIMES[::-1], [1.0, 2.0, 3.0], "expected rising times and finite values; sort it and drop gaps"),
+        (TIMES, [1.0, np.nan, 3.0], "expected rising times and finite values"),
+        (TIMES[[0, 1, 1]], [1.0, 2.0, 3.0], "expected rising times and finite values"),
         (TIMES[:2], [1.0, 2.0, 3.0], r"expected as many times as values, got \(2,\) and \(3,\)"),
         (TIMES[None], [[1.0, 2.0, 3.0]], r"expected as many times as values, got \(1, 3\) and \(1, 3\)"),
         (TIMES[:0], [], r"expected as many times as values, got \(0,\) and \(0,\)"),
@@ -345,6 +336,6 @@ def test_estimates_are_classed_and_what_determines_nothing_is_refused():
     impossible = KnownState(2 * hot.counts, 2.0, hot.temperature_degC, 0.2)
     assert estimate_emissivity(cold, impossible, PARAMETERS).quality == "undetermined"
     state = _states(0.9)[0]
-    with pytest.raises(RadiometryError, match="both states have 22 degC: heat the surface between them"):
+    with pytest.raises(RadiometryError, match="both states have 22 degC: heat it between them"):
         estimate_emissivity(state, state, PARAMETERS)
     assert np.isnan(estimate_emissivity(*_states(0.995), PARAMETERS).reflected_temperature_degC)

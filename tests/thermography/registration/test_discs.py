@@ -40,9 +40,8 @@ def draw(centre_px, radius_px, *, disc_K=-3.0, slope=0.0, shape=(120, 200)):
 @pytest.mark.parametrize("slope", [0.0, 0.02])
 def test_centroid_is_exact_at_both_contrasts_and_on_a_gradient(disc_K, slope):
     disc, centre = Fiducial("F1", 50.13, 30.32, 16.0), np.array([100.26, 60.64])
-    located = locate_disc(
-        draw(centre, 16.0, disc_K=disc_K, slope=slope), disc, SMALL_GRID, centre + np.array([1.5, -1.0]), JACOBIAN
-    )
+    image, start = draw(centre, 16.0, disc_K=disc_K, slope=slope), centre + np.array([1.5, -1.0])
+    located = locate_disc(image, disc, SMALL_GRID, start, JACOBIAN)
     assert isinstance(located, LocatedDisc)
     assert np.hypot(located.column_px - centre[0], located.row_px - centre[1]) < 0.01
     assert located.contrast_K == pytest.approx(disc_K, abs=0.01)
@@ -52,9 +51,8 @@ def test_centroid_is_exact_at_both_contrasts_and_on_a_gradient(disc_K, slope):
 def test_stated_uncertainty_is_the_scatter_of_the_centroid(rng):
     disc, centre = Fiducial("F1", 50.0, 30.0, 16.0), np.array([100.0, 60.0])
     image = draw(centre, 16.0)
-    located = [
-        locate_disc(image + rng.normal(0, 0.3, image.shape), disc, SMALL_GRID, centre, JACOBIAN) for _ in range(100)
-    ]
+    noisy = (image + rng.normal(0, 0.3, image.shape) for _ in range(100))
+    located = [locate_disc(each, disc, SMALL_GRID, centre, JACOBIAN) for each in noisy]
     scatter = np.std([(place.column_px, place.row_px) for place in located], axis=0).mean()
     # 200 values give their standard deviation to 5 %; the planes under and around the disc share the noise.
     assert np.mean([place.u_px for place in located]) == pytest.approx(scatter, rel=0.3)
@@ -68,10 +66,8 @@ def test_reasons_why_a_disc_is_not_located(rng):
     off = locate_disc(draw(centre, 16.0), disc, SMALL_GRID, centre + np.array([12.0, 0.0]), JACOBIAN)
     assert off == "no disc within 3.0 px of where it should be"
     tiny = Fiducial("F1", 50.0, 30.0, 1.0)
-    assert (
-        locate_disc(plain, tiny, SMALL_GRID, centre, JACOBIAN)
-        == "is too small in the frame or too near the plan's edge"
-    )
+    reason = locate_disc(plain, tiny, SMALL_GRID, centre, JACOBIAN)
+    assert reason == "is too small in the frame or too near the plan's edge"
 
 
 def test_discs_are_detected_where_and_as_large_as_they_are_and_bars_are_not(rng):

@@ -32,6 +32,14 @@ def registration():
     return registered()
 
 
+def monitored(frames, registration):
+    """What the monitor shows of frames, (n, row, column) degC."""
+    rows, columns = plan_window(registration, GRID)
+    counts = np.round(counts_from_temperature(frames, SC660)).astype(np.uint16)[:, rows, columns]
+    # Counts of 6 mK: 50 mK of noise are 8 counts.
+    return monitor_fiducials(registration, GRID, (rows, columns)).displacements(counts, 8.0)
+
+
 @pytest.mark.parametrize("shift", [(3.0, -2.0), (0.4, 0.3), (0.0, 0.0), (-6.0, 5.0)])
 def test_shift_of_a_table_without_contrast_of_its_discs(rng, registration, shift):
     reference, frame = BARE.render(rng), replace(BARE, shift_px=shift).render(rng)
@@ -65,20 +73,15 @@ def test_knock_while_the_discs_have_no_contrast_is_found_and_mended(rng, registr
 def test_monitor_and_located_fiducials_show_the_shift_of_each_frame(rng, registration):
     shifts = [(0.0, 0.0), (0.4, -0.3), (-0.7, 0.2)]
     frames = np.stack([replace(Scene(disc_K=-4.0), shift_px=shift).render(rng) for shift in shifts])
-    rows, columns = plan_window(registration, GRID)
-    counts = np.round(counts_from_temperature(frames, SC660)).astype(np.uint16)[:, rows, columns]
-    monitor = monitor_fiducials(registration, GRID, (rows, columns))
-    # Counts of 6 mK: 50 mK of noise are 8 counts. The monitor is linear for shifts well below its margin of some pixels.
-    np.testing.assert_allclose(monitor.displacements(counts, 8.0)[:, :2], shifts, atol=0.05)
+    # The monitor is linear for shifts well below its margin of some pixels.
+    np.testing.assert_allclose(monitored(frames, registration)[:, :2], shifts, atol=0.05)
     for frame, shift in zip(frames, shifts, strict=True):
         np.testing.assert_allclose(fiducial_displacement(frame, registration, GRID), [*shift, 0.0, 0.0], atol=0.02)
 
 
 def test_discs_without_contrast_show_no_shift(rng, registration):
     frame = BARE.render(rng)
-    rows, columns = plan_window(registration, GRID)
-    counts = np.round(counts_from_temperature(frame, SC660)).astype(np.uint16)[None, rows, columns]
-    assert np.isnan(monitor_fiducials(registration, GRID, (rows, columns)).displacements(counts, 8.0)).all()
+    assert np.isnan(monitored(frame[None], registration)).all()
     assert np.isnan(fiducial_displacement(frame, registration, GRID)).all()
 
 

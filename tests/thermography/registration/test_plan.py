@@ -50,12 +50,10 @@ def test_points_near_discs_are_those_nearer_than_the_margin(rng):
     points = np.round(rng.uniform(0, 30, (40, 50, 2)) * 4) / 4
     margin = rng.uniform(0, 3, (40, 50))
     points[0, 0], margin[1, 1], margin[2, 2] = np.nan, np.inf, np.nan
-    for margin_mm in (0.0, 1.0, margin):
-        near = [
-            np.hypot(points[..., 0] - d.x_mm, points[..., 1] - d.y_mm) < d.diameter_mm / 2 + margin_mm for d in discs
-        ]
+    for reach in (0.0, 1.0, margin):
+        near = [np.hypot(points[..., 0] - d.x_mm, points[..., 1] - d.y_mm) < d.diameter_mm / 2 + reach for d in discs]
         assert 100 < np.sum(near) < 2000
-        np.testing.assert_array_equal(mask_discs(points, discs, margin_mm=margin_mm), near[0] | near[1])
+        np.testing.assert_array_equal(mask_discs(points, discs, margin_mm=reach), near[0] | near[1])
 
 
 @pytest.mark.parametrize(
@@ -83,7 +81,7 @@ def test_marker_column_of_the_fiducial_file(tmp_path):
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,7"]))
     assert [one.marker for one in read_fiducials(path)] == [None] * 4 + [7]
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,50"]))
-    with pytest.raises(FiducialError, match=r"fiducials\.csv:6: marker = '50'; give the number of an ArUco marker"):
+    with pytest.raises(FiducialError, match=r"fiducials\.csv:6: marker = '50'; give an ArUco number"):
         read_fiducials(path)
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows[1:], "M7,120,40,52,7"]))
     with pytest.raises(FiducialError, match="lists 3 fiducials; a plan is located by at least 4"):
@@ -139,7 +137,7 @@ def test_the_picture_as_the_plan():
     assert not registration.position_u(picture_grid((6, 8), 1).centres_mm).any()
     assert usual_cell_px((512, 640)) == 4 and usual_cell_px((7, 11)) == 1
     assert picture_grid((480, 640)).shape == (120, 160)
-    with pytest.raises(ThermographyError, match=r"7 px.* 640 x 480 pixels; choose one of 1, 2, 4, 5, 8"):
+    with pytest.raises(ThermographyError, match=r"7 px.* 640 x 480 pixels; choose 1, 2, 4, 5, 8"):
         picture_grid((480, 640), 7)
 
 
@@ -162,5 +160,5 @@ def test_shares_of_cells_in_a_polygon_are_areas():
 
 @pytest.mark.parametrize("corners", [[(0, 0), (1, 1)], [(0, 0, 0), (1, 1, 1), (2, 0, 0)], []])
 def test_what_is_no_polygon_is_refused(corners):
-    with pytest.raises(PolygonError, match=r"r: corners have shape .*; a polygon needs at least three \(x, y\) in mm"):
+    with pytest.raises(PolygonError, match=r"r: corners have shape .*; give at least three \(x, y\) in mm"):
         Polygon("r", corners)
