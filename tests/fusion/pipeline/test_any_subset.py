@@ -202,7 +202,6 @@ def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
     assert codes["plan_sensors"] and codes["sensors_coverage"] and "sensors_rise" not in codes
 
 
-@pytest.mark.usefixtures("no_charts")
 def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(folder, results_folder, tmp_path):
     write_sensors(folder, results_folder / "fields.nc", gain=1.5)
     path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
