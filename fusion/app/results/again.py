@@ -23,7 +23,7 @@ from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
 from fusion.messages import ExitCode
 from fusion.results.folder import branch_results
-from fusion.results.store import write_text
+from fusion.results.store import file_sha256, is_file_list, write_text
 
 # A campaign file in which emissivity or the declared effects were changed, beside the one that it came from.
 
@@ -131,9 +131,14 @@ class RunAgain:
 
     def _campaign(self) -> Path | None:
         """Return the campaign file of the run, as far as it lies in the folder of the application."""
-        for candidate in (campaign_of(self._products.folder), self._state.campaign):
+        folder, inputs = self._products.folder, self._products.provenance.get("inputs")
+        noted = campaign_of(folder)
+        read = {one["sha256"] for one in inputs.values()} if is_file_list(inputs) else set()
+        for candidate in (noted, self._state.campaign, folder.parent / "campaign.toml"):
             with suppress(ui.PathError):
-                if candidate is not None and (found := ui.allowed_path(self._state.root, candidate)).is_file():
+                found = None if candidate is None else ui.allowed_path(self._state.root, candidate)
+                # Results that were moved no longer say where their file is: then it is the one with the content that was read.
+                if found is not None and found.is_file() and (candidate == noted or file_sha256(found) in read):
                     return found
         return None
 

@@ -37,6 +37,16 @@ def test_it_starts_only_after_a_change_and_says_what_is_kept(form):
     assert "thermal fields, deviations and correlation are kept" in texts([again.view])
 
 
+def test_the_file_of_another_campaign_is_not_changed(form):
+    state, _ = form
+    other = state.root / "other.toml"
+    other.write_text('[campaign]\ntitle = "another"\n')
+    again = RunAgain(State(root=state.root, campaign=other, results=state.results), Products(state.results))
+    assert again._campaign() == state.root / "campaign.toml"
+    (state.root / "campaign.toml").rename(state.root / "elsewhere.toml")
+    assert again._campaign() is None
+
+
 def test_a_file_outside_the_folder_is_not_changed(form, tmp_path):
     state, _ = form
     products = Products(state.results)
@@ -59,7 +69,7 @@ def test_a_file_outside_the_folder_is_not_changed(form, tmp_path):
 def test_parameters_that_no_run_wrote_are_left_empty(form, parameters):
     state, _ = form
     products = Products(state.results)
-    products.provenance = {"campaign_file": "x" * 5000, "parameters": parameters}
+    products.provenance |= {"campaign_file": "x" * 5000, "parameters": parameters}
     view = RunAgain(state, products).view
     assert [one.value for one in view.select(pn.widgets.FloatInput)] == [None]
     assert [one.value for one in view.select(pn.widgets.CheckBoxGroup)] == [[]]
