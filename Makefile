@@ -40,8 +40,9 @@ quick: $(VENV)/.test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m 'not slow and not chain and not browser and not long' --numprocesses 2 --dist loadfile
 
 # The documentation site, tutorials run, in build/docs. Needs no network; measured files that cannot be had leave their page unexecuted, and it says so.
-docs: $(VENV)/.docs
+docs: $(VENV)/.docs $(VENV)/.test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/sphinx-build --fail-on-warning --keep-going --nitpicky --quiet docs build/docs
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -q -m docs tests/test_documentation_site.py
 	@echo "documentation: $(CURDIR)/build/docs/index.html"
 
 # The pictures of README and documentation, from the demo's report in a headless Chromium.
@@ -50,7 +51,7 @@ screenshots: $(VENV)/.test demo
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests/soak -m slow -s
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests --ignore tests/benchmarks -m slow -s
 
 # Speeds, as ratios against named peers measured in the same run.
 benchmarks: $(VENV)/.test

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.docs]
 
 ROOT = Path(__file__).resolve().parents[1]
 #: What makes a browser load something at once, as opposed to a link.

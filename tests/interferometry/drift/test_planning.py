@@ -57,6 +57,7 @@ def test_settling_of_one_known_time_constant(rng):
     assert shift.amplitude_um == pytest.approx(8.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_shape_that_the_readings_add_settles_with_the_others(rng):
     deviations, truth = simulate(rng, kind="warmup")
     zone = 10.0 * (1.0 - np.exp(-truth.seconds / 5400.0)) * np.minimum(truth.position, 0.55) / 0.55

@@ -43,7 +43,7 @@ def hinted(scene, rng, error_px):
     return [replace(d, column_px=c, row_px=r) for d, (c, r) in zip(DISCS, places, strict=True)]
 
 
-@pytest.mark.parametrize(("k1", "disc_K"), [(0.0, -4.0), (-1.2, 4.0)])
+@pytest.mark.parametrize(("k1", "disc_K"), [pytest.param(0.0, -4.0, marks=pytest.mark.slow), (-1.2, 4.0)])
 def test_plan_is_found_without_hints_at_both_contrasts(rng, k1, disc_K):
     scene = Scene(k1=k1, disc_K=disc_K)
     registration = register(scene.render(rng), DISCS, grid=GRID)

@@ -66,10 +66,10 @@ def test_a_complete_model_stays_as_it_is(complete):
     ("name", "parameters"),
     [
         ("reversal_drift", {}),
-        ("dead_path", {}),
+        pytest.param("dead_path", {}, marks=pytest.mark.slow),
         ("step_event", {"at_cycle": 25}),
         ("periodic_disturbance", {"period_min": 23.0}),
-        ("pitch_error", {}),
+        pytest.param("pitch_error", {}, marks=pytest.mark.slow),
     ],
 )
 def test_one_missing_effect_is_named_and_the_held_out_error_falls_to_the_noise(name, parameters):
