@@ -18,7 +18,7 @@ from fusion.common import FusionError
 from fusion.pipeline.check import BAD_INPUT
 from fusion.pipeline.watch import Enough, LiveState, follow
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, add_series, new_figure, palette, span_words
-from fusion.report.wording import number
+from fusion.report.numbers import number
 from fusion.results.progress import counted
 from interferometry.plots import ACCENT, INK, MUTED
 

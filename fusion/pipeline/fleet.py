@@ -26,8 +26,8 @@ from fusion.messages import cell
 from fusion.pipeline.stages import kept_results
 from fusion.pipeline.workers import start_module
 from fusion.report.conclusions import headline
+from fusion.report.numbers import measured, number
 from fusion.report.page import render_page
-from fusion.report.wording import measured, number
 from fusion.results.folder import MANIFEST, claim, open_folder
 from fusion.results.progress import Report, silent
 from fusion.results.results import read_results

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fusion.campaign.values import name_and_unit
 from fusion.common import FusionError, TomlError, read_toml
-from fusion.report.wording import duration, join, moment, print_unit
+from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
 from fusion.results.progress import counted, left_out_notices, listed
 from fusion.results.store import OutputError, write_atomically

@@ -22,7 +22,7 @@ from fusion.campaign.config import (
 )
 from fusion.campaign.inputs import read_laser
 from fusion.campaign.recompensation import Origin, StatedBudget, material_by_cycle
-from fusion.report.wording import moment
+from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
 from fusion.results.progress import left_out_notices
 from fusion.results.results import read_results

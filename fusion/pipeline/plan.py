@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fusion.analysis.attribution.duty import DutyPlanError, Machine, plan_duty, switchings
 from fusion.campaign.values import read_option
-from fusion.report.wording import duration
+from fusion.report.numbers import duration
 
 
 def duty_lines(

@@ -21,7 +21,7 @@ from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import Campaign
 from fusion.campaign.inputs import pipe_notices, read_record
-from fusion.report.wording import duration, number
+from fusion.report.numbers import duration, number
 from fusion.results.progress import Report, counted, left_out_notices, listed
 from fusion.results.results import Notice, Outcome
 

@@ -24,7 +24,7 @@ from fusion.campaign.time_zones import bring_to_utc
 from fusion.common import Array
 from fusion.pipeline.positioning import insufficient_for_model
 from fusion.pipeline.thermal import overridden_parameters
-from fusion.report.wording import number
+from fusion.report.numbers import number
 from interferometry.common import InterferometryError
 from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift

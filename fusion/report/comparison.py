@@ -7,6 +7,7 @@ from typing import Any
 
 from fusion.analysis.comparison import LEVEL, Change, ComparedCampaign, PairComparison
 from fusion.report.conclusions import position_words
+from fusion.report.numbers import join, measured, number, p_cell, print_unit
 from fusion.report.wording import (
     Row,
     Table,
@@ -15,11 +16,6 @@ from fusion.report.wording import (
     conditional,
     effect_words,
     iso230_values,
-    join,
-    measured,
-    number,
-    p_cell,
-    print_unit,
     quantity,
     quoted_window,
     table,

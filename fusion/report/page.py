@@ -26,22 +26,9 @@ from fusion.report.charts.campaign import Drawn, draw_campaign
 from fusion.report.charts.readings import plot_single_runs, plot_test, plot_windows
 from fusion.report.charts.style import Chart, EmbeddedChart, chart_scripts, embed
 from fusion.report.conclusions import headline
+from fusion.report.numbers import moment, number, place, print_unit
 from fusion.report.record import describe_record, draw_record
-from fusion.report.wording import (
-    CHANNELS,
-    TEMPLATES,
-    Table,
-    Words,
-    environment,
-    moment,
-    number,
-    place,
-    print_table,
-    print_unit,
-    say,
-    sentences,
-    table,
-)
+from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, print_table, say, sentences, table
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results

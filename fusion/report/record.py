@@ -14,7 +14,7 @@ from fusion.report.charts import record as charts
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import Chart
 from fusion.report.conclusions import conclude, headline, next_steps
-from fusion.report.wording import duration, join, moment
+from fusion.report.numbers import duration, join, moment
 from fusion.results.loop import RecordLoop
 from fusion.results.progress import counted
 from fusion.results.results import Results

@@ -9,16 +9,8 @@ import rich.table
 
 from fusion.messages import cell
 from fusion.report.conclusions import conclude, headline, next_steps
-from fusion.report.wording import (
-    alike,
-    baseline_words,
-    condition,
-    figures_of,
-    number,
-    p_words,
-    step_errors,
-    untouched,
-)
+from fusion.report.numbers import alike, number, p_words
+from fusion.report.wording import baseline_words, condition, figures_of, step_errors, untouched
 from fusion.results.axis import DriftPart, RegistrationPart
 from fusion.results.loop import Loop, RecordLoop
 from fusion.results.parts import Figures

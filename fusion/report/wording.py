@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
-from zoneinfo import ZoneInfo
 
 import jinja2
 import numpy as np
@@ -20,6 +17,23 @@ from markupsafe import Markup
 from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.messages import cell, printable
+from fusion.report.numbers import (
+    alike,
+    duration,
+    gain,
+    join,
+    lower_first,
+    measured,
+    moment,
+    number,
+    p_cell,
+    p_words,
+    percent,
+    place,
+    print_unit,
+    small,
+    upper_first,
+)
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, HotspotPart, Iso230Part, Iso230Window
 from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop, StepPart
 from fusion.results.parts import AreaPart, Figures, InputsPart, PixelAreaPart, Quantity
@@ -114,126 +128,14 @@ def effect_words(name: str) -> EffectWords:
     return EffectWords(name.replace("_", " "), "") if effect is None else EffectWords(effect.words, effect.remedy)
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with significant digits and a true minus sign."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    return fixed(value, max(0, digits - 1 - math.floor(math.log10(abs(value))))) if value else "0"
-
-
-def fixed(value: float | None, decimals: int) -> str:
-    """Return a number with so many decimals and a true minus sign; a dash where there is none."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")
-
-
-def decimals_of(u: float) -> int:
-    """Return how many decimals show an expanded uncertainty with two significant digits (GUM 7.2.6)."""
-    return max(0, 1 - math.floor(math.log10(2 * u))) if u > 0 and math.isfinite(u) else 2
-
-
-def measured(value: float | None, u: float | None, unit: str = "", *, decimals: int | None = None) -> str:
-    """Return ``value ± U unit`` with the expanded uncertainty U = 2 u, both to the same decimal place."""
-    tail = f" {unit}" if unit else ""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if u is None or not math.isfinite(u) or u <= 0:
-        return f"{number(value)}{tail}"
-    places = decimals_of(u) if decimals is None else decimals
-    return f"{value:.{places}f} ± {2 * u:.{places}f}{tail}".replace("-", "−")
-
-
 def quantity(found: Quantity, unit: str = "") -> str:
     """Return a quantity of the results as ``value ± U unit``, see `measured`."""
     return measured(found.value, found.u, unit)
 
 
-def print_unit(unit: str) -> str:
-    """Return a unit as it is printed."""
-    return {"degC": "°C", "percent": "%", "1": ""}.get(unit, unit.replace("um", "µm"))
-
-
-def small(value: float | None) -> str:
-    """Return a size in µm, values below a nanometre as such."""
-    return "below 0.001" if value is not None and value < 1e-3 else number(value, 2)
-
-
-def gain(value: float | None) -> str:
-    """Return a gain in log-likelihood to one decimal."""
-    return "–" if value is None else f"{value:z.1f}".replace("-", "−")
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent."""
-    return f"{100 * share:g} %"
-
-
-def p_cell(p: float | None, least: float | None = None) -> str:
-    """Return a p-value for a table: to two digits, as a bound below 0.001 and where it is `least`, the resolution of the simulations."""
-    if p is None or not math.isfinite(p):
-        return "–"
-    if least and p <= least * (1.0 + 1e-9):
-        digit = math.floor(math.log10(p))
-        rounded = math.ceil(round(p / 10.0**digit, 6)) * 10.0**digit
-        return f"≤ {rounded:.{max(0, -digit)}f}"
-    return "< 0.001" if p < 0.001 else f"{p:.2g}"
-
-
-def p_words(p: float | None, least: float | None = None) -> str:
-    """Return a p-value in a sentence, see `p_cell`."""
-    cell = p_cell(p, least)
-    if cell.startswith("≤"):
-        return f"p {cell}, resolution of the Monte Carlo test"
-    return f"p {cell}" if cell.startswith("<") else f"p = {cell}"
-
-
-def alike(values: Sequence[float | None], *, distinct: bool = True) -> list[str]:
-    """Return numbers that are compared with as many decimals each, so many that the smallest has two digits, more where `distinct`."""
-    known = [value for value in values if value is not None and math.isfinite(value) and value]
-    smallest = min(map(abs, known), default=1.0)
-    decimals = max(0, 1 - math.floor(math.log10(smallest)))
-    differ = len(set(known))
-    while distinct and decimals < 4 and len({round(value, decimals) for value in known}) < differ:
-        decimals += 1
-    return [fixed(value, decimals) for value in values]
-
-
-def duration(seconds: float | None) -> str:
-    """Return a time span in seconds below 2 min, in minutes below 2 h, in hours above."""
-    if seconds is None or not math.isfinite(seconds):
-        return "–"
-    if 0 < seconds < 2:
-        return f"{seconds:.2g} s"
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    if seconds < 7200:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
-
-
-def moment(time: np.datetime64 | str, zone: str | None = None) -> str:
-    """Return a UTC time to the minute with its zone, local to a zone of the IANA data base where one is named; NaT is a dash."""
-    stamp = np.datetime64(time.removesuffix("Z")) if isinstance(time, str) else time
-    if np.isnat(stamp):
-        return "–"
-    at = datetime.fromisoformat(np.datetime_as_string(stamp, unit="s")).replace(tzinfo=UTC)
-    local = at if zone is None else at.astimezone(ZoneInfo(zone))
-    return f"{local:%Y-%m-%d %H:%M} {local.tzname()}"
-
-
-def place(x: float | None, y: float | None, unit: str = "mm") -> str:
-    """Return a place on the plan to the millimetre, or to the pixel."""
-    across, down = ("–" if value is None else f"{value:z.0f}" for value in (x, y))
-    return f"x {across} {unit}, y {down} {unit}"
-
-
 def region_words(name: str) -> str:
     """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself."""
     return re.sub(r"^hotspot (?=\d+$)", "disc about hotspot ", name)
-
-
-def join(items: Sequence[str]) -> str:
-    """Return ``a, b and c``."""
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
 
 
 #: Plain predictions of the hold-out in words, by their key in ``loop.baselines``.
@@ -251,16 +153,6 @@ def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> 
     sentence = sentence.strip()
     right = assumption(inputs, *figures)
     return f"Only if {right}: {lower_first(sentence)}" if right and sentence else sentence
-
-
-def lower_first(text: str) -> str:
-    """Return a sentence as it goes on after a colon."""
-    return text[:1].lower() + text[1:]
-
-
-def upper_first(text: str) -> str:
-    """Return a text as it begins a sentence."""
-    return text[:1].upper() + text[1:]
 
 
 def condition(inputs: InputsPart | None, *figures: Figures) -> str:
@@ -364,13 +256,11 @@ def environment(*, html: bool) -> jinja2.Environment:
         loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=html, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
         finalize=_without_control if html else None,
     )  # fmt: skip
-    made.filters |= {
-        name: globals()[name]
-        for name in (
-            "condition", "conditional", "duration", "gain", "lower_first", "measured", "moment", "number", "p_cell", "p_words",
-            "parameters", "percent", "place", "print_unit", "quantity", "region_words", "small", "upper_first",
-        )
-    }  # fmt: skip
+    formats = (
+        condition, conditional, duration, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
+        print_unit, quantity, region_words, small, upper_first,
+    )  # fmt: skip
+    made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
         "channel": lambda name: CHANNELS.get(name, name),
         "contributor": lambda name: CONTRIBUTORS.get(name, name),

@@ -34,6 +34,7 @@ from fusion.report.charts.plan import (
 from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
 from fusion.report.conclusions import action, conclude, describe_anomaly, next_steps, step_phrase
+from fusion.report.numbers import join, moment, number, p_words, place
 from fusion.report.record import draw_record
 from fusion.report.wording import (
     Table,
@@ -44,11 +45,6 @@ from fusion.report.wording import (
     drift_u_note,
     effect_words,
     iso230_values,
-    join,
-    moment,
-    number,
-    p_words,
-    place,
     quoted_window,
     step_errors,
 )

@@ -25,7 +25,7 @@ from fusion.report.charts.style import (
     palette,
     span_words,
 )
-from fusion.report.wording import join, number, place
+from fusion.report.numbers import join, number, place
 from fusion.results.axis import HotspotPart
 from fusion.results.parts import ContactSensorPart
 from interferometry.plots import ACCENT, INK

@@ -23,7 +23,8 @@ from fusion.report.charts.style import (
     shared_range,
     span_words,
 )
-from fusion.report.wording import effect_words, join, number, print_unit
+from fusion.report.numbers import join, number, print_unit
+from fusion.report.wording import effect_words
 from interferometry.plots import COLOURS, INK
 
 _TIME, _AFTER, _PALE = "time since start / h", COLOURS["positive"], "#b3bdc2"

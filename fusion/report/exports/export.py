@@ -33,7 +33,8 @@ from fusion.report.exports.controls import (
     siemens_temperature,
     tabulate,
 )
-from fusion.report.wording import anomaly_cause, anomaly_place, number
+from fusion.report.numbers import number
+from fusion.report.wording import anomaly_cause, anomaly_place
 from fusion.results.axis import AnomalyPart
 from fusion.results.results import Results, read_results
 from fusion.results.store import has, read_product, write_atomically

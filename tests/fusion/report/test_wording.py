@@ -8,7 +8,7 @@ from rich.console import Console
 
 from fusion.analysis.consistency.checks import Check, inputs_part
 from fusion.report import conclusions as answers
-from fusion.report import wording
+from fusion.report import numbers, wording
 from fusion.report.conclusions import action, next_steps, step_phrase
 from fusion.report.wording import Row, Words, effect_words, print_table, say, table
 from fusion.results.axis import DutyPart, Evidence, Iso230Direction, Iso230Window, SourcePart
@@ -31,28 +31,28 @@ from tests.fusion.results_sample import PARTS
     ],
 )
 def test_a_value_has_the_digits_of_its_uncertainty(value, u, text):
-    assert wording.measured(value, u, "µm") == text
+    assert numbers.measured(value, u, "µm") == text
 
 
 def test_numbers_probabilities_and_times_are_printed_as_a_reader_expects_them():
-    assert wording.p_cell(0.0004) == "< 0.001" and wording.p_cell(0.0123) == "0.012" and wording.p_cell(None) == "–"
-    assert wording.duration(90) == "90 s" and wording.duration(1800) == "30 min" and wording.duration(25200) == "7.0 h"
-    assert wording.join(["a", "b", "c"]) == "a, b and c" and wording.join(["a"]) == "a" and wording.join([]) == ""
-    assert wording.moment(np.datetime64("2026-03-09T06:30:05")) == "2026-03-09 06:30 UTC"
-    assert wording.p_cell(1 / 280, 1 / 280) == "≤ 0.004" and wording.p_cell(0.002, 0.002) == "≤ 0.002"
-    assert wording.p_cell(0.025, 0.025) == "≤ 0.03" and wording.p_cell(0.004, 0.002) == "0.004"
-    assert wording.p_words(0.002, 0.002) == "p ≤ 0.002, resolution of the Monte Carlo test"
-    assert wording.p_words(0.004, 0.002) == "p = 0.004" and wording.p_words(1e-9, 0.0) == "p < 0.001"
-    assert wording.alike([1.938, 0.4643, None]) == ["1.94", "0.46", "–"]
-    assert wording.alike([0.7331, 0.7372]) == ["0.73", "0.74"]
+    assert numbers.p_cell(0.0004) == "< 0.001" and numbers.p_cell(0.0123) == "0.012" and numbers.p_cell(None) == "–"
+    assert numbers.duration(90) == "90 s" and numbers.duration(1800) == "30 min" and numbers.duration(25200) == "7.0 h"
+    assert numbers.join(["a", "b", "c"]) == "a, b and c" and numbers.join(["a"]) == "a" and numbers.join([]) == ""
+    assert numbers.moment(np.datetime64("2026-03-09T06:30:05")) == "2026-03-09 06:30 UTC"
+    assert numbers.p_cell(1 / 280, 1 / 280) == "≤ 0.004" and numbers.p_cell(0.002, 0.002) == "≤ 0.002"
+    assert numbers.p_cell(0.025, 0.025) == "≤ 0.03" and numbers.p_cell(0.004, 0.002) == "0.004"
+    assert numbers.p_words(0.002, 0.002) == "p ≤ 0.002, resolution of the Monte Carlo test"
+    assert numbers.p_words(0.004, 0.002) == "p = 0.004" and numbers.p_words(1e-9, 0.0) == "p < 0.001"
+    assert numbers.alike([1.938, 0.4643, None]) == ["1.94", "0.46", "–"]
+    assert numbers.alike([0.7331, 0.7372]) == ["0.73", "0.74"]
     # Two that differ do not read alike; two that are equal do.
-    assert wording.alike([0.7331, 0.7332]) == ["0.7331", "0.7332"]
-    assert wording.alike([0.5, 0.5]) == ["0.50", "0.50"]
-    assert wording.alike([-0.5, float("nan")]) == ["−0.50", "–"]
-    assert wording.moment("2026-03-09T06:30:05Z", "Europe/Vienna") == "2026-03-09 07:30 CET"
-    assert wording.moment("2026-07-09T06:30:05Z", "Europe/Vienna") == "2026-07-09 08:30 CEST"
-    assert wording.moment(np.datetime64("NaT")) == "–"
-    assert wording.gain(-0.04) == "0.0" and wording.gain(-0.06) == "−0.1" and wording.gain(None) == "–"
+    assert numbers.alike([0.7331, 0.7332]) == ["0.7331", "0.7332"]
+    assert numbers.alike([0.5, 0.5]) == ["0.50", "0.50"]
+    assert numbers.alike([-0.5, float("nan")]) == ["−0.50", "–"]
+    assert numbers.moment("2026-03-09T06:30:05Z", "Europe/Vienna") == "2026-03-09 07:30 CET"
+    assert numbers.moment("2026-07-09T06:30:05Z", "Europe/Vienna") == "2026-07-09 08:30 CEST"
+    assert numbers.moment(np.datetime64("NaT")) == "–"
+    assert numbers.gain(-0.04) == "0.0" and numbers.gain(-0.06) == "−0.1" and numbers.gain(None) == "–"
 
 
 def doubted(*codes: str) -> InputsPart:

@@ -14,7 +14,7 @@ from fusion.report.charts import style
 from fusion.report.charts.campaign import draw_attributed, draw_campaign, draw_measured, draw_modelled, draw_placed
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import Chart, chart_scripts, embed, new_figure
-from fusion.report.wording import alike, number
+from fusion.report.numbers import alike, number
 from fusion.results.results import read_results
 from fusion.results.store import group, read_fusion, read_product
 from tests.browser import CHROMIUM, record_faults
