@@ -22,12 +22,11 @@ from typing import Any
 from urllib.parse import quote, unquote, urljoin, urlsplit
 
 import filelock
-import pooch
 
 from fusion.campaign.values import FILE_KEYS
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.results.progress import Report, silent
-from fusion.results.store import read_json_object, write_json
+from fusion.results.store import file_sha256, read_json_object, write_json
 from interferometry.common import InterferometryError
 from thermography.common import ThermographyError
 from thermography.io.files import write_atomically
@@ -59,6 +58,7 @@ def cache_folder() -> Path:
     """Return the folder that keeps what is fetched: that of THERMOFUSE_CACHE, or one in the user's cache."""
     if named := os.environ.get(CACHE_VARIABLE):
         return Path(named)
+    import pooch
 
     return Path(pooch.os_cache("thermofuse")) / "remote"
 
@@ -436,6 +436,8 @@ def fetch_sample(name: str, *, registry: str | Path = REGISTRY) -> Path:
         )
     dataset = listed[name]
     if not (folder := os.environ.get(FOLDER_VARIABLE)):
+        import pooch
+
         target = pooch.os_cache("thermofuse") / name
         try:
             return Path(
@@ -451,7 +453,7 @@ def fetch_sample(name: str, *, registry: str | Path = REGISTRY) -> Path:
         raise DatasetError(
             f"{path} does not exist; {FOLDER_VARIABLE} must name a folder with the files under registry names"
         )
-    digest = pooch.file_hash(str(path))
+    digest = file_sha256(path)
     if digest != dataset.sha256:
         raise DatasetError(f"{path}: SHA-256 is {digest}, the registry promises {dataset.sha256}; fetch the file again")
     return path

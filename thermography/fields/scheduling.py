@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import h5netcdf
 import xarray as xr
 from xarray.backends import BackendArray, H5NetCDFStore
 from xarray.backends.file_manager import PickleableFileManager
@@ -159,6 +158,9 @@ def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Gener
 
 def open_stored(path: Path, reading: Callable[[], AbstractContextManager[None]], part_bytes: int) -> xr.Dataset:
     """Open a NetCDF 4 file whose arrays are read when they are asked for, and not kept."""
+    # Not before a long test needs it: 27 ms and 20 MB.
+    import h5netcdf
+
     # Files that xarray opens by their path may be closed for the next ones, and opened again.
     kept = {"decode_vlen_strings": True, "rdcc_nbytes": part_bytes}
     manager = PickleableFileManager(h5netcdf.File, str(path), mode="r", kwargs=kept)
