@@ -34,13 +34,6 @@ amplitude_um = 1.5
 """
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whatever looks at the products of a whole run belongs to the chain."""
-    for item in items:
-        if "results_folder" in getattr(item, "fixturenames", ()):
-            item.add_marker("chain")
-
-
 @pytest.fixture(scope="session")
 def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared."""

@@ -33,9 +33,12 @@ def started(folder: Path) -> Iterator[str]:
             assert process.wait(10) == 128 + signal.SIGTERM
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def app(campaign_folder, results_folder, tmp_path_factory):
-    """Address of an application, and its folder: a finished campaign, and a file outside to which a link leads."""
+    """Address of an application, and its folder: a finished campaign, and a file outside to which a link leads.
+
+    It remembers what was opened last, so that every file of tests has its own.
+    """
     above = tmp_path_factory.mktemp("app")
     folder = above / "folder"
     shutil.copytree(campaign_folder, folder)
@@ -77,7 +80,7 @@ def ask():
     return request
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def cookie(app, ask):
     """The cookie that the application gives for its token."""
     return ask(app[0], f"/?{urlsplit(app[0]).query}").headers["Set-Cookie"].split(";")[0]

@@ -109,7 +109,6 @@ def test_a_missing_campaign_and_one_outside_the_folder_are_named(tmp_path):
 def test_a_test_is_followed_and_stopped_by_keyboard(app, new_page):
     page = new_page(app[0], width=390)
     page.get_by_role("button", name="Live", exact=True).press("Enter")
-    page.get_by_label("Campaign file of the running test").fill(str(app[1] / "campaign.toml"))
     page.get_by_role("button", name="Follow", exact=True).press("Enter")
     page.get_by_text("By ISO 230-2, the last five cycles").wait_for(timeout=60_000)
     page.get_by_role("button", name="Stop following").press("Enter")

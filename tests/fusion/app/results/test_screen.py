@@ -35,9 +35,8 @@ def name_folder(page, folder):
     opened(page, "Open")
 
 
-def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page, app):
+def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page):
     opened(page, "Results")
-    name_folder(page, app[1] / "results")
     page.get_by_text("Cycle 24 (").wait_for()
     page.get_by_role("slider").focus()
     for _ in range(4):
