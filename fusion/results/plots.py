@@ -62,6 +62,8 @@ def plot_correlation(maps: xr.DataTree, ax: Axes | None = None, *, channel: str 
     ------
     FusionError
         There is no such channel.
+    InterferometryError
+        Matplotlib is not installed.
 
     Notes
     -----
@@ -103,7 +105,7 @@ def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) 
 
     Raises
     ------
-    FusionError
+    InterferometryError
         Matplotlib is not installed.
 
     Notes
