@@ -50,7 +50,7 @@ _TAKEN = (
 _LONGEST_RECORD_S = 4.5e9
 _DECIMAL_COMMA = re.compile(r"\d,\d")
 #: A unit of each role, for a message.
-_EXAMPLES = {"temperature": "degC", "displacement": "um", "driver": "1/min"}
+_EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: Where seconds count from in a table whose start is not stated.
 NO_START = np.datetime64("1970-01-01", "ns")
 
@@ -207,17 +207,19 @@ def columns_of(
     } or dict.fromkeys(stated)
     for heading in filter(role_by_heading.__contains__, headings):
         column, (name, in_heading) = stated.get(heading, ColumnTable()), name_and_unit(heading)
-        unit = unit_name(column.unit or units.get(heading, "") or in_heading)
+        elsewhere = unit_name(column.unit or units.get(heading, ""))
+        unit = elsewhere or in_heading
         role = role_by_heading[heading] or column.role or role_of_unit(unit)
         if not unit and name == heading.strip():
             raise TableError(
-                f'{path}: the column "{heading}" has no unit; write it under [record.columns]: "{heading}" = "{_EXAMPLES[role]}"'
+                f'{path}: the column "{heading}" has no unit; write it under [record.columns]: "{heading}" = {_EXAMPLES[role]}'
             )
-        roles[role][heading] = (name, unit)
+        # TC(1) and TC(2) of a logger are two names, whose units stand elsewhere.
+        roles[role][heading] = (heading if elsewhere and in_heading not in ("", elsewhere) else name, unit)
     for role in ("temperature", "displacement"):
         if not roles[role]:
             raise TableError(
-                f'{path}: no column is a {role}; write one under [record.columns], such as "{headings[-1]}" = "{_EXAMPLES[role]}"'
+                f'{path}: no column is a {role}; write one under [record.columns], such as "{headings[-1]}" = {_EXAMPLES[role]}'
             )
     return roles
 
@@ -270,7 +272,7 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
     decimal_comma = delimiter == ";" or (delimiter != "," and _DECIMAL_COMMA.search("".join(below[:1])) is not None)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
-        frame = pd.read_csv(
+        frame = pd.read_csv(  # type: ignore[call-overload] # numbers may be marks too
             io.StringIO("".join([names.strip("\n"), "\n", *below])),
             sep=delimiter or r"\s+",
             decimal="," if decimal_comma else ".",

@@ -25,7 +25,7 @@ from interferometry.io.tables import DateOrder, decode_text, delimiter_of_values
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
-_NO_NUMBERS = "no numbers"
+_NO_NUMBERS, _BY_VALUES, _NOT_KNOWN = "no numbers", "by its values", "not known"
 #: Lines in which the values of a table have begun.
 _HEAD = 200
 #: Rows of values, one below the other, that are no accident.
@@ -66,7 +66,6 @@ _OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
 _LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
 #: Shortest thermal test, by which a number without unit is told to be seconds or minutes.
 _SHORTEST_S = 1800.0
-_WARMEST_DEGC = 200.0
 #: Words of headings, the plain ones before those of one or two letters.
 _WORDS = (
     ("out", "target setpoint soll cmd value comment humidity rh feuchte pressure druck rain wind level batt battery"),
@@ -80,6 +79,8 @@ _WORDS = (
 )  # fmt: skip
 #: Words of a column that counts, where no other word stands beside them.
 _COUNTING = "index sample record recno rn no nr n id row scan count counter nummer number unnamed"
+#: Units at the end of a heading, after a space or an underscore.
+_SUFFIXES = {"um": "um", "µm": "um", "mm": "mm", "nm": "nm", "degc": "degC", "°c": "degC", "c": "degC", "degf": "degF"}
 _UNIT_OF_WORD = {"rpm": "1/min", "drehzahl": "1/min", "转速": "1/min", "power": "W", "current": "A", "voltage": "V"}
 
 
@@ -131,6 +132,12 @@ class TableProposal:
             f"{f'; found: {known}' if known else ''}; a column is named with its unit, such as T1 [degC] or Z [um]"
         )
 
+    @property
+    def may_be_record(self) -> bool:
+        """Whether temperatures and displacements are found, or something that may be the displacement."""
+        unknown = any(column.remark == _NOT_KNOWN for column in self.columns)
+        return not self.lacks or (unknown and bool(self.of("temperature")))
+
     def lines(self) -> Iterator[str]:
         """Yield the columns as a table of text: number, heading, first values, role and unit."""
         rows = [("", "column", "first values", "range", "role", "unit", "")]
@@ -159,7 +166,11 @@ class TableProposal:
                 )
             for number in numbers:
                 before = columns[number - 1]
-                columns[number - 1] = replace(before, role=role, unit=match[4] or before.unit, remark="")
+                usual, remark = _usual_unit(role, before)
+                unit = match[4] or before.unit or usual
+                columns[number - 1] = replace(
+                    before, role=role, unit=unit, remark="" if match[4] or before.unit else remark
+                )
         return replace(self, columns=tuple(columns))
 
 
@@ -187,7 +198,12 @@ def propose_table(path: Path) -> TableProposal:
         long = keys["long"]
         heading, channel = str(long["value"]), rows.frame[long["channel"]].astype(str)
         groups = {name: values[heading] for name, values in rows.frame.groupby(channel)}
-        return _with_columns(path, keys, groups, {}, len(rows.frame), asked)
+        proposal = _with_columns(path, keys, groups, {}, len(rows.frame), asked)
+        if all(column.remark == _BY_VALUES for column in proposal.of("temperature")):
+            # Channels have names: what none of them calls a temperature is a position, a count, a state.
+            named = [replace(one, role="out") if one.remark == _BY_VALUES else one for one in proposal.columns]
+            proposal = replace(proposal, columns=tuple(named))
+        return proposal
     times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
     groups = {str(name): rows.frame[name] for name in rows.frame.columns if name not in times}
     proposal = _with_columns(path, keys, groups, rows.units, len(rows.frame), asked)
@@ -393,7 +409,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     """Propose role and unit of a column from its unit, the words of its heading, and its values."""
     finite = numbers[np.isfinite(numbers)]
     name, in_heading = name_and_unit(heading)
-    unit = unit_name(unit or in_heading or read_heading(heading).unit or "")
+    if in_heading.isdecimal() and "[" not in heading:
+        in_heading = ""  # TC(1), TC(2): a number, no unit
+    unit = unit_name(unit or in_heading or _SUFFIXES.get(read_heading(heading).unit or "", ""))
     first = _first(series)
     if not finite.size:
         return Column(heading, "out", unit, first, remark=_NO_NUMBERS)
@@ -412,17 +430,14 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     if role == "driver":
         return replace(known, role=role, unit=_UNIT_OF_WORD.get(word, "1"))
     typical = float(np.median(finite))
-    whole = bool((finite == np.round(finite)).all())
-    if role == "temperature" or (role == "" and 12.0 < typical < 80.0 and not whole):
-        # Kelvins of a machine are above what its degrees Celsius reach.
-        unit = "K" if typical > _WARMEST_DEGC and low > 200.0 and high < 500.0 else "degC"
-        return replace(known, role="temperature", unit=unit, remark="" if role else "by its values")
-    if role == "displacement" or (role == "" and max(abs(low), abs(high)) < 1e-3):
+    if role == "temperature" or (role == "" and 12.0 < typical < 80.0 and not (finite == np.round(finite)).all()):
         return replace(
-            known, role="displacement", unit=_unit_of_displacements(low, high, whole=whole),
-            remark="whole numbers: counts? then one count with its unit, as 0.0125 mm" if whole else "unit by its values",
-        )  # fmt: skip
-    return replace(known, remark="not known")
+            known, role="temperature", unit=_usual_unit("temperature", known)[0], remark="" if role else _BY_VALUES
+        )
+    if role == "displacement" or (role == "" and max(abs(low), abs(high)) < 1e-3):
+        unit, remark = _usual_unit("displacement", known)
+        return replace(known, role="displacement", unit=unit, remark=remark)
+    return replace(known, remark=_NOT_KNOWN)
 
 
 def _word(name: str) -> tuple[str, str]:
@@ -437,10 +452,18 @@ def _word(name: str) -> tuple[str, str]:
     return "", ""
 
 
-def _unit_of_displacements(low: float, high: float, *, whole: bool) -> str:
-    """Return the unit in which a range is one of thermal displacements, micrometres to tenths of millimetres."""
-    span = high - low
-    return "um" if whole or span >= 2.0 else "mm" if span >= 2e-3 else "m"
+def _usual_unit(role: str, column: Column) -> tuple[str, str]:
+    """Return the unit in which the numbers of a column are usual ones of a role, and what is to be known of it."""
+    span = column.high - column.low
+    if role == "temperature":
+        # Kelvins of a machine are above what its degrees Celsius reach.
+        return ("K" if column.low > 200.0 and column.high < 500.0 else "degC"), ""
+    if role != "displacement":
+        return ("" if role == "out" else "1"), ""
+    # Thermal displacements are micrometres to tenths of millimetres.
+    unit = "um" if span >= 2.0 else "mm" if span >= 2e-3 else "m"
+    whole = column.low.is_integer() and column.high.is_integer()
+    return unit, "whole numbers: counts? then one count with its unit, as 0.0125 mm" if whole else "unit by its values"
 
 
 def _is_mark(mark: float, numbers: np.ndarray) -> bool:

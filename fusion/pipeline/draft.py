@@ -140,7 +140,9 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     """Yield what names and asks for everything that the campaign uses."""
     readings, records = content.of(Kind.DEVIATIONS), content.of(Kind.RECORD)
     if not (content.frames or readings or records):
-        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason}" for one in content.unknown[:3])
+        others = [one for kind, files in content.files.items() if kind not in _NO_INPUT for one in files]
+        told = [*content.unknown, *others][:3]
+        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason or one.kind}" for one in told)
         raise DraftError(
             f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
             + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
@@ -362,7 +364,7 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
     """Return a table as somebody wants its columns to be taken: as proposed, or corrected, with what its file does not tell."""
     while asker.ask is not None:
         asker.say(f"{name}, {counted(table.rows, 'row')}:")
-        for line in table.lines():
+        for line in (*table.lines(), *filter(None, [table.lacks])):
             asker.say(line)
         answer = asker.text('Columns as shown; or corrections, such as "3-5 = temperature degC; 7 = out"', "").strip()
         try:
@@ -370,7 +372,7 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
         except ColumnsError as error:
             asker.say(str(error))
             continue
-        if not answer and not table.lacks:
+        if not answer:
             break
     keys = dict(table.keys)
     for key, shown in table.asked.items():

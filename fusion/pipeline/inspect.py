@@ -118,7 +118,7 @@ def recognise(path: Path) -> Recognised:
         if isinstance(reader, TextReader) and reader.holds_a_frame(path):
             return Recognised(path, Kind.STACK)
         table = None if _of_a_laser(headings) else _logged_table(path)
-        if table is not None and not table.lacks:
+        if table is not None and table.may_be_record:
             return Recognised(path, Kind.RECORD, headings=tuple(column.heading for column in table.columns))
         if table is not None:
             return Recognised(path, Kind.UNKNOWN, table.lacks)
