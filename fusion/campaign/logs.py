@@ -21,7 +21,7 @@ from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderR
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.campaign.values import QuantityError, column_conversion, name_and_unit, role_of_unit, unit_name
 from fusion.common import Array, FusionError
-from interferometry.io.faults import SENTINEL_MAGNITUDE, Numerals, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.faults import Numerals, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     BadReading,
@@ -255,9 +255,14 @@ def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None, missin
     return _named(frame, by_line.get(header.units or 0, []), [])
 
 
+def text_lines(path: Path) -> list[str]:
+    """Return the lines of a text, each with its end."""
+    return list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
+
+
 def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]) -> Rows:
     """Read delimited text with the dialect that its header line, or without one its first line of values, shows."""
-    lines = list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
+    lines = text_lines(path)
     if header is None:
         before, _ = find_header(lines)
         header = HeaderRows(names=before + 1, values=before + 2)
@@ -302,8 +307,7 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
 def numbers_in(column: pd.Series) -> np.ndarray:
     """Return the numbers of a column, NaN where a row has none."""
     if pd.api.types.is_numeric_dtype(column):
-        values = column.to_numpy(dtype="f8", na_value=np.nan)
-        return np.where(np.abs(values) < SENTINEL_MAGNITUDE, values, np.nan)
+        return column.to_numpy(dtype="f8", na_value=np.nan)
     texts = [str(value) for value in column]
     numerals = Numerals.of(texts)
 

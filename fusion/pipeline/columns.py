@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -14,14 +16,14 @@ import pandas as pd
 from pandas.tseries.api import guess_datetime_format
 
 from fusion.campaign.config import HeaderRows
-from fusion.campaign.logs import Rows, numbers_in, read_rows
+from fusion.campaign.logs import Rows, numbers_in, read_rows, text_lines
 from fusion.campaign.values import is_unit, name_and_unit, role_of_unit, unit_name
 from fusion.common import FusionError
 from fusion.pipeline.inspect import column_unit, is_time
 from fusion.results.progress import listed
-from interferometry.io.faults import BadReading, LaserFormatError
+from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
-from interferometry.io.tables import DateOrder, decode_text, delimiter_of_values, fields_of, parse_time, read_heading
+from interferometry.io.tables import DateOrder, delimiter_of_values, fields_of, parse_time, read_heading
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
@@ -36,31 +38,16 @@ _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|dat
 _VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
 _MARKS = (
-    -127,
-    -180,
-    999,
-    -999,
-    999.9,
-    -999.9,
-    9999,
-    -9999,
-    6999,
-    -6999,
-    7999,
-    -7999,
-    3276.7,
-    -3276.8,
-    32767,
-    -32768,
-    65535,
-)
+    -127, -180, 999, -999, 999.9, -999.9, 9999, -9999, 6999, -6999, 7999, -7999, 3276.7, -3276.8, 32767, -32768, 65535,
+)  # fmt: skip
 #: A mark lies this far outside the other values of its column.
 _FAR = 50.0
 #: Times that neither ISO 8601 nor the guess of pandas covers.
 _FORMATS = (
-    "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%d/%m/%y %H:%M:%S",
-    "%d.%m.%y %H:%M:%S",
+    "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
+    "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M",
 )  # fmt: skip
+_SWAPPED = re.compile(r"%([md])([-/.])%([md])")
 _OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
 #: Second of 1904-01-01 plus this many is in the years in which LabVIEW has written times, in seconds since 1970 in ours.
 _LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
@@ -171,7 +158,20 @@ class TableProposal:
                 columns[number - 1] = replace(
                     before, role=role, unit=unit, remark="" if match[4] or before.unit else remark
                 )
-        return replace(self, columns=tuple(columns))
+        times = [column for column in columns if column.role == "time"]
+        if times == list(self.of("time")):
+            return replace(self, columns=tuple(columns))
+        kept = {
+            key: value
+            for key, value in self.keys.items()
+            if key not in ("time", "every", "time_unit", "time_format", "long")
+        }
+        if not times:
+            return replace(self, columns=tuple(columns), keys=kept, asked={"every": ""})
+        unit = {"time_unit": times[0].unit} if times[0].unit else {}
+        return replace(
+            self, columns=tuple(columns), keys=kept | {"time": [one.heading for one in times]} | unit, asked={}
+        )
 
 
 def propose_runs(paths: Sequence[Path]) -> TableProposal:
@@ -189,39 +189,44 @@ def propose_table(path: Path) -> TableProposal:
     """Read a logged table, and propose how it is laid out and what its columns hold."""
     head = _head(path)
     keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(head)
-    header = HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None
-    rows = read_rows(path, header=header)
-    if "long" not in keys:
-        keys |= _long(rows)
-    asked: dict[str, str] = {}
+    rows = read_rows(path, header=HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None)
+    frame, asked = rows.frame, dict[str, str]()
+    if frame.empty:
+        raise LaserFormatError(f"{path}: no rows below the header")
+    keys |= {} if "long" in keys else _long(frame)
     if "long" in keys:
-        long = keys["long"]
-        heading, channel = str(long["value"]), rows.frame[long["channel"]].astype(str)
-        groups = {name: values[heading] for name, values in rows.frame.groupby(channel)}
-        proposal = _with_columns(path, keys, groups, {}, len(rows.frame), asked)
-        if all(column.remark == _BY_VALUES for column in proposal.of("temperature")):
+        channels = frame.groupby(frame[keys["long"]["channel"]].astype(str))
+        groups = {str(name): values[keys["long"]["value"]] for name, values in channels}
+        columns, marks = _columns(groups, {})
+        if all(column.remark == _BY_VALUES for column in columns if column.role == "temperature"):
             # Channels have names: what none of them calls a temperature is a position, a count, a state.
-            named = [replace(one, role="out") if one.remark == _BY_VALUES else one for one in proposal.columns]
-            proposal = replace(proposal, columns=tuple(named))
-        return proposal
-    times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
-    groups = {str(name): rows.frame[name] for name in rows.frame.columns if name not in times}
-    proposal = _with_columns(path, keys, groups, rows.units, len(rows.frame), asked)
-    held = tuple(Column(name, "time", keys.get("time_unit", ""), _first(rows.frame[name])) for name in times)
-    return replace(proposal, columns=(*held, *proposal.columns))
+            columns = [replace(one, role="out") if one.remark == _BY_VALUES else one for one in columns]
+    else:
+        times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
+        columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
+        columns = [*(Column(name, "time", keys.get("time_unit", ""), _first(frame[name])) for name in times), *columns]
+    return TableProposal(path, keys | ({"missing": marks} if marks else {}), tuple(columns), len(frame), asked)
 
 
-def _with_columns(
-    path: Path, keys: dict[str, Any], groups: dict[str, pd.Series], units: Any, rows: int, asked: dict[str, str]
-) -> TableProposal:
-    columns, marks = [], set()
-    for heading, series in groups.items():
-        numbers = numbers_in(series)
-        found = [mark for mark in _MARKS if _is_mark(mark, numbers)]
-        marks |= set(found)
-        columns.append(_column(heading, units.get(heading, ""), series, numbers[~np.isin(numbers, found)]))
-    missing = {"missing": sorted(marks)} if marks else {}
-    return TableProposal(path, keys | missing, tuple(columns), rows, asked)
+def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
+    """Propose what every column holds, and which numbers are marks for no reading in all of them."""
+    numbers = {heading: _readings(series) for heading, series in groups.items()}
+    found = {heading: [mark for mark in _MARKS if _is_mark(mark, values)] for heading, values in numbers.items()}
+    columns = [
+        _column(heading, units.get(heading, ""), series, numbers[heading][~np.isin(numbers[heading], found[heading])])
+        for heading, series in groups.items()
+    ]
+    used = [column.heading for column in columns if column.role != "out"]
+    marks = {mark for heading in used for mark in found[heading]}
+    return columns, sorted(
+        mark for mark in marks if all(mark in found[name] or mark not in numbers[name] for name in used)
+    )
+
+
+def _readings(column: pd.Series) -> np.ndarray:
+    """Return the numbers of a column that can be readings."""
+    numbers = numbers_in(column)
+    return numbers[np.abs(numbers) < SENTINEL_MAGNITUDE]
 
 
 # Where names, units and values stand.
@@ -233,9 +238,13 @@ def _head(path: Path) -> list[tuple[int, str, list[str]]]:
     if is_workbook(content):
         rows = next(iter(read_cells(path, as_stored=True).values()))[:_HEAD]
         return [(line, "", [cell_text(cell) for cell in cells]) for line, cells in rows]
-    lines = decode_text(path, content).splitlines()[:_HEAD]
+    lines = text_lines(path)[:_HEAD]
     delimiter = delimiter_of_values(max(lines[len(lines) // 2 :], key=lambda line: len(line.strip()), default=""))
-    return [(k, line, fields_of(line, delimiter)) for k, line in enumerate(lines, start=1) if line.strip()]
+    return [
+        (k, line, [text.strip() for text in fields_of(line, delimiter)])
+        for k, line in enumerate(lines, 1)
+        if line.strip()
+    ]
 
 
 def _of_labview(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
@@ -243,7 +252,9 @@ def _of_labview(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     if not head or not head[0][1].startswith("LabVIEW Measurement"):
         return {}
     ends = [k for k, (_, text, _) in enumerate(head) if text.startswith("***End_of_Header***")]
-    stated = {fields[0]: (line, fields[1:]) for line, _, fields in head[: ends[-1]] if len(fields) > 1}
+    stated = {fields[0]: (line, fields[1:]) for line, _, fields in head[: ends[-1] if ends else 0] if len(fields) > 1}
+    if not {"Date", "Time", "X_Columns"} <= stated.keys() or ends[-1] + 1 == len(head):
+        return {}
     names = head[ends[-1] + 1][0]
     header = {"names": names, "values": names + 1}
     if "Y_Unit_Label" in stated:
@@ -251,7 +262,7 @@ def _of_labview(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     keys: dict[str, Any] = {"header_rows": header}
     date, clock = (stated[name][1][0].replace("/", "-").replace(",", ".") for name in ("Date", "Time"))
     keys["start"] = f"{date}T{clock[:15]}"
-    if stated["X_Columns"][1][0] == "No":
+    if stated["X_Columns"][1][0] == "No" and "Delta_X" in stated:
         keys["every"] = f"{stated['Delta_X'][1][0].replace(',', '.')} s"
     else:
         keys |= {"time": "X_Value", "time_unit": "s"}
@@ -298,19 +309,18 @@ def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
     return len(widths) == 1 and all(count >= max(1, len(row) / 2) for count, row in zip(numeric, texts, strict=True))
 
 
-def _long(rows: Rows) -> dict[str, Any]:
+def _long(frame: pd.DataFrame) -> dict[str, Any]:
     """Return the columns of a table with a line for every change: a time, a name that recurs, a number."""
-    if len(rows.frame.columns) != 3:
+    if len(frame.columns) != 3:
         return {}
     time, channel, value = "", "", ""
-    for name in rows.frame.columns:
-        column = rows.frame[name].astype(str)
-        if pd.api.types.is_numeric_dtype(rows.frame[name]):
-            value = name
-        elif _clock(column) is not None:
-            time = name
+    for name, column in frame.items():
+        if pd.api.types.is_numeric_dtype(column):
+            value = str(name)
+        elif _clock(column.astype(str)) is not None:
+            time = str(name)
         elif column.nunique() < len(column) / 3:
-            channel = name
+            channel = str(name)
     return {"long": {"time": time, "channel": channel, "value": value}} if time and channel and value else {}
 
 
@@ -320,38 +330,30 @@ def _long(rows: Rows) -> dict[str, Any]:
 def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
     """Return the headings of the times; write into `keys` how they are to be read, and into `asked` what nothing tells."""
     frame = rows.frame
+    texts = [name for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name])]
     named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
-    for name in [*named, *(name for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name]))]:
-        if pd.api.types.is_numeric_dtype(frame[name]):
+    # A first column without a name that grows, and does not count rows, is the time.
+    for name in [*named, *texts, *(["1"] if frame.columns[0] == "1" and not _counts(frame["1"]) else [])]:
+        if name not in texts:
             if not _grows(frame[name]):
                 continue
             keys["time"] = name
             if {unit_name(rows.units.get(name, "")), column_unit(name)}.isdisjoint(_TIME_UNITS):
                 keys["time_unit"], start = _unit_of_times(frame[name].dropna().to_numpy(float))
                 keys |= {"start": start} if start else {}
-                if not start:
-                    asked["time_unit"] = f"{_plain(frame[name].iloc[0])} to {_plain(frame[name].iloc[-1])}"
+                asked |= (
+                    {} if start else {"time_unit": f"{_plain(frame[name].iloc[0])} to {_plain(frame[name].iloc[-1])}"}
+                )
             return (name,)
-        other = next((two for two in named if two != name and _OF_DAY.fullmatch(str(frame[two].iloc[0]).strip())), None)
-        if other is not None and _clock(both := frame[name].astype(str) + " " + frame[other].astype(str)) is not None:
-            keys["time"] = [name, other]
-            keys |= _clock(both) or {}
-            return name, other
-        form = _clock(frame[name].astype(str))
-        if form is not None:
-            keys["time"] = name
-            keys |= form
-            return (name,)
-    first = frame.columns[0]
-    if (
-        first == "1"
-        and pd.api.types.is_numeric_dtype(frame[first])
-        and _grows(frame[first])
-        and not _counts(frame[first])
-    ):
-        keys |= {"time": "1", "time_unit": "s"}
-        asked["time_unit"] = f"{_plain(frame[first].iloc[0])} to {_plain(frame[first].iloc[-1])}"
-        return ("1",)
+        of_day = [
+            two for two in named if two in texts and two != name and _OF_DAY.fullmatch(str(frame[two].iloc[0]).strip())
+        ]
+        for columns in ([name, *of_day[:1]], [name]):
+            form = _clock(frame[columns].astype(str).agg(" ".join, axis=1))
+            if form is not None:
+                asked |= {"time_format": form.pop("or")} if "or" in form else {}
+                keys |= {"time": columns if len(columns) > 1 else name} | form
+                return tuple(columns)
     asked["every"] = ""
     return ()
 
@@ -367,7 +369,7 @@ def _grows(column: pd.Series) -> bool:
 
 
 def _counts(column: pd.Series) -> bool:
-    return bool((np.diff(column.dropna().to_numpy(float)) == 1.0).all())
+    return not pd.api.types.is_numeric_dtype(column) or bool((np.diff(column.dropna().to_numpy(float)) == 1.0).all())
 
 
 def _unit_of_times(numbers: np.ndarray) -> tuple[str, str]:
@@ -382,7 +384,9 @@ def _unit_of_times(numbers: np.ndarray) -> tuple[str, str]:
 
 
 def _clock(column: pd.Series) -> dict[str, str] | None:
-    """Return the key that says how times are written, an empty one where they are read without; None where they are none."""
+    """Return the key that says how times are written, and another way that fits as well; none where they are read without it; None where
+    the texts are no times.
+    """
     texts = [text.strip() for text in column.iloc[:: max(1, len(column) // 50)]]
     try:
         order = DateOrder.of(Path(), enumerate(texts))
@@ -391,15 +395,18 @@ def _clock(column: pd.Series) -> dict[str, str] | None:
         return {}
     except (BadReading, LaserFormatError):
         pass
-    if not re.search(r"\d[:_]?\d\d", texts[0]):
-        return None
-    for form in (guess_datetime_format(texts[0]), *_FORMATS):
-        try:
-            if form and all(datetime.strptime(text, form) for text in texts):
-                return {"time_format": form}
-        except ValueError:
-            continue
-    return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the day stands first
+        guessed = guess_datetime_format(texts[0])
+    spans = {}
+    for form in (guessed, *_FORMATS) if re.search(r"\d[:_]?\d\d", texts[0]) else ():
+        # Day and month are told apart by the shorter test.
+        for written in (form, _SWAPPED.sub(r"%\3\2%\1", form)) if form else ():
+            with suppress(ValueError):
+                times = [datetime.strptime(text, written) for text in texts]
+                spans[written] = max(times) - min(times)
+    shortest = [form for form in spans if spans[form] == min(spans.values())]
+    return dict(zip(("time_format", "or"), shortest, strict=False)) if spans else None
 
 
 # What a column holds, and its unit.
@@ -407,15 +414,14 @@ def _clock(column: pd.Series) -> dict[str, str] | None:
 
 def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> Column:
     """Propose role and unit of a column from its unit, the words of its heading, and its values."""
-    finite = numbers[np.isfinite(numbers)]
     name, in_heading = name_and_unit(heading)
     if in_heading.isdecimal() and "[" not in heading:
         in_heading = ""  # TC(1), TC(2): a number, no unit
     unit = unit_name(unit or in_heading or _SUFFIXES.get(read_heading(heading).unit or "", ""))
     first = _first(series)
-    if not finite.size:
+    if not numbers.size:
         return Column(heading, "out", unit, first, remark=_NO_NUMBERS)
-    low, high = float(finite.min()), float(finite.max())
+    low, high = float(numbers.min()), float(numbers.max())
     known = Column(heading, "out", unit, first, low, high)
     word, role = _word(name)
     if unit:
@@ -429,8 +435,8 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return replace(known, remark="constant")
     if role == "driver":
         return replace(known, role=role, unit=_UNIT_OF_WORD.get(word, "1"))
-    typical = float(np.median(finite))
-    if role == "temperature" or (role == "" and 12.0 < typical < 80.0 and not (finite == np.round(finite)).all()):
+    typical = float(np.median(numbers))
+    if role == "temperature" or (role == "" and 12.0 < typical < 80.0 and not (numbers == np.round(numbers)).all()):
         return replace(
             known, role="temperature", unit=_usual_unit("temperature", known)[0], remark="" if role else _BY_VALUES
         )
@@ -468,11 +474,9 @@ def _usual_unit(role: str, column: Column) -> tuple[str, str]:
 
 def _is_mark(mark: float, numbers: np.ndarray) -> bool:
     """Whether a number is a mark for no reading: far outside all others, or the only one of its column."""
-    others = numbers[np.isfinite(numbers) & (numbers != mark)]
-    if others.size == numbers[np.isfinite(numbers)].size:
-        return False
-    if not others.size:
-        return True
+    others = numbers[numbers != mark]
+    if others.size in (0, numbers.size):
+        return others.size < numbers.size
     far = _FAR + float(np.ptp(others))
     return mark < float(others.min()) - far or mark > float(others.max()) + far
 

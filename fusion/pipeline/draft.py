@@ -376,7 +376,9 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             break
     keys = dict(table.keys)
     for key, shown in table.asked.items():
-        if key == "time_unit":
+        if key == "time_format":
+            keys[key] = asker.choice(f"Times such as {table.of('time')[0].first[0]} are written", (keys[key], shown))
+        elif key == "time_unit":
             units = (keys[key], *(unit for unit in ("s", "min", "h") if unit != keys[key]))
             keys[key] = asker.choice(f"Unit of the times in {table.of('time')[0].heading}, {shown}", units)
         else:

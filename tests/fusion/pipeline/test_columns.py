@@ -136,18 +136,22 @@ def test_a_sheet_with_lines_above_its_table_is_read_too(tmp_path: Path, by_hand:
 def test_counts_are_converted_and_marks_are_no_readings(tmp_path: Path) -> None:
     lines = [
         "time [s],steps,T1",
-        *(f"{60 * k},{8 * k},{20 + k / 100 if k != 30 else -127:.2f}" for k in range(60)),
-        "3600,3.4e38,21",
+        *(f"{60 * k},{8 * k - 127},{20 + k / 100 if k != 30 else -180:.2f}" for k in range(60)),
     ]
-    data = drafted(
-        tmp_path / "folder",
-        "\n".join(lines),
-        "log.csv",
-        {"Columns as shown": "2 = displacement", "Unit of": "0.0125 mm"},
-    )
-    np.testing.assert_allclose(data["displacement"].values[:-1, 0], 100.0 * np.arange(60))
+    lines += ["3600,n.c.,21"]
+    answers = {"Columns as shown": "2 = displacement", "Unit of": "0.0125 mm"}
+    data = drafted(tmp_path / "folder", "\n".join(lines), "log.csv", answers)
+    np.testing.assert_allclose(data["displacement"].values[:-1, 0], 12.5 * (8 * np.arange(60) - 127))
     assert np.isnan(data["displacement"].values[-1, 0])
     assert np.flatnonzero(np.isnan(data["temperature"].values[:, 0])).tolist() == [30]
+    assert load_campaign(tmp_path / "folder" / "campaign.toml").record.missing == (-180,)  # type: ignore[union-attr]
+
+
+def test_day_and_month_are_told_apart_by_the_shorter_test(tmp_path: Path) -> None:
+    """Two days of May: read with the month first they would be a month apart."""
+    lines = [f"{6 + k // 24:02d}/05/21-{k % 24:02d}:00:00,{20 + k / 10},{k}" for k in range(36)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,T1,Z", *lines]) + "\n")
+    assert propose_table(tmp_path / "log.csv").keys["time_format"] == "%d/%m/%y-%H:%M:%S"
 
 
 RECORD = """\

@@ -109,7 +109,7 @@ def test_a_folder_without_measurements_is_refused(tmp_path):
     with pytest.raises(DraftError, match=r"in it \(notes.csv: "):
         write_campaign(tmp_path, Asker(None))
     assert not (tmp_path / "campaign.toml").exists()
-    (tmp_path / "notes.csv").write_text("\ufeff0.1,20.1,7.5\n1,20.2,7.6\n2,20.4,7.8\n", encoding="utf-8")
+    (tmp_path / "notes.csv").write_text("\ufeff0.1,20.1,21.5\n1,20.2,21.6\n2,20.4,21.8\n", encoding="utf-8")
     with pytest.raises(
         DraftError, match=r"notes.csv: a table of 3 columns and 3 rows without a displacement, which a record needs"
     ):
