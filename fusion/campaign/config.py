@@ -591,6 +591,15 @@ class ColumnTable(Table):
     unit: str = ""
 
 
+#: A unit alone, or a table with role and unit.
+StatedColumn = Annotated[
+    ColumnTable,
+    BeforeValidator(
+        lambda value: {"unit": value} if isinstance(value, str) else value, json_schema_input_type=str | ColumnTable
+    ),
+]
+
+
 class HeaderRows(Table):
     """``header_rows`` of a record: lines of the file, from 1, that hold the names, the units and the first values."""
 
@@ -606,13 +615,19 @@ class HeaderRows(Table):
 
 
 #: One heading, or two of a date and a time of day.
-Headings = Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)]
+Headings = Annotated[
+    tuple[str, ...],
+    BeforeValidator(
+        lambda value: (value,) if isinstance(value, str) else value, json_schema_input_type=str | tuple[str, ...]
+    ),
+    Field(min_length=1, max_length=2),
+]
 
 
 class LongTable(Table):
     """``long`` of a record: headings of a table with a line for every change, its time, its channel and its value."""
 
-    time: Headings = Field(min_length=1, max_length=2)
+    time: Headings
     channel: str
     value: str
 
@@ -628,7 +643,7 @@ class RecordTable(Table):
     files: RunPatterns = ()
     test: RunPatterns = ()
     sheet: str | None = None
-    time: Headings | None = Field(default=None, min_length=1, max_length=2)
+    time: Headings | None = None
     every_s: PositiveSeconds | None = None
     long: LongTable | None = None
     time_format: str | None = None
@@ -640,9 +655,7 @@ class RecordTable(Table):
     temperatures: tuple[str, ...] = ()
     displacements: tuple[str, ...] = ()
     drivers: tuple[str, ...] = ()
-    columns: dict[
-        str, Annotated[ColumnTable, BeforeValidator(lambda value: {"unit": value} if isinstance(value, str) else value)]
-    ] = {}
+    columns: dict[str, StatedColumn] = {}
 
     @model_validator(mode="after")
     def _times_are_stated_once(self) -> RecordTable:

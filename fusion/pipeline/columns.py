@@ -134,10 +134,8 @@ class TableProposal:
         ]
         widths = [min(max(map(len, cells)), 36) for cells in zip(*rows, strict=True)]
         for row in rows:
-            yield (
-                "  ".join(f"{cell[:width]:<{width}}" for cell, width in zip(row[:-1], widths, strict=False))
-                + f"  {row[-1]}".rstrip()
-            )
+            cells = (f"{cell[:width]:<{width}}" for cell, width in zip(row, [*widths[:-1], 99], strict=True))
+            yield "  ".join(cells).rstrip()
 
     def corrected(self, text: str) -> TableProposal:
         """Return it with other roles and units: ``3-5 = temperature degC; 7 = out``."""
@@ -463,7 +461,7 @@ def _usual_unit(role: str, column: Column) -> tuple[str, str]:
     span = column.high - column.low
     if role == "temperature":
         # Kelvins of a machine are above what its degrees Celsius reach.
-        return ("K" if column.low > 200.0 and column.high < 500.0 else "degC"), ""
+        return ("K" if column.low > 250.0 and column.high < 450.0 else "degC"), ""
     if role != "displacement":
         return ("" if role == "out" else "1"), ""
     # Thermal displacements are micrometres to tenths of millimetres.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.campaign.values import QuantityError, column_conversion, read_quantity
+from fusion.campaign.values import QuantityError, column_conversion, read_quantity, role_of_unit
 from fusion.common import FusionError
 from fusion.pipeline.columns import ROLES, ColumnsError, TableProposal, propose_runs
 from fusion.pipeline.inspect import (
@@ -357,7 +357,9 @@ def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker)
         if column.role in ROLES[1:-1]:
             yield f"{_quoted(column.heading)} = {_toml({'role': column.role, 'unit': column.unit})}{remark}"
         elif column.role == "out":
-            yield f'# {_quoted(_plain(column.heading))} = {{role = "driver", unit = "1"}}{remark}'
+            unit = column.unit or "1"
+            example = _toml({"role": role_of_unit(unit), "unit": unit})
+            yield f"# {_quoted(_plain(column.heading))} = {example}{remark}"
 
 
 def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:

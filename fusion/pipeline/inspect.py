@@ -299,7 +299,7 @@ def _describe_record(found: Recognised) -> list[str]:
     from fusion.pipeline.columns import propose_table
 
     table = propose_table(found.path)
-    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "column left out"}
+    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}
     columns = {kind: [column.heading for column in table.of(role)] for role, kind in roles.items()}
     described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
     held = join([column.heading for column in table.of("time")])
