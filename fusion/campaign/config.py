@@ -617,10 +617,10 @@ class HeaderRows(Table):
 #: One heading, or two of a date and a time of day.
 Headings = Annotated[
     tuple[str, ...],
+    Field(min_length=1, max_length=2),
     BeforeValidator(
         lambda value: (value,) if isinstance(value, str) else value, json_schema_input_type=str | tuple[str, ...]
     ),
-    Field(min_length=1, max_length=2),
 ]
 
 
