@@ -47,7 +47,8 @@ _FORMATS = (
     "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
     "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M",
 )  # fmt: skip
-_SWAPPED = re.compile(r"%([md])([-/.])%([md])")
+#: Day and month of a date whose year comes last; with dots between them the day stands first.
+_SWAPPED = re.compile(r"^%([md])([-/])%([md])")
 _OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
 #: Second of 1904-01-01 plus this many is in the years in which LabVIEW has written times, in seconds since 1970 in ours.
 _LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)

@@ -151,7 +151,13 @@ def test_day_and_month_are_told_apart_by_the_shorter_test(tmp_path: Path) -> Non
     """Two days of May: read with the month first they would be a month apart."""
     lines = [f"{6 + k // 24:02d}/05/21-{k % 24:02d}:00:00,{20 + k / 10},{k}" for k in range(36)]
     (tmp_path / "log.csv").write_text("\n".join(["time,T1,Z", *lines]) + "\n")
-    assert propose_table(tmp_path / "log.csv").keys["time_format"] == "%d/%m/%y-%H:%M:%S"
+    table = propose_table(tmp_path / "log.csv")
+    assert table.keys["time_format"] == "%d/%m/%y-%H:%M:%S" and table.asked == {}
+    # One day says nothing of the order, and is asked about; a year that comes first does.
+    for written, asked in (("03/04/2026 {:02d}:00", {"time_format"}), ("2026/03/04-{:02d}:00", set())):
+        lines = [f"{written.format(k)},{20 + k / 10},{k}.5" for k in range(24)]
+        (tmp_path / "log.csv").write_text("\n".join(["time,T1,Z", *lines]) + "\n")
+        assert set(propose_table(tmp_path / "log.csv").asked) == asked
 
 
 RECORD = """\
