@@ -317,8 +317,9 @@ def evaluate_regions(
         ``maximum_row``, ``minimum_column``, ``minimum_row``, px; ``pixels``, and of these ``overrange`` and ``underrange``;
         ``emissivity``. Where ``overrange`` is not 0 the maximum is the limit of the calibrated range, "at least", and has no
         uncertainty (NaN); ``underrange`` and the minimum likewise. Frames of models that are not calibrated have none either. A region
-        that a frame does not store is NaN with 0 pixels. Coordinates ``time`` (UTC), ``source``, ``frame`` and ``camera`` along ``time``, ``kind`` along ``region``; the attribute ``rejected`` lists
-        as JSON the frames whose pixels could not be read and that are left out.
+        that a frame does not store is NaN with 0 pixels. Coordinates ``time`` (UTC), ``source``, ``frame`` and ``camera`` along
+        ``time``, ``kind`` along ``region``; the attribute ``rejected`` lists as JSON the frames whose pixels could not be read and that
+        are left out.
 
     Raises
     ------

@@ -8,13 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from thermography.common import ThermographyError
 from thermography.evaluation import RegionTable, measures_temperature, tabulate_regions
-from thermography.io.flir import FlirFrameReference, FlirReader, index_frames, read_frame
+from thermography.io.flir import FlirFrameReference, FlirReader, index_frames
 from thermography.io.frame import CalibratedRange, FlirFormatError, FrameReference, RejectedFrame
 from thermography.io.other_cameras import START_BYTES, StackOptions, TemperatureReader, find_reader, plug_ins
 from thermography.radiometry.planck import (
@@ -31,7 +30,6 @@ from thermography.radiometry.planck import (
 _FRAMES_CHECKED = 32
 #: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
-_THUMBNAIL_WIDTH = 320
 #: Code of a warning -> what to do about it.
 _REMEDIES = {
     "frame_left_out": "Copy the file from the camera again if the frame matters.",
@@ -294,16 +292,6 @@ def describe_stack(path: Path) -> list[str]:
     missing = [] if contents.unit else ["unit"]
     missing += [] if contents.times is not None else ["time_in_name, times, or start and interval"]
     return lines + ([f"  state under [thermography.stack]: {'; '.join(missing)}"] if missing else [])
-
-
-def thumbnail(path: Path) -> bytes:
-    """Return a small picture of the first frame."""
-    counts = read_frame(path).counts.astype(np.float32)
-    low, high = np.percentile(counts, (1, 99))
-    grey = np.clip((counts - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
-    scale = min(1.0, _THUMBNAIL_WIDTH / grey.shape[1])
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".png", cv2.applyColorMap(small, cv2.COLORMAP_INFERNO))[1].tobytes()
 
 
 def _warning(code: str, message: str) -> FileWarning:

@@ -20,7 +20,6 @@ from fusion.common import FusionError, TomlError, read_toml
 from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
 from fusion.results.progress import counted, left_out_notices, listed
-from fusion.results.store import OutputError, write_atomically
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
 from thermography.common import ThermographyError
@@ -32,11 +31,10 @@ from thermography.inspection import (
     describe_stack,
     inspect_file,
     is_flir_file,
-    thumbnail,
 )
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
-from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader
+from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader, name_unread
 from thermography.radiometry.planck import ZERO_CELSIUS_K
 from thermography.registration.plan import read_fiducials
 
@@ -106,6 +104,8 @@ def recognise(path: Path) -> Recognised:
     if reader is not None and not isinstance(reader, TextReader):
         reason = f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
         return Recognised(path, Kind.UNKNOWN, reason)
+    if reader is None and (what := name_unread(path)):
+        return Recognised(path, Kind.UNKNOWN, what)
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
@@ -540,19 +540,14 @@ def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
             yield _inspect_series(members, label=str(path.parent / f"*{path.suffix}"))
 
 
-def write_thumbnails(paths: Sequence[Path], folder: Path) -> Iterator[Path]:
-    """Write a small picture of the first frame of every thermal file as ``<file>.png``."""
-    written: set[str] = set()
-    for path in filter(is_thermal, _files(paths)):
-        try:
-            picture = thumbnail(path)
-        except ThermographyError:
-            continue
-        name = f"{path.name}.png" if f"{path.name}.png" not in written else f"{path.parent.name}_{path.name}.png"
-        if name not in written and (folder / name).exists():
-            raise OutputError(f"{folder / name} exists already; name another folder with --thumbnails, or remove it")
-        written.add(name)
-        yield write_atomically(folder / name, lambda part, picture=picture: part.write_bytes(picture))  # type: ignore[misc]
+def write_frames(paths: Sequence[Path], folder: Path, formats: Sequence[str]) -> Iterator[str]:
+    """Write the frames of all thermal files for other programs, see `thermography.pictures.export_frames`; say what was written."""
+    from thermography.pictures import export_frames  # loads xarray, which nothing else here needs
+
+    frames, rejected = index_frames([path for path in _files(paths) if is_thermal(path)])
+    if frames:
+        yield from (f"written: {path}" for path in export_frames(frames, folder, formats))
+    yield from (f"left out: {one.reason}" for one in rejected)
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
