@@ -95,8 +95,9 @@ class CountRange(NamedTuple):
 def calibrated_counts(frame: FrameHeader) -> CountRange:
     """Return the counts between which a frame is calibrated: those of its range on a black body, without saturated ones."""
     limits, p = frame.limits, frame.parameters
-    if limits.maximum_K > limits.minimum_K > 0 and min(p.planck_r1, p.planck_b, p.planck_r2) > 0:
-        low, high = black_body_signal(np.array([limits.minimum_K, limits.maximum_K]), p).tolist()
+    if limits.in_kelvin and min(p.planck_r1, p.planck_b, p.planck_r2) > 0:
+        with np.errstate(all="ignore"):  # of damaged constants
+            low, high = black_body_signal(np.array([limits.minimum_K, limits.maximum_K]), p).tolist()
         return CountRange(max(low, 1.0), min(high, 65_534.0))
     return CountRange(limits.raw_minimum + 1.0, (limits.raw_maximum or 65_535) - 1.0)
 

@@ -196,7 +196,7 @@ def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
 
 def describe_range(limits: CalibratedRange) -> str:
     """Say within which readings of a black body a camera is calibrated."""
-    if not limits.maximum_K > limits.minimum_K > 0:
+    if not limits.in_kelvin:
         return "calibrated range not stored"
     low, high = (round(kelvin - ZERO_CELSIUS_K) for kelvin in (limits.minimum_K, limits.maximum_K))
     return f"calibrated range {low} to {high} °C (readings of a black body)"

@@ -245,6 +245,21 @@ def test_a_real_picture_has_the_extremes_that_the_vendor_exports(real_file):
 
 
 @pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("name", "region", "printed"),
+    [
+        ("gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg", "Sp1", 31.4),
+        ("gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg", "Sp2", 24.3),
+        ("SanNianYiSi__thermal_parser/images/FLIR_E40.jpg", "spot 1", 20.9),
+        ("gtatters__Thermimage/inst/extdata/IR_2412.jpg", "box 1", 28.1),
+    ],
+)
+def test_stored_regions_have_the_means_that_the_camera_printed_into_its_picture(real_file, name, region, printed):
+    found = evaluate_regions(index_frames([real_file(name)])[0]).sel(region=region)
+    assert round(float(found["mean"][0]), 1) == printed
+
+
+@pytest.mark.real_data
 def test_a_part_heated_beyond_the_range_of_its_camera_is_given_at_least_the_limit(real_file):
     paths = [real_file(f"frkatona__ThermalImageFitter/Nov19/FLIR{number}.jpg") for number in range(2167, 2216, 2)]
     whole = evaluate_regions(index_frames(paths)[0]).sel(region="whole picture")

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,7 +18,7 @@ from tests.thermography.flir_mutations import (
     sequence,
 )
 from thermography.common import ThermographyError
-from thermography.inspection import describe_stack, inspect_file, is_flir_file, thumbnail
+from thermography.inspection import describe_stack, inspect_file, is_flir_file
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, FlirFormatError
 from thermography.radiometry.planck import override
@@ -150,14 +149,6 @@ def test_files_are_distinguished_by_their_first_bytes(tmp_path):
     sequence(tmp_path / "a.seq")
     (tmp_path / "laser.csv").write_text("cycle,direction\n", encoding="utf-8")
     assert [is_flir_file(tmp_path / name) for name in ("a.jpg", "a.seq", "laser.csv")] == [True, True, False]
-
-
-def test_thumbnail_is_a_small_picture(tmp_path):
-    jpeg(tmp_path / "a.jpg", rows=480, columns=640)
-    picture = cv2.imdecode(np.frombuffer(thumbnail(tmp_path / "a.jpg"), np.uint8), cv2.IMREAD_COLOR)
-    assert picture.shape == (240, 320, 3)
-    # Counts grow to the right, and so does the brightness of the colour map.
-    assert picture[:, -20:].mean() > picture[:, :20].mean() + 50
 
 
 def test_sensors_at_zero_degc_are_placeholders(tmp_path):
