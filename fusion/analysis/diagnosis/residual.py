@@ -113,9 +113,7 @@ def examine(
     readings: Readings, fit: DriftFit, rng: np.random.Generator, *, set_aside: Collection[tuple[int, str]] = ()
 ) -> Remainder:
     """Test what the fit leaves for structure and describe the largest of it."""
-    noise, share = fit.noise()
-    standard = noise / (fit.sigma * np.sqrt(np.maximum(share, 1e-12)))
-    cycles, sites, matrix = _matrix(readings, np.clip(standard, -4.0, 4.0))
+    cycles, sites, matrix = _matrix(readings, np.clip(fit.white_noise(), -4.0, 4.0))
     kept = [k for k, site in enumerate(sites) if site not in set(set_aside)]
     tested = matrix[:, kept]
     tested = (tested - np.nanmean(tested, axis=0)) / np.maximum(np.nanstd(tested, axis=0), 1e-9)
@@ -347,8 +345,7 @@ class ResidualTests(ResidualPart):
 def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests:
     """Test the residual of a model for structure."""
     readings, fit = model.readings.subset(model.used), model.fit
-    whitened, _ = fit.system.whiten(fit.residual()[:, None])
-    innovations = np.asarray(whitened[:, 0] / fit.sigma)
+    innovations = fit.innovations()
     clipped = np.clip(innovations, -_CLIP, _CLIP)
     window = max(2, round(readings.seconds.size / np.unique(readings.cycle).size))
     periods = _periods_min(readings.seconds)

@@ -163,6 +163,7 @@ class ModelFit:
             self.fit.system.ratios,
             variance,
             self.used,
+            memory=self.fit.system.memory,
         )
 
     def open_loop_errors(self) -> tuple[Array, Array]:
@@ -188,7 +189,14 @@ def fit_model(readings: Readings, terms: Sequence[Term], *, used: NDArray[np.boo
     first = estimate(seconds, loadings, response, design, robust=True)
     variance = _site_variance(readings.subset(used), first) * first.system.variance
     fit = estimate(
-        seconds, loadings, response, design, order=first.system.order, start=first.system.ratios, variance=variance
+        seconds,
+        loadings,
+        response,
+        design,
+        order=first.system.order,
+        memory=True,
+        start=first.system.ratios,
+        variance=variance,
     )
     model = ModelFit(readings, used, tuple(terms), fit, profile)
     for place, prior in model.priors():
