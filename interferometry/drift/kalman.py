@@ -10,7 +10,8 @@ T = [[1, h], [0, 1]] over a step of h seconds). Z holds the loadings, at the lev
 the gain K = T P Z' / F, transition included; here the gain is M = P Z' / F and the transition is a step of its own.
 
 Noise that neighbouring readings share, as turbulent air along the beam makes it, is one more state, the last, with loading 1 and
-T = exp(-h / correlation time): an autoregression at irregular times. ``memory`` holds its stationary variance and correlation time, or nothing.
+T = exp(-h / correlation time): an autoregression at irregular times. ``memory`` holds its stationary variance and correlation time,
+or nothing.
 
 Arrays share these shapes: n readings, p columns that are filtered alike (response and design), c components, m = c * order states, one more
 where the noise has a memory.
@@ -465,7 +466,7 @@ class Smoothed(NamedTuple):
     level_covariance : (n, components, components) ndarray
         Covariance of the levels, the columns' coefficients being known.
     u : (n, p) ndarray
-        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is the estimated noise of each reading alone, ``u / D`` its
+        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is each reading's own estimated noise, ``u / D`` its
         deletion residual, the reading minus its prediction from all others.
     D : (n,) ndarray
         Variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.

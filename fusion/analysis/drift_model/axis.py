@@ -523,7 +523,8 @@ def reject_inconsistent_patterns(problem: AxisProblem, state: AxisState) -> Axis
 
 def examine_remainder(model: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> remainder.Remainder:
     """Describe what a model leaves: a shape among the sites or, where there is none, an unexplained drift of all of them."""
-    left = remainder.examine(model.readings, model.fit, np.random.default_rng(seed), set_aside=set_aside)
+    rng = np.random.default_rng(seed)
+    left = remainder.examine(model.readings, model.fit, rng, memory=model.memory, set_aside=set_aside)
     return left if left.shape else remainder.with_drift(left, model.fit)
 
 
