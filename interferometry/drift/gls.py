@@ -655,7 +655,9 @@ def memory_of_each(values: Array) -> Autoregression:
     estimates = np.empty((_SIMULATED_MEMORY.size, _SIMULATIONS))
     for row, weight in zip(estimates, _SIMULATED_MEMORY, strict=True):
         for k in range(_SIMULATIONS):
-            simulated = Autoregression(np.array([weight]), 1.0 - weight**2).with_memory(rng.normal(size=values.shape[::-1]))
+            simulated = Autoregression(np.array([weight]), 1.0 - weight**2).with_memory(
+                rng.normal(size=values.shape[::-1])
+            )
             row[k] = _lag_one(simulated.T)
     measured, independent = _lag_one(values), estimates[0]
     if measured < independent.mean() + _LEAST_MEMORY * independent.std(ddof=1):

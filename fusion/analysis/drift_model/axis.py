@@ -961,6 +961,7 @@ class LoopResult:
             unconfirmed_effects=self.unnamed,
             unexplained=self._unexplained(),
             residual_drift=self.residual_drift,
+            noise=_noise_of(self.after),
             held_out_test=self.state.question or schema.Nothing(),
             search=[[_score_of(score) for score in scored.scores] for scored in self.state.rounds],
             identifiability=[limit for scored in self.state.rounds for limit in scored.detection_limits],
@@ -1082,6 +1083,17 @@ def _size(model: ModelFit, term: Term) -> float:
 def rmse(errors: Array) -> float:
     """Root mean square of errors, those of sites without a prediction left out."""
     return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def _noise_of(model: ModelFit) -> schema.NoisePart:
+    """Noise of a reading with its memory within a pass and over the cycles."""
+    within = model.fit.system.memory
+    return schema.NoisePart(
+        reading_um=model.fit.sigma,
+        shared_share=within.share if within else 0.0,
+        correlation_time_s=within.time_s if within else None,
+        cycle_correlation=float(model.memory.weights.sum()),
+    )
 
 
 def residual_drift_size(model: ModelFit) -> schema.ResidualDrift:

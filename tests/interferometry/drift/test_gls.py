@@ -7,9 +7,11 @@ import pytest
 
 from interferometry.drift import gls
 from interferometry.drift.gls import (
+    Autoregression,
     average_drift,
     estimate,
     fit_fixed_effects,
+    memory_of_each,
     settling_noise_scale,
     typical_memory,
     von_neumann_p_value,
@@ -376,3 +378,25 @@ def test_memory_is_recognised_and_taken_out(rng):
 def test_series_without_values_or_too_few_cycles_have_no_memory():
     assert typical_memory(np.zeros((4, 50))).weights.size == 0
     assert typical_memory(np.ones((4, 3))).weights.size == 0
+
+
+@pytest.mark.parametrize("weight", [0.3, 0.6])
+def test_the_memory_of_each_site_is_estimated_beside_what_all_do_together(rng, weight):
+    """32 sites over 50 cycles, and a motion of all that is no noise."""
+    together = np.outer(rng.normal(size=32), np.sin(np.arange(50) / 5.0))
+    found = memory_of_each(with_memory(rng.normal(size=(50, 32)), weight).T + together)
+    # 1600 values: a correlation is known to 0.025, less what the patterns take.
+    assert found.weights[0] == pytest.approx(weight, abs=0.1)
+
+
+def test_independent_sites_have_no_memory_and_few_sites_are_not_asked(rng):
+    assert all(memory_of_each(rng.normal(size=(32, 50))).weights.size == 0 for _ in range(10))
+    together = np.outer(rng.normal(size=32), np.sin(np.arange(50) / 5.0))
+    assert memory_of_each(rng.normal(size=(32, 50)) + together).weights.size == 0
+    assert memory_of_each(with_memory(rng.normal(size=(50, 6)), 0.6).T).weights.size == 0
+
+
+def test_simulated_noise_has_the_memory_and_its_variance(rng):
+    noise = Autoregression(np.array([0.6]), 0.64).with_memory(rng.normal(size=(4000, 5)))
+    assert noise.std() == pytest.approx(1.0, abs=0.03)
+    assert np.mean(noise[1:] * noise[:-1]) == pytest.approx(0.6, abs=0.04)
