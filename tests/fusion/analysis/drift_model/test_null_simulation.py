@@ -185,9 +185,9 @@ def test_simulating_a_long_test_takes_little_more_memory_than_its_readings(monke
 def test_simulated_noise_has_the_memory_of_the_fit(rng):
     """Within a pass by time, and of every site from cycle to cycle: five sites in turn, 10 s apart."""
     fit = quiet_fit(rng.standard_normal(50))
-    within = replace(fit, system=replace(fit.system, memory=Memory(0.8, 20.0)))
+    within = fit_fixed_effects(replace(fit.system, memory=Memory(0.8, 20.0)), fit.response, fit.design)
     draws = simulate_null(within, rng, draws=4000)
-    assert draws[20].var() == pytest.approx(fit.sigma**2, rel=0.1)
+    assert draws[20].var() == pytest.approx(within.sigma**2, rel=0.1)
     assert np.corrcoef(draws[20], draws[21])[0, 1] == pytest.approx(0.8 * np.exp(-0.5), abs=0.05)
     memory = Autoregression(np.array([0.6]), 0.64)
     draws = simulate_null(fit, rng, draws=4000, memory=memory, site=np.arange(50) % 5)
