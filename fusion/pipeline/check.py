@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
+from fusion.analysis.consistency.checks import Check, ContradictionError, Severity, open_doubts, refuse_contradictions
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_source
 from fusion.campaign.logs import read_drivers
@@ -46,7 +46,7 @@ class CampaignCheck:
     @property
     def doubts(self) -> list[Check]:
         """Checks that are not passed, nor accepted, and that a run would name first."""
-        return open_doubts(self.checks, self.accepted)
+        return [one for one in open_doubts(self.checks, self.accepted) if one.severity is Severity.DOUBT]
 
     def lines(self, *, quiet: bool = False) -> list[str]:
         """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only."""
@@ -79,7 +79,7 @@ class CampaignCheck:
             "faults": list(self.faults),
             "doubts": [{"code": one.code, "evidence": one.evidence, "remedy": one.remedy} for one in self.doubts],
             "notices": [{"code": one.code, "message": one.message, "remedy": one.remedy} for one in self.notices],
-            "checks_passed": len(self.checks) - len(self.doubts),
+            "checks_passed": sum(one.passed or one.code in self.accepted for one in self.checks),
         }
 
 

@@ -40,6 +40,13 @@ def test_a_log_of_another_day_is_a_contradiction() -> None:
     assert "Check the date, the clock and the time zone of drivers.csv" in found.remedy
 
 
+@pytest.mark.parametrize("noted_s", [[-600.0], [1800.0], [-600.0, -540.0, 15_000.0, 15_060.0]])
+def test_conditions_noted_before_or_after_the_test_are_no_contradiction(noted_s: list[float]) -> None:
+    noted = log(0.0, 0.0).isel(time=[0] * len(noted_s)).assign_coords(time=START + np.array(noted_s).astype("m8[s]"))
+    found = check(noted)
+    assert found.severity is Severity.DOUBT and found.value == 0.0
+
+
 @pytest.mark.parametrize(("last_s", "share"), [(4 * 3600.0, 1.0), (2 * 3600.0, 0.5), (3600.0, 0.25)])
 def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
     found = check(log(-60.0, last_s))
