@@ -48,8 +48,8 @@ class CampaignCheck:
         """Checks that are not passed, nor accepted, and that a run would name first."""
         return [one for one in open_doubts(self.checks, self.accepted) if one.severity is Severity.DOUBT]
 
-    def lines(self, *, quiet: bool = False) -> list[str]:
-        """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only."""
+    def lines(self, *, quiet: bool = False, brief: bool = False) -> list[str]:
+        """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only, `brief` the verdict too."""
         doubts = [f"doubt ({check.code}): {check.evidence} {check.remedy}" for check in self.doubts]
         faults = [f"fault: {fault}" for fault in self.faults]
         if quiet:
@@ -64,7 +64,7 @@ class CampaignCheck:
             verdict = f"ready to run: {counted(len(self.checks) - len(doubts), 'check')} passed{doubted}"
         else:
             verdict = "ready to run"
-        return [*title, *details, *notices, *doubts, *faults, verdict]
+        return [*doubts, *faults, verdict] if brief else [*title, *details, *notices, *doubts, *faults, verdict]
 
     def as_json(self) -> dict[str, Any]:
         """Return the check as a mapping of JSON's own types."""
