@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import covered_share, likely_zone_shift
-from fusion.analysis.alignment.sensor_health import examine_sensors
+from fusion.analysis.alignment.sensor_health import Kind, examine_sensors
 from fusion.analysis.consistency.checks import Check, Severity, judge
 from fusion.analysis.consistency.field_series import FieldSeries, field_at
 from fusion.common import Array
@@ -88,7 +88,12 @@ def check_contact_sensors(environment: xr.Dataset | None, drivers: xr.Dataset | 
     faults = examine_sensors(
         seconds, np.column_stack(list(columns.values())), np.column_stack(loads) if loads else None
     )
-    names = [f"{list(columns)[fault.sensor].replace('_', ' ')} {fault.words}" for fault in faults if fault.is_clear]
+    # One reading throughout is that of a stable room or of a stuck sensor: `material_still` tells which where the table is seen.
+    changing = {
+        sensor for sensor, column in enumerate(columns.values()) if np.unique(column[np.isfinite(column)]).size > 1
+    }
+    clear = [fault for fault in faults if fault.is_clear and (fault.kind is not Kind.STUCK or fault.sensor in changing)]
+    names = [f"{list(columns)[fault.sensor].replace('_', ' ')} {fault.words}" for fault in clear]
     return [
         judge(
             "contact_sensors",

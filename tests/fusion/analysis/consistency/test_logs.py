@@ -118,6 +118,17 @@ def test_a_contact_sensor_that_jumps_alone_is_doubted_by_name() -> None:
     assert check_contact_sensors(None, None, file="environment.csv") == []
 
 
+def test_a_stable_room_that_shows_one_digit_is_sound() -> None:
+    """A material that moves by 0.05 K reads the same at a resolution of 0.1 K, while the air swings with its conditioning."""
+    hours = np.arange(300) / 60.0
+    columns = {"air_temperature": 20.0 + 0.4 * np.sin(12.0 * hours), "material_temperature": 20.5 + 0.01 * hours}
+    time = START + np.arange(300) * np.timedelta64(60, "s")
+    room = xr.Dataset({name: ("time", np.round(one, 1)) for name, one in columns.items()}, coords={"time": time})
+    assert np.ptp(room["material_temperature"].values) == 0.0
+    (check,) = check_contact_sensors(room, None, file="environment.csv")
+    assert check.passed
+
+
 def test_a_temperature_among_the_drivers_is_examined_and_its_load_is_not() -> None:
     (doubted,) = check_contact_sensors(environment(), drivers(3.0), file="environment.csv")
     assert doubted.evidence.startswith("environment.csv: nut jumps by 3 K from 2.9")
