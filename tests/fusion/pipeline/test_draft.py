@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -111,8 +112,10 @@ def test_a_folder_without_measurements_is_refused(tmp_path):
     with pytest.raises(DraftError, match=r"in it \(notes.csv: "):
         write_campaign(tmp_path, Asker(None))
     assert not (tmp_path / "campaign.toml").exists()
-    (tmp_path / "notes.csv").write_text("\ufeff0,20.1,4.41E-05\n1,20.2,4.3E-05\n", encoding="utf-8")
-    with pytest.raises(DraftError, match=r"notes.csv: a table of numbers without headings; write a first line"):
+    (tmp_path / "notes.csv").write_text("\ufeff0.1,20.1,21.5\n1,20.2,21.6\n2,20.4,21.8\n", encoding="utf-8")
+    with pytest.raises(
+        DraftError, match=r"notes.csv: a table of 3 columns and 3 rows without a displacement, which a record needs"
+    ):
         write_campaign(tmp_path, Asker(None))
     with pytest.raises(DraftError, match="no such folder"):
         write_campaign(tmp_path / "absent", Asker(None))
@@ -135,8 +138,9 @@ def test_runs_of_a_record_are_one_campaign(tmp_path):
     write_campaign(tmp_path, Asker(None))
     record = load_campaign(path).record
     assert record.files == ("run_1.csv", "run_2.csv")
-    columns = (*record.temperatures, *record.displacements, *record.drivers)
-    assert columns == ("t1 [degC]", "ch1 [um]", "speed [1/min]")
+    assert {name: column.role for name, column in record.columns.items()} == {
+        "t1 [degC]": "temperature", "ch1 [um]": "displacement", "speed [1/min]": "driver",
+    }  # fmt: skip
     assert check_campaign(path).faults == ()
 
 
@@ -156,7 +160,11 @@ def test_the_public_spindle_record_is_ready_at_once(real_file, tmp_path):
     path, missing = write_campaign(tmp_path, Asker(None))
     record = load_campaign(path).record
     assert missing == []
-    assert (len(record.temperatures), len(record.displacements), record.drivers) == (16, 5, ("spindle(RPM)",))
+    assert Counter(column.role for column in record.columns.values()) == {
+        "temperature": 16,
+        "displacement": 5,
+        "driver": 1,
+    }
     assert check_campaign(path).faults == ()
 
 
@@ -203,11 +211,15 @@ def test_laser_tests_of_one_folder_become_a_campaign_each_and_questions_are_aske
 
     def answer(question, default):
         asked.append(question)
+        if question.startswith("Dead path") and asked.count(question) == 1:
+            return "5 kg"
         return "U" if question.startswith("Axis that report_other.csv is of") else default
 
     written = write_campaigns(tmp_path, Asker(answer))
     names = ["ecmc", "report_other", "report_x_csv_campaign", "report_x_txt_campaign", "report_y"]
-    assert [path.parent.name for path, _ in written] == names and len(asked) == len(set(asked))
+    assert [path.parent.name for path, _ in written] == names
+    # A refused answer is asked for again, and nothing else twice.
+    assert [question for question, count in Counter(asked).items() if count > 1] == ["Dead path of the laser"]
     campaigns = [load_campaign(path) for path, _ in written]
     assert [one.campaign.axis for one in campaigns] == ["Z", "U", "X", "X", "Y"]
     assert all(check_campaign(path).faults == () for path, _ in written)
