@@ -314,17 +314,22 @@ def fleet(
 
 @app.command()
 def init(
-    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder with the files of one measurement.")],
+    folder: Annotated[
+        Path, Argument(metavar="FOLDER", help="Folder with the files of one measurement, or of several laser tests.")
+    ],
     yes: Annotated[
         bool, Option("--yes", "-y", help="Do not ask: leave marked lines to fill in for what the files do not contain.")
     ] = False,
 ) -> None:
     """Write a commented campaign file for a folder.
 
-    Its files are inspected, what they do not contain is asked for, and the result is checked. An existing campaign.toml is never replaced.
+    Its files are inspected, what they do not contain is asked for, and the result is checked; exit code 2 where it is not ready to run. Of
+    several laser tests without frames each gets a folder with a campaign file, which fleet runs. An existing campaign.toml is never
+    replaced.
     """
     from fusion.pipeline.check import check_campaign
-    from fusion.pipeline.draft import Asker, DraftError, unused_files, write_campaign
+    from fusion.pipeline.draft import Asker, DraftError, unused_files, write_campaigns
+    from fusion.results.progress import counted
 
     def ask(question: str, default: str) -> str:
         shown = printable(f"{question} [{default}]" if default else question)
@@ -333,11 +338,23 @@ def init(
     with _answering():
         if not yes and not sys.stdin.isatty():
             raise DraftError("there is no terminal to ask at; add --yes, which leaves marked lines to fill in")
-        path, missing = write_campaign(folder, Asker(None if yes else ask, errors.print))
-        console.print(f"campaign: {path.resolve()}", soft_wrap=True)
-        lines = [f"not used: {line}" for line in unused_files(path)]
-        lines += [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
-        _print_lines(lines)
+        written, ready = write_campaigns(folder, Asker(None if yes else ask, errors.print)), 0
+        several = len(written) > 1
+        _print_lines(dict.fromkeys(f"not used: {line}" for path, _ in written for line in unused_files(path)))
+        for path, missing in written:
+            console.print(f"campaign: {path.resolve()}", soft_wrap=True)
+            if missing:
+                _print_lines(f"to fill in, {line}" for line in missing)
+                console.print(f"not ready: {counted(len(missing), 'line')} to fill in")
+                continue
+            checked = check_campaign(path)
+            _print_lines(checked.lines(brief=several))
+            ready += not checked.faults
+        if several:
+            then = f"thermofuse fleet {folder} gives a report of each and one table"
+            console.print(f"{ready} of {len(written)} tests are ready to run; {then}", soft_wrap=True)
+        if ready < len(written):
+            raise typer.Exit(ExitCode.BAD_INPUT)
 
 
 @app.command("app")

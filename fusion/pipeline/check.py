@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
+from fusion.analysis.consistency.checks import Check, ContradictionError, Severity, open_doubts, refuse_contradictions
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_source
 from fusion.campaign.logs import read_drivers
@@ -46,10 +46,10 @@ class CampaignCheck:
     @property
     def doubts(self) -> list[Check]:
         """Checks that are not passed, nor accepted, and that a run would name first."""
-        return open_doubts(self.checks, self.accepted)
+        return [one for one in open_doubts(self.checks, self.accepted) if one.severity is Severity.DOUBT]
 
-    def lines(self, *, quiet: bool = False) -> list[str]:
-        """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only."""
+    def lines(self, *, quiet: bool = False, brief: bool = False) -> list[str]:
+        """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only, `brief` the verdict too."""
         doubts = [f"doubt ({check.code}): {check.evidence} {check.remedy}" for check in self.doubts]
         faults = [f"fault: {fault}" for fault in self.faults]
         if quiet:
@@ -64,7 +64,7 @@ class CampaignCheck:
             verdict = f"ready to run: {counted(len(self.checks) - len(doubts), 'check')} passed{doubted}"
         else:
             verdict = "ready to run"
-        return [*title, *details, *notices, *doubts, *faults, verdict]
+        return [*doubts, *faults, verdict] if brief else [*title, *details, *notices, *doubts, *faults, verdict]
 
     def as_json(self) -> dict[str, Any]:
         """Return the check as a mapping of JSON's own types."""
@@ -79,7 +79,7 @@ class CampaignCheck:
             "faults": list(self.faults),
             "doubts": [{"code": one.code, "evidence": one.evidence, "remedy": one.remedy} for one in self.doubts],
             "notices": [{"code": one.code, "message": one.message, "remedy": one.remedy} for one in self.notices],
-            "checks_passed": len(self.checks) - len(self.doubts),
+            "checks_passed": sum(one.passed or one.code in self.accepted for one in self.checks),
         }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,6 +84,7 @@ class Asker:
 
 
 _FILE = "campaign.toml"
+_TITLE = "Title of the report"
 #: Beginning of a drafted file, by which its examples in comments are distinguished from comments that somebody wrote.
 DRAFTED = "# Written by thermofuse init."
 #: How places of the frames can be given.
@@ -99,14 +101,59 @@ _HINTS = {
 }
 #: Values above this are kelvins and no temperatures of a machine table in degC.
 _WARMEST_DEGC = 150.0
+#: The name of an axis as a word of its own, and the line of a header that holds it: its heading, or the channel of an ecmc log's targets.
+_AXIS = re.compile(r"(?<![^\W_])([XYZ]\d?|[UVW])(?:[-_ ]?ax[ei]s?|[-_ ]?achse)?(?![^\W_])", re.IGNORECASE)
+_AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE | re.MULTILINE)
+#: Bytes of a file in which a header is looked for.
+_HEADER = 4096
 
 
 class DraftError(FusionError):
     """A folder for which no campaign file can be written; the message says why and what to do."""
 
 
-def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
-    """Look at a folder and write a commented campaign file into it."""
+def write_campaigns(folder: Path, asker: Asker) -> list[tuple[Path, list[str]]]:
+    """Look at a folder and write a commented campaign file into it; of several tests without frames, one for each in a folder of its own.
+
+    Returns every file with its lines that are left to be filled in.
+    """
+    _refuse_place(folder)
+    content = scan_folder(folder.resolve())
+    tests = content.of(Kind.DEVIATIONS)
+    if content.frames or len(tests) < 2:
+        return [write_campaign(folder, asker, content)]
+    stems = Counter(test.path.with_suffix("") for test in tests)
+    written: list[tuple[Path, list[str]]] = []
+    answers: dict[str, str] = {}
+    for test in tests:
+        once = Asker(asker.ask and _asking_once(asker.ask, answers), asker.say)
+        own = test.path.with_suffix("")
+        if stems[own] > 1 or own.is_file():
+            own = own.with_name(f"{test.path.name.replace('.', '_')}_campaign")
+        own.mkdir(exist_ok=True)
+        files = {**content.files, Kind.DEVIATIONS: (test,)}
+        written.append(write_campaign(own, once, replace(content, folder=own, files=files)))
+    return written
+
+
+def _asking_once(ask: Ask, answers: dict[str, str]) -> Ask:
+    """Ask for one of several campaigns what `answers` of those before do not say, and for no title: each has the name of its file."""
+    answered: set[str] = set()
+
+    def answer(question: str, default: str) -> str:
+        if question == _TITLE:
+            return default
+        # A question that comes again for the same campaign is one whose answer was refused.
+        if question in answered or question not in answers:
+            answers[question] = ask(question, default)
+        answered.add(question)
+        return answers[question]
+
+    return answer
+
+
+def _refuse_place(folder: Path) -> None:
+    """Refuse a folder that takes no new campaign file."""
     path = folder / _FILE
     if not folder.is_dir():
         raise DraftError(f"{folder}: no such folder; name the folder that holds the files of the measurement")
@@ -116,7 +163,12 @@ def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
         raise DraftError(
             f"{folder}: holds the results of a run; name the folder that holds the files of the measurement"
         )
-    content = scan_folder(folder.resolve())
+
+
+def write_campaign(folder: Path, asker: Asker, content: FolderContent | None = None) -> tuple[Path, list[str]]:
+    """Write a commented campaign file into a folder; `content` is what it takes, left out: everything in the folder."""
+    _refuse_place(folder)
+    path, content = folder / _FILE, content or scan_folder(folder.resolve())
     lines = list(draft_lines(content, asker))
     unnamed = next((line for line in lines if not is_text(line)), None)
     if unnamed is not None:
@@ -151,9 +203,9 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {_FILE} says what is still missing.'
     yield ""
     yield "[campaign]"
-    yield f"title = {_quoted(asker.text('Title of the report', content.folder.name or 'Campaign'))}"
+    yield f"title = {_quoted(asker.text(_TITLE, content.folder.name or 'Campaign'))}"
     if readings:
-        yield f"axis = {_quoted(asker.text('Axis that was measured', 'X'))}"
+        yield from _axis(readings[0].path, asker)
     yield from _time_zone(readings, asker)
     if content.frames:
         yield from _thermography(content, asker)
@@ -185,13 +237,27 @@ def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
         yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
 
 
+def _axis(path: Path, asker: Asker) -> Iterator[str]:
+    """Yield the axis of a file of deviations: as its header, its name or its folder says, else as answered."""
+    with path.open("rb") as stream:
+        header = " ".join(_AXIS_LINE.findall(stream.read(_HEADER).decode("utf-8", errors="replace")))
+    stated = json.loads(_attributes(path).get("user_text", "{}")).get("axis", "")
+    for source in (stated, header, path.stem, path.parent.name):
+        found = {name.upper() for name in _AXIS.findall(source)}
+        if len(found) == 1:
+            yield f'axis = "{found.pop()}"   # as the file or its name says'
+            return
+    answer = asker.text(f"Axis that {path.name} is of; empty: not stated", "")
+    yield f"axis = {_quoted(answer)}" if answer else '# axis = "X"'
+
+
 def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
     """Yield the zone of times that the readings give without one."""
-    without = [one.path.name for one in readings if _times(one.path).get("reference") == NO_ZONE]
+    without = [one.path.name for one in readings if _attributes(one.path).get("reference") == NO_ZONE]
     if not without:
         yield '# time_zone = "Europe/Vienna"            # only where files give times without their zone'
         return
-    zone = asker.text(f"Time zone of the times in {without[0]}, an IANA name such as Europe/Vienna", "UTC")
+    zone = asker.text("Time zone of the times of the deviations, an IANA name such as Europe/Vienna", "UTC")
     doubt = "   # taken, as the file gives none: check it" if asker.ask is None else ""
     yield f"time_zone = {_quoted(zone)}{doubt}"
 
@@ -305,15 +371,16 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     )
     yield f"expansion_coefficient = {coefficient}"
     yield f"dead_path = {asker.quantity('Dead path of the laser', 'mm', '0 mm')}"
-    if _times(content.folder / chosen).get("origin") == "reconstructed":
+    if _attributes(content.folder / chosen).get("origin") == "reconstructed":
         yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
         yield '# dwell = "2 s"'
 
 
-def _times(path: Path) -> dict[str, str]:
-    """Return what is known of the times of a file of deviations; nothing where it cannot be read, which the check says."""
+def _attributes(path: Path) -> dict[str, str]:
+    """Return what is known of a file of deviations and of its times; nothing where it cannot be read, which the check says."""
     try:
-        return {str(name): str(value) for name, value in read_deviations(path)["time"].attrs.items()}
+        deviations = read_deviations(path)
+        return {str(name): str(value) for name, value in {**deviations.attrs, **deviations["time"].attrs}.items()}
     except InterferometryError:
         return {}
 

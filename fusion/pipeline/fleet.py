@@ -63,7 +63,8 @@ def find_members(paths: Sequence[Path]) -> list[Member]:
             found = sorted(path.rglob(CAMPAIGN_FILE))
             if not found:
                 raise FleetError(
-                    f"{path}: holds no {CAMPAIGN_FILE}; name the campaign files, or the folder above theirs"
+                    f"{path}: holds no {CAMPAIGN_FILE}; thermofuse init {path} writes one, of several laser tests one for each; or "
+                    "name the campaign files, or the folder above theirs"
                 )
             files += found
         elif path.is_file():
@@ -123,6 +124,10 @@ class Row:
         Of the closed loop, and as a sentence; empty where there is none.
     drift_um, drift_u_um : float or None, um
         Largest range of the drift over the targets, and its standard uncertainty.
+    axis : str
+        As the campaign file names it.
+    A_um, A_u_um and so on : float or None, um
+        Values by ISO 230-2 of the most settled window, each with its standard uncertainty.
     anomalies, warnings : int or None
         Positions that stand out, and warnings.
     seconds, peak_MB : float
@@ -139,6 +144,17 @@ class Row:
     headline: str = ""
     drift_um: float | None = None
     drift_u_um: float | None = None
+    axis: str = ""
+    A_um: float | None = None
+    A_u_um: float | None = None
+    R_um: float | None = None
+    R_u_um: float | None = None
+    E_um: float | None = None
+    E_u_um: float | None = None
+    M_um: float | None = None
+    M_u_um: float | None = None
+    B_um: float | None = None
+    B_u_um: float | None = None
     anomalies: int | None = None
     warnings: int | None = None
     inputs: str = ""
@@ -172,6 +188,8 @@ def with_findings(row: Row, folder: Path) -> Row:
     ranges = () if drift is None else zip(drift.range_um, drift.range_u_um, strict=True)
     known = [(value, u) for value, u in ranges if value is not None]
     most, most_u = max(known, key=lambda one: one[0]) if known else (None, None)
+    test = results.iso230
+    values = {} if test is None else {name: getattr(test.settled or test, f"{name}_um") for name in _SYMBOLS}
     return replace(
         row,
         title=results.campaign,
@@ -179,6 +197,9 @@ def with_findings(row: Row, folder: Path) -> Row:
         headline="" if results.loop is None else headline(results),
         drift_um=most,
         drift_u_um=most_u,
+        axis=next((one.text for one in test.conditions if one.name == "Axis"), "") if test else "",
+        **{f"{name}_um": one.value for name, one in values.items()},
+        **{f"{name}_u_um": one.u for name, one in values.items()},
         anomalies=None if results.anomalies is None else len(results.anomalies),
         warnings=len(results.warnings),
         inputs="" if results.inputs is None else results.inputs.state,
@@ -218,11 +239,12 @@ def _no_formula(text: str) -> str:
 
 
 def cells(row: Row) -> list[str]:
-    """Return a row as page and terminal show it: name, verdict, drift, positions that stand out, warnings, inputs, exit code."""
+    """Return a row as page and terminal show it, in the order of `HEADINGS`; a dash where there is nothing."""
     return [
         row.name,
+        row.axis or "–",
         row.verdict.replace("_", " ") or ("not modelled" if row.is_whole else row.state),
-        "–" if row.drift_um is None else measured(row.drift_um, row.drift_u_um, "µm"),
+        *(measured(getattr(row, f"{name}_um"), getattr(row, f"{name}_u_um")) for name in ("drift", *_SYMBOLS)),
         *("–" if count is None else str(count) for count in (row.anomalies, row.warnings)),
         row.inputs or "–",
         "–" if row.exit_code is None else str(row.exit_code),
@@ -231,20 +253,32 @@ def cells(row: Row) -> list[str]:
     ]
 
 
+_SYMBOLS = ("A", "R", "E", "M", "B")
 #: Headings of `cells`.
-HEADINGS = ("campaign", "verdict", "drift", "anomalies", "warnings", "inputs", "exit code", "time / s", "memory / MB")
-#: Those of text; the others head numbers. The terminal shows them up to the exit code.
-TEXT = ("campaign", "verdict", "inputs")
-_SHOWN = 7
+HEADINGS = (
+    *("campaign", "axis", "verdict", "drift / µm", *(f"{name} / µm" for name in _SYMBOLS)),
+    *("anomalies", "warnings", "inputs", "exit code", "time / s", "memory / MB"),
+)
+#: Those of text; the others head numbers.
+TEXT = ("campaign", "axis", "verdict", "inputs")
+#: What the page alone shows.
+_COST = ("time / s", "memory / MB")
+
+
+def columns(rows: Sequence[Row]) -> dict[str, list[str]]:
+    """Return the cells of all rows by heading, without columns in which no row has anything."""
+    shown = zip(HEADINGS, zip(*map(cells, rows), strict=True), strict=True)
+    return {heading: list(column) for heading, column in shown if set(column) != {"–"}}
 
 
 def summary_table(rows: Sequence[Row], title: str) -> rich.table.Table:
     """Return the rows of a fleet as a table for the terminal."""
     printed = rich.table.Table(title=cell(title), title_justify="left")
-    for heading in HEADINGS[:_SHOWN]:
+    shown = {heading: column for heading, column in columns(rows).items() if heading not in _COST}
+    for heading in shown:
         printed.add_column(heading, justify="left" if heading in TEXT else "right", overflow="fold")
-    for row in rows:
-        printed.add_row(*map(cell, cells(row)[:_SHOWN]))
+    for line in zip(*shown.values(), strict=True):
+        printed.add_row(*map(cell, line))
     return printed
 
 
@@ -267,13 +301,17 @@ def count_line(rows: Sequence[Row]) -> str:
 
 def render_fleet(rows: Sequence[Row], *, started: str) -> str:
     """Return the page of a fleet as HTML text."""
+    shown = columns(rows)
     return render_page(
         "fleet.html.j2",
         {},
         counts=count_line(rows),
         started=f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M} UTC",
-        headings=[(heading[0].upper() + heading[1:], heading not in TEXT) for heading in HEADINGS],
-        rows=[(row, quote(row.report), cells(row)[1:]) for row in rows],
+        headings=[(heading[0].upper() + heading[1:], heading not in TEXT) for heading in shown],
+        rows=[
+            (row, quote(row.report), line[1:])
+            for row, line in zip(rows, zip(*shown.values(), strict=True), strict=True)
+        ],
         failed=[(row, quote(row.log)) for row in rows if row.state == "failed"],
         summary={"assumptions": {}},
     )

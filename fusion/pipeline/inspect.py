@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import itertools
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
@@ -430,7 +431,7 @@ class FolderContent:
 
     def relative(self, path: Path) -> str:
         """Return a path as a campaign file in the folder writes it."""
-        return path.relative_to(self.folder).as_posix()
+        return Path(os.path.relpath(path, self.folder)).as_posix()
 
 
 def scan_folder(folder: Path) -> FolderContent:

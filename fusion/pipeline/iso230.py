@@ -28,7 +28,7 @@ from fusion.results.progress import left_out_notices
 from fusion.results.results import read_results
 from fusion.results.store import group, has, joined, plain, read_product
 from interferometry.common import InterferometryError
-from interferometry.drift.estimate import estimate_drift
+from interferometry.drift.estimate import NoScatterError, estimate_drift
 from interferometry.drift.planning import estimate_settling
 from interferometry.inspection import describe_notes
 from interferometry.io.readings import read_deviations
@@ -379,7 +379,13 @@ def _evaluate(
     if deviations.sizes["cycle"] == 1:
         return StandardTest(title, None, deviations, remarks)
     timed = not np.isnat(deviations["time"].values).all()
-    drift = estimate_drift(deviations) if timed else None
+    try:
+        drift = estimate_drift(deviations) if timed else None
+    except NoScatterError:
+        drift, remarks = (
+            None,
+            (*remarks, "all or nearly all readings repeat exactly: no drift is estimated; export more digits"),
+        )
     windows, settled, found = evaluate_standard(
         deviations,
         budget,

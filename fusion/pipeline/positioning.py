@@ -24,7 +24,7 @@ from fusion.results.store import group, joined
 from interferometry import neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.deviations import OUTLIER
-from interferometry.drift.estimate import estimate_drift, flag_outliers
+from interferometry.drift.estimate import NoScatterError, estimate_drift, flag_outliers
 from thermography.fields.cycle_fields import cycles_with_field
 
 #: Share of the readings that may lie outside the frames' time before the next test should be filmed otherwise.
@@ -36,7 +36,7 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
     report("deviations", 0, 1)
     deviations = source.deviations
     times = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
-    drift = None if np.isnat(times).all() else estimate_drift(deviations)
+    drift, digits = (None, ()) if np.isnat(times).all() else _joint_estimate(deviations)
     deviations = deviations if drift is None else flag_outliers(deviations, drift)
     comparison = neighbours.compare(deviations, drift)
     windows, settled, standard = evaluate_standard(
@@ -71,7 +71,21 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
             "range_u_um": range_u.values.tolist(),
         }
     report("deviations", 1, 1)
-    return Outcome(dataset, parts, (*_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
+    return Outcome(dataset, parts, (*digits, *_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
+
+
+def _joint_estimate(deviations: xr.Dataset) -> tuple[xr.Dataset | None, tuple[Notice, ...]]:
+    """Return the joint estimate; None, and a notice, where the digits are too coarse for any scatter."""
+    try:
+        return estimate_drift(deviations), ()
+    except NoScatterError:
+        message = (
+            f"All or nearly all readings of {_file(deviations)} repeat exactly from cycle to cycle: their digits hide scatter and drift. "
+            "ISO 230-2 values are evaluated as they are; drift, positions that stand out and causes are not."
+        )
+        return None, (
+            Notice("no_scatter", message, "Write more digits, or read with an instrument of finer resolution."),
+        )
 
 
 def _approach_notices(deviations: xr.Dataset) -> Iterator[Notice]:

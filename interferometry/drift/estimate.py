@@ -131,6 +131,10 @@ class DriftDataError(InterferometryError):
     """The deviations cannot be fitted jointly; the message says what is missing."""
 
 
+class NoScatterError(DriftDataError):
+    """Readings repeat exactly: coarser digits than their scatter and drift."""
+
+
 @one_thread
 def estimate_drift(
     deviations: xr.Dataset,
@@ -180,7 +184,8 @@ def estimate_drift(
     Raises
     ------
     DriftDataError
-        Fewer than two cycles or targets hold readings, no reading has a time, readings repeat exactly, or an argument is unknown.
+        Fewer than two cycles or targets hold readings, no reading has a time, readings repeat exactly (`NoScatterError`), or an argument
+        is unknown.
     InterferometryError
         ``deviations`` lack a variable of ``contract.DEVIATIONS``.
 
@@ -290,7 +295,7 @@ def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
             f"{cycles} cycles and {targets} targets hold readings; the joint estimate needs two of each"
         )
     if not _without_medians(readings).any():
-        raise DriftDataError("readings repeat exactly: there is no scatter to weight them by; export more digits")
+        raise NoScatterError("readings repeat exactly: there is no scatter to weight them by; export more digits")
 
 
 def _is_gross(readings: xr.Dataset) -> NDArray[np.bool_]:

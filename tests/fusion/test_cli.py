@@ -160,8 +160,12 @@ def test_init_asks_at_a_terminal_only(campaign_folder: Path, tmp_path: Path) -> 
     silent = invoke("init", folder)
     assert (silent.exit_code, "add --yes" in silent.stderr) == (2, True)
     written = invoke("init", folder, "--yes")
-    assert written.exit_code == 0, written.output
-    assert "to fill in, line" in written.output and (folder / "campaign.toml").is_file()
+    assert written.exit_code == 2, written.output
+    assert (
+        "not ready: " in written.output
+        and "to fill in, line" in written.output
+        and (folder / "campaign.toml").is_file()
+    )
     assert invoke("init", folder, "--yes").exit_code == 2
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.analysis.consistency.checks import Check, Severity, judge
+from fusion.analysis.consistency.checks import Check, judge
 from fusion.common import Array
 from thermography.common import ThermographyError
 from thermography.evaluation import share_outside_range
@@ -213,7 +213,7 @@ def _range(frames: Sequence[Frame]) -> Check:
         "camera_range",
         outside,
         _OUTSIDE_SHARE,
-        f"Up to {100.0 * outside:.0f} % of the pixels of a frame are outside the range in which the camera is calibrated.",
+        f"Up to {100.0 * outside:.3g} % of the pixels of a frame are outside the range in which the camera is calibrated.",
         "Select the range of the camera that holds the temperatures of the table.",
     )
 
@@ -231,7 +231,7 @@ def _spread(frames: Sequence[FrameReference]) -> list[Frame]:
 
 
 def _frozen(frames: Sequence[Frame]) -> list[Check]:
-    """Whether the first, the middle and the last frame are the same image: the noise of a detector never repeats one."""
+    """Whether the first, the middle and the last frame are the same image: the noise of a detector repeats none, rounded numbers may."""
     if len(frames) < 3:
         return []
     compared = f"The frames of {frames[0].time}Z, {frames[1].time}Z and {frames[2].time}Z"
@@ -240,10 +240,9 @@ def _frozen(frames: Sequence[Frame]) -> list[Check]:
             "frozen_camera",
             all(np.array_equal(frames[0].counts, frame.counts) for frame in frames[1:]),
             0.0,
-            f"{compared} hold the same image, count for count: the camera was frozen.",
-            "Provide the frames of the test; repeated copies of one image show no change of temperature.",
+            f"{compared} hold the same image, count for count: the camera was frozen, or the frames are rounded to more than they change.",
+            "Provide the frames of the test as the camera stored them; copies of one image show no change of temperature.",
             sound=f"{compared} are different images.",
-            severity=Severity.CONTRADICTION,
         )
     ]
 

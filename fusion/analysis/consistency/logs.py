@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import covered_share, likely_zone_shift
-from fusion.analysis.alignment.sensor_health import examine_sensors
+from fusion.analysis.alignment.sensor_health import Kind, examine_sensors
 from fusion.analysis.consistency.checks import Check, Severity, judge
 from fusion.analysis.consistency.field_series import FieldSeries, field_at
 from fusion.common import Array
@@ -21,6 +21,9 @@ _CONTACT_SENSORS = ("air_temperature", "material_temperature")
 _LEAST_COVERED = 0.9
 #: A gap is a stretch without a sample that is longer than this, s, and ten times the usual step.
 _GAP_S = 600.0
+#: A log that ends longer before the first reading, or begins longer after the last one, than this, s, is of another test: conditions are
+#: often noted once or twice, before and after.
+_APART_S = 3600.0
 #: A log that covers less than this share of the readings, and begins and ends with them after a shift, is on another clock, ...
 _COVERED_NOW = 0.6
 #: ... both ends within this time, s: loggers are switched on and off by hand.
@@ -44,6 +47,7 @@ def check_log(log: xr.Dataset | None, times: NDArray[np.datetime64], *, name: st
     first, last, start, end = (
         f"{np.datetime_as_string(time, unit='s')}Z" for time in (*logged[[0, -1]], readings.min(), readings.max())
     )
+    apart_s = max(readings.min() - logged[-1], logged[0] - readings.max()) / np.timedelta64(1, "s")
     evidence = f"{file} ({first} to {last}) covers {100.0 * covered:.0f} % of the readings ({start} to {end})"
     if gaps:
         evidence += "; the others fall into gaps of the log"
@@ -61,7 +65,7 @@ def check_log(log: xr.Dataset | None, times: NDArray[np.datetime64], *, name: st
             else f"Check the date, the clock and the time zone of {file} (write its times with their zone, or time_zone), or leave it out "
             "of the campaign file.",
             passed=passed,
-            severity=Severity.CONTRADICTION if covered == 0.0 or clear else Severity.DOUBT,
+            severity=Severity.CONTRADICTION if apart_s > _APART_S or clear else Severity.DOUBT,
         )
     ]
 
@@ -84,7 +88,12 @@ def check_contact_sensors(environment: xr.Dataset | None, drivers: xr.Dataset | 
     faults = examine_sensors(
         seconds, np.column_stack(list(columns.values())), np.column_stack(loads) if loads else None
     )
-    names = [f"{list(columns)[fault.sensor].replace('_', ' ')} {fault.words}" for fault in faults if fault.is_clear]
+    # One reading throughout is that of a stable room or of a stuck sensor: `material_still` tells which where the table is seen.
+    changing = {
+        sensor for sensor, column in enumerate(columns.values()) if np.unique(column[np.isfinite(column)]).size > 1
+    }
+    clear = [fault for fault in faults if fault.is_clear and (fault.kind is not Kind.STUCK or fault.sensor in changing)]
+    names = [f"{list(columns)[fault.sensor].replace('_', ' ')} {fault.words}" for fault in clear]
     return [
         judge(
             "contact_sensors",

@@ -210,7 +210,8 @@ def _interpolate(ends: Array, places: Array, known: Array) -> Array:
 
 #: Standard deviations by which the readings may contradict the stated expansion coefficient.
 _LIMIT = 2.5
-#: Largest expansion coefficient of a material that tables and frames of machine tools are made of, ppm/K: aluminium alloys, and a tenth.
+#: Largest expansion coefficient of a material that tables and frames of machine tools are made of, ppm/K: aluminium alloys, and a tenth;
+#: that of the campaign file, and a tenth, where it is larger.
 _LARGEST_PPM_PER_K = 26.0
 #: Largest length of a frame that can move the laser against the table, as a multiple of the travel, and its smallest value, mm.
 _FRAME_TRAVELS, _LEAST_FRAME_MM = 5.0, 3000.0
@@ -280,7 +281,10 @@ def _jackknife_u(entry: Mapping[str, Any]) -> float:
 def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> list[Check]:
     """The coefficient per kelvin that lies furthest beyond what expansion can do, or nearest to it."""
     frame_mm = max(_FRAME_TRAVELS * travel_mm, _LEAST_FRAME_MM)
-    largest = {"ppm/K": _LARGEST_PPM_PER_K, "um/K": _LARGEST_PPM_PER_K * frame_mm * 1e-3}
+    stated = [entry["prior"] for entry in coefficients if entry["unit"] == "ppm/K" and entry.get("prior") is not None]
+    # Stages and printers of polymer state a larger one.
+    ppm_per_K = max([_LARGEST_PPM_PER_K, *(1.1 * value for value in stated)])
+    largest = {"ppm/K": ppm_per_K, "um/K": ppm_per_K * frame_mm * 1e-3}
 
     def share_of(entry: Mapping[str, Any]) -> float:
         size = abs(entry["value"]) - _BEYOND_SIGMAS * math.hypot(entry["u"], _jackknife_u(entry))

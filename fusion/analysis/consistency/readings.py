@@ -11,18 +11,21 @@ import xarray as xr
 from scipy import sparse, special
 
 from fusion.analysis.alignment.readings import known_mean
-from fusion.analysis.consistency.checks import Check, Severity, judge
+from fusion.analysis.consistency.checks import Check, judge
 from fusion.common import Array
 from thermography.common import scatter_by_median
 
-#: Largest positioning deviation that a machine can have, um per metre of travel: 1 % is no deviation but another unit.
-_LARGEST_UM_PER_M = 10_000.0
-#: Smallest random part of a reading in a machine, um: refraction in still air alone makes more over 0.1 m.
-_LEAST_NOISE_UM = 0.002
+#: Deviations that spread over more than this share of the travel, and over more than a millimetre or the distance of two targets, look like
+#: another unit: short stages scatter over 6 % of their travel, printers over tenths of a millimetre, and only an axis whose scale was never
+#: set errs by more than 1 % of a long travel.
+_LARGEST_SHARE, _LARGEST_MM = 0.01, 1.0
+#: Smallest random part of a reading, um, over a travel of this length, mm: refraction in still air makes more. Less over a shorter one.
+_LEAST_NOISE_UM, _NOISE_TRAVEL_MM = 0.002, 200.0
 #: Smallest travel as a share of the plan's extent along the axis.
 _LEAST_TRAVEL_SHARE = 0.03
-#: Share of equal readings from which two cycles are copies, and the share that ordinary cycles may have.
-_COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
+#: Share of equal readings from which two cycles are copies, the share that ordinary cycles may have, and how many pairs of copies chance
+#: may make where the readings of a cycle are few.
+_COPIED_SHARE, _ORDINARY_SHARE, _COPIED_BY_CHANCE = 0.8, 0.3, 0.01
 #: Cycles that are compared with all others at once.
 _CYCLES_AT_ONCE = 256
 #: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
@@ -47,11 +50,9 @@ def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> l
     if not np.isfinite(values).any():
         return []
     noise_um = random_part_um(values)
-    # Smallest step between two different readings, um; 0 where all are alike.
-    steps = np.diff(np.unique(values[np.isfinite(values)]))
     return [
         _largest_deviation(deviations),
-        _least_noise(max(noise_um, (float(steps.min()) if steps.size else 0.0) / np.sqrt(12.0))),
+        _least_noise(deviations, max(noise_um, _rounding_um(values))),
         *([] if plan_extent_mm is None else [_travel(deviations, plan_extent_mm)]),
         _copied_cycles(deviations),
         _exchanged_approaches(deviations, noise_um),
@@ -70,6 +71,13 @@ def random_part_um(values: Array) -> float:
     return float(scatter_by_median(second) / np.sqrt(6.0))
 
 
+def _rounding_um(values: Array) -> float:
+    """Standard uncertainty of the rounding to the smallest step between two readings, um; 0 where all are alike."""
+    # To the picometre, as differences of positions in mm carry the rounding of the arithmetic.
+    steps = np.diff(np.unique(np.round(values[np.isfinite(values)], 6)))
+    return float(steps.min()) / np.sqrt(12.0) if steps.size else 0.0
+
+
 def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
     """Find readings that are errors of reading: they are left out where drift and field are compared and modelled."""
     size = abs(standardised)
@@ -79,29 +87,33 @@ def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
 
 
 def _largest_deviation(deviations: xr.Dataset) -> Check:
-    """Unit check: deviations beyond 1 % of the travel suggest another unit."""
-    position = deviations["position"].values
-    span_m = max(float(np.ptp(position)), 1e-9) * 1e-3
-    largest = float(np.nanquantile(np.abs(deviations["deviation"].values), 0.95)) / span_m
+    """Unit check: deviations that spread over a large share of the travel and over the distance of two targets suggest another unit."""
+    position = np.sort(deviations["position"].values)
+    low, high = np.nanquantile(deviations["deviation"].values, [0.025, 0.975])
+    spread_um, travel_mm = float(high - low), float(np.ptp(position))
+    least_mm = min([_LARGEST_MM, *np.diff(position)])
+    limit_um = 1e3 * max(_LARGEST_SHARE * travel_mm, least_mm)
     return judge(
         "deviation_magnitude",
-        largest,
-        _LARGEST_UM_PER_M,
-        f"The deviations reach {largest:.3g} µm per metre of travel (limit {_LARGEST_UM_PER_M:g}).",
+        spread_um,
+        limit_um,
+        f"The deviations spread over {spread_um:.3g} µm, on a travel of {travel_mm:.4g} mm with {position.size} targets (limit "
+        f"{limit_um:.3g} µm).",
         "Check the units: deviations are read as µm and positions as mm.",
-        severity=Severity.CONTRADICTION,
     )
 
 
-def _least_noise(noise_um: float) -> Check:
-    """Unit check: repeatability below 2 nm, not from rounding, suggests values in mm."""
+def _least_noise(deviations: xr.Dataset, noise_um: float) -> Check:
+    """Unit check: repeatability below that of air, not from rounding, suggests values in mm."""
+    travel_mm = float(np.ptp(deviations["position"].values))
+    limit_um = _LEAST_NOISE_UM * min(travel_mm / _NOISE_TRAVEL_MM, 1.0)
     return judge(
         "deviation_unit",
         noise_um,
-        _LEAST_NOISE_UM,
-        f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (no machine repeats within {_LEAST_NOISE_UM:g} µm).",
+        limit_um,
+        f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (air makes {limit_um:.2g} µm over {travel_mm:.4g} mm).",
         "Check the unit of the deviations: they look like mm and are read as µm.",
-        passed=not noise_um < _LEAST_NOISE_UM,
+        passed=not noise_um < limit_um,
     )
 
 
@@ -114,7 +126,7 @@ def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
         share,
         _LEAST_TRAVEL_SHARE,
         f"The targets span {travel_mm:.4g} mm, {100.0 * share:.2g} % of the plan along the axis ({plan_extent_mm:.4g} mm).",
-        "Check the unit of the positions: they are read as mm and look like m or inch.",
+        "Check the unit of the positions: they are read as mm and look like m or inch; if the travel is that short, accept travel.",
         passed=share >= _LEAST_TRAVEL_SHARE,
     )
 
@@ -129,8 +141,12 @@ def _copied_cycles(deviations: xr.Dataset) -> Check:
         following.append(np.diagonal(shares, start + 1).copy())
         copies.append(np.argwhere(later >= _COPIED_SHARE) + np.array([start, 0]))
     pairs = []
-    # Coarsely rounded readings agree from cycle to cycle; then agreement says nothing.
-    if values.shape[0] > 1 and np.median(np.concatenate(following)) <= _ORDINARY_SHARE:
+    ordinary = np.concatenate(following)
+    # Coarsely rounded readings agree from cycle to cycle, and those of one or two targets in one pair of many; then agreement says nothing.
+    by_chance = (
+        0.5 * len(values) ** 2 * ordinary.mean() ** (_COPIED_SHARE * values.shape[1]) if ordinary.size else np.inf
+    )
+    if by_chance <= _COPIED_BY_CHANCE and np.median(ordinary) <= _ORDINARY_SHARE:
         number = deviations["cycle"].values
         pairs = [f"{number[a]} and {number[b]}" for a, b in np.concatenate(copies)]
     named = ", ".join(pairs[:5]) + (f" and {len(pairs) - 5} more" if len(pairs) > 5 else "")
@@ -365,13 +381,13 @@ def _mirrored_passes(deviations: xr.Dataset) -> list[str]:
     cycles = deviations["cycle"].values[np.isfinite(deviations["deviation"].values).all(axis=(1, 2))]
     size, levels = _shape_size(values), values.mean(axis=2)
     steps = np.diff(size, axis=0)
-    usual = float(np.median(np.abs(steps)))
+    usual = max(float(np.median(np.abs(steps))), _rounding_um(values))
     sums, jumps = np.abs(size[1:] + size[:-1]).mean(axis=1), np.abs(steps).min(axis=1)
-    changes = (sums <= _INVERTED_AT_MOST * usual) & (jumps >= _PASS_AT_LEAST * usual)
+    changes = (sums <= _INVERTED_AT_MOST * usual) & (jumps > _PASS_AT_LEAST * usual)
     found = [f"from cycle {cycle} on" for cycle in cycles[1:][changes]]
     if size.shape[1] == 2:
         mirrored = np.median(np.abs(size.sum(axis=1))) <= _INVERTED_AT_MOST * usual
-        apart = np.median(np.abs(np.diff(size, axis=1))) >= _PASS_AT_LEAST * usual
+        apart = np.median(np.abs(np.diff(size, axis=1))) > _PASS_AT_LEAST * usual
         if mirrored and apart and np.corrcoef(levels.T)[0, 1] <= _OPPOSITE:
             names = deviations["direction"].values
             found.append(f"approach in {names[1]} direction against approach in {names[0]} direction")
@@ -397,8 +413,8 @@ def _mirrored_targets(deviations: xr.Dataset) -> list[str]:
     expected = np.stack([_line_through_others(passes, position, target) for target in targets], axis=1)
     as_read = np.sqrt(np.mean((passes - expected) ** 2, axis=0))
     inverted = np.sqrt(np.mean((passes + expected) ** 2, axis=0))
-    usual = float(np.median(as_read))
-    found = (as_read >= _TARGET_AT_LEAST * usual) & (inverted <= _INVERTED_AT_MOST * usual)
+    usual = max(float(np.median(as_read)), _rounding_um(values))
+    found = (as_read > _TARGET_AT_LEAST * usual) & (inverted <= _INVERTED_AT_MOST * usual)
     return [f"target {number}" for number in deviations["target"].values[found]]
 
 

@@ -196,7 +196,7 @@ def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, b
         )
         if np.unique(tried).size > 1:
             # The values next to those that fit: the likelihood falls somewhere between, so the interval is rather too wide.
-            low, high = min(value, *fitting), max(value, *fitting)
+            low, high = min([value, *fitting]), max([value, *fitting])
             below, above = tried[tried < low - _SAME * abs(low)], tried[tried > high + _SAME * abs(high)]
             lowest = float(below.max()) if below.size else 0.0 if low == 0.0 else None
             ranges[name] = [lowest, float(above.min()) if above.size else None]

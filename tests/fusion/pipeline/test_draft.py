@@ -1,6 +1,7 @@
 """Campaign files for folders: what the files tell, what is asked, and a check that says what is missing."""
 
 import os
+import shutil
 from collections import Counter
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 from fusion.campaign.config import load_campaign
 from fusion.campaign.values import QuantityError
 from fusion.pipeline.check import check_campaign
-from fusion.pipeline.draft import Asker, DraftError, draft_lines, unused_files, write_campaign
+from fusion.pipeline.draft import Asker, DraftError, draft_lines, unused_files, write_campaign, write_campaigns
+from fusion.pipeline.fleet import find_members
 from fusion.pipeline.inspect import scan_folder
+from tests.fusion.campaign_parts import write_laser
 from thermography.io.flir import index_frames
 from thermography.radiometry.planck import calibrate
 
@@ -79,7 +82,7 @@ def test_times_without_a_zone_are_asked_for(copied):
         asked.append(question)
         return (
             "Europe/Vienna"
-            if question.startswith("Time zone of the times in laser.csv")
+            if question.startswith("Time zone of the times of the deviations")
             else answering(question, default)
         )
 
@@ -188,6 +191,41 @@ def test_what_frames_of_another_camera_do_not_tell_is_marked(tmp_path):
     text = "\n".join(draft_lines(scan_folder(tmp_path), Asker(None)))
     for line in ('frames = ["*.npy"]', 'scale = "FILL IN"', 'unit = "K"', 'start = "FILL IN"', 'interval = "FILL IN"'):
         assert f"\n{line}" in text
+
+
+def test_laser_tests_of_one_folder_become_a_campaign_each_and_questions_are_asked_once(tmp_path):
+    laser = write_laser(tmp_path.with_name("written"), 5, 4).with_name("laser.csv")
+    for axis in ("x", "y", "other"):
+        shutil.copy(laser, tmp_path / f"report_{axis}.csv")
+    shutil.copy(tmp_path / "report_x.csv", tmp_path / "report_x.txt")
+    (tmp_path / "ecmc.dat").write_text(
+        "TGT_SET_PV=TARGET_DU:Z-PosCmd\nUNIT=mm\nCYCLES=2\nPOSITIONS=2\nTGT_DATA[1]=0\nTGT_DATA[2]=4\n"
+        + "".join(
+            f"REF_DATA_{way}[{i},{j}]={4 * (i - 1) + 0.01 * i * j}\n"
+            for way in ("FWD", "BWD")
+            for i in (1, 2)
+            for j in (1, 2)
+        )
+    )
+    asked = []
+
+    def answer(question, default):
+        asked.append(question)
+        if question.startswith("Dead path") and asked.count(question) == 1:
+            return "5 kg"
+        return "U" if question.startswith("Axis that report_other.csv is of") else default
+
+    written = write_campaigns(tmp_path, Asker(answer))
+    names = ["ecmc", "report_other", "report_x_csv_campaign", "report_x_txt_campaign", "report_y"]
+    assert [path.parent.name for path, _ in written] == names
+    # A refused answer is asked for again, and nothing else twice.
+    assert [question for question, count in Counter(asked).items() if count > 1] == ["Dead path of the laser"]
+    campaigns = [load_campaign(path) for path, _ in written]
+    assert [one.campaign.axis for one in campaigns] == ["Z", "U", "X", "X", "Y"]
+    assert all(check_campaign(path).faults == () for path, _ in written)
+    assert [member.campaign for member in find_members([tmp_path])] == [path for path, _ in written]
+    with pytest.raises(DraftError, match="exists already"):
+        write_campaigns(tmp_path, Asker(answer))
 
 
 def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path):

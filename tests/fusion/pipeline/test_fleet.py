@@ -17,12 +17,14 @@ import pytest
 from rich.console import Console
 
 from fusion.pipeline.fleet import (
+    HEADINGS,
     SUMMARY,
     FleetError,
     Row,
     as_csv,
     as_json,
     cells,
+    columns,
     count_line,
     find_members,
     has_room,
@@ -57,7 +59,7 @@ def test_campaigns_are_named_after_their_folders_or_their_own_names(tmp_path):
 
 def test_what_is_no_fleet_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FleetError, match=r"empty: holds no campaign.toml; name the campaign files"):
+    with pytest.raises(FleetError, match=r"empty: holds no campaign.toml; thermofuse init"):
         find_members([tmp_path / "empty"])
     with pytest.raises(FleetError, match=r"gone: is not there"):
         find_members([tmp_path / "gone"])
@@ -188,11 +190,14 @@ def test_a_row_says_what_the_results_say(whole, results_folder):
     assert whole.drift_u_um in results.drift.range_u_um
     assert (whole.anomalies, whole.warnings) == (len(results.anomalies), len(results.warnings))
     assert whole.report == "a/report.html"
-    shown = cells(whole)
-    assert shown[0] == "a"
-    assert shown[2].endswith(" µm") and "±" in shown[2]
-    assert shown[6:] == ["0", "61.2", "412"]
-    assert cells(FAILED)[1:4] == ["failed", "–", "–"]
+    settled = results.iso230.settled
+    assert (whole.A_um, whole.A_u_um, whole.B_um) == (settled.A_um.value, settled.A_um.u, settled.B_um.value)
+    shown = dict(zip(HEADINGS, cells(whole), strict=True))
+    assert (shown["campaign"], shown["axis"]) == ("a", "X")
+    assert "±" in shown["drift / µm"] and "±" in shown["A / µm"]
+    assert cells(whole)[-3:] == ["0", "61.2", "412"]
+    assert cells(FAILED)[2:5] == ["failed", "–", "–"]
+    assert list(columns([FAILED])) == ["campaign", "verdict", "exit code", "time / s"]
 
 
 def test_results_that_cannot_be_read_are_a_failure(tmp_path):
@@ -243,5 +248,5 @@ def test_the_page_escapes_what_files_hold_and_shows_failures_first():
     assert page.index("laser.csv, line 3") < page.index("<h2>Campaigns</h2>")
     assert 'href="logs/m_Y.log"' in page
     assert "2 campaigns: 1 finished, 1 failed. Started 2026-11-22 01:30 UTC." in page
-    assert "12.30 ± 0.80 µm" in page
+    assert "12.30 ± 0.80" in page and "A / µm" not in page
     assert "What failed" not in render_fleet([WHOLE], started=STARTED)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -10,6 +11,7 @@ from fusion.analysis.diagnosis.diagnose import CAUSES, Diagnosis
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import Source, read_source
 from fusion.pipeline import positioning as module
+from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.positioning import (
     MOST_TARGETS,
     DiagnosedPosition,
@@ -55,6 +57,18 @@ def test_gaps_and_outliers_are_noted_with_what_they_cost(copied):
     # Nothing has to be done about a gap.
     assert notices["readings_missing"].remedy == ""
     assert 0.0 < (notices["readings_missing"].effect_um or 0.0) < 0.1
+
+
+def test_digits_that_hide_the_scatter_leave_the_values_of_the_standard(copied):
+    """A dial indicator of 10 um shows every cycle alike: nothing to weight readings by, but a sound test."""
+    table = pd.read_csv(copied / "laser.csv")
+    table["deviation_um"] = 10.0 * table["target"].round()
+    table.to_csv(copied / "laser.csv", index=False)
+    outcome = evaluate_interferometry(read_source(load_campaign(copied / "campaign.toml")))
+    assert "no_scatter" in {notice.code for notice in outcome.notices} and "drift" not in outcome.parts
+    assert outcome.parts["iso230"]["settled"]["A_um"]["value"] == pytest.approx(50.0)
+    test = read_test(copied / "laser.csv", None)
+    assert test.part.R_um.value == 0.0 and any("repeat exactly" in remark for remark in test.remarks)
 
 
 def test_parts_agree_with_the_product(campaign_folder):

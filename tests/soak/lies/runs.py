@@ -87,7 +87,8 @@ def _said(results: Results) -> Iterator[str]:
 
 def _verdict(results: Results) -> str:
     loop = results.loop
-    assert loop is not None
+    if loop is None:
+        return "no model"
     causes = [step.effect for step in loop.steps]
     return f"{loop.verdict}: {', '.join(causes) or '-'}"
 

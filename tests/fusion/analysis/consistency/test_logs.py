@@ -40,6 +40,13 @@ def test_a_log_of_another_day_is_a_contradiction() -> None:
     assert "Check the date, the clock and the time zone of drivers.csv" in found.remedy
 
 
+@pytest.mark.parametrize("noted_s", [[-600.0], [1800.0], [-600.0, -540.0, 15_000.0, 15_060.0]])
+def test_conditions_noted_before_or_after_the_test_are_no_contradiction(noted_s: list[float]) -> None:
+    noted = log(0.0, 0.0).isel(time=[0] * len(noted_s)).assign_coords(time=START + np.array(noted_s).astype("m8[s]"))
+    found = check(noted)
+    assert found.severity is Severity.DOUBT and found.value == 0.0
+
+
 @pytest.mark.parametrize(("last_s", "share"), [(4 * 3600.0, 1.0), (2 * 3600.0, 0.5), (3600.0, 0.25)])
 def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
     found = check(log(-60.0, last_s))
@@ -109,6 +116,17 @@ def test_a_contact_sensor_that_jumps_alone_is_doubted_by_name() -> None:
     assert not doubted.passed
     assert doubted.evidence.startswith("environment.csv: material temperature jumps by 2 K from 2.9")
     assert check_contact_sensors(None, None, file="environment.csv") == []
+
+
+def test_a_stable_room_that_shows_one_digit_is_sound() -> None:
+    """A material that moves by 0.05 K reads the same at a resolution of 0.1 K, while the air swings with its conditioning."""
+    hours = np.arange(300) / 60.0
+    columns = {"air_temperature": 20.0 + 0.4 * np.sin(12.0 * hours), "material_temperature": 20.5 + 0.01 * hours}
+    time = START + np.arange(300) * np.timedelta64(60, "s")
+    room = xr.Dataset({name: ("time", np.round(one, 1)) for name, one in columns.items()}, coords={"time": time})
+    assert np.ptp(room["material_temperature"].values) == 0.0
+    (check,) = check_contact_sensors(room, None, file="environment.csv")
+    assert check.passed
 
 
 def test_a_temperature_among_the_drivers_is_examined_and_its_load_is_not() -> None:

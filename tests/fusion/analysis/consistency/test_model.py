@@ -221,6 +221,11 @@ def test_no_frame_moves_further_than_it_expands() -> None:
     assert by_code(loop, travel_mm=2000.0)["sensitivity"].passed
 
 
+def test_a_stage_of_polymer_may_expand_as_it_is_stated() -> None:
+    entry = {"effect": "axis_expansion", "value": 92.0, "u": 2.0, "prior": 90.0, "prior_u": 5.0, "unit": "ppm/K"}
+    assert by_code({"declared_coefficients": [entry]})["sensitivity"].passed
+
+
 def test_the_coefficients_of_added_effects_are_held_against_physics_as_well() -> None:
     lag = {"value": 60.0, "u": 2.0, "unit": "ppm/K"}
     loop = {**declared(11.5, 0.2), "steps": [{"effect": "thermal_lag", "coefficients": [lag]}]}

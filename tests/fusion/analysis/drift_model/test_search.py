@@ -646,6 +646,8 @@ def states(*minutes: float, follows: str = "duty") -> list[Candidate]:
         # A value fits as well within half a chi-squared of one degree, 1.92.
         (states(10, 20, 30), [0.0, 10.0 - 1.91, 10.0], 2, {"time_constant_min": [10.0, None]}),
         (states(10, 20, 30), [0.0, 10.0 - 1.93, 10.0], 2, {"time_constant_min": [20.0, None]}),
+        # Rounding of a very large likelihood may leave the best alone below itself.
+        (states(10, 20, 30), [0.0, 7.0, 0.0], 1, {"time_constant_min": [10.0, 30.0]}),
         # A size may be negative.
         (varied("jump", -20.0, -5.0, 5.0), [10.0, 0.0, 0.0], 0, {"jump": [None, -5.0]}),
         (varied("jump", -20.0, -5.0, 5.0), [0.0, 10.0, 0.0], 1, {"jump": [-20.0, 5.0]}),
