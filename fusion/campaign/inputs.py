@@ -20,9 +20,7 @@ from fusion.analysis.alignment.align import (
     AxisGeometry,
     MeasuredLine,
     camera_on_laser_clock,
-    covered_share,
     cycle_bounds,
-    likely_zone_shift,
 )
 from fusion.analysis.attribution.duty import DutyLaw, read_duty
 from fusion.analysis.attribution.modes import Region, read_regions
@@ -45,7 +43,7 @@ from fusion.campaign.logs import (
     split_heading,
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
-from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
+from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
 from fusion.campaign.values import matching_pipes
 from fusion.common import FusionError
 from fusion.messages import naming
@@ -289,7 +287,9 @@ def _read_drivers(campaign: Campaign) -> dict[str, Any]:
     if table is None:
         return {}
     path = campaign.resolve(table.file)
-    drivers = bring_to_utc(read_drivers(path), campaign.zone_of("drivers"), file=table.file)
+    drivers = bring_to_utc(
+        read_drivers(path), campaign.zone_of("drivers"), file=table.file, late_s=table.clock_offset_s
+    )
     if table.mean_dwell_s is None:
         return {"drivers": drivers}
     law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
@@ -298,7 +298,7 @@ def _read_drivers(campaign: Campaign) -> dict[str, Any]:
 
 
 def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
-    """Read the frames of a campaign with readings, and refuse clocks that cannot both be right."""
+    """Read the frames of a campaign with readings."""
     plan = campaign.plan
     assert plan is not None and plan.axis is not None
     if not _is_timed(common["deviations"]):
@@ -317,7 +317,6 @@ def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
         MeasuredLine(cells, axis, source.deviations["position"].values)
     except AlignmentError as error:
         raise AlignmentError(f"{campaign.path}: plan.axis: {error}") from error
-    _raise_if_clocks_disagree(source)
     return source
 
 
@@ -328,7 +327,8 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     laser = campaign.resolve(interferometry.deviations)
     how = {name: getattr(interferometry, name) for name in ("feed_mm_per_min", "dwell_s", "sheet")}
     zone = campaign.zone_of("interferometry")
-    deviations = bring_to_utc(read_deviations(laser, **how), zone, file=interferometry.deviations)
+    late_s = interferometry.clock_offset_s
+    deviations = bring_to_utc(read_deviations(laser, **how), zone, file=interferometry.deviations, late_s=late_s)
     check(deviations, DEVIATIONS, name=laser.name)
     deviations, notices = _timed_cycles(deviations, file=interferometry.deviations)
     _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations)
@@ -337,7 +337,8 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
-        environment = bring_to_utc(environment, zone, file=interferometry.environment)
+        late_s = interferometry.environment_clock_offset_s
+        environment = bring_to_utc(environment, zone, file=interferometry.environment, late_s=late_s)
     with naming(campaign.resolve(interferometry.environment or interferometry.deviations)):
         compensated = compensate_readings(deviations, environment, interferometry)
     if interferometry.material_temperature == "logged":
@@ -630,32 +631,6 @@ def _reason(item: Mapping[str, Any]) -> str:
     """Return why a frame was left out without the absolute path that the reader's message starts with."""
     text = str(item["reason"])
     return text.split(f"{Path(item['file']).name}: ", 1)[-1]
-
-
-#: A shift by whole quarter hours counts as a wrong time zone where less than this share of the readings lies within the frames.
-_COVERED_NOW = 0.6
-
-
-def _raise_if_clocks_disagree(source: Source) -> None:
-    """Raise if the recordings do not overlap in time or their clocks differ by a time zone."""
-    readings, path = source.deviations["time"].values, source.campaign.path
-    readings, offset_s = readings[~np.isnat(readings)], source.thermography.clock_offset_s or 0.0
-    frames = camera_on_laser_clock(source.frame_times, offset_s)
-    covered = covered_share(readings, frames)
-    shift = likely_zone_shift(readings, frames)
-    laser = f"readings of {source.deviations.attrs.get('source', 'the laser')}"
-    span = f"frames {utc(frames[0])} to {utc(frames[-1])}, {laser} {utc(readings.min())} to {utc(readings.max())}"
-    if covered < _COVERED_NOW and shift is not None:
-        raise AlignmentError(
-            f"{path}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
-            f'between frames); write thermography.clock_offset = "{offset_s + shift:g} s" (camera clock minus laser '
-            "clock) if so, or give the times of both with their zone"
-        )
-    if covered == 0.0:
-        raise AlignmentError(
-            f"{path}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
-            "or check that both folders belong to the same test"
-        )
 
 
 # A record of one run or of several: every table read, the runs in the order of their times, held to the same columns.

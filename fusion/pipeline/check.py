@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
+from fusion.analysis.consistency.checks import Check, ContradictionError, Severity, open_doubts, refuse_contradictions
+from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_source
 from fusion.campaign.logs import read_drivers
@@ -45,8 +46,8 @@ class CampaignCheck:
 
     @property
     def doubts(self) -> list[Check]:
-        """Checks that are not passed, nor accepted, and that a run would name first."""
-        return open_doubts(self.checks, self.accepted)
+        """Checks that are not passed, nor accepted, and that a run would name first; contradictions are faults."""
+        return [one for one in open_doubts(self.checks, self.accepted) if one.severity is Severity.DOUBT]
 
     def lines(self, *, quiet: bool = False) -> list[str]:
         """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only."""
@@ -79,7 +80,7 @@ class CampaignCheck:
             "faults": list(self.faults),
             "doubts": [{"code": one.code, "evidence": one.evidence, "remedy": one.remedy} for one in self.doubts],
             "notices": [{"code": one.code, "message": one.message, "remedy": one.remedy} for one in self.notices],
-            "checks_passed": len(self.checks) - len(self.doubts),
+            "checks_passed": sum(check.passed for check in self.checks),
         }
 
 
@@ -94,7 +95,7 @@ def check_campaign(path: Path) -> CampaignCheck:
         if campaign.record is not None:
             return _check_record(campaign)
         source = read_source(campaign)
-        checks = tuple(check_source(source))
+        checks = tuple(without_consequences(check_source(source), campaign.accept.doubts))
     except BAD_INPUT as error:
         faults = dict.fromkeys([_words(error), *_faults_of_files(campaign)])
         return CampaignCheck(campaign.path, title, faults=tuple(faults))

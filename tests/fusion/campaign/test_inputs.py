@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.analysis.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import (
     LaserInputs,
@@ -27,19 +26,6 @@ from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import change, keep_cycles, without
 from thermography.io.flir import index_frames
 from thermography.radiometry.planck import calibrate
-
-
-def shift_frames(folder: Path, hours: float) -> None:
-    """Let the laser's clock run ahead of the camera's by rewriting the times of the readings."""
-    path = folder / "laser.csv"
-    lines = path.read_text().splitlines()
-    shifted = [lines[0]]
-    for line in lines[1:]:
-        fields = line.split(",")
-        time = np.datetime64(fields[4].split("+")[0]) + np.timedelta64(round(hours * 3600), "s")
-        fields[4] = f"{time}+00:00"
-        shifted.append(",".join(fields))
-    path.write_text("\n".join(shifted) + "\n")
 
 
 def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
@@ -70,20 +56,6 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     assert missing.message.startswith("2 readings of 288 missing, in ")
     # One reading of 24 at two cells: u grows by 1 - sqrt(23 / 24) = 2.1 %.
     assert missing.effect_um == pytest.approx(0.021 * float(outcome.dataset["drift_profile_u"].max()), rel=0.2)
-
-
-def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: Path) -> None:
-    shift_frames(copied, 1.0)
-    with pytest.raises(AlignmentError, match=r"the clocks look 1 h apart, .* \(frames 2026-03-09T06:"):
-        read_source(load_campaign(copied / "campaign.toml"))
-    path = change(copied / "campaign.toml", 'clock_offset = "0 s"', 'clock_offset = "-1 h"')
-    assert read_source(load_campaign(path)).thermography.clock_offset_s == -3600
-
-
-def test_recordings_of_two_days_are_refused(copied: Path) -> None:
-    shift_frames(copied, 100.0)
-    with pytest.raises(AlignmentError, match=r"T06:32:44Z to 2026-03-09T07:41:44Z, readings of laser\.csv 2026-03-13T"):
-        read_source(load_campaign(copied / "campaign.toml"))
 
 
 def test_a_link_whose_frame_is_gone_is_named(copied: Path) -> None:
