@@ -43,7 +43,7 @@ from fusion.campaign.logs import (
     split_heading,
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
-from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
+from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
 from fusion.campaign.values import matching_pipes
 from fusion.common import FusionError
 from fusion.messages import naming
@@ -57,7 +57,7 @@ from interferometry.io.tables import DateOrder, parse_time, read_table
 from thermography.common import ThermographyError
 from thermography.io.frame import FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
-from thermography.io.sequence import FrameList, frame_times
+from thermography.io.sequence import FrameList, camera_names, frame_times
 from thermography.registration.plan import Fiducial, PlanGrid, Polygon, PolygonError, read_fiducials
 from thermography.registration.projection import Lens, read_lens
 from thermography.registration.register import picture_grid
@@ -255,8 +255,8 @@ class Source(CameraInputs, LaserInputs):
         return float(np.abs(self.deviations["position"].values).max())
 
 
-#: Words of the reason why a frame of another size is left out.
-_OTHER_SIZE = "pixels among frames"
+#: Words of the reason why a frame of another camera or size is left out.
+_OTHER_CAMERA = "among frames of"
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
@@ -435,7 +435,7 @@ def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
     """Return the usable frames sorted by time, and file, index and reason of the others."""
     frames, rejected = index_recordings(campaign.frame_paths(), stack_options(campaign))
     has_time = ~np.isnat(frames.times)
-    timed, odd = _of_one_size(frames.choose(has_time))
+    timed, odd = _of_one_camera(frames.choose(has_time), campaign.path)
     left_out: list[tuple[Any, str]] = [
         *((frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected),
         *((frame, "the frame has no time") for frame in frames.choose(~has_time)),
@@ -447,19 +447,24 @@ def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
     ]
 
 
-def _of_one_size(frames: FrameList) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
-    """Keep the frames of the size that most of them have; the others with the reason."""
-    if not frames:
+def _of_one_camera(frames: FrameList, path: Path) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
+    """Keep the frames of the camera and size that took most of them; the others with camera and time as the reason."""
+    names = camera_names(frames).astype(str)
+    listed_names, first, counts = np.unique(names, return_index=True, return_counts=True)
+    if listed_names.size < 2:
         return frames, []
-    shapes = frames.shapes()
-    sizes, counted = np.unique(shapes, axis=0, return_counts=True)
-    # Of two sizes as frequent as each other, that of the earlier frame.
-    most = sizes[counted == counted.max()]
-    first = min(range(len(most)), key=lambda i: int(np.argmax((shapes == most[i]).all(axis=1))))
-    fits = (shapes == most[first]).all(axis=1)
-    reason = f"{{1}} x {{0}} {_OTHER_SIZE} of {{3}} x {{2}}"
-    return frames.choose(fits), [
-        (frame, reason.format(*frame.shape, *most[first].tolist())) for frame in frames.choose(~fits)
+    order = np.lexsort((first, -counts))
+    cameras = {name.rpartition(",")[0] for name in listed_names}
+    if len(cameras) > 1 and 2 * counts.max() <= len(frames):
+        of_each = "; ".join(f"{counts[k]} of {listed_names[k]}" for k in order)
+        raise SourceError(
+            f"{path}: thermography.frames matches {len(frames)} frames of {len(cameras)} cameras, none of which took most of them, so they "
+            f"are no series: {of_each}; name the frames of one camera"
+        )
+    most = listed_names[order[0]]
+    return frames.choose(names == most), [
+        (frame, f"{name}, taken {utc(frame.time)}, {_OTHER_CAMERA} {most}")
+        for frame, name in zip(frames.choose(names != most), names[names != most], strict=True)
     ]
 
 
@@ -604,7 +609,7 @@ def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_re
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
     remedy = "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours."
-    if all(_OTHER_SIZE in _reason(item) for item in rejected):
+    if all(_OTHER_CAMERA in _reason(item) for item in rejected):
         remedy = "Name the frames of one camera and one size only in thermography.frames."
     return [Notice(code, f"{counted(len(rejected), 'frame')} left out: {listed(named)}.", remedy)]
 

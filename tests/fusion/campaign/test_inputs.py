@@ -25,6 +25,8 @@ from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import change, keep_cycles, without
 from thermography.io.flir import index_frames
+from thermography.io.flir_writer import write_jpeg
+from thermography.io.frame import CameraIdentity
 from thermography.radiometry.planck import calibrate
 
 
@@ -111,11 +113,34 @@ def test_a_region_that_cannot_be_used_is_refused(copied: Path, corners: str, kno
 
 
 def test_a_frame_of_another_size_is_not_called_damaged() -> None:
-    other = {"file": "b.seq", "index": 0, "reason": "b.seq: 640 x 480 pixels among frames of 640 x 512"}
+    other = {
+        "file": "b.seq",
+        "index": 0,
+        "reason": "FLIR E40 7, 160 x 120, taken 2012-11-21T10:00:00Z, among frames of FLIR T1020 9, 320 x 240",
+    }
     (notice,) = frames_notices([other])
     assert notice.remedy == "Name the frames of one camera and one size only in thermography.frames."
     (notice,) = frames_notices([other, {"file": "c.seq", "index": 0, "reason": "c.seq: cut off"}])
     assert notice.remedy.startswith("Copy damaged files again")
+
+
+def test_frames_of_another_camera_are_the_odd_ones_out(copied: Path) -> None:
+    path, frames = copied / "campaign.toml", sorted((copied / "thermal").glob("*.jpg"))
+    sound = read_source(load_campaign(path))
+    (first, _), _ = index_frames(frames[:2])
+    for k in range(2):
+        time = f"2012-11-21T10:00:0{k}"
+        other = CameraIdentity(model="FLIR A645sc", serial="55")
+        write_jpeg(copied / "thermal" / f"IR_other{k}.jpg", first.read().counts, first.parameters, time, camera=other)
+    source = read_source(load_campaign(path))
+    assert isinstance(source, Source) and isinstance(sound, Source)
+    assert source.frames == sound.frames
+    assert [one["file"] for one in source.frames_rejected] == ["thermal/IR_other0.jpg", "thermal/IR_other1.jpg"]
+    assert "FLIR A645sc 55, 640 x 480, taken 2012-11-21T10:00:00Z, among" in source.frames_rejected[0]["reason"]
+    for frame in frames[2:]:
+        frame.unlink()
+    with pytest.raises(SourceError, match=r"4 frames of 2 cameras, none of which .* 2 of FLIR A645sc 55, 640 x 480"):
+        read_source(load_campaign(path))
 
 
 def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:
