@@ -642,8 +642,8 @@ def _reason(item: Mapping[str, Any]) -> str:
 
 #: Time between runs that each count their seconds from zero, so that they can be laid one after the other: one day.
 _BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
-#: A run counts from its own zero where its first time is at most this share of its length.
-_OWN_ZERO = 0.01
+#: Times before this one count from a start that is not stated.
+_DATED = np.datetime64("1980-01-01", "ns")
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:
@@ -654,18 +654,20 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     tables = {path: read_run(campaign, path) for path in paths}
     _refuse_different_columns(tables)
     refuse_mixed_zones({path.name: table for path, table in tables.items()}, source=str(campaign.path))
-    # Every run gives seconds since its own zero, and nothing says when that was.
-    times = [table["time"].values for table in tables.values()]
-    own_zero = all(NO_START <= time[0] <= NO_START + _OWN_ZERO * (time[-1] - time[0]) for time in times)
+    ordered = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
+    overlaps = _overlaps(ordered)
+    # Times without a date that overlap: every run counts from its own zero, and nothing says when that was.
+    own_zero = bool(overlaps) and all(table["time"].values[-1] < _DATED for table in tables.values())
     if own_zero:
         start = NO_START
         for path, table in tables.items():
             moved = table["time"].values + (start - table["time"].values[0])
             tables[path] = table.assign_coords(time=("time", moved, table["time"].attrs))
             start = moved[-1] + _BETWEEN
+    elif overlaps:
+        raise TableError(overlaps[0])
     else:
-        tables = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
-        _refuse_overlap(tables)
+        tables = ordered
     test = set(campaign.test_paths()) or {list(tables)[-1]}
     numbered = [
         table.assign_coords(run=("time", np.full(table.sizes["time"], k))) for k, table in enumerate(tables.values())
@@ -707,12 +709,14 @@ def _refuse_different_columns(tables: dict[Path, xr.Dataset]) -> None:
                 )
 
 
-def _refuse_overlap(tables: dict[Path, xr.Dataset]) -> None:
-    """Refuse runs of which one begins before the other has ended."""
+def _overlaps(tables: dict[Path, xr.Dataset]) -> list[str]:
+    """Say which runs, in the order of their times, begin before the one before has ended."""
+    found = []
     for (before, earlier), (path, later) in pairwise(tables.items()):
         first, last = later["time"].values[0], earlier["time"].values[-1]
         if first <= last:
-            raise TableError(
+            found.append(
                 f"{path}: the run begins at {np.datetime_as_string(first, unit='s')}, before {before.name} has ended "
                 f"({np.datetime_as_string(last, unit='s')}); name every run once, and correct its times or record.start"
             )
+    return found
