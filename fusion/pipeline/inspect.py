@@ -102,6 +102,8 @@ def recognise(path: Path) -> Recognised:
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
+    if text is not None and isinstance(reader, TextReader) and reader.begins_a_frame(text):
+        return Recognised(path, Kind.STACK)
     # Not before: frames are looked into without xarray.
     from interferometry.io.readings import is_environment_log, read_deviations
     from interferometry.io.tables import read_table
