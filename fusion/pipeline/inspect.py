@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import csv
 import itertools
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
@@ -21,20 +20,28 @@ from fusion.common import FusionError, TomlError, read_toml
 from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
 from fusion.results.progress import counted, left_out_notices, listed
-from fusion.results.store import OutputError, write_atomically
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
 from thermography.common import ThermographyError
-from thermography.inspection import check_series, describe_stack, inspect_file, is_flir_file, thumbnail
+from thermography.evaluation import tabulate_regions
+from thermography.inspection import (
+    check_series,
+    describe_evaluation,
+    describe_stack,
+    inspect_file,
+    is_flir_file,
+)
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
-from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader
+from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader, name_unread
 from thermography.io.sequence import camera_names
-from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate
+from thermography.radiometry.planck import ZERO_CELSIUS_K
 from thermography.registration.plan import read_fiducials
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from fusion.pipeline.columns import TableProposal
 
 
 # What kind of file something is, recognised by its content: the campaign's own files, recordings, logs and plans.
@@ -45,12 +52,6 @@ _START = 65_536
 _LONGEST_REASON = 160
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
-_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
-#: Reason of a table whose columns nobody can know.
-_BARE = (
-    "a table of numbers without headings; write a first line that names every column with its unit, such as "
-    "time [s],spindle [degC],nose [um]"
-)
 
 
 class Kind(StrEnum):
@@ -99,6 +100,8 @@ def recognise(path: Path) -> Recognised:
     if reader is not None and not isinstance(reader, TextReader):
         reason = f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
         return Recognised(path, Kind.UNKNOWN, reason)
+    if reader is None and (what := name_unread(path)):
+        return Recognised(path, Kind.UNKNOWN, what)
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
@@ -108,6 +111,7 @@ def recognise(path: Path) -> Recognised:
     from interferometry.io.readings import is_environment_log, read_deviations
     from interferometry.io.tables import read_table
 
+    headings: tuple[str, ...] = ()
     try:
         headings = _headings(text) if text is not None else _sheet_headings(path)
         kind = _by_headings(headings)
@@ -125,9 +129,11 @@ def recognise(path: Path) -> Recognised:
         # Text may be one frame of temperatures; what is neither is refused as the table that it is not.
         if isinstance(reader, TextReader) and reader.holds_a_frame(path):
             return Recognised(path, Kind.STACK)
-        first = () if text is None else _headings(text)
-        if len(first) > 1 and all(_NUMBER.fullmatch(number.lstrip("\ufeff")) for number in first):
-            return Recognised(path, Kind.UNKNOWN, _BARE)
+        table = None if _of_a_laser(headings) else _logged_table(path)
+        if table is not None and table.may_be_record:
+            return Recognised(path, Kind.RECORD, headings=tuple(column.heading for column in table.columns))
+        if table is not None:
+            return Recognised(path, Kind.UNKNOWN, table.lacks)
         reason = str(error).removeprefix(f"{path}").lstrip(":, ")
         shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
         return Recognised(path, Kind.UNKNOWN, shortened)
@@ -154,6 +160,24 @@ def is_time(heading: str) -> bool:
     from interferometry.io.tables import read_heading
 
     return read_heading(heading).role in ("time", "date") or column_unit(heading) in ("s", "ms", "min", "h")
+
+
+def _of_a_laser(headings: Sequence[str]) -> bool:
+    """Return whether headings are those of a table of readings, whatever it lacks."""
+    from interferometry.io.tables import read_heading
+
+    roles = {read_heading(name).role for name in headings}
+    return len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
+
+
+def _logged_table(path: Path) -> TableProposal | None:
+    """Return the proposal for a table of something over time, None where a file is no table."""
+    from fusion.pipeline.columns import propose_table
+
+    try:
+        return propose_table(path)
+    except (FusionError, InterferometryError):
+        return None
 
 
 def _holds_deviations(path: Path) -> bool:
@@ -284,18 +308,17 @@ def _describe_log(found: Recognised) -> list[str]:
 
 
 def _describe_record(found: Recognised) -> list[str]:
-    from interferometry.io.tables import read_grids
+    from fusion.pipeline.columns import propose_table
 
-    time = next(name for name in found.headings if is_time(name))
-    columns: dict[str, list[str]] = {"temperature": [], "displacement": [], "other column": []}
-    for name in found.headings:
-        if is_temperature(name) or is_displacement(name):
-            columns["temperature" if is_temperature(name) else "displacement"].append(name)
-        elif name != time:
-            columns["other column"].append(name)
-    rows = len(read_grids(found.path)[0].rows) - 1
+    table = propose_table(found.path)
+    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}
+    columns = {kind: [column.heading for column in table.of(role)] for role, kind in roles.items()}
     described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
-    return [f"record, {counted(rows, 'row')}, time in the column {time}", *described]
+    held = join([column.heading for column in table.of("time")])
+    time = (
+        f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
+    )
+    return [f"record, {counted(table.rows, 'row')}, {time}", *described]
 
 
 def _describe_fiducials(found: Recognised) -> list[str]:
@@ -535,19 +558,14 @@ def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
             yield _inspect_series(members, label=str(path.parent / f"*{path.suffix}"))
 
 
-def write_thumbnails(paths: Sequence[Path], folder: Path) -> Iterator[Path]:
-    """Write a small picture of the first frame of every thermal file as ``<file>.png``."""
-    written: set[str] = set()
-    for path in filter(is_thermal, _files(paths)):
-        try:
-            picture = thumbnail(path)
-        except ThermographyError:
-            continue
-        name = f"{path.name}.png" if f"{path.name}.png" not in written else f"{path.parent.name}_{path.name}.png"
-        if name not in written and (folder / name).exists():
-            raise OutputError(f"{folder / name} exists already; name another folder with --thumbnails, or remove it")
-        written.add(name)
-        yield write_atomically(folder / name, lambda part, picture=picture: part.write_bytes(picture))  # type: ignore[misc]
+def write_frames(paths: Sequence[Path], folder: Path, formats: Sequence[str]) -> Iterator[str]:
+    """Write the frames of all thermal files for other programs, see `thermography.pictures.export_frames`; say what was written."""
+    from thermography.pictures import export_frames  # loads xarray, which nothing else here needs
+
+    frames, rejected = index_frames([path for path in _files(paths) if is_thermal(path)])
+    if frames:
+        yield from (f"written: {path}" for path in export_frames(frames, folder, formats))
+    yield from (f"left out: {one.reason}" for one in rejected)
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
@@ -645,9 +663,6 @@ def _bar(
 
 # A series of thermal frames in about ten lines: one camera? gaps in time? the same settings? anything left out?
 
-#: Frames whose pixels are read, spread evenly over the series.
-_FRAMES_READ = 8
-
 
 def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
     """Return what a series of thermal files holds."""
@@ -656,26 +671,23 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
         raise ThermographyError(f"{label}: no frame can be read; {rejected[0].reason}")
     names = camera_names(frames).astype(str)
     cameras = Counter(names.tolist())
-    of_what = (
-        f"of {frames[0].shape[1]} x {frames[0].shape[0]}"
-        if len(cameras) == 1
-        else f"of {len(cameras)} cameras or sizes"
-    )
-    lines = [f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} {of_what}"]
+    size = f"{frames[0].shape[1]} x {frames[0].shape[0]}" if len(cameras) == 1 else f"{len(cameras)} cameras or sizes"
+    lines = [f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} of {size}"]
     for name, count in cameras.most_common():
-        chosen = frames.choose(names == name)
         if len(cameras) > 1:
             lines.append(f"  {counted(count, 'frame')} of {name}")
-        about = [
-            f"camera {_camera(chosen)}",
-            *_times(chosen),
-            f"settings {_settings(chosen)}",
-            f"temperature {_temperatures(chosen)}",
-        ]
+        of_one = frames.choose(names == name)
+        about = [f"camera {_camera(of_one)}", *_times(of_one), f"settings {_settings(of_one)}"]
         lines += [f"  {'' if len(cameras) == 1 else '  '}{line}" for line in about]
+    try:
+        evaluation = tabulate_regions(frames)
+        rejected += evaluation.rejected
+    except ThermographyError:
+        evaluation = None
+    lines += [f"  {line}" for line in describe_evaluation(evaluation)]
     if len(cameras) > 1:
         lines.append(
-            "  warning: frames of several cameras or sizes are no series; a campaign takes those of the one with most of them"
+            "  warning: frames of several cameras or sizes are no series; beside a laser those of the one with most of them are taken"
         )
     if rejected:
         reasons = listed(f"{one.path.name}: {one.reason.removeprefix(f'{one.path}').lstrip(': ')}" for one in rejected)
@@ -720,26 +732,10 @@ def _settings(frames: Sequence[FrameReference]) -> str:
     p = frames[0].parameters
     stored = (
         f"emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
-        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} degC, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} degC, "
+        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
         f"relative humidity {p.relative_humidity:.0%}"
     )
-    names = [each.name for each in fields(CameraParameters)]
+    # Each camera has its own calibration: what differs in it is no setting.
+    names = [each.name for each in fields(CameraParameters) if not each.name.startswith(("planck", "atmosphere_"))]
     varying = [name for name in names if len({getattr(frame.parameters, name) for frame in frames}) > 1]
     return f"{stored}: {'the same in all frames' if not varying else f'of the first frame; not the same in all: {join(varying)}'}"
-
-
-def _temperatures(frames: Sequence[FrameReference]) -> str:
-    """Say which temperatures a few frames show with their own parameters."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _FRAMES_READ).round().astype(int))
-    lows, highs = [], []
-    for frame in (frames[index] for index in chosen):
-        try:
-            values = calibrate(frame.read_counts(), frame.parameters)
-        except ThermographyError:
-            continue
-        if np.isfinite(values).any():
-            lows.append(float(np.nanmin(values)))
-            highs.append(float(np.nanmax(values)))
-    if not lows:
-        return "cannot be determined from the stored parameters"
-    return f"{min(lows):.2f} to {max(highs):.2f} degC in {counted(len(lows), 'frame')} spread over the series"

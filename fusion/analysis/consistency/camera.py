@@ -18,9 +18,10 @@ from fusion.analysis.consistency.checks import Check, Severity, judge
 from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
 from fusion.common import Array
 from thermography.common import ThermographyError
+from thermography.evaluation import share_outside_range
 from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.large_arrays import median_of_pieces, piece_slices
-from thermography.inspection import FileWarning, check_series, share_outside_range
+from thermography.inspection import FileWarning, check_series
 from thermography.io.frame import Frame, FrameReference
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import image_displacement

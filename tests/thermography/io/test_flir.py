@@ -22,7 +22,6 @@ from thermography.io import sequence as by_threads
 from thermography.io.flir import (
     FlirFrameReference,
     FrameReference,
-    MeasurementRegion,
     index_frames,
     index_sequence,
     read_frame,
@@ -32,6 +31,7 @@ from thermography.io.flir import (
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
 from thermography.io.other_cameras import index_recordings
+from thermography.io.region import Region
 from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate, override
 
 SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
@@ -327,8 +327,8 @@ def reference(path: Path) -> FlirFrameReference:
 @pytest.mark.real_data
 def test_the_spots_of_a_real_file(real_file):
     assert read_measurement_regions(reference(real_file(SPOTS))) == [
-        MeasurementRegion("Sp1", "spot", {"column": 66, "row": 57}),
-        MeasurementRegion("Sp2", "spot", {"column": 83, "row": 112}),
+        Region("Sp1", "spot", ((66, 57),)),
+        Region("Sp2", "spot", ((83, 112),)),
     ]
 
 
@@ -336,8 +336,36 @@ def test_the_spots_of_a_real_file(real_file):
 def test_the_area_of_a_real_file_lies_in_its_frame(real_file):
     frame = reference(real_file(AREA))
     (region,) = read_measurement_regions(frame)
-    assert (region.kind, region.place) == ("area", {"column": 210, "row": 157, "width": 219, "height": 166})
-    assert region.place["column"] + region.place["width"] <= frame.shape[1]
+    # Stored as column 210, row 157, width 219, height 166.
+    assert region == Region("box 1", "box", ((210, 157), (428, 322)))
+
+
+def test_tools_of_the_documented_kinds_become_regions_with_names_of_their_own(tmp_path, monkeypatch):
+    """Layout and kinds after ExifTool's FLIR Tags: length, length of the coordinates at 4, kind at 10, coordinates at 0x24, label."""
+
+    def tool(kind: int, *values: int, label: str = "1") -> bytes:
+        text = (label + "\0").encode("utf-16-le")
+        head = bytearray(0x24)
+        struct.pack_into("<H2xH4xH", head, 0, 0x24 + 2 * len(values) + len(text), 2 * len(values), kind)
+        return bytes(head) + struct.pack(f"<{len(values)}H", *values) + text
+
+    record = b"\1\0".ljust(12, b"\0") + b"".join(
+        [
+            tool(3, 50, 40, 60, 40, 50, 46),
+            tool(4, 1, 2, 30, 20, label="Li1"),
+            tool(1, 5, 6),
+            tool(1, 7, 8),
+            tool(6, 0, 1, 0, 1, 9142, 0),  # an alarm is no region
+        ]
+    )
+    monkeypatch.setattr("thermography.io.flir._record", lambda *_: record)
+    jpeg(tmp_path / "a.jpg")
+    assert read_measurement_regions(reference(tmp_path / "a.jpg")) == [
+        Region("ellipse 1", "ellipse", ((40, 34), (60, 46))),
+        Region("Li1", "line", ((1, 2), (30, 20))),
+        Region("spot 1", "spot", ((5, 6),)),
+        Region("spot 1'", "spot", ((7, 8),)),
+    ]
 
 
 @pytest.mark.real_data
