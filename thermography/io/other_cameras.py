@@ -513,6 +513,10 @@ _FEWEST = 8
 _MOST_MISSING = 0.25
 #: Largest ratio of the sides of a frame: a log of a few columns over many lines is none.
 _LONGEST = 4
+#: Lines that tell a frame from a table, and fewest of them and of their columns that do: a log names as many columns above its numbers.
+_LOOKED_AT, _FEWEST_ALIKE, _FEWEST_WIDE = 20, 10, 32
+#: Characters of a text of numbers alone.
+_PLAIN = b"0123456789.,;+-eE \t\r\n"
 #: A text frame of a large camera has about 10 MB.
 _MOST_BYTES = 1 << 28
 #: No sensor has more columns, or with the lines around its numbers more lines: a longer table is no frame, and is not read to see that.
@@ -529,6 +533,17 @@ class TextReader(TemperatureReader):
         marked = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         return bool(start) and (marked or not set(start) & (set(range(32)) - {9, 10, 12, 13, 27}))
 
+    def begins_a_frame(self, text: str) -> bool:
+        """Return whether the first lines of a text are rows of a picture, without a line above them that names as many columns."""
+        lines = text.splitlines()[:_LOOKED_AT]
+        for delimiter in _DELIMITERS:
+            rows = [_numbers(line, delimiter) for line in lines]
+            widths = [len(row) for row in rows if row is not None]
+            if len(widths) >= _FEWEST_ALIKE and len(set(widths)) == 1 and widths[0] >= _FEWEST_WIDE:
+                above = lines[: next(k for k, row in enumerate(rows) if row is not None)]
+                return all(line.count(delimiter) < widths[0] - 1 for line in above)
+        return False
+
     def holds_a_frame(self, path: Path) -> bool:
         """Return whether a text file holds a block of numbers."""
         try:
@@ -538,9 +553,9 @@ class TextReader(TemperatureReader):
         return True
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
-        """Return what a file holds."""
-        values = self.read_values(path, 0, options)
-        return StackContents(1, (values.shape[0], values.shape[1]))
+        """Return what a file holds; the pixels of numbers alone are counted and not read."""
+        rows, columns = _plain_shape(path.read_bytes()) or self.read_values(path, 0, options).shape
+        return StackContents(1, (rows, columns))
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the numbers of a file, (row, column); NaN where a field is no number."""
@@ -558,11 +573,26 @@ class TextReader(TemperatureReader):
         )
 
 
+def _plain_shape(content: bytes) -> tuple[int, int] | None:
+    """Return rows and columns of a text of numbers alone, of which every line holds as many; None of another one."""
+    lines = content.removeprefix(codecs.BOM_UTF8).splitlines()
+    if len(lines) > _MOST_LINES or content.removeprefix(codecs.BOM_UTF8).translate(None, _PLAIN):
+        return None
+    for delimiter in (mark.encode() for mark in _DELIMITERS[:3]):
+        columns = {line.rstrip().removesuffix(delimiter).count(delimiter) + 1 for line in lines}
+        if len(columns) == 1 and _has_proportions(len(lines), width := columns.pop()):
+            return len(lines), width
+    return None
+
+
+def _has_proportions(rows: int, columns: int) -> bool:
+    """Whether a block of numbers has the sides of a sensor."""
+    return min(rows, columns) >= _FEWEST and max(rows, columns) <= _LONGEST * min(rows, columns)
+
+
 def _is_a_frame(block: list[list[float]]) -> bool:
     rows, columns = len(block), len(block[0]) if block else 0
-    if min(rows, columns) < _FEWEST or max(rows, columns) > _LONGEST * min(rows, columns):
-        return False
-    return bool(np.isnan(block).mean() <= _MOST_MISSING)
+    return _has_proportions(rows, columns) and bool(np.isnan(block).mean() <= _MOST_MISSING)
 
 
 def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:

@@ -223,6 +223,17 @@ def test_an_export_of_the_vendors_program_is_its_picture(real_file):
     assert values == pytest.approx(calibrate(frame.counts, frame.parameters), abs=5e-3)
 
 
+def test_a_picture_is_told_from_a_log_by_its_first_lines_and_sized_without_reading_it(tmp_path):
+    rows = [";".join(f"{20 + column / 10:.1f}".replace(".", ",") for column in range(40)) + ";" for _ in range(30)]
+    named = ";".join(f"t{column} [degC]" for column in range(40))
+    assert READER.begins_a_frame("\n".join(["File: a", "Emissivity: 0.95", *rows]))
+    assert not READER.begins_a_frame("\n".join([named, *rows]))
+    path = tmp_path / "a.csv"
+    for text in ("\n".join(rows), "\n".join([*rows[:4], rows[4].replace("20,1", ""), *rows[5:]])):
+        path.write_text(text)
+        assert READER.contents(path, StackOptions()).shape == READER.read_values(path, 0, StackOptions()).shape
+
+
 @pytest.mark.parametrize("text", ["1," * 20_000, ";" * 20_000, "\n" * 200_000], ids=["numbers", "marks", "lines"])
 def test_a_line_or_a_table_longer_than_a_frame_is_passed_over(tmp_path, text):
     path = tmp_path / "a.csv"
