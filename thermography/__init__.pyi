@@ -1,4 +1,12 @@
 from .common import ThermographyError
+from .evaluation import (
+    count_temperatures,
+    evaluate_regions,
+    find_isotherm,
+    read_profile,
+    subtract_frames,
+    thermogram,
+)
 from .fields.hotspots import detect_hotspots, region_series
 from .fields.moving import reduce_moving_frames
 from .fields.still import reduce_frames
@@ -7,6 +15,7 @@ from .io.flir import index_frames, read_frame
 from .io.flir_writer import write_jpeg, write_sequence
 from .io.frame import CameraParameters
 from .io.other_cameras import StackOptions, index_recordings
+from .io.region import Region
 from .plots import plot_field
 from .radiometry.planck import calibrate
 from .radiometry.uncertainty import temperature_uncertainty
@@ -16,21 +25,28 @@ from .registration.register import register
 __all__ = [
     "CameraParameters",
     "PlanGrid",
+    "Region",
     "StackOptions",
     "ThermographyError",
     "calibrate",
+    "count_temperatures",
     "detect_hotspots",
+    "evaluate_regions",
+    "find_isotherm",
     "index_frames",
     "index_recordings",
     "inspect_file",
     "plot_field",
     "read_fiducials",
     "read_frame",
+    "read_profile",
     "reduce_frames",
     "reduce_moving_frames",
     "region_series",
     "register",
+    "subtract_frames",
     "temperature_uncertainty",
+    "thermogram",
     "write_jpeg",
     "write_sequence",
 ]

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from thermography.common import ThermographyError
+from thermography.evaluation import share_outside_range
 from thermography.io.flir import FlirFrameReference, FlirReader, index_frames, read_frame
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame
 from thermography.io.other_cameras import START_BYTES, StackOptions, TemperatureReader, find_reader, plug_ins
@@ -335,18 +336,6 @@ def _check_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
         yield _warning("outside_range", f"{of_pixels}{low:.0f} to {high:.0f} degC.")
     if any(frame.counts.min() == frame.counts.max() for frame in frames):
         yield _warning("no_content", "a frame has the same count in all pixels.")
-
-
-def share_outside_range(frame: Frame) -> float:
-    """Share of the pixels outside the temperatures for which the camera is calibrated."""
-    limits = frame.limits
-    if not limits.maximum_K > limits.minimum_K > 0:
-        return 0.0
-    try:
-        kelvin = calibrate(frame.counts, frame.parameters) + ZERO_CELSIUS_K
-    except RadiometryError:
-        return 0.0
-    return float(np.mean(~((kelvin >= limits.minimum_K) & (kelvin <= limits.maximum_K))))
 
 
 def _check_transmission(frame: Frame) -> Iterator[FileWarning]:

@@ -30,6 +30,7 @@ from thermography.io.fff_record import (
     read_header,
 )
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
+from thermography.io.region import Region, RegionKind
 from thermography.io.sequence import (
     FlirFrameReference,
     FrameList,
@@ -357,19 +358,10 @@ def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
 _TOOLS_RECORD, _PICTURE_RECORD, _OVERLAY_RECORD = 0x21, 0x0E, 0x2A
 #: Header of the measurement tools, and of each tool, bytes.
 _TOOLS_HEADER, _TOOL_HEADER = 12, 0x24
-#: Number of a tool -> its name and the meaning of its coordinates, as far as files show it.
-_KINDS = {1: ("spot", ("column", "row")), 2: ("area", ("column", "row", "width", "height"))}
+#: Number of a tool -> kind of region and number of its coordinates (ExifTool, FLIR Tags); 5 to 8 are end points, alarms and differences.
+_KINDS: dict[int, tuple[RegionKind, int]] = {1: ("spot", 2), 2: ("box", 4), 3: ("ellipse", 6), 4: ("line", 4)}
 #: Largest records of these kinds; a damaged length must not cost memory.
 _LARGEST_TOOLS, _LARGEST_PICTURE = 1 << 16, 1 << 26
-
-
-@dataclass(frozen=True)
-class MeasurementRegion:
-    """A measurement tool set in the camera: label on the screen, kind ("spot", "area", "tool 3") and coordinates by name, px from 0."""
-
-    label: str
-    kind: str
-    place: dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,25 +381,41 @@ class VisiblePicture:
     offset_px: tuple[int, int]
 
 
-def read_measurement_regions(frame: FlirFrameReference) -> list[MeasurementRegion]:
-    """Read the spots and areas that a frame stores."""
+def read_measurement_regions(frame: FlirFrameReference) -> list[Region]:
+    """Read the spots, boxes, ellipses and lines that a frame stores, each with a name of its own."""
     data = _record(frame, _TOOLS_RECORD, _LARGEST_TOOLS)
-    regions: list[MeasurementRegion] = []
+    regions: dict[str, Region] = {}
     if data is None or data[:2] != b"\1\0":
-        return regions
+        return []
     at = _TOOLS_HEADER
     while at + _TOOL_HEADER <= len(data):
-        length, coordinates, kind = (struct.unpack_from("<H", data, at + place)[0] for place in (0, 4, 10))
+        length, coordinates, number = (struct.unpack_from("<H", data, at + place)[0] for place in (0, 4, 10))
         if not _TOOL_HEADER + coordinates <= length <= len(data) - at or coordinates % 2 or coordinates == 0:
             break
         values = struct.unpack_from(f"<{coordinates // 2}H", data, at + _TOOL_HEADER)
-        label = data[at + _TOOL_HEADER + coordinates : at + length].decode("utf-16-le", "replace").split("\0")[0]
-        name, meanings = _KINDS.get(kind, (f"tool {kind}", ()))
-        if len(meanings) != len(values):
-            meanings = tuple(f"value {i + 1}" for i in range(len(values)))
-        regions.append(MeasurementRegion(label, name, dict(zip(meanings, values, strict=True))))
+        label = (
+            data[at + _TOOL_HEADER + coordinates : at + length].decode("utf-16-le", "replace").split("\0")[0].strip()
+        )
+        kind, expected = _KINDS.get(number, ("spot", 0))
+        if len(values) == expected:
+            # Older cameras number the tools of every kind from 1.
+            name = label if label and not label.isdecimal() else f"{kind} {label}".strip()
+            while name in regions:
+                name += "'"
+            regions[name] = Region(name, kind, _corners(kind, values))
         at += length
-    return regions
+    return list(regions.values())
+
+
+def _corners(kind: RegionKind, values: tuple[int, ...]) -> tuple[tuple[float, float], ...]:
+    """Return the points of a region from the coordinates of a tool."""
+    column, row, *others = values
+    if kind == "box":
+        return (column, row), (column + max(others[0], 1) - 1, row + max(others[1], 1) - 1)
+    if kind == "ellipse":  # its centre and a point on each axis
+        across, down = (max(abs(others[i] - values[i]), abs(others[i + 2] - values[i])) for i in (0, 1))
+        return (column - across, row - down), (column + across, row + down)
+    return tuple(zip(values[::2], values[1::2], strict=True))
 
 
 def read_visible_picture(frame: FlirFrameReference) -> VisiblePicture | None:

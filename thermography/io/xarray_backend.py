@@ -21,6 +21,7 @@ from xarray.core import indexing
 
 from thermography.io.flir import FlirFrameReference, index_frames, read_measurement_regions, read_visible_picture
 from thermography.io.frame import CameraParameters, FlirFormatError
+from thermography.io.region import Region
 from thermography.io.sequence import FrameList, call_by_threads, frame_times, usable_threads
 from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
 
@@ -141,10 +142,9 @@ class FlirAccessor:
             An override is unknown or has no meaning, or the Dataset lacks counts or a parameter.
         """
         dataset, changes = self._dataset, _parameter_changes(overrides)
-        lacking = [name for name in ("counts", *(name for name, _ in _PARAMETERS.values())) if name not in dataset]
-        if lacking:
-            raise RadiometryError(f"the Dataset has no {', '.join(lacking)}; open it with engine='flir' and keep them")
-        parameters = [override(each, **changes) if changes else each for each in _stored_parameters(dataset)]
+        if "counts" not in dataset:
+            raise RadiometryError("the Dataset has no counts; open it with engine='flir' and keep them")
+        parameters = [override(each, **changes) if changes else each for each in self._parameters()]
         index = xr.DataArray(np.arange(len(parameters)), dims="time") if len(parameters) > 1 else xr.DataArray(0)
         temperature: xr.DataArray = xr.apply_ufunc(
             lambda counts, which: _calibrate_each(counts, which, parameters),
@@ -174,12 +174,7 @@ class FlirAccessor:
         FlirFormatError
             The picture is damaged, or the file is not there any more.
         """
-        place = self._dataset.isel(time=frame) if "time" in self._dataset.dims else self._dataset
-        references, rejected = index_frames([str(place["source"].values)])
-        found = [one for one in references if one.index == int(place["frame"]) and isinstance(one, FlirFrameReference)]
-        if not found:
-            raise FlirFormatError(rejected[0].reason if rejected else f"{place['source'].values}: the frame is gone")
-        picture = read_visible_picture(found[0])
+        picture = read_visible_picture(self._references(frame)[0])
         if picture is None:
             return None
         return xr.DataArray(
@@ -189,6 +184,67 @@ class FlirAccessor:
             name="visible_light",
             attrs={"long_name": "visible-light picture", "scale": picture.scale, "offset_px": list(picture.offset_px)},
         )
+
+    def regions(self) -> list[Region]:
+        """Return the spots, boxes, ellipses and lines that the first frame stores.
+
+        Returns
+        -------
+        list of Region
+            In pixels of the sensor.
+        """
+        return [
+            Region(**{**one, "points": tuple(map(tuple, one["points"]))})
+            for one in json.loads(self._dataset.attrs.get("measurement_regions", "[]"))
+        ]
+
+    def evaluate(self, regions: Sequence[Region] | None = None, *, reference: str | None = None) -> xr.Dataset:
+        """Evaluate the whole picture and regions of it in every frame, with the parameters that the Dataset holds.
+
+        Parameters
+        ----------
+        regions : sequence of Region, optional
+            The same in all frames; None: those that each frame stores.
+        reference : str, optional
+            Name of a region that the means of the others are compared with.
+
+        Returns
+        -------
+        Dataset
+            Maximum, minimum, mean and more over (time, region), see `thermography.evaluation.evaluate_regions`.
+
+        Raises
+        ------
+        ThermographyError
+            As `thermography.evaluation.evaluate_regions` does, or the Dataset lacks a parameter.
+        """
+        from thermography.evaluation import (
+            evaluate_regions,
+        )  # opening a file needs neither statistics nor uncertainties
+
+        frames, sets = self._references(), self._parameters()
+        places = {(str(frame.path), frame.index): sets[i % len(sets)] for i, frame in enumerate(frames)}
+        return evaluate_regions(
+            frames, regions, parameters=lambda frame: places[str(frame.path), frame.index], reference=reference
+        )
+
+    def _parameters(self) -> list[CameraParameters]:
+        lacking = [name for name, _ in _PARAMETERS.values() if name not in self._dataset]
+        if lacking:
+            raise RadiometryError(f"the Dataset has no {', '.join(lacking)}; open it with engine='flir' and keep them")
+        return _stored_parameters(self._dataset)
+
+    def _references(self, frame: int | None = None) -> list[FlirFrameReference]:
+        """Find the frames of the Dataset, or one of them, in their files again."""
+        sources, numbers = (np.atleast_1d(self._dataset[name].values) for name in ("source", "frame"))
+        chosen = range(len(sources)) if frame is None else [frame]
+        wanted = [(str(sources[i]), int(numbers[i])) for i in chosen]
+        references, rejected = index_frames(list(dict.fromkeys(source for source, _ in wanted)))
+        found = {(str(one.path), one.index): one for one in references if isinstance(one, FlirFrameReference)}
+        gone = [f"{source}: frame {number} is gone" for source, number in wanted if (source, number) not in found]
+        if gone:
+            raise FlirFormatError(rejected[0].reason if rejected else gone[0])
+        return [found[one] for one in wanted]
 
 
 def _parameter_changes(overrides: dict[str, float | None]) -> dict[str, float]:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from fusion.analysis.consistency.checks import Check, Severity, judge
 from fusion.common import Array
 from thermography.common import ThermographyError
+from thermography.evaluation import share_outside_range
 from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.large_arrays import median_of_pieces, piece_slices
-from thermography.inspection import FileWarning, check_series, share_outside_range
+from thermography.inspection import FileWarning, check_series
 from thermography.io.frame import Frame, FrameReference
 
 # Checks of the times that the camera writes: order of the frames, rate of its clock, place in the motion of the axis.

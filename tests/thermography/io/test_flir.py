@@ -22,7 +22,6 @@ from thermography.io import sequence as by_threads
 from thermography.io.flir import (
     FlirFrameReference,
     FrameReference,
-    MeasurementRegion,
     index_frames,
     index_sequence,
     read_frame,
@@ -32,6 +31,7 @@ from thermography.io.flir import (
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
 from thermography.io.other_cameras import index_recordings
+from thermography.io.region import Region
 from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate, override
 
 SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
@@ -327,8 +327,8 @@ def reference(path: Path) -> FlirFrameReference:
 @pytest.mark.real_data
 def test_the_spots_of_a_real_file(real_file):
     assert read_measurement_regions(reference(real_file(SPOTS))) == [
-        MeasurementRegion("Sp1", "spot", {"column": 66, "row": 57}),
-        MeasurementRegion("Sp2", "spot", {"column": 83, "row": 112}),
+        Region("Sp1", "spot", ((66, 57),)),
+        Region("Sp2", "spot", ((83, 112),)),
     ]
 
 
@@ -336,8 +336,8 @@ def test_the_spots_of_a_real_file(real_file):
 def test_the_area_of_a_real_file_lies_in_its_frame(real_file):
     frame = reference(real_file(AREA))
     (region,) = read_measurement_regions(frame)
-    assert (region.kind, region.place) == ("area", {"column": 210, "row": 157, "width": 219, "height": 166})
-    assert region.place["column"] + region.place["width"] <= frame.shape[1]
+    # Stored as column 210, row 157, width 219, height 166.
+    assert region == Region("box 1", "box", ((210, 157), (428, 322)))
 
 
 @pytest.mark.real_data

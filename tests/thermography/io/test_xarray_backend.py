@@ -163,7 +163,7 @@ def test_the_accessor_calibrates_anew(tmp_path, chunks):
 @pytest.mark.real_data
 def test_regions_and_picture_of_real_files(real_file):
     spots = _open(real_file("gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg"))
-    assert [each["label"] for each in json.loads(spots.attrs["measurement_regions"])] == ["Sp1", "Sp2"]
+    assert [each["name"] for each in json.loads(spots.attrs["measurement_regions"])] == ["Sp1", "Sp2"]
     picture = _open(real_file("frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg")).flir.visible_light()
     assert picture.dims == ("visible_row", "visible_column", "channel") and picture.shape == (480, 640, 3)
     assert picture.attrs["offset_px"] == [10, -20]
