@@ -205,7 +205,7 @@ def _evaluate_thermograms(run: Run, alone: CameraInputs) -> xr.Dataset:
     table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
     claim(run.folder, _TABLE)
     run.products.append(write_text(run.folder / _TABLE, table.to_dataframe().reset_index().to_csv(index=False)))
-    run.draw(partial(_draw, "thermograms", thermograms))
+    run.draw(partial(_draw, "pictures", thermograms, run.parts["thermograms"]["series"]))
     return thermograms
 
 

@@ -80,9 +80,17 @@ def add_names(drawn: figure, x: Any, y: Any, names: Any, **options: Any) -> None
     )  # fmt: skip
 
 
-def draw_picture(values: np.ndarray, low: float, high: float, label: str, *, colours: str = SEQUENTIAL) -> figure:
-    """Draw a picture in sensor pixels, row 0 at the top, with the scale of its values; NaN stay grey."""
-    rows, columns = values.shape
+def draw_picture(
+    values: np.ndarray,
+    low: float,
+    high: float,
+    label: str,
+    *,
+    colours: str = SEQUENTIAL,
+    size: tuple[int, ...] | None = None,
+) -> figure:
+    """Draw a picture in sensor pixels, of which there are `size`, row 0 at the top, with the scale of its values; NaN stay grey."""
+    rows, columns = size or values.shape
     mapper = LinearColorMapper(palette(colours), low=low, high=high, nan_color="#e1e5e7")
     ranges: dict[str, Any] = {"x_range": (-0.5, columns - 0.5), "y_range": (rows - 0.5, -0.5)}
     drawn = new_figure(x="column / px", y="row / px", height=380, **ranges)

@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import numpy as np
+import skimage.measure
 import xarray as xr
 from bokeh.plotting import figure
 
@@ -17,6 +18,8 @@ from fusion.report.numbers import fixed
 MOST_LINES = 8
 #: Share of the pixels that lie beyond the colour scale of a picture at either end, so that single ones do not set it.
 _BEYOND = 0.1
+#: Most pixels of a picture that is drawn, and of one whose values the reader can download; larger ones are averaged in blocks.
+_DRAWN, _DOWNLOADED = 400_000, 40_000
 #: Units of a time axis: from how many seconds, unit, seconds.
 _TIMES = ((7200.0, "h", 3600.0), (120.0, "min", 60.0), (0.0, "s", 1.0))
 
@@ -36,11 +39,14 @@ def plot_thermogram(thermograms: xr.Dataset) -> Chart:
     """Draw the hottest picture with its regions and the places of its extremes."""
     values, flag = thermograms["thermogram"].values, thermograms["flag"].values
     low, high = (float(value) for value in np.nanpercentile(values, (_BEYOND, 100.0 - _BEYOND)))
-    drawn = draw_picture(values, low, high if high > low else low + 1.0, "temperature / °C")
+    drawn = _draw(values, low, high if high > low else low + 1.0, "temperature / °C")
     for outline in json.loads(thermograms.attrs["outlines"]):
         _draw_outline(drawn, outline)
     places = {}
-    for name, marker, at in (("highest", "triangle", np.nanargmax(values)), ("lowest", "inverted_triangle", np.nanargmin(values))):
+    for name, marker, at in (
+        ("highest", "triangle", np.nanargmax(values)),
+        ("lowest", "inverted_triangle", np.nanargmin(values)),
+    ):
         row, column = np.unravel_index(int(at), values.shape)
         places[name] = f"{fixed(float(values[row, column]), 1)} °C at column {column}, row {row}"
         add_marks(drawn, [float(column)], [float(row)], marker, 9)
@@ -49,9 +55,25 @@ def plot_thermogram(thermograms: xr.Dataset) -> Chart:
         f"Thermogram {thermograms.attrs['hottest']} of {values.shape[1]} by {values.shape[0]} pixels: highest {places['highest']}, lowest "
         f"{places['lowest']}; {beyond} pixels outside the calibrated range."
     )
-    row, column = np.indices(values.shape)
-    columns = {"column / px": column.ravel(), "row / px": row.ravel(), "temperature / °C": values.ravel()}
-    return Chart(drawn, seen, {**columns, "outside the calibrated range": flag.ravel()})
+    return Chart(drawn, seen, _columns(values, "temperature / °C"))
+
+
+def _draw(values: np.ndarray, low: float, high: float, label: str, **looks: Any) -> figure:
+    """Draw a picture of any size with its places in pixels of the sensor."""
+    return draw_picture(_averaged(values, _DRAWN)[0], low, high, label, size=values.shape, **looks)
+
+
+def _averaged(values: np.ndarray, most: int) -> tuple[np.ndarray, int]:
+    """Return a picture of so many pixels at most, each the mean of a block, and the side of a block."""
+    block = int(np.ceil(np.sqrt(values.size / most)))
+    return skimage.measure.block_reduce(values, (block, block), np.nanmean, cval=np.nan) if block > 1 else values, block
+
+
+def _columns(values: np.ndarray, label: str) -> dict[str, np.ndarray]:
+    """Return what the reader can download of a picture, one row per pixel or block."""
+    means, block = _averaged(values, _DOWNLOADED)
+    row, column = block * np.indices(means.shape) + (block - 1) / 2
+    return {"column / px": column.ravel(), "row / px": row.ravel(), label: means.ravel()}
 
 
 def _draw_outline(drawn: figure, outline: dict[str, Any]) -> None:
@@ -99,7 +121,6 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
 def plot_difference(values: np.ndarray) -> Chart:
     """Draw the last picture minus the first."""
     most = float(np.nanpercentile(np.abs(values), 100.0 - _BEYOND)) or 1.0
-    drawn = draw_picture(values, -most, most, "change / K", colours=DIVERGING)
-    row, column = np.indices(values.shape)
-    columns = {"column / px": column.ravel(), "row / px": row.ravel(), "change / K": values.ravel()}
-    return Chart(drawn, f"Change of every pixel from the first picture to the last: {span_words(values, 'K')}.", columns)
+    drawn = _draw(values, -most, most, "change / K", colours=DIVERGING)
+    seen = f"Change of every pixel from the first picture to the last: {span_words(values, 'K')}."
+    return Chart(drawn, seen, _columns(values, "change / K"))
