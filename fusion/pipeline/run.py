@@ -53,6 +53,7 @@ from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
+from thermography.fields.cycle_fields import plan_unit
 
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
@@ -333,7 +334,8 @@ def _find_hotspots(
     """Wait for the correlation, which tests the hotspots; describe them where there is none."""
     if correlation is not None:
         return correlation()
-    run.parts["hotspots"] = attribution.describe_hotspots(fields)
+    shift_px = run.parts["thermograms"]["largest_shift_px"] if plan_unit(fields) == "px" else None
+    run.parts["hotspots"] = attribution.describe_hotspots(fields, shift_px or 0.0)
     return None
 
 

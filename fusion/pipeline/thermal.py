@@ -285,7 +285,7 @@ _NO_SURROUNDINGS_IN_A_PICTURE = Notice(
     "camera_unchecked",
     "The whole picture is the plan, so that there are no surroundings to show steps and drift of the camera's zero, which look like a "
     "rise of the whole picture.",
-    'State the drift as thermography.camera_drift_u = "0.2 K", or give a plan in mm that leaves a margin of the picture.',
+    'State the drift, for example thermography.camera_drift_u = "0.2 K".',
 )
 
 

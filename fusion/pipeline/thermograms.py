@@ -60,14 +60,16 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         every = evaluate_regions(frames, parameters=override, inputs=inputs)
         if stated and of_series in ("", name):
             more = evaluate_regions(frames, stated, parameters=override, inputs=inputs)
-            every = xr.concat([every, more.isel(region=slice(1, None))], "region", data_vars="all", coords="different")
+            every = xr.concat([every, more.isel(region=slice(1, None))], "region", coords="minimal", compat="override")
         files = [relative_name(Path(str(file)), folder) for file in every["source"].values]
         of_camera = np.full(len(files), name, object)
         tables.append(every.assign_coords(camera=("time", of_camera), source=("time", np.array(files, object))))
         count(len(frames))
     rejected = [one for each in tables for one in json.loads(each.attrs["rejected"])]
     kinds = {str(region): str(kind) for each in tables for region, kind in each["kind"].to_series().items()}
-    table = xr.concat([each.drop_vars("kind") for each in tables], "time", join="outer", coords="minimal", compat="override")
+    table = xr.concat(
+        [each.drop_vars("kind") for each in tables], "time", join="outer", coords="minimal", compat="override"
+    )
     table = table.sel(region=list(kinds)).assign_coords(kind=("region", np.array(list(kinds.values()), object)))
     hottest = _hottest(source, table, of_series)
     shown = thermogram(hottest, override(hottest))
@@ -100,7 +102,11 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     if visible is not None:
         dataset["visible"] = (("visible_row", "visible_column", "channel"), _reduced(visible.pixels))
     dataset.attrs["rejected"] = json.dumps(rejected).replace(f"{folder}/", "")
-    return Outcome(dataset, {"thermograms": part, "regions": [part for each in tables for part in _region_parts(each)]}, tuple(notices))
+    return Outcome(
+        dataset,
+        {"thermograms": part, "regions": [part for each in tables for part in _region_parts(each)]},
+        tuple(notices),
+    )
 
 
 def _stated_regions(source: CameraInputs, override: Overrides) -> list[Region]:

@@ -504,6 +504,7 @@ def describe_campaign(
     """Return the facts of a campaign that the templates of its report state."""
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
     figures = figures_of(results)
+    doubts = results.inputs.doubts if results.inputs else ()
     laser = None if deviations is None else _laser(deviations)
     loop = None
     if isinstance(results.loop, AxisLoop):
@@ -522,7 +523,8 @@ def describe_campaign(
         "figures": figures,
         "verdict": results.loop.verdict if results.loop else "",
         "headline": headline(results),
-        "doubts": results.inputs.doubts if results.inputs else (),
+        # What a camera that measures alone shows beyond its range is counted with its temperatures.
+        "doubts": [one for one in doubts if results.thermograms is None or one.code != "camera_range"],
         "untouched": untouched(results.inputs, figures),
         "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
         "answers": conclude(results),

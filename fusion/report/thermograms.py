@@ -105,7 +105,7 @@ def _table_of_pictures(thermograms: xr.Dataset, zone: str | None) -> Table:
         values = [fixed(float(values[at]), 1) for values in columns]
         values[0] = f"> {values[0]}" if beyond[at] else values[0]
         picture = f"{files[at]} #{frames[at]}" if several else str(files[at])
-        rows.append([picture, "–" if np.isnat(time) else moment(time, zone), *values])
+        rows.append([picture, moment(time, zone, seconds=True), *values])
     titles = [Words("Picture"), Words("Time"), *(f"{name} / °C" for name in ("Highest", "Lowest", "Mean", *regions))]
     return table(titles, rows)
 

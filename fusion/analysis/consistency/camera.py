@@ -211,7 +211,7 @@ def _range(frames: Sequence[Frame]) -> Check:
         outside,
         _OUTSIDE_SHARE,
         f"Up to {100.0 * outside:.0f} % of the pixels of a frame are outside the range in which the camera is calibrated.",
-        "Select the range of the camera that holds the temperatures of the table.",
+        "Select the range of the camera that holds these temperatures.",
     )
 
 

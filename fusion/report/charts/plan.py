@@ -87,14 +87,16 @@ def draw_picture(
     label: str,
     *,
     colours: str = SEQUENTIAL,
-    size: tuple[int, ...] | None = None,
+    block: int = 1,
 ) -> figure:
-    """Draw a picture in sensor pixels, of which there are `size`, row 0 at the top, with the scale of its values; NaN stay grey."""
-    rows, columns = size or values.shape
+    """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey."""
+    rows, columns = (block * size for size in values.shape)
     mapper = LinearColorMapper(palette(colours), low=low, high=high, nan_color="#e1e5e7")
     ranges: dict[str, Any] = {"x_range": (-0.5, columns - 0.5), "y_range": (rows - 0.5, -0.5)}
-    drawn = new_figure(x="column / px", y="row / px", height=380, **ranges)
-    drawn.match_aspect = True
+    # The width that axis and scale take beside the picture, and the height of the axis below it.
+    width, beside, below = 520, 120, 55
+    drawn = new_figure(x="column / px", y="row / px", height=round((width - beside) * rows / columns) + below, **ranges)
+    drawn.update(width=width, sizing_mode="scale_width")
     drawn.grid.grid_line_color = None
     rounded = np.round(values * _STEP_PER_K) / _STEP_PER_K
     place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}

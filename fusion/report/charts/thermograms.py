@@ -6,13 +6,13 @@ import json
 from typing import Any
 
 import numpy as np
-import skimage.measure
 import xarray as xr
 from bokeh.plotting import figure
 
 from fusion.report.charts.plan import add_marks, add_names, draw_picture
 from fusion.report.charts.style import DIVERGING, Chart, add_series, new_figure, of_rank, span_words
 from fusion.report.numbers import fixed
+from interferometry.plots import INK
 
 #: Regions that are drawn over time: more lines cannot be told apart.
 MOST_LINES = 8
@@ -60,13 +60,16 @@ def plot_thermogram(thermograms: xr.Dataset) -> Chart:
 
 def _draw(values: np.ndarray, low: float, high: float, label: str, **looks: Any) -> figure:
     """Draw a picture of any size with its places in pixels of the sensor."""
-    return draw_picture(_averaged(values, _DRAWN)[0], low, high, label, size=values.shape, **looks)
+    means, block = _averaged(values, _DRAWN)
+    return draw_picture(means, low, high, label, block=block, **looks)
 
 
 def _averaged(values: np.ndarray, most: int) -> tuple[np.ndarray, int]:
     """Return a picture of so many pixels at most, each the mean of a block, and the side of a block."""
     block = int(np.ceil(np.sqrt(values.size / most)))
-    return skimage.measure.block_reduce(values, (block, block), np.nanmean, cval=np.nan) if block > 1 else values, block
+    rows, columns = (size // block for size in values.shape)
+    whole = values[: rows * block, : columns * block]
+    return whole.reshape(rows, block, columns, block).mean(axis=(1, 3)), block
 
 
 def _columns(values: np.ndarray, label: str) -> dict[str, np.ndarray]:
@@ -92,9 +95,11 @@ def _draw_outline(drawn: figure, outline: dict[str, Any]) -> None:
     if outline["kind"] in ("box", "polygon"):
         points = np.vstack([points, points[:1]])
     if len(points) > 1:
-        for colour, width in (("#1f2a30", 4), ("#ffffff", 1.6)):
+        for colour, width in ((INK, 4), ("#ffffff", 1.6)):
             drawn.line(points[:, 0], points[:, 1], line_color=colour, line_width=width)
-    add_names(drawn, [right], [top], [outline["name"]], x_offset=6, y_offset=-4)
+    inside = right < 0.85 * drawn.x_range.end
+    offset, align = (6, "left") if inside else (-6, "right")
+    add_names(drawn, [right], [top], [outline["name"]], x_offset=offset, y_offset=-4, text_align=align)
 
 
 def plot_regions(thermograms: xr.Dataset) -> Chart:
