@@ -171,7 +171,7 @@ def usual_window_s(times: NDArray[np.datetime64]) -> float:
     if times.size > _MOST_WINDOWS:
         return next((window for window in _WINDOWS_S if window >= length_s / _MOST_WINDOWS), _WINDOWS_S[-1])
     between_s = float(np.median(np.diff(times) / np.timedelta64(1, "s"))) if times.size > 1 else _WINDOWS_S[-1]
-    return next((window for window in reversed(_WINDOWS_S) if window <= between_s), _WINDOWS_S[0])
+    return next((window for window in reversed(_WINDOWS_S) if window <= between_s), between_s)
 
 
 @dataclass(frozen=True, kw_only=True)

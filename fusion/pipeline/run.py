@@ -54,6 +54,7 @@ from fusion.results.progress import Report, silent
 from fusion.results.results import Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
 from thermography.fields.cycle_fields import plan_unit
+from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
@@ -416,7 +417,7 @@ RUN: Mapping[str, Callable[..., Any]] = {
 
 def _without_frames(source: Any) -> Any:
     """Return inputs as another process needs them where it reads no frame: there may be very many."""
-    return replace(source, frames=(), pictures=()) if isinstance(source, Source) else source
+    return replace(source, frames=(), pictures=FrameList([])) if isinstance(source, Source) else source
 
 
 def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:

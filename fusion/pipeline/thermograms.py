@@ -253,7 +253,7 @@ def _region_parts(table: xr.Dataset) -> Iterator[dict[str, Any]]:
 def _extreme(one: xr.Dataset, name: str, at: Any) -> dict[str, Any]:
     """The highest or lowest temperature of a region over its pictures, with picture and place."""
     there = one.isel(time=int(at))
-    time = there["time"].values
+    time = np.datetime64(there["time"].item(), "ns")
     return {
         f"{name}_degC": {"value": float(there[name]), "u": float(there[f"{name}_u"])},
         f"{name}_at": {

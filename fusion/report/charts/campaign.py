@@ -44,7 +44,7 @@ def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
     """Draw all charts of a campaign's report."""
     fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
     drawn = draw_measured(fields, deviations, None if fused is None else fused.to_dataset())
-    if "thermograms" in datasets:
+    if results.thermograms is not None and "thermograms" in datasets:
         drawn = drawn.with_more(draw_pictures(datasets["thermograms"], results.thermograms.series))
     correlation = results.correlation
     if fused is not None and correlation is not None and "correlation" in fused.children:
