@@ -217,12 +217,18 @@ FIELDS = {
 }
 
 
+def is_picture(campaign: CampaignText) -> bool:
+    """Whether the picture itself is the plan, which has no size in mm."""
+    return campaign.value("plan", "registration") == "pixels" or campaign.value("plan") is None
+
+
 def read_fields(campaign: CampaignText) -> dict[str, str]:
     """Return the fields of a campaign file with their present texts, empty where nothing is written."""
     return {
         name: _shown(campaign.value(*field.table, field.key), field)
         for name, field in FIELDS.items()
         if field.table == _REPORT or campaign.value(*field.table) is not None
+        if field.table != _PLAN or not is_picture(campaign)
     }
 
 
