@@ -53,6 +53,17 @@ class ExportFormat(StrEnum):
     renishaw = "renishaw"
 
 
+class FrameFormat(StrEnum):
+    """What `inspect` can write of thermal frames."""
+
+    png = "png"
+    tiff = "tiff"
+    csv = "csv"
+    gif = "gif"
+    mp4 = "mp4"
+    table = "table"
+
+
 #: Arguments and options that several commands have.
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
 ResultsFolder = Annotated[Path, Argument(metavar="RESULTS", help="Results folder of a run.")]
@@ -438,7 +449,14 @@ def inspect(
             help="Any file that a run reads or its address (s3://, https://), or folders of them.",
         ),
     ],
-    thumbnails: Annotated[Path | None, Option(help="Folder for a small PNG of every thermal file.")] = None,
+    export: Annotated[Path | None, Option(help="Folder for the thermal frames as pictures and tables.")] = None,
+    formats: Annotated[
+        list[FrameFormat] | None,
+        Option(
+            "--as",
+            help="png with scale, tiff or csv of the temperatures, a film, the table of regions; left out: png and table.",
+        ),
+    ] = None,
     as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print faults and warnings only.")] = False,
 ) -> None:
@@ -446,7 +464,7 @@ def inspect(
 
     A series of frames is summed up. A file that cannot be used is named and does not stop the others; the exit code is then 2.
     """
-    from fusion.pipeline.inspect import inspect_paths, write_thumbnails
+    from fusion.pipeline.inspect import inspect_paths, write_frames
 
     with _answering():
         looked_into = []
@@ -460,9 +478,9 @@ def inspect(
             looked_into.append(one)
             if not as_json:
                 _print_lines(map(with_address, one.shown(quiet=quiet)))
-        if thumbnails is not None:
-            pictures = [f"  thumbnail: {picture}" for picture in write_thumbnails(places, thumbnails)]
-            _print_lines([] if quiet or as_json else pictures)
+        if export is not None:
+            written = [f"  {line}" for line in write_frames(places, export, formats or ["png", "table"])]
+            _print_lines([] if quiet or as_json else written)
         if as_json:
             print_json({"files": [one.as_json() for one in looked_into]}, with_address)
         if any(one.fails for one in looked_into):

@@ -16,6 +16,7 @@ from .io.flir_writer import write_jpeg, write_sequence
 from .io.frame import CameraParameters
 from .io.other_cameras import StackOptions, index_recordings
 from .io.region import Region
+from .pictures import draw_thermogram, export_frames
 from .plots import plot_field
 from .radiometry.planck import calibrate
 from .radiometry.uncertainty import temperature_uncertainty
@@ -31,7 +32,9 @@ __all__ = [
     "calibrate",
     "count_temperatures",
     "detect_hotspots",
+    "draw_thermogram",
     "evaluate_regions",
+    "export_frames",
     "find_isotherm",
     "index_frames",
     "index_recordings",

@@ -8,18 +8,18 @@ limits in counts do, so that it does not depend on the emissivity.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from thermography.common import Array, ThermographyError
 from thermography.io.flir import FlirFrameReference, read_measurement_regions
-from thermography.io.frame import CameraParameters, Frame, FrameHeader, FrameReference, RejectedFrame
+from thermography.io.frame import CameraIdentity, CameraParameters, Frame, FrameHeader, FrameReference, RejectedFrame
 from thermography.io.other_cameras import TemperatureFrame
 from thermography.io.region import Region
 from thermography.io.sequence import call_by_threads, frame_times, usable_threads
@@ -39,6 +39,12 @@ from thermography.radiometry.uncertainty import (
     temperature_uncertainty,
 )
 
+if TYPE_CHECKING:
+    import xarray as xr
+
+#: Models that FLIR sells with and without calibration; R stands in the name of those that are calibrated (Vue Pro R, Duo Pro R,
+#: Vue TZ20-R). The others write the same files with constants that are no calibration.
+_NOT_RADIOMETRIC = re.compile(r"(?:FLIR )?(?:Vue|Duo)\b(?!.*\bR\b)", re.IGNORECASE)
 #: Name of the first region of every evaluation.
 WHOLE_PICTURE = "whole picture"
 #: Values of ``flag`` of a thermogram.
@@ -69,7 +75,14 @@ _VARIABLES = {
     "overrange": {"long_name": "pixels above the calibrated range", **_PIXELS},
     "underrange": {"long_name": "pixels below the calibrated range", **_PIXELS},
     "emissivity": {"long_name": "emissivity", "units": "1"},
+    "difference": {"long_name": "mean temperature minus that of the reference region", **_KELVIN},
+    "difference_u": {"long_name": "standard uncertainty of the difference", **_KELVIN},
 }
+
+
+def measures_temperature(camera: CameraIdentity) -> bool:
+    """Return whether the model of a camera is one that its maker calibrates, as far as the model tells."""
+    return not _NOT_RADIOMETRIC.match(camera.model)
 
 
 class CountRange(NamedTuple):
@@ -82,11 +95,11 @@ class CountRange(NamedTuple):
 def calibrated_counts(frame: FrameHeader) -> CountRange:
     """Return the counts between which a frame is calibrated: those of its range on a black body, without saturated ones."""
     limits, p = frame.limits, frame.parameters
-    low, high = limits.raw_minimum + 1.0, (limits.raw_maximum or 65_535) - 1.0
-    if limits.maximum_K > limits.minimum_K > 0 and min(p.planck_r1, p.planck_b, p.planck_r2) > 0:
-        bounds = black_body_signal(np.array([limits.minimum_K, limits.maximum_K]), p)
-        low, high = max(low, float(bounds[0])), min(high, float(bounds[1]))
-    return CountRange(low, high)
+    if limits.in_kelvin and min(p.planck_r1, p.planck_b, p.planck_r2) > 0:
+        with np.errstate(all="ignore"):  # of damaged constants
+            low, high = black_body_signal(np.array([limits.minimum_K, limits.maximum_K]), p).tolist()
+        return CountRange(max(low, 1.0), min(high, 65_534.0))
+    return CountRange(limits.raw_minimum + 1.0, (limits.raw_maximum or 65_535) - 1.0)
 
 
 def share_outside_range(frame: Frame) -> float:
@@ -170,6 +183,8 @@ def thermogram(frame: Frame | FrameReference, parameters: CameraParameters | Non
     >>> int((hot["flag"] == 1).sum())  # doctest: +SKIP
     92
     """
+    import xarray as xr
+
     picture = _read(frame, parameters)
     celsius, (low, high) = picture.temperature(picture.signal), picture.calibrated
     flag = np.where(picture.signal > high, OVERRANGE, 0) + np.where(
@@ -302,9 +317,10 @@ def evaluate_regions(
         uncertainties ``maximum_u``, ``minimum_u``, ``mean_u``, K; ``standard_deviation`` of the pixels, K; ``maximum_column``,
         ``maximum_row``, ``minimum_column``, ``minimum_row``, px; ``pixels``, and of these ``overrange`` and ``underrange``;
         ``emissivity``. Where ``overrange`` is not 0 the maximum is the limit of the calibrated range, "at least", and has no
-        uncertainty (NaN); ``underrange`` and the minimum likewise. A region that a frame does not store is NaN with 0 pixels. Coordinates
-        ``time`` (UTC), ``source``, ``frame`` and ``camera`` along ``time``, ``kind`` along ``region``; the attribute ``rejected`` lists
-        as JSON the frames whose pixels could not be read and that are left out.
+        uncertainty (NaN); ``underrange`` and the minimum likewise. Frames of models that are not calibrated have none either. A region
+        that a frame does not store is NaN with 0 pixels. Coordinates ``time`` (UTC), ``source``, ``frame`` and ``camera`` along
+        ``time``, ``kind`` along ``region``; the attribute ``rejected`` lists as JSON the frames whose pixels could not be read and that
+        are left out.
 
     Raises
     ------
@@ -325,13 +341,78 @@ def evaluate_regions(
     >>> float(course["maximum"].sel(region="bearing").max())  # doctest: +SKIP
     63.2
     """
+    return tabulate_regions(
+        frames, regions, parameters=parameters, inputs=inputs, reference=reference, progress=progress
+    ).to_dataset()
+
+
+@dataclass(frozen=True, eq=False)
+class RegionTable:
+    """What `evaluate_regions` finds, as arrays.
+
+    Attributes
+    ----------
+    headers : list of FrameReference
+        Of the frames that were read, (time,).
+    kinds : dict of str to str
+        Regions by name, (region,), and their kinds.
+    columns : dict of str to (time, region) ndarray
+        Variables of the Dataset.
+    rejected : list of RejectedFrame
+        Frames whose pixels could not be read.
+    """
+
+    headers: list[FrameReference]
+    kinds: dict[str, str]
+    columns: dict[str, Array]
+    rejected: list[RejectedFrame]
+    reference: str | None = None
+
+    @property
+    def cameras(self) -> list[str]:
+        """Model and serial number of the camera of every frame."""
+        return [" ".join(filter(None, (frame.camera.model, frame.camera.serial))) for frame in self.headers]
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return it as a Dataset."""
+        import xarray as xr
+
+        left_out = [{"path": str(one.path), "index": one.index, "reason": one.reason} for one in self.rejected]
+        time = {"standard_name": "time", "units_metadata": "leap_seconds: utc"}
+        return xr.Dataset(
+            {name: (("time", "region"), values, _VARIABLES[name]) for name, values in self.columns.items()},
+            coords={
+                "time": ("time", frame_times(self.headers), time),
+                "region": ("region", np.array(list(self.kinds), object)),
+                "kind": ("region", np.array(list(self.kinds.values()), object)),
+                "source": ("time", np.array([str(frame.path) for frame in self.headers], object)),
+                "frame": ("time", np.array([frame.index for frame in self.headers])),
+                "camera": ("time", np.array(self.cameras, object)),
+            },
+            attrs={
+                "Conventions": "CF-1.11",
+                "rejected": json.dumps(left_out),
+                **({"reference": self.reference} if self.reference else {}),
+            },
+        )
+
+
+def tabulate_regions(
+    frames: Sequence[FrameReference],
+    regions: Sequence[Region] | None = None,
+    *,
+    parameters: Callable[[FrameReference], CameraParameters] | None = None,
+    inputs: InputUncertainty | None = None,
+    reference: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> RegionTable:
+    """Evaluate regions as `evaluate_regions` does, without loading xarray."""
     if regions is not None and len({each.name for each in regions} | {WHOLE_PICTURE}) < len(regions) + 1:
         raise ThermographyError(
             f"regions {', '.join(each.name for each in regions)}: give each its own name, none {WHOLE_PICTURE!r}"
         )
-    kinds = {WHOLE_PICTURE: "box", **{each.name: each.kind for each in regions or ()}}
 
-    def evaluate(frame: FrameReference) -> dict[str, _Row] | RejectedFrame:
+    def evaluate(frame: FrameReference) -> dict[str, tuple[str, _Row]] | RejectedFrame:
         try:
             picture = _read(frame, parameters(frame) if parameters else None)
             chosen = stored_regions(frame) if regions is None else regions
@@ -339,53 +420,40 @@ def evaluate_regions(
             return RejectedFrame(frame.path, frame.index, f"{frame.path}: frame {frame.index}: {error}")
         except (OSError, ThermographyError) as error:
             return RejectedFrame(frame.path, frame.index, str(error))
-        kinds.update({each.name: each.kind for each in chosen})
-        return {WHOLE_PICTURE: _statistics(picture, None), **{each.name: _statistics(picture, each) for each in chosen}}
+        return {WHOLE_PICTURE: ("box", _statistics(picture, None))} | {
+            each.name: (each.kind, _statistics(picture, each)) for each in chosen
+        }
 
-    found: list[dict[str, _Row] | RejectedFrame] = []
-    for each in call_by_threads(evaluate, frames, usable_threads()):
-        found.append(each)
+    table: list[dict[str, tuple[str, _Row]]] = []
+    headers: list[FrameReference] = []
+    rejected: list[RejectedFrame] = []
+    for frame, found in zip(frames, call_by_threads(evaluate, frames, usable_threads()), strict=True):
+        if isinstance(found, RejectedFrame):
+            rejected.append(found)
+        else:
+            headers.append(frame)
+            table.append(found)
         if progress:
-            progress(len(found), len(frames))
-    rejected = [each for each in found if isinstance(each, RejectedFrame)]
-    read = [i for i, each in enumerate(found) if not isinstance(each, RejectedFrame)]
-    if not read:
+            progress(len(headers) + len(rejected), len(frames))
+    if not table:
         raise ThermographyError(rejected[0].reason if rejected else "there is no frame to evaluate")
-    names = list(kinds)
-    if reference is not None and reference not in names:
-        raise ThermographyError(f"reference = {reference!r}: there are the regions {', '.join(names)}")
-    table = [[each.get(name, _NO_ROW) for name in names] for each in found if not isinstance(each, RejectedFrame)]
+    kinds = {name: kind for row in table for name, (kind, _) in row.items()}
+    if reference is not None and reference not in kinds:
+        raise ThermographyError(f"reference = {reference!r}: there are the regions {', '.join(kinds)}")
+    nothing = ("", _NO_ROW)
     columns = {
-        name: np.array([[getattr(one, name) for one in row] for row in table], float if name in _FLOATS else np.int32)
+        name: np.array(
+            [[getattr(row.get(region, nothing)[1], name) for region in kinds] for row in table],
+            float if name in _FLOATS else np.int32,
+        )
         for name in _Row._fields
     }
-    evaluated = [frames[i] for i in read]
-    used = [parameters(frame) if parameters else frame.parameters for frame in evaluated]
-    columns |= _uncertainties(
-        columns, used, inputs or InputUncertainty(), names.index(reference) if reference else None
-    )
-    dims = ("time", "region")
-    return xr.Dataset(
-        {name: (dims, values, _VARIABLES.get(name, _KELVIN)) for name, values in columns.items()},
-        coords={
-            "time": ("time", frame_times(evaluated), {"standard_name": "time", "units_metadata": "leap_seconds: utc"}),
-            "region": ("region", np.array(names, object)),
-            "kind": ("region", np.array([kinds[name] for name in names], object)),
-            "source": ("time", np.array([str(frame.path) for frame in evaluated], object)),
-            "frame": ("time", np.array([frame.index for frame in evaluated])),
-            "camera": (
-                "time",
-                np.array([" ".join(filter(None, (f.camera.model, f.camera.serial))) for f in evaluated], object),
-            ),
-        },
-        attrs={
-            "Conventions": "CF-1.11",
-            "rejected": json.dumps(
-                [{"path": str(one.path), "index": one.index, "reason": one.reason} for one in rejected]
-            ),
-            **({"reference": reference} if reference else {}),
-        },
-    )
+    used = [parameters(frame) if parameters else frame.parameters for frame in headers]
+    place = None if reference is None else list(kinds).index(reference)
+    columns |= _uncertainties(columns, used, inputs or InputUncertainty(), place)
+    for name in columns.keys() & {"maximum_u", "minimum_u", "mean_u", "difference_u"}:
+        columns[name][[not measures_temperature(frame.camera) for frame in headers]] = np.nan
+    return RegionTable(headers, kinds, columns, rejected, reference)
 
 
 _FLOATS = ("maximum", "minimum", "mean", "standard_deviation", "emissivity")
@@ -467,6 +535,8 @@ def read_profile(picture: xr.Dataset, line: Region) -> xr.DataArray:
     --------
     >>> across = read_profile(hot, Region("edge", "line", ((0, 10), (159, 10))))  # doctest: +SKIP
     """
+    import xarray as xr
+
     path = line.path() if line.kind == "line" else np.empty((0, 2), int)
     rows, columns = picture["temperature"].shape
     if line.kind != "line" or not ((path >= 0) & (path < (columns, rows))).all():
@@ -523,6 +593,8 @@ def count_temperatures(picture: xr.Dataset, region: Region | None = None, *, bin
     --------
     >>> count_temperatures(hot, bins=20).sum()  # doctest: +SKIP
     """
+    import xarray as xr
+
     values = _values(picture, region)
     counts, edges = np.histogram(values, bins)
     middles = ("temperature", (edges[:-1] + edges[1:]) / 2, _DEGC)

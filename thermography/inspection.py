@@ -8,30 +8,28 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from thermography.common import ThermographyError
-from thermography.evaluation import share_outside_range
-from thermography.io.flir import FlirFrameReference, FlirReader, index_frames, read_frame
-from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame
+from thermography.evaluation import RegionTable, measures_temperature, tabulate_regions
+from thermography.io.flir import FlirFrameReference, FlirReader, index_frames
+from thermography.io.frame import CalibratedRange, FlirFormatError, FrameReference, RejectedFrame
 from thermography.io.other_cameras import START_BYTES, StackOptions, TemperatureReader, find_reader, plug_ins
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
-    calibrate,
+    check_parameters,
+    counts_from_temperature,
     override,
     path_transmission,
     temperature_from_counts,
 )
 
-#: Maximum number of frames whose pixels are read, spread evenly over the file, so that long recordings are inspected quickly.
-_FRAMES_READ = 32
-#: Pixels that are read in all: 32 frames of the largest usual camera, 1024 x 1024.
-_PIXELS_READ = _FRAMES_READ << 20
+#: Most frames whose records are compared with their checksums, spread evenly over the file; that of the pixels is compared in all.
+_FRAMES_CHECKED = 32
 #: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
-_THUMBNAIL_WIDTH = 320
 #: Code of a warning -> what to do about it.
 _REMEDIES = {
     "frame_left_out": "Copy the file from the camera again if the frame matters.",
@@ -46,9 +44,9 @@ _REMEDIES = {
     "humidity_percent": "It was divided by 100.",
     "not_calibrated": "Only the counts can be used.",
     "checksum": "The file was changed after the camera wrote it; compare it with the original.",
-    "saturated": "Select another range in the camera.",
-    "under_range": "Select another range in the camera.",
-    "outside_range": "Their temperatures are not calibrated.",
+    "not_radiometric": "Use its counts for contrast only; FLIR's model with R in its name is calibrated.",
+    "overrange": "Select another range in the camera.",
+    "underrange": "Select another range in the camera.",
     "no_content": "The shutter was closed, or the frame is damaged.",
     "stored_transmission": "Give object_distance to calculate it instead.",
 }
@@ -73,10 +71,9 @@ class FlirInspection:
         Usable frames in order of time.
     rejected : tuple of RejectedFrame
         Frames that cannot be used, and why.
-    lowest_degC, highest_degC, mean_degC : float
-        Surface temperature over the frames that were read, degC; NaN where the parameters give no temperature.
-    frames_read : int
-        Number of frames whose pixels were read.
+    evaluation : RegionTable or None
+        Maximum, minimum and mean of every frame and of the regions that it stores, see
+        `thermography.evaluation.evaluate_regions`; None where the parameters give no temperature.
     warnings : tuple of FileWarning
         Everything that is implausible or damaged.
     """
@@ -84,10 +81,7 @@ class FlirInspection:
     path: Path
     frames: tuple[FrameReference, ...]
     rejected: tuple[RejectedFrame, ...]
-    lowest_degC: float
-    highest_degC: float
-    mean_degC: float
-    frames_read: int
+    evaluation: RegionTable | None
     warnings: tuple[FileWarning, ...]
 
     def __str__(self) -> str:
@@ -114,16 +108,16 @@ class FlirInspection:
             f"  camera {camera.model or 'unknown'}{serial}{lens}",
             f"  time {times} (camera set to {zone})",
             f"  emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
-            f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} degC, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} degC, "
+            f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
             f"relative humidity {p.relative_humidity:.0%}, window transmission {p.window_transmission:.3g}",
             f"  R1 {p.planck_r1:.9g}, B {p.planck_b:.7g}, F {p.planck_f:.7g}, O {p.planck_o:g}, R2 {p.planck_r2:.8g}",
-            f"  temperature {self.lowest_degC:.2f} to {self.highest_degC:.2f} degC, mean {self.mean_degC:.2f} degC "
-            f"({self.frames_read} of {len(self.frames)} frames read)",
+            f"  {describe_range(first.limits)}",
+            *(f"  {line}" for line in describe_evaluation(self.evaluation)),
         ]
         if rate_Hz := first.settings.frame_rate_Hz:
             lines.append(f"  frame rate {rate_Hz:g} Hz, focus {first.settings.focus_distance_m:.3g} m")
         if housekeeping:
-            lines.append(f"  inside the camera, degC: {housekeeping}")
+            lines.append(f"  inside the camera, °C: {housekeeping}")
         lines += [f"  note: {note}" for note in dict.fromkeys(note for frame in self.frames for note in frame.notes)]
         return lines + [f"  warning: {each.message} {each.remedy}" for each in self.warnings]
 
@@ -136,7 +130,7 @@ def is_flir_file(path: Path) -> bool:
 
 
 def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
-    """Read the headers of a FLIR file and the pixels of up to 32 frames, and check them for implausible or damaged content.
+    """Evaluate all frames of a FLIR file, and check them for implausible or damaged content.
 
     Parameters
     ----------
@@ -146,7 +140,7 @@ def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
     Returns
     -------
     FlirInspection
-        Frames, camera, parameters, temperature range (degC) and warnings; its method `lines` gives them as text.
+        Frames, camera, parameters, temperatures of the picture and of stored regions, and warnings; its method `lines` gives them as text.
 
     Raises
     ------
@@ -171,32 +165,107 @@ def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
     >>> with TemporaryDirectory() as folder:
     ...     write_jpeg(Path(folder, "a.jpg"), np.array([[18000, 18500]], np.uint16), sc660, "2026-03-09T06:33:47")
     ...     inspection = inspect_file(Path(folder, "a.jpg"))
-    >>> round(inspection.mean_degC, 2), inspection.warnings[0].message
+    >>> float(inspection.evaluation.columns["mean"][0, 0].round(2)), inspection.warnings[0].message
     (24.6, 'distance 0 m: the atmosphere is not corrected.')
     """
     path = Path(path)
     references, rejected = index_frames([path])
     if not references:
         raise FlirFormatError(rejected[0].reason)
-    count = max(1, min(_FRAMES_READ, _PIXELS_READ // int(references.shapes().prod(axis=1).max())))
-    chosen = np.unique(np.linspace(0, len(references) - 1, count).round().astype(int))
-    frames: list[Frame] = []
-    warnings: list[FileWarning] = []
-    for index in chosen:
-        try:
-            frames.append(references[index].read())
-            warnings += _check_checksums(references[index])
-        except FlirFormatError as error:
-            rejected.append(RejectedFrame(path, references[index].index, str(error)))
+    evaluation = None
+    try:
+        check_parameters(references[0].parameters)
+        evaluation = tabulate_regions(references)
+        rejected += evaluation.rejected
+    except RadiometryError:
+        pass  # `_check_parameters` names what is wrong
+    except ThermographyError as error:
+        rejected.append(RejectedFrame(path, 0, str(error)))
+    unread = {each.index for each in rejected}
+    checked = np.unique(np.linspace(0, len(references) - 1, _FRAMES_CHECKED).round().astype(int))
     warnings = [
         *(_warning("frame_left_out", f"{each.reason}.") for each in rejected),
         *_check_times(references),
         *_check_parameters(references, ()),
-        *warnings,
-        *_check_pixels(frames),
-        *(_check_transmission(frames[0]) if frames else ()),
+        *(one for i in checked if references[i].index not in unread for one in _check_checksums(references[i])),
+        *(_check_pixels(evaluation) if evaluation else ()),
+        *(_check_transmission(evaluation) if evaluation else ()),
     ]
-    return FlirInspection(path, tuple(references), tuple(rejected), *_range_degC(frames), len(frames), tuple(warnings))
+    return FlirInspection(path, tuple(references), tuple(rejected), evaluation, tuple(warnings))
+
+
+def describe_range(limits: CalibratedRange) -> str:
+    """Say within which readings of a black body a camera is calibrated."""
+    if not limits.in_kelvin:
+        return "calibrated range not stored"
+    low, high = (round(kelvin - ZERO_CELSIUS_K) for kelvin in (limits.minimum_K, limits.maximum_K))
+    return f"calibrated range {low} to {high} °C (readings of a black body)"
+
+
+def describe_evaluation(evaluation: RegionTable | None) -> list[str]:
+    """Say the highest, lowest and mean temperature of every region over all frames, camera by camera."""
+    if evaluation is None:
+        return ["temperature cannot be determined from the stored parameters"]
+    cameras = np.array(evaluation.cameras, object)
+    several = list(dict.fromkeys(cameras))
+    lines = []
+    for camera in several:
+        rows = np.flatnonzero(cameras == camera)
+        head = (
+            f"{camera or 'unknown camera'}, {len(rows)} {'frame' if len(rows) == 1 else 'frames'}: "
+            if len(several) > 1
+            else ""
+        )
+        for place, (name, kind) in enumerate(evaluation.kinds.items()):
+            shown = rows[evaluation.columns["pixels"][rows, place] > 0]
+            if not measures_temperature(evaluation.headers[rows[0]].camera):
+                lines.append(f"{head}{name}: no temperature is stated, because the camera is not calibrated")
+            elif shown.size:
+                lines.append(f"{head}{name}: {_describe_region(evaluation, shown, place, kind)}")
+    return [
+        *lines,
+        "u: standard uncertainty for a painted surface and a camera of ± 2 K or ± 2 %, as data sheets state it",
+    ]
+
+
+def _describe_region(evaluation: RegionTable, rows: NDArray[np.intp], place: int, kind: str) -> str:
+    """Say the extremes and the mean of one region in some frames."""
+    values = {name: column[rows, place] for name, column in evaluation.columns.items()}
+    # Of frames whose extreme is the limit of the range, the one with most pixels beyond it.
+    hottest = int(np.lexsort((-values["overrange"], -values["maximum"]))[0])
+    coldest = int(np.lexsort((-values["underrange"], values["minimum"]))[0])
+
+    def when(one: int) -> str:
+        if len(rows) == 1:
+            return ""
+        frame = evaluation.headers[rows[one]]
+        one_file = len({header.path for header in evaluation.headers}) == 1
+        time = "" if np.isnat(frame.time) else f", {np.datetime_as_string(frame.time, unit='s')} UTC"
+        return f" in {f'frame {frame.index}' if one_file else frame.path.name}{time}"
+
+    def extreme(name: str, one: int, word: str, beyond: str) -> str:
+        outside = int(values[beyond][one])
+        u = values[f"{name}_u"][one]
+        told = f"{values[name][one]:.1f} °C"
+        if outside:
+            told = f"{word} {told} ({outside} of {values['pixels'][one]} pixels {beyond})"
+        elif np.isfinite(u):
+            told += f" (u {u:.1f} K)"
+        return f"{told} at {values[f'{name}_column'][one]},{values[f'{name}_row'][one]}{when(one)}"
+
+    highest = extreme("maximum", hottest, "at least", "overrange")
+    if kind == "spot" and len(rows) == 1:
+        return highest
+    weights = values["pixels"] - values["overrange"] - values["underrange"]
+    inside = weights > 0
+    mean = (
+        f"{np.average(values['mean'][inside], weights=weights[inside]):.1f} °C"
+        if inside.any()
+        else "none within the range"
+    )
+    if len(rows) == 1 and inside.any():
+        mean += f" (u {values['mean_u'][0]:.1f} K), standard deviation {values['standard_deviation'][0]:.1f} K"
+    return f"maximum {highest}; minimum {extreme('minimum', coldest, 'at most', 'underrange')}; mean {mean}"
 
 
 def describe_stack(path: Path) -> list[str]:
@@ -225,31 +294,6 @@ def describe_stack(path: Path) -> list[str]:
     return lines + ([f"  state under [thermography.stack]: {'; '.join(missing)}"] if missing else [])
 
 
-def thumbnail(path: Path) -> bytes:
-    """Return a small picture of the first frame."""
-    counts = read_frame(path).counts.astype(np.float32)
-    low, high = np.percentile(counts, (1, 99))
-    grey = np.clip((counts - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
-    scale = min(1.0, _THUMBNAIL_WIDTH / grey.shape[1])
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".png", cv2.applyColorMap(small, cv2.COLORMAP_INFERNO))[1].tobytes()
-
-
-def _range_degC(frames: Sequence[Frame]) -> tuple[float, float, float]:
-    """Return lowest, highest and mean temperature, degC; NaN where no frame gives a temperature."""
-    ranges = []
-    for frame in frames:
-        with suppress(RadiometryError):
-            temperature = calibrate(frame.counts, frame.parameters)
-            valid = temperature[np.isfinite(temperature)]
-            if valid.size:
-                ranges.append((valid.min(), valid.max(), valid.mean(dtype=np.float64)))
-    if not ranges:
-        return (float("nan"),) * 3
-    low, high, mean = np.transpose(ranges)
-    return float(low.min()), float(high.max()), float(mean.mean())
-
-
 def _warning(code: str, message: str) -> FileWarning:
     return FileWarning(code, message, _REMEDIES[code])
 
@@ -258,12 +302,16 @@ def check_series(references: Sequence[FrameReference], *, overridden: Collection
     """Check the settings that the frames of one series store, without reading a pixel."""
     if not references:
         return []
-    cameras = [each for each in _check_times(references) if each.code in ("several_cameras", "several_lenses")]
+    cameras = [
+        each
+        for each in _check_times(references)
+        if each.code in ("several_cameras", "several_lenses", "not_radiometric")
+    ]
     return [*cameras, *_check_parameters(references, overridden)]
 
 
 def _check_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
-    """Warn about missing or implausible times, and about frames of several cameras or lenses."""
+    """Warn about missing or implausible times, about frames of several cameras or lenses, and of cameras that do not measure."""
     without = sum(bool(np.isnat(frame.time)) for frame in references)
     if without:
         yield _warning("no_time", f"{without} frames have no time.")
@@ -277,6 +325,8 @@ def _check_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
         yield _warning("several_cameras", f"the file holds frames of {len(cameras)} cameras.")
     elif len(lenses) > 1:
         yield _warning("several_lenses", f"the frames were taken through {len(lenses)} lenses.")
+    for model in sorted({each.model for each in identities if not measures_temperature(each)}):
+        yield _warning("not_radiometric", f"the {model} is not calibrated: its temperatures mean nothing.")
 
 
 def _check_parameters(references: Sequence[FrameReference], overridden: Collection[str]) -> Iterator[FileWarning]:
@@ -316,36 +366,31 @@ def _check_checksums(frame: FrameReference) -> Iterator[FileWarning]:
         yield _warning("checksum", f"frame {frame.index}: records {names} differ from their checksum.")
 
 
-def _check_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
-    """Warn about counts outside the calibrated range, and about frames of one constant value."""
-    above = [np.mean(frame.counts >= (frame.limits.raw_maximum or 65535)) for frame in frames]
-    below = [np.mean(frame.counts <= frame.limits.raw_minimum) for frame in frames]
-    for code, limit, shares in (
-        ("saturated", "at or above the upper", above),
-        ("under_range", "at or below the lower", below),
-    ):
-        if (most := max(shares, default=0)) > 0:
-            share = f"{most:.2%}" if most >= 1e-4 else f"{most:.1e}"
+def _check_pixels(evaluation: RegionTable) -> Iterator[FileWarning]:
+    """Warn about pixels outside the calibrated range, and about frames of one constant value."""
+    columns = {name: column[:, 0] for name, column in evaluation.columns.items()}
+    for code, side in (("overrange", "above"), ("underrange", "below")):
+        if (most := int(columns[code].argmax())) >= 0 and columns[code][most]:
+            frames = int(np.count_nonzero(columns[code]))
             yield _warning(
-                code, f"up to {share} of the pixels of a frame are {limit} limit of the calibrated range of the camera."
+                code,
+                f"in {frames} of {len(columns[code])} frames pixels are {side} the calibrated range, up to {columns[code][most]} of "
+                f"{columns['pixels'][most]}; they are in no mean, and an extreme among them is the limit of the range.",
             )
-    outside_share = max((share_outside_range(frame) for frame in frames), default=0.0)
-    if outside_share > 0:
-        low, high = (limit - ZERO_CELSIUS_K for limit in (frames[0].limits.minimum_K, frames[0].limits.maximum_K))
-        of_pixels = f"up to {outside_share:.2%} of the pixels of a frame are outside the calibrated range of "
-        yield _warning("outside_range", f"{of_pixels}{low:.0f} to {high:.0f} degC.")
-    if any(frame.counts.min() == frame.counts.max() for frame in frames):
+    inside = columns["pixels"] - columns["overrange"] - columns["underrange"]
+    if ((columns["maximum"] == columns["minimum"]) & (inside > 1)).any():
         yield _warning("no_content", "a frame has the same count in all pixels.")
 
 
-def _check_transmission(frame: Frame) -> Iterator[FileWarning]:
+def _check_transmission(evaluation: RegionTable) -> Iterator[FileWarning]:
     """Warn where the stored transmission disagrees with distance, humidity and air temperature, and quantify its effect."""
-    p, mean = frame.parameters, frame.counts.mean()
-    if p.stored_transmission <= 0:
+    p, stored = evaluation.headers[0].parameters, float(evaluation.columns["mean"][0, 0])
+    if p.stored_transmission <= 0 or not np.isfinite(stored):
         return
     with suppress(RadiometryError):
-        stored = float(temperature_from_counts(mean, p))
-        calculated = float(temperature_from_counts(mean, override(p, stored_transmission=0.0)))
+        calculated = float(
+            temperature_from_counts(counts_from_temperature(stored, p), override(p, stored_transmission=0.0))
+        )
         if abs(stored - calculated) > 0.01:
             yield _warning(
                 "stored_transmission",

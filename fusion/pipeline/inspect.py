@@ -20,15 +20,22 @@ from fusion.common import FusionError, TomlError, read_toml
 from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
 from fusion.results.progress import counted, left_out_notices, listed
-from fusion.results.store import OutputError, write_atomically
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
 from thermography.common import ThermographyError
-from thermography.inspection import check_series, describe_stack, inspect_file, is_flir_file, thumbnail
+from thermography.evaluation import tabulate_regions
+from thermography.inspection import (
+    check_series,
+    describe_evaluation,
+    describe_range,
+    describe_stack,
+    inspect_file,
+    is_flir_file,
+)
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
-from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader
-from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate
+from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader, name_unread
+from thermography.radiometry.planck import ZERO_CELSIUS_K
 from thermography.registration.plan import read_fiducials
 
 if TYPE_CHECKING:
@@ -97,6 +104,8 @@ def recognise(path: Path) -> Recognised:
     if reader is not None and not isinstance(reader, TextReader):
         reason = f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
         return Recognised(path, Kind.UNKNOWN, reason)
+    if reader is None and (what := name_unread(path)):
+        return Recognised(path, Kind.UNKNOWN, what)
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
@@ -531,19 +540,14 @@ def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
             yield _inspect_series(members, label=str(path.parent / f"*{path.suffix}"))
 
 
-def write_thumbnails(paths: Sequence[Path], folder: Path) -> Iterator[Path]:
-    """Write a small picture of the first frame of every thermal file as ``<file>.png``."""
-    written: set[str] = set()
-    for path in filter(is_thermal, _files(paths)):
-        try:
-            picture = thumbnail(path)
-        except ThermographyError:
-            continue
-        name = f"{path.name}.png" if f"{path.name}.png" not in written else f"{path.parent.name}_{path.name}.png"
-        if name not in written and (folder / name).exists():
-            raise OutputError(f"{folder / name} exists already; name another folder with --thumbnails, or remove it")
-        written.add(name)
-        yield write_atomically(folder / name, lambda part, picture=picture: part.write_bytes(picture))  # type: ignore[misc]
+def write_frames(paths: Sequence[Path], folder: Path, formats: Sequence[str]) -> Iterator[str]:
+    """Write the frames of all thermal files for other programs, see `thermography.pictures.export_frames`; say what was written."""
+    from thermography.pictures import export_frames  # loads xarray, which nothing else here needs
+
+    frames, rejected = index_frames([path for path in _files(paths) if is_thermal(path)])
+    if frames:
+        yield from (f"written: {path}" for path in export_frames(frames, folder, formats))
+    yield from (f"left out: {one.reason}" for one in rejected)
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
@@ -641,9 +645,6 @@ def _bar(
 
 # A series of thermal frames in about ten lines: one camera? gaps in time? the same settings? anything left out?
 
-#: Frames whose pixels are read, spread evenly over the series.
-_FRAMES_READ = 8
-
 
 def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
     """Return what a series of thermal files holds."""
@@ -656,8 +657,14 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
         f"  camera {_cameras(frames)}",
         *(f"  {line}" for line in _times(frames)),
         f"  settings {_settings(frames)}",
-        f"  temperature {_temperatures(frames)}",
+        *(f"  {describe_range(limits)}" for limits in dict.fromkeys(frame.limits for frame in frames)),
     ]
+    try:
+        evaluation = tabulate_regions(frames)
+        rejected += evaluation.rejected
+    except ThermographyError:
+        evaluation = None
+    lines += [f"  {line}" for line in describe_evaluation(evaluation)]
     if len({frame.shape for frame in frames}) > 1:
         lines.append("  warning: frames of several sizes; a run keeps those of the commonest")
     if rejected:
@@ -705,26 +712,9 @@ def _settings(frames: Sequence[FrameReference]) -> str:
     p = frames[0].parameters
     stored = (
         f"emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
-        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} degC, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} degC, "
+        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
         f"relative humidity {p.relative_humidity:.0%}"
     )
     names = [each.name for each in fields(CameraParameters)]
     varying = [name for name in names if len({getattr(frame.parameters, name) for frame in frames}) > 1]
     return f"{stored}: {'the same in all frames' if not varying else f'of the first frame; not the same in all: {join(varying)}'}"
-
-
-def _temperatures(frames: Sequence[FrameReference]) -> str:
-    """Say which temperatures a few frames show with their own parameters."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _FRAMES_READ).round().astype(int))
-    lows, highs = [], []
-    for frame in (frames[index] for index in chosen):
-        try:
-            values = calibrate(frame.read_counts(), frame.parameters)
-        except ThermographyError:
-            continue
-        if np.isfinite(values).any():
-            lows.append(float(np.nanmin(values)))
-            highs.append(float(np.nanmax(values)))
-    if not lows:
-        return "cannot be determined from the stored parameters"
-    return f"{min(lows):.2f} to {max(highs):.2f} degC in {counted(len(lows), 'frame')} spread over the series"

@@ -268,18 +268,11 @@ def test_simulate_writes_a_campaign_once(tmp_path: Path) -> None:
     assert invoke("simulate", recipe, "--out", tmp_path / "campaign").exit_code == 2
 
 
-def test_a_thumbnail_is_written_where_it_is_asked_for(campaign_folder: Path, tmp_path: Path) -> None:
-    import cv2
-
+def test_frames_are_exported_where_it_is_asked_for(campaign_folder: Path, tmp_path: Path) -> None:
     frame = sorted((campaign_folder / "thermal").iterdir())[0]
-    result = invoke("inspect", frame, campaign_folder / "laser.csv", "--thumbnails", tmp_path)
+    result = invoke("inspect", frame, campaign_folder / "laser.csv", "--export", tmp_path / "out")
     assert result.exit_code == 0, result.output
-    (picture,) = tmp_path.iterdir()
-    assert picture.name == f"{frame.name}.png"
-    image = cv2.imread(str(picture))
-    # 4 : 3 as the sensor, and not one colour.
-    assert image.shape[1] * 3 == image.shape[0] * 4
-    assert image.std() > 5
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"{frame.name}.png", "regions.csv"]
 
 
 def test_the_version_is_printed_alone() -> None:

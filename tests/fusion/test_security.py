@@ -78,6 +78,7 @@ def run(*arguments: str | Path) -> None:
     assert ended.exit_code == 0, ended.output
 
 
+@pytest.mark.slow
 def test_names_from_files_are_text_in_the_report(record_results: Path) -> None:
     page = (record_results / "report.html").read_text(encoding="utf-8")
     assert "&lt;script&gt;window.harmed=1" in page and "HYPERLINK" in page

@@ -97,7 +97,8 @@ class Usage:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory and open files are read from /proc")
-@pytest.mark.parametrize("cycles", [240, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cycles", [240, 10_000])
 def test_memory_files_and_time_per_cycle_stay_flat(
     cycles: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

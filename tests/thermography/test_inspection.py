@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,7 +18,7 @@ from tests.thermography.flir_mutations import (
     sequence,
 )
 from thermography.common import ThermographyError
-from thermography.inspection import describe_stack, inspect_file, is_flir_file, thumbnail
+from thermography.inspection import describe_stack, inspect_file, is_flir_file
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, FlirFormatError
 from thermography.radiometry.planck import override
@@ -38,24 +37,29 @@ def _write(path: Path, *, counts: np.ndarray | None = None, time: object = TIME,
 def test_an_intact_file_gives_its_content_and_no_warnings(tmp_path):
     sequence(tmp_path / "a.seq", frames=3)
     inspection = inspect_file(tmp_path / "a.seq")
-    assert inspection.warnings == () and len(inspection.frames) == inspection.frames_read == 3
-    assert 22 < inspection.lowest_degC < inspection.mean_degC < inspection.highest_degC < 28
+    whole = {name: values[:, 0] for name, values in inspection.evaluation.columns.items()}
+    assert inspection.warnings == () and len(inspection.frames) == len(whole["mean"]) == 3
+    assert 22 < whole["minimum"].min() < whole["mean"].mean() < whole["maximum"].max() < 28
     assert "FLIR, 3 frames of 16 x 12, samples raw" in inspection.lines()[0]
     for part in (
         "camera FLIR SC660, serial 404003980, lens FOL38",
         "time 2026-03-09T06:33:47.125 to 2026-03-09T06:33:49.125 UTC (camera set to +1 h)",
-        "emissivity 0.95, distance 1 m, reflected 20.00 degC, air 20.00 degC, relative humidity 50%, window transmission 1",
+        "emissivity 0.95, distance 1 m, reflected 20.00 °C, air 20.00 °C, relative humidity 50%, window transmission 1",
         "R1 21106.7695, B 1501, F 1, O -7340, R2 0.012545258",
-        "(3 of 3 frames read)",
-        "inside the camera, degC: TSLens 26.1, TSShutter 27.4",
+        "calibrated range -40 to 120 °C",
+        "whole picture: maximum ",
+        "inside the camera, °C: TSLens 26.1, TSShutter 27.4",
     ):
         assert part in str(inspection)
 
 
-def test_a_long_sequence_is_sampled(tmp_path):
-    sequence(tmp_path / "a.seq", frames=100)
-    inspection = inspect_file(tmp_path / "a.seq")
-    assert len(inspection.frames) == 100 and inspection.frames_read == 32
+def test_the_hottest_frame_of_a_long_sequence_is_found_and_told_with_its_time(tmp_path):
+    hot = frame(seconds=77).counts.copy()
+    hot[3, 5] += 2000
+    frames = (frame(seconds=n) if n != 77 else replace(frame(seconds=n), counts=hot) for n in range(100))
+    write_sequence(tmp_path / "a.seq", frames)
+    told = next(line for line in inspect_file(tmp_path / "a.seq").lines() if "whole picture" in line)
+    assert "at 5,3 in frame 77, 2026-03-09T06:35:04 UTC" in told
 
 
 @pytest.mark.parametrize(
@@ -83,12 +87,12 @@ def test_implausible_parameters_give_a_warning(tmp_path, parameters, code, messa
 def test_pixels_outside_the_calibrated_range_give_a_warning(tmp_path):
     hot = frame().counts.copy()
     hot[:3] = 60000
-    assert _codes(_write(tmp_path / "a.jpg", counts=hot)) == {"saturated", "outside_range"}
+    assert _codes(_write(tmp_path / "a.jpg", counts=hot)) == {"overrange"}
     cold = frame().counts.copy()
     cold[0, 0] = 8000
     warnings = inspect_file(_write(tmp_path / "b.jpg", counts=cold)).warnings
-    assert {each.code for each in warnings} == {"under_range", "outside_range"}
-    assert "up to 0.52% of the pixels of a frame are at or below the lower limit" in warnings[0].message
+    assert {each.code for each in warnings} == {"underrange"}
+    assert "below the calibrated range, up to 1 of 192;" in warnings[0].message
     silent = CalibratedRange(0.0, 0.0, 0, 0)
     assert _codes(_write(tmp_path / "c.jpg", counts=hot, limits=silent)) == set()
 
@@ -131,7 +135,7 @@ def test_damaged_pixels_are_not_shown(tmp_path):
     inspection = inspect_file(path)
     (warning,) = inspection.warnings
     assert warning.code == "frame_left_out" and "damaged samples" in warning.message
-    assert inspection.frames_read == 1
+    assert len(inspection.evaluation.headers) == 1
 
 
 def test_a_file_without_a_frame_raises(tmp_path):
@@ -147,14 +151,6 @@ def test_files_are_distinguished_by_their_first_bytes(tmp_path):
     assert [is_flir_file(tmp_path / name) for name in ("a.jpg", "a.seq", "laser.csv")] == [True, True, False]
 
 
-def test_thumbnail_is_a_small_picture(tmp_path):
-    jpeg(tmp_path / "a.jpg", rows=480, columns=640)
-    picture = cv2.imdecode(np.frombuffer(thumbnail(tmp_path / "a.jpg"), np.uint8), cv2.IMREAD_COLOR)
-    assert picture.shape == (240, 320, 3)
-    # Counts grow to the right, and so does the brightness of the colour map.
-    assert picture[:, -20:].mean() > picture[:, :20].mean() + 50
-
-
 def test_sensors_at_zero_degc_are_placeholders(tmp_path):
     each = replace(frame(), housekeeping={**HOUSEKEEPING, "Internal": 273.15})
     write_sequence(tmp_path / "a.seq", [each])
@@ -165,7 +161,7 @@ def test_sensors_at_zero_degc_are_placeholders(tmp_path):
 def test_real_files_give_the_warnings_of_their_known_faults(real_file):
     expected = {
         "gtatters__Thermimage/inst/extdata/IR_2412.jpg": set(),
-        "VladimirSinitsin__flir_extractor/bin/examples/frame.fff": {"clock_not_set", "outside_range"},
+        "VladimirSinitsin__flir_extractor/bin/examples/frame.fff": {"clock_not_set", "underrange"},
         "LJMUAstroecology__flirpy/test/test_data/test.seq": {"stored_transmission"},
         "LJMUAstroecology__flirpy/test/test_data/frame_000000_le.fff": {"distance_zero"},
         "SanNianYiSi__thermal_parser/images/DJI_XT2.jpg": {"stored_transmission", "emissivity"},
@@ -197,10 +193,13 @@ def test_what_no_camera_writes_is_told_and_not_made(tmp_path):
             describe_stack(tmp_path / "a.npy")
 
 
-def test_of_large_frames_fewer_are_read(tmp_path, monkeypatch):
-    write_sequence(tmp_path / "a.seq", (frame(6, 8, seconds=second) for second in range(5)))
-    assert inspect_file(tmp_path / "a.seq").frames_read == 5
-    monkeypatch.setattr("thermography.inspection._PIXELS_READ", 2 * 6 * 8)
-    assert inspect_file(tmp_path / "a.seq").frames_read == 2
-    monkeypatch.setattr("thermography.inspection._PIXELS_READ", 1)
-    assert inspect_file(tmp_path / "a.seq").frames_read == 1
+@pytest.mark.parametrize(
+    ("model", "calibrated"), [("Vue Pro 640 13mm", False), ("Vue Pro R 640 13mm", True), ("Duo Pro R 7", True)]
+)
+def test_a_model_without_calibration_is_doubted_by_name_and_its_temperatures_are_not_stated(
+    tmp_path, model, calibrated
+):
+    path = tmp_path / "a.jpg"
+    write_jpeg(path, frame().counts, PARAMETERS, TIME, camera=replace(CAMERA, model=model), limits=LIMITS)
+    assert (_codes(path) == set()) == calibrated
+    assert any("no temperature is stated" in line for line in inspect_file(path).lines()) != calibrated

@@ -126,6 +126,11 @@ class CalibratedRange:
     raw_minimum: int = 0
     raw_maximum: int = 65535
 
+    @property
+    def in_kelvin(self) -> bool:
+        """Whether the file stores limits in temperature that a camera can have."""
+        return 0 < self.minimum_K < self.maximum_K < 10_000
+
 
 @dataclass(frozen=True)
 class CameraSettings:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import codecs
 import os
 import re
+import struct
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -442,6 +443,51 @@ class NetcdfReader(TemperatureReader):
             return np.asarray(values[index].values)
 
 
+class FpfReader(TemperatureReader):
+    """Reader of the FLIR Public Format, the one frame per file that ThermaCAM Researcher exports (layout: FLIR's header fpfimg.h)."""
+
+    name = "FLIR Public Format"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file begins as the format does."""
+        return start.startswith(b"FPF Public Image Format\0")
+
+    def _header(self, path: Path) -> tuple[int, np.dtype[Any], tuple[int, int], Sequence[int]]:
+        """Return first byte and type of the pixels, rows and columns, and the time as seven numbers."""
+        with path.open("rb") as file:
+            head = file.read(_FPF_HEADER)
+        if len(head) < _FPF_HEADER:
+            raise ThermographyError(
+                f"{path}: {len(head)} bytes, shorter than the header of {_FPF_HEADER}; export it again"
+            )
+        offset, quantity, kind, columns, rows = struct.unpack_from("<I4H", head, 0x24)
+        if quantity != 0 or kind >= len(_FPF_KINDS):
+            raise ThermographyError(
+                f"{path}: image type {quantity} in format {kind} is no temperature; export temperatures"
+            )
+        return offset, np.dtype(_FPF_KINDS[kind]), (rows, columns), struct.unpack_from("<7i", head, 0x248)
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds; the unit is that which the program showed, and is not stored."""
+        _, kind, shape, (year, month, day, hour, minute, second, ms) = self._header(path)
+        _require_scale(path, kind, options)
+        stamp = f"{year:04d}:{month:02d}:{day:02d} {hour:02d}:{minute:02d}:{second:02d}"
+        times = _stamp(stamp)
+        return StackContents(1, shape, times=times and (times[0] + np.timedelta64(ms, "ms"),))
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of the file, (row, column)."""
+        offset, kind, (rows, columns), _ = self._header(path)
+        values = np.fromfile(path, kind, rows * columns, offset=offset)
+        if values.size < rows * columns:
+            raise ThermographyError(f"{path}: {values.size} of {columns} x {rows} pixels; export it again")
+        return values.reshape(rows, columns)
+
+
+#: Header of the FLIR Public Format, bytes, and its kinds of pixels.
+_FPF_HEADER, _FPF_KINDS = 892, ("<i2", "<i4", "<f4", "<f8")
+
+
 def _require_scale(path: Path, kind: np.dtype[Any], options: StackOptions) -> None:
     if kind.kind in "iu" and options.scale == 1.0 and options.offset == 0.0:
         raise StackError(
@@ -615,7 +661,7 @@ def plug_ins() -> tuple[FrameReader, ...]:
 @cache
 def readers() -> tuple[FrameReader, ...]:
     """Return all readers, plug-ins first."""
-    return (*plug_ins(), FlirReader(), TiffReader(), NumpyReader(), NetcdfReader(), TextReader())
+    return (*plug_ins(), FlirReader(), FpfReader(), TiffReader(), NumpyReader(), NetcdfReader(), TextReader())
 
 
 def find_reader(path: Path) -> FrameReader | None:
@@ -625,6 +671,30 @@ def find_reader(path: Path) -> FrameReader | None:
         with path.open("rb") as file:
             start = file.read(START_BYTES)
     return next((reader for reader in readers() if reader.recognises(path, start)), None)
+
+
+#: First byte and bytes, or ending, of files of thermal cameras that are not read -> what they are and what to do instead.
+_VIDEO = "a video of colours (MP4, MOV or AVI) without temperatures; record radiometric video (.seq, .csq), or take single pictures"
+_EXPORT = "export it as CSV or TIFF of temperatures in the program that reads it"
+_NOT_READ: dict[tuple[int, bytes] | str, str] = {
+    (4, b"ftyp"): _VIDEO,
+    (0, b"RIFF"): _VIDEO,
+    (0, b"AFF\0"): f"an AFF sequence of a cooled FLIR camera, whose layout is not public; {_EXPORT}",
+    ".ats": f"an ATS recording of FLIR ResearchIR or Research Studio, whose layout is not public; export it as SEQ there, or {_EXPORT}",
+    ".irb": f"a recording of InfraTec, whose layout is not public; {_EXPORT}",
+    ".bmt": f"a picture of Testo, whose layout is not public; {_EXPORT}",
+    ".is2": f"a picture of Fluke, whose layout is not public; {_EXPORT}",
+}
+
+
+def name_unread(path: Path) -> str:
+    """Say what a file of a thermal camera is that is not read, and what to do instead; empty for all others."""
+    with path.open("rb") as file:
+        start = file.read(START_BYTES)
+    known = (
+        why for mark, why in _NOT_READ.items() if not isinstance(mark, str) and start[mark[0] :].startswith(mark[1])
+    )
+    return next(known, _NOT_READ.get(path.suffix.lower(), ""))
 
 
 def index_recordings(
@@ -672,7 +742,9 @@ def index_recordings(
     def walk(path: Path) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
         reader = find_reader(path)
         if reader is None:
-            raise ThermographyError(f"{path}: not a known thermal file; docs/formats.md lists them")
+            raise ThermographyError(
+                f"{path}: {name_unread(path) or 'not a known thermal file; docs/formats.md lists them'}"
+            )
         yield from reader.index(path, options)
 
     files = [paths] if isinstance(paths, str | os.PathLike) else paths

@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special
 
 from thermography.common import Array, ThermographyError
 from thermography.io.frame import CameraParameters
@@ -283,6 +282,8 @@ def _draw_lines(
     parameters: CameraParameters, inputs: InputUncertainty, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Gain and offset of `count_line` for draws of its parameters, (draws,)."""
+    from scipy import special  # first order does without it
+
     p = parameters
 
     def draw(name: str) -> Array:

@@ -486,14 +486,19 @@ def second_search(problem: AxisProblem, state: AxisState) -> AxisState:
     decided = len(state.steps)
     if any(decision.reason in FINAL for decision in state.decisions):
         return state
-    while len(state.steps) < MOST_EFFECTS:
+    for _ in range(MOST_EFFECTS - decided):
         state, score = choose(problem, state.scored(problem.score(state)), level=SECOND_LEVEL)
         if score is None or state.events + (score.name == "step_event") > MOST_EVENTS:
             return state
         model = size_camera_errors(
             fit_model(problem.readings, [*state.model.terms, Term(score.name, score.best)]), problem.effects
         )
-        state = drop_superfluous(problem, state.entered(model, score, Confirmed.SECOND_SEARCH), first=decided)
+        before, state = (
+            state,
+            drop_superfluous(problem, state.entered(model, score, Confirmed.SECOND_SEARCH), first=decided),
+        )
+        if state.named_terms in state.held:
+            return before
     return state
 
 

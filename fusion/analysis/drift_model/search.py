@@ -402,6 +402,7 @@ class LoopState(Generic[M]):
         hold-out set is opened
     errors_without_um : hold-out error of the last of these models without each of these steps, um
     question : what the hold-out set says of an undecided candidate
+    held : the models that the search has held before this one
     """
 
     model: M
@@ -411,6 +412,12 @@ class LoopState(Generic[M]):
     errors_um: tuple[float, ...] = ()
     errors_without_um: tuple[float, ...] = ()
     question: schema.HoldOutQuestion | None = None
+    held: frozenset[tuple[str, ...]] = frozenset()
+
+    @property
+    def named_terms(self) -> tuple[str, ...]:
+        """Effects and parameters of the model, in whatever order they entered."""
+        return tuple(sorted(f"{one.effect} {sorted(one.candidate.parameters.items())}" for one in self.model.terms))
 
     @property
     def declared(self) -> tuple[Term, ...]:
@@ -484,7 +491,7 @@ class LoopState(Generic[M]):
         """The state after an effect was added to the model."""
         step = Step(score, self.rounds[-1], confirmed)
         decided = self.decide(Decision(score.name, Reason.ENTERED))
-        return replace(decided, model=model, steps=(*self.steps, step))
+        return replace(decided, model=model, steps=(*self.steps, step), held=self.held | {self.named_terms})
 
     def kept(self, places: Collection[int]) -> tuple[Term, ...]:
         """Declared terms and those of the steps that are not among ``places``."""
@@ -560,13 +567,15 @@ class Problem(ABC, Generic[M]):
 
 
 def search(problem: Problem[M], state: LoopState[M], *, progress: Progress = no_progress) -> LoopState[M]:
-    """Add effects one by one, without a look at the hold-out set."""
+    """Add effects one by one, without a look at the hold-out set; it ends where an effect would lead back to a model that it has held."""
     for number in range(1, MOST_EFFECTS + 1):
         progress(number, MOST_EFFECTS + 2, f"searching for effect {number}")
         state, score = choose(problem, state.scored(problem.score(state)))
         if score is None:
             return state
-        state = drop_superfluous(problem, enter(problem, state, score))
+        before, state = state, drop_superfluous(problem, enter(problem, state, score))
+        if state.named_terms in state.held:
+            return before
         if state.events > MOST_EVENTS:
             events = [place for place, step in enumerate(state.steps) if step.effect == "step_event"]
             evidence = {"most": MOST_EVENTS, "search_p": state.steps[-1].score.family_wise_p}

@@ -117,6 +117,7 @@ def opened(page):
     return page
 
 
+@pytest.mark.slow
 def test_a_run_is_cancelled_resumed_and_reported_by_keyboard_in_two_tabs(app, new_page):
     page = opened(new_page(app[0]))
     other = opened(new_page(app[0]))

@@ -87,6 +87,7 @@ def hall(tmp_path_factory):
 
 
 @pytest.mark.chain
+@pytest.mark.slow
 def test_one_that_fails_stops_no_other_and_the_next_fleet_keeps_what_is_finished(hall, tmp_path):
     out, ended, told = tmp_path / "out", [], []
     members = find_members([hall])
@@ -124,6 +125,7 @@ def test_one_that_fails_stops_no_other_and_the_next_fleet_keeps_what_is_finished
 
 
 @pytest.mark.chain
+@pytest.mark.slow
 def test_campaigns_whose_names_differ_by_a_slash_have_logs_of_their_own(hall, tmp_path):
     nested = tmp_path / "halls"
     shutil.copytree(hall / "b", nested / "m" / "X")

@@ -23,9 +23,8 @@ from fusion.pipeline.inspect import (
     recognise,
     scan_folder,
     time_bars,
-    write_thumbnails,
+    write_frames,
 )
-from fusion.results.store import OutputError
 from tests.thermography.flir_mutations import PARAMETERS, frame
 from thermography import inspection
 from thermography.common import ThermographyError
@@ -64,16 +63,15 @@ def test_quiet_leaves_what_asks_for_action(copied):
     assert lines and all(line.startswith(f"{copied / 'laser.csv'}: warning: ") for line in lines)
 
 
-def test_thumbnails_of_the_same_name_are_kept_apart(campaign_folder, tmp_path):
-    frame = sorted((campaign_folder / "thermal").iterdir())[0]
-    for name in "ab":
+def test_exported_frames_of_the_same_name_are_kept_apart_and_none_is_overwritten(campaign_folder, tmp_path):
+    thermal = sorted((campaign_folder / "thermal").iterdir())[:2]
+    for name, path in zip("ab", thermal, strict=True):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "x.jpg").write_bytes(frame.read_bytes())
-    (tmp_path / "a" / "damaged.jpg").write_bytes(frame.read_bytes()[:300])
-    written = list(write_thumbnails([tmp_path / "a", tmp_path / "b"], tmp_path / "out"))
-    assert [path.name for path in written] == ["x.jpg.png", "b_x.jpg.png"]
-    with pytest.raises(OutputError, match=r"x\.jpg\.png exists already; name another folder with --thumbnails"):
-        list(write_thumbnails([tmp_path / "a"], tmp_path / "out"))
+        (tmp_path / name / "x.jpg").write_bytes(path.read_bytes())
+    told = list(write_frames([tmp_path / "a", tmp_path / "b"], tmp_path / "out", ["tiff"]))
+    assert told == [f"written: {tmp_path / 'out' / name}" for name in ("a_x.jpg.tiff", "b_x.jpg.tiff")]
+    with pytest.raises(ThermographyError, match=r"a_x\.jpg\.tiff exists already; name another folder"):
+        list(write_frames([tmp_path / "a", tmp_path / "b"], tmp_path / "out", ["tiff"]))
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path):

@@ -78,6 +78,7 @@ def test_fields_pass_the_cf_checker(results_folder):
 
 
 @pytest.mark.chain
+@pytest.mark.slow
 def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path):
     """The clock is 37 s ahead and nobody says so; 13 s between frames do not divide the cycle, 0.2 s is a tenth of the dwell."""
     recipe = (

@@ -69,6 +69,7 @@ def test_the_stated_state_is_where_drift_is_zero(rng):
     assert float(middle["profile_u"].mean()) < float(start["profile_u"].mean())
 
 
+@pytest.mark.slow
 def test_the_state_at_the_start_of_a_steep_warm_up_is_within_its_bands():
     inside = []
     for seed in range(10):
@@ -210,6 +211,7 @@ def test_the_order_of_targets_does_not_matter(rng):
     np.testing.assert_allclose(shuffled["profile"], estimate_drift(deviations)["profile"], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_hot_zone_of_the_screw_gets_a_shape_of_its_own(rng):
     deviations, truth = simulate(rng, kind="warmup")
     zone = 10.0 * (1.0 - np.exp(-truth.seconds / 5400.0)) * np.minimum(truth.position, 0.55) / 0.55
@@ -222,6 +224,7 @@ def test_a_hot_zone_of_the_screw_gets_a_shape_of_its_own(rng):
     assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.15
 
 
+@pytest.mark.slow
 def test_noise_with_memory_over_the_cycles_widens_the_profile(rng):
     noise = with_memory(rng.standard_normal((100, 2, 16)), 0.5)
     plain, _ = simulate(np.random.default_rng(1))

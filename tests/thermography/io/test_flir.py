@@ -340,6 +340,34 @@ def test_the_area_of_a_real_file_lies_in_its_frame(real_file):
     assert region == Region("box 1", "box", ((210, 157), (428, 322)))
 
 
+def test_tools_of_the_documented_kinds_become_regions_with_names_of_their_own(tmp_path, monkeypatch):
+    """Layout and kinds after ExifTool's FLIR Tags: length, length of the coordinates at 4, kind at 10, coordinates at 0x24, label."""
+
+    def tool(kind: int, *values: int, label: str = "1") -> bytes:
+        text = (label + "\0").encode("utf-16-le")
+        head = bytearray(0x24)
+        struct.pack_into("<H2xH4xH", head, 0, 0x24 + 2 * len(values) + len(text), 2 * len(values), kind)
+        return bytes(head) + struct.pack(f"<{len(values)}H", *values) + text
+
+    record = b"\1\0".ljust(12, b"\0") + b"".join(
+        [
+            tool(3, 50, 40, 60, 40, 50, 46),
+            tool(4, 1, 2, 30, 20, label="Li1"),
+            tool(1, 5, 6),
+            tool(1, 7, 8),
+            tool(6, 0, 1, 0, 1, 9142, 0),  # an alarm is no region
+        ]
+    )
+    monkeypatch.setattr("thermography.io.flir._record", lambda *_: record)
+    jpeg(tmp_path / "a.jpg")
+    assert read_measurement_regions(reference(tmp_path / "a.jpg")) == [
+        Region("ellipse 1", "ellipse", ((40, 34), (60, 46))),
+        Region("Li1", "line", ((1, 2), (30, 20))),
+        Region("spot 1", "spot", ((5, 6),)),
+        Region("spot 1'", "spot", ((7, 8),)),
+    ]
+
+
 @pytest.mark.real_data
 def test_the_picture_of_a_real_file(real_file):
     picture = read_visible_picture(reference(real_file(C3X_JPEG)))

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import pickle
+import struct
 import threading
 import time
 from pathlib import Path
@@ -416,3 +417,46 @@ def test_what_the_options_must_say_is_asked_for(tmp_path):
         index_recordings([tmp_path / "a.npy"])
     with pytest.raises(StackError, match=r"the file holds no times; write time_in_name = .* times = .* or start = "):
         index_recordings([tmp_path / "a.npy"], StackOptions(unit="K"))
+
+
+def public_format(path: Path, kind: int, values: np.ndarray, *, quantity: int = 0) -> Path:
+    """A file of FLIR's header fpfimg.h: offset, quantity, kind of pixels, columns and rows at 0x24, the time at 0x248."""
+    head = bytearray(892)
+    head[:24] = b"FPF Public Image Format\0"
+    struct.pack_into("<2I4H", head, 0x20, 2, 892, quantity, kind, values.shape[1], values.shape[0])
+    struct.pack_into("<7i", head, 0x248, 2026, 3, 9, 6, 30, 10, 250)
+    path.write_bytes(bytes(head) + values.tobytes())
+    return path
+
+
+def test_the_public_format_of_flir_is_read_with_its_time(tmp_path):
+    path = public_format(tmp_path / "a.fpf", 2, STACK[0] + np.float32(273.15))
+    (frame,), rejected = index_recordings([path], StackOptions(unit="K"))
+    assert not rejected and frame.time == np.datetime64("2026-03-09T06:30:10.250")
+    np.testing.assert_allclose(frame.read_temperature(), STACK[0], atol=1e-4)
+    with pytest.raises(StackError, match='write unit = "degC" or unit = "K"'):
+        index_recordings([path])
+    for content, told in (
+        (public_format(tmp_path / "b.fpf", 2, STACK[0], quantity=4).read_bytes(), "image type 4 in format 2"),
+        (path.read_bytes()[:500], "shorter than the header of 892"),
+    ):
+        path.write_bytes(content)
+        assert told in index_recordings([path], StackOptions(unit="K"))[1][0].reason
+    path.write_bytes(public_format(tmp_path / "b.fpf", 2, STACK[0]).read_bytes()[:-4])
+    (cut,), _ = index_recordings([path], StackOptions(unit="K"))
+    with pytest.raises(ThermographyError, match="119 of 12 x 10 pixels"):
+        cut.read_temperature()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.mp4", b"\0\0\0\x1cftypmp42\0\0\0\1", "a video of colours"),
+        ("a.seq", b"AFF\0\0\0", "an AFF sequence"),
+        ("a.ats", b"\0\1\2", "an ATS recording"),
+    ],
+)
+def test_files_of_cameras_that_are_not_read_are_named_for_what_they_are(tmp_path, name, content, told):
+    (tmp_path / name).write_bytes(content)
+    (rejected,) = index_recordings([tmp_path / name])[1]
+    assert told in rejected.reason and "not text" not in rejected.reason

@@ -163,7 +163,12 @@ def test_the_accessor_calibrates_anew(tmp_path, chunks):
 @pytest.mark.real_data
 def test_regions_and_picture_of_real_files(real_file):
     spots = _open(real_file("gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg"))
-    assert [each["name"] for each in json.loads(spots.attrs["measurement_regions"])] == ["Sp1", "Sp2"]
+    assert [each.name for each in spots.flir.regions()] == ["Sp1", "Sp2"]
+    with np.errstate(all="raise"):
+        evaluated = spots.flir.evaluate(reference="Sp2")
+    pixels = spots["temperature"][0].values[[57, 112], [66, 83]]
+    np.testing.assert_allclose(evaluated["mean"][0, 1:], pixels, rtol=1e-6)
+    assert float(evaluated["difference"][0, 1]) == pytest.approx(pixels[0] - pixels[1], abs=1e-4)
     picture = _open(real_file("frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg")).flir.visible_light()
     assert picture.dims == ("visible_row", "visible_column", "channel") and picture.shape == (480, 640, 3)
     assert picture.attrs["offset_px"] == [10, -20]

@@ -192,6 +192,15 @@ def test_the_second_look_has_a_level_of_its_own(p_value, entered, monkeypatch):
     assert [step.confirmed for step in state.steps] == [Confirmed.SECOND_SEARCH] * entered
 
 
+def test_the_second_look_ends_where_two_effects_replace_each_other(monkeypatch):
+    other = np.cos(BARE.seconds / 40.0)
+    problem = problem_of(WAVE, other, effects={})
+    a, b = score("periodic_disturbance", term(WAVE).candidate), score("pitch_error", term(other).candidate)
+    monkeypatch.setattr(problem, "loss_without", lambda model, term: 0.0)
+    state = second_look(problem, monkeypatch, *(Round((one,)) for one in (a, b) * 10))
+    assert [step.effect for step in state.steps] == ["pitch_error"] and len(state.rounds) == 3
+
+
 def test_nothing_is_searched_for_where_a_pattern_was_wrong(monkeypatch):
     """What would be found in all cycles stands in for a pattern that the library does not hold."""
     problem = problem_of(WAVE)

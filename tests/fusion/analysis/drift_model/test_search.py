@@ -11,6 +11,8 @@ from string import Formatter
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import fusion
 import fusion.analysis.drift_model.search as scoring_module
@@ -230,6 +232,29 @@ def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(loss, left):
     if left == ["b"]:
         assert state.decisions[-1] == Decision("a", Reason.SUPERFLUOUS, {"loss": loss})
         assert state.model.names == ("declared", "b")
+
+
+@given(
+    offered=st.lists(st.sampled_from("abc"), min_size=4, max_size=4),
+    replaces=st.sets(st.tuples(st.sampled_from("abc"), st.sampled_from("abc"))),
+)
+def test_whatever_replaces_what_no_model_is_held_twice(offered, replaces):
+    """The model after each round, for any scores and any losses; an effect that leads back ends the search."""
+    held = []
+    for rounds in range(len(offered) + 1):
+        problem = Script([Round((score(name),)) for name in offered[:rounds]])
+        problem.loss_without = lambda model, term: 0.0 if (model.names[-1], term.effect) in replaces else 50.0
+        held.append(tuple(sorted(search(problem, start()).model.names)))
+        assert problem.asked.count("score") <= 4
+    distinct = [one for place, one in enumerate(held) if place == 0 or one != held[place - 1]]
+    assert len(distinct) == len(set(distinct))
+
+
+def test_of_two_effects_that_replace_each_other_the_later_stays():
+    problem = Script([Round((score(name),)) for name in "abab"])
+    problem.loss_without = lambda model, term: 0.0
+    state = search(problem, start())
+    assert [step.effect for step in state.steps] == ["b"] and len(state.rounds) == 3
 
 
 def test_superfluous_effects_are_dropped_one_after_the_other():

@@ -70,6 +70,7 @@ def test_the_loop_and_the_positions_say_what_was_found(page):
     page.wait_for_function("document.documentElement.scrollWidth <= 390")
 
 
+@pytest.mark.slow
 def test_a_changed_run_goes_to_a_folder_of_its_own_and_is_shown(page, app):
     opened(page, "Run again")
     page.get_by_text("Nothing was changed.").wait_for()

@@ -117,6 +117,7 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
     assert again.get_by_label("Spindle at axis position 0, x").input_value() == "500 mm"
 
 
+@pytest.mark.slow
 def test_files_are_dropped_into_the_folder_and_a_wrong_or_large_one_is_refused(app, new_folder, new_page, tmp_path):
     page = new_page(app[0])
     page.get_by_text("24 frames of 640 x 480").first.wait_for()
