@@ -138,7 +138,7 @@ def _content(source: Inputs) -> Iterator[str]:
     if isinstance(source, CameraInputs):
         grid, names = source.grid, camera_names(source.pictures)
         cameras = [f"{np.count_nonzero(names == name)} of {name}" for name in dict.fromkeys(names)]
-        yield f"pictures: {'; '.join(cameras)}; {len(source.frames_rejected)} left out"
+        yield f"frames: {'; '.join(cameras)}; {len(source.frames_rejected)} left out"
         if not source.frames:
             yield "no camera took most of them, or they have no time: a table of single pictures, not a series"
         elif source.plan.in_pixels:
