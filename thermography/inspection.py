@@ -111,7 +111,6 @@ class FlirInspection:
             f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
             f"relative humidity {p.relative_humidity:.0%}, window transmission {p.window_transmission:.3g}",
             f"  R1 {p.planck_r1:.9g}, B {p.planck_b:.7g}, F {p.planck_f:.7g}, O {p.planck_o:g}, R2 {p.planck_r2:.8g}",
-            f"  {describe_range(first.limits)}",
             *(f"  {line}" for line in describe_evaluation(self.evaluation)),
         ]
         if rate_Hz := first.settings.frame_rate_Hz:
@@ -203,7 +202,7 @@ def describe_range(limits: CalibratedRange) -> str:
 
 
 def describe_evaluation(evaluation: RegionTable | None) -> list[str]:
-    """Say the highest, lowest and mean temperature of every region over all frames, camera by camera."""
+    """Say the calibrated range, and highest, lowest and mean temperature of every region over all frames, camera by camera."""
     if evaluation is None:
         return ["temperature cannot be determined from the stored parameters"]
     cameras = np.array(evaluation.cameras, object)
@@ -211,20 +210,20 @@ def describe_evaluation(evaluation: RegionTable | None) -> list[str]:
     lines = []
     for camera in several:
         rows = np.flatnonzero(cameras == camera)
-        head = (
-            f"{camera or 'unknown camera'}, {len(rows)} {'frame' if len(rows) == 1 else 'frames'}: "
-            if len(several) > 1
-            else ""
-        )
+        first = evaluation.headers[rows[0]]
+        if len(several) > 1:
+            lines.append(f"{camera or 'unknown camera'}, {len(rows)} {'frame' if len(rows) == 1 else 'frames'}:")
+        if not measures_temperature(first.camera):
+            lines.append("no temperature is stated, because the camera is not calibrated")
+            continue
+        lines += dict.fromkeys(describe_range(evaluation.headers[row].limits) for row in rows)
         for place, (name, kind) in enumerate(evaluation.kinds.items()):
             shown = rows[evaluation.columns["pixels"][rows, place] > 0]
-            if not measures_temperature(evaluation.headers[rows[0]].camera):
-                lines.append(f"{head}{name}: no temperature is stated, because the camera is not calibrated")
-            elif shown.size:
-                lines.append(f"{head}{name}: {_describe_region(evaluation, shown, place, kind)}")
+            if shown.size:
+                lines.append(f"{name}: {_describe_region(evaluation, shown, place, kind)}")
     return [
         *lines,
-        "u: standard uncertainty for a painted surface and a camera of ± 2 K or ± 2 %, as data sheets state it",
+        "places: column,row in pixels; u: standard uncertainty for a painted surface and a camera of ± 2 K or ± 2 %",
     ]
 
 
@@ -333,7 +332,14 @@ def _check_parameters(references: Sequence[FrameReference], overridden: Collecti
     """Warn about implausible parameters that are not overridden."""
     p, sets = references[0].parameters, {frame.parameters for frame in references}
     stored = [each.name for each in fields(p) if each.name not in overridden]
-    varying = [name for name in stored if len({getattr(each, name) for each in sets}) > 1]
+    one_camera = len({frame.camera.serial for frame in references}) == 1
+    varying = [
+        name
+        for name in stored
+        # Each camera has its own calibration.
+        if len({getattr(each, name) for each in sets}) > 1
+        and (one_camera or not name.startswith(("planck", "atmosphere_")))
+    ]
     if varying:
         yield _warning("parameters_vary", f"parameters differ between the frames: {', '.join(varying)}.")
     for name in ("reflected_temperature_K", "atmospheric_temperature_K"):

@@ -121,10 +121,10 @@ def export_frames(
     parameters : callable, optional
         From a frame to the camera parameters to calibrate it with; left out: those of the file.
 
-    Yields
-    ------
-    Path
-        Of every file that was written. Frames are named after their file, those of a sequence with their number.
+    Returns
+    -------
+    iterator of Path
+        Of every file, as it is written. Frames are named after their file, those of a sequence with their number.
 
     Raises
     ------

@@ -27,7 +27,6 @@ from thermography.evaluation import tabulate_regions
 from thermography.inspection import (
     check_series,
     describe_evaluation,
-    describe_range,
     describe_stack,
     inspect_file,
     is_flir_file,
@@ -657,7 +656,6 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
         f"  camera {_cameras(frames)}",
         *(f"  {line}" for line in _times(frames)),
         f"  settings {_settings(frames)}",
-        *(f"  {describe_range(limits)}" for limits in dict.fromkeys(frame.limits for frame in frames)),
     ]
     try:
         evaluation = tabulate_regions(frames)
@@ -715,6 +713,7 @@ def _settings(frames: Sequence[FrameReference]) -> str:
         f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
         f"relative humidity {p.relative_humidity:.0%}"
     )
-    names = [each.name for each in fields(CameraParameters)]
+    # Each camera has its own calibration: what differs in it is no setting.
+    names = [each.name for each in fields(CameraParameters) if not each.name.startswith(("planck", "atmosphere_"))]
     varying = [name for name in names if len({getattr(frame.parameters, name) for frame in frames}) > 1]
     return f"{stored}: {'the same in all frames' if not varying else f'of the first frame; not the same in all: {join(varying)}'}"
