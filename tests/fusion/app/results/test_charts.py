@@ -1,6 +1,5 @@
 """Parts of the screen *Results*: laser, closed loop, positions, and the thermal map."""
 
-
 import numpy as np
 import panel as pn
 import pytest
