@@ -31,7 +31,7 @@ def summary_table(results: Results) -> rich.table.Table:
 def summary_rows(results: Results) -> list[tuple[str, str]]:
     """Return names and texts of the findings of a run, in the order of the report."""
     rows: list[tuple[str, str]] = []
-    if results.inputs is not None and results.inputs.checks:
+    if results.inputs is not None and not (results.thermograms and not results.thermograms.series):
         doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
         lines = [line for line in (*doubts, untouched(results.inputs, figures_of(results))) if line]
         rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
