@@ -92,7 +92,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     }
     if (change := _difference(source, override, scene, shifts)) is not None:
         dataset["difference"] = change
-        part["difference"] = _difference_part(source, override, change)
+        part["difference"] = _difference_part(source, override, change, shifts[-1] if scene == "still" else None)
     notices = [*_rejected_notices(rejected, folder), *_scene_notices(source, part)]
     try:
         visible = read_visible_picture(hottest) if isinstance(hottest, FlirFrameReference) else None
@@ -185,26 +185,34 @@ def _difference(source: CameraInputs, override: Overrides, scene: Scene, shifts:
     return subtract_frames(last, first).drop_vars(["row", "column"])
 
 
-def _difference_part(source: CameraInputs, override: Overrides, change: xr.DataArray) -> dict[str, Any]:
-    """The largest change and the mean one; what both pictures share cancels but for its effect on the scale of the difference."""
+def _difference_part(
+    source: CameraInputs, override: Overrides, change: xr.DataArray, shift_px: Array | None
+) -> dict[str, Any]:
+    """The largest change and the mean one; what both pictures share cancels but for its effect on the scale of the difference.
+
+    A shift adds its length times the gradient; where it is not known, or was taken out, the uncertainty of a single pixel is not known.
+    """
     frame, inputs = source.frames[0], stated_uncertainty(source.thermography)
     camera = override(frame)
-    level = float(np.nanmean(within_range(thermogram(frame, camera)).values))
-    values = change.values
+    first, values = within_range(thermogram(frame, camera)).values, change.values
+    level = float(np.nanmean(first))
     row, column = np.unravel_index(int(np.nanargmax(np.abs(values))), values.shape)
     largest, mean = float(values[row, column]), float(np.nanmean(values))
     noise = float(np.sqrt(2.0) * temperature_uncertainty(np.array(level), camera, inputs).per_frame_u)
+    edge = None
+    if shift_px is not None:
+        steepest = max(float(np.hypot(*np.gradient(picture))[row, column]) for picture in (first, first + values))
+        edge = float(np.linalg.norm(shift_px)) * steepest
 
-    def u(value: float, noise_K: float) -> float:
+    def u(value: float, *more_K: float) -> float:
         scale = rise_scale_contributions(level + value / 2.0, camera, inputs)
-        return float(
-            np.sqrt(sum((share * value) ** 2 for share in scale.values()) + noise_K**2 + inputs.camera_drift_K**2)
-        )
+        parts = [*(float(share) * value for share in scale.values()), inputs.camera_drift_K, *more_K]
+        return float(np.linalg.norm(parts))
 
     return {
         "seconds": float((source.frame_times[-1] - source.frame_times[0]) / np.timedelta64(1, "s")),
-        "mean_K": {"value": mean, "u": u(mean, 0.0)},
-        "largest_K": {"value": largest, "u": u(largest, noise)},
+        "mean_K": {"value": mean, "u": u(mean)},
+        "largest_K": {"value": largest, "u": None if edge is None else u(largest, noise, edge)},
         "largest_column_px": int(column),
         "largest_row_px": int(row),
     }

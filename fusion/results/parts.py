@@ -393,7 +393,7 @@ class DifferencePart(ResultPart):
     mean_K: Quantity
     """Mean over the pixels, K."""
     largest_K: Quantity
-    """Largest change of a pixel in either direction, K."""
+    """Largest change of a pixel in either direction, K; without uncertainty where the camera moved, or may have."""
     largest_column_px: int
     """Its column, from 0 at the left edge."""
     largest_row_px: int
