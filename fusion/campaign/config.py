@@ -568,6 +568,7 @@ class SensorsTable(Table):
     file: ExistingFile
     places: ExistingFile
     time_zone: TimeZone | None = None
+    clock_offset_s: Seconds = 0.0
     temperature_u_K: KelvinU = 0.2
 
 
@@ -578,6 +579,8 @@ class InterferometryTable(_Measured):
     sheet: str | None = None
     environment: ExistingFile | None = None
     time_zone: TimeZone | None = None
+    clock_offset_s: Seconds = 0.0
+    environment_clock_offset_s: Seconds = 0.0
     dead_path_mm: Millimetres = 0.0
     expansion_coefficient_ppm_per_K: PartsPerMillion = 11.7
     expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = None
@@ -616,6 +619,7 @@ class DriversTable(Table):
 
     file: ExistingFile
     time_zone: TimeZone | None = None
+    clock_offset_s: Seconds = 0.0
     randomised: tuple[str, ...] = ()
     mean_dwell_s: PositiveSeconds | None = None
     least_dwell_s: Seconds = 0.0

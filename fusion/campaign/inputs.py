@@ -20,9 +20,7 @@ from fusion.analysis.alignment.align import (
     AxisGeometry,
     MeasuredLine,
     camera_on_laser_clock,
-    covered_share,
     cycle_bounds,
-    likely_zone_shift,
 )
 from fusion.analysis.attribution.duty import DutyLaw, read_duty
 from fusion.analysis.attribution.modes import Region, read_regions
@@ -59,7 +57,7 @@ from interferometry.io.tables import DateOrder, parse_time, read_table
 from thermography.common import ThermographyError
 from thermography.io.frame import FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
-from thermography.io.sequence import FrameList, frame_times
+from thermography.io.sequence import FrameList, camera_names, frame_times
 from thermography.registration.plan import Fiducial, PlanGrid, Polygon, PolygonError, read_fiducials
 from thermography.registration.projection import Lens, read_lens
 from thermography.registration.register import picture_grid
@@ -258,8 +256,8 @@ class Source(CameraInputs, LaserInputs):
         return float(np.abs(self.deviations["position"].values).max())
 
 
-#: Words of the reason why a frame of another size is left out.
-_OTHER_SIZE = "pixels among frames"
+#: Words of the reason why a frame of another camera or size is left out.
+_OTHER_CAMERA = "among frames of"
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
@@ -290,7 +288,9 @@ def _read_drivers(campaign: Campaign) -> dict[str, Any]:
     if table is None:
         return {}
     path = campaign.resolve(table.file)
-    drivers = bring_to_utc(read_drivers(path), campaign.zone_of("drivers"), file=table.file)
+    drivers = bring_to_utc(
+        read_drivers(path), campaign.zone_of("drivers"), file=table.file, late_s=table.clock_offset_s
+    )
     if table.mean_dwell_s is None:
         return {"drivers": drivers}
     law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
@@ -299,7 +299,7 @@ def _read_drivers(campaign: Campaign) -> dict[str, Any]:
 
 
 def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
-    """Read the frames of a campaign with readings, and refuse clocks that cannot both be right."""
+    """Read the frames of a campaign with readings."""
     plan = campaign.plan
     assert plan is not None and plan.axis is not None
     if not _is_timed(common["deviations"]):
@@ -317,7 +317,6 @@ def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
         MeasuredLine(cells, axis, source.deviations["position"].values)
     except AlignmentError as error:
         raise AlignmentError(f"{campaign.path}: plan.axis: {error}") from error
-    _raise_if_clocks_disagree(source)
     return source
 
 
@@ -328,7 +327,8 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     laser = campaign.resolve(interferometry.deviations)
     how = {name: getattr(interferometry, name) for name in ("feed_mm_per_min", "dwell_s", "sheet")}
     zone = campaign.zone_of("interferometry")
-    deviations = bring_to_utc(read_deviations(laser, **how), zone, file=interferometry.deviations)
+    late_s = interferometry.clock_offset_s
+    deviations = bring_to_utc(read_deviations(laser, **how), zone, file=interferometry.deviations, late_s=late_s)
     check(deviations, DEVIATIONS, name=laser.name)
     deviations, notices = _timed_cycles(deviations, file=interferometry.deviations)
     _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations)
@@ -337,7 +337,8 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
-        environment = bring_to_utc(environment, zone, file=interferometry.environment)
+        late_s = interferometry.environment_clock_offset_s
+        environment = bring_to_utc(environment, zone, file=interferometry.environment, late_s=late_s)
     with naming(campaign.resolve(interferometry.environment or interferometry.deviations)):
         compensated = compensate_readings(deviations, environment, interferometry)
     if interferometry.material_temperature == "logged":
@@ -439,24 +440,12 @@ def _read_frames(campaign: Campaign, *, several_cameras: bool) -> tuple[FrameLis
     if not several_cameras:
         has_time = ~np.isnat(frames.times)
         left_out += [(frame, "the frame has no time") for frame in frames.choose(~has_time)]
-        frames, odd = _of_one_size(frames.choose(has_time))
+        frames, odd = _of_one_camera(frames.choose(has_time), campaign.path)
         left_out += odd
     return frames, [
         {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
         for frame, reason in left_out
     ]
-
-
-def camera_names(frames: FrameList | Sequence[FrameReference]) -> NDArray[np.object_]:
-    """Return which camera took each frame, with the size of its picture, (n,) of str."""
-
-    def name(frame: FrameReference) -> str:
-        serial = f" {frame.camera.serial}" if frame.camera.serial else ""
-        return f"{frame.camera.model or 'camera not stored'}{serial}, {frame.shape[1]} x {frame.shape[0]}"
-
-    if not isinstance(frames, FrameList):
-        return np.array([name(frame) for frame in frames], object)
-    return frames.column(lambda table: np.full(len(table), name(table.reference(0)), object), name, "object")
 
 
 def _series(pictures: FrameList) -> FrameList:
@@ -468,19 +457,24 @@ def _series(pictures: FrameList) -> FrameList:
     return pictures.choose(chosen & (2 * chosen.sum() > chosen.size))
 
 
-def _of_one_size(frames: FrameList) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
-    """Keep the frames of the size that most of them have; the others with the reason."""
-    if not frames:
+def _of_one_camera(frames: FrameList, path: Path) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
+    """Keep the frames of the camera and size that took most of them; the others with camera and time as the reason."""
+    names = camera_names(frames).astype(str)
+    listed_names, first, counts = np.unique(names, return_index=True, return_counts=True)
+    if listed_names.size < 2:
         return frames, []
-    shapes = frames.shapes()
-    sizes, counted = np.unique(shapes, axis=0, return_counts=True)
-    # Of two sizes as frequent as each other, that of the earlier frame.
-    most = sizes[counted == counted.max()]
-    first = min(range(len(most)), key=lambda i: int(np.argmax((shapes == most[i]).all(axis=1))))
-    fits = (shapes == most[first]).all(axis=1)
-    reason = f"{{1}} x {{0}} {_OTHER_SIZE} of {{3}} x {{2}}"
-    return frames.choose(fits), [
-        (frame, reason.format(*frame.shape, *most[first].tolist())) for frame in frames.choose(~fits)
+    order = np.lexsort((first, -counts))
+    cameras = {name.rpartition(",")[0] for name in listed_names}
+    if len(cameras) > 1 and 2 * counts.max() <= len(frames):
+        of_each = "; ".join(f"{counts[k]} of {listed_names[k]}" for k in order)
+        raise SourceError(
+            f"{path}: thermography.frames matches {len(frames)} frames of {len(cameras)} cameras, none of which took most of them, so they "
+            f"are no series: {of_each}; name the frames of one camera"
+        )
+    most = listed_names[order[0]]
+    return frames.choose(names == most), [
+        (frame, f"{name}, taken {utc(frame.time)}, {_OTHER_CAMERA} {most}")
+        for frame, name in zip(frames.choose(names != most), names[names != most], strict=True)
     ]
 
 
@@ -624,7 +618,7 @@ def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_re
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
     remedy = "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours."
-    if all(_OTHER_SIZE in _reason(item) for item in rejected):
+    if all(_OTHER_CAMERA in _reason(item) for item in rejected):
         remedy = "Name the frames of one camera and one size only in thermography.frames."
     return [Notice(code, f"{counted(len(rejected), 'frame')} left out: {listed(named)}.", remedy)]
 
@@ -653,38 +647,12 @@ def _reason(item: Mapping[str, Any]) -> str:
     return text.split(f"{Path(item['file']).name}: ", 1)[-1]
 
 
-#: A shift by whole quarter hours counts as a wrong time zone where less than this share of the readings lies within the frames.
-_COVERED_NOW = 0.6
-
-
-def _raise_if_clocks_disagree(source: Source) -> None:
-    """Raise if the recordings do not overlap in time or their clocks differ by a time zone."""
-    readings, path = source.deviations["time"].values, source.campaign.path
-    readings, offset_s = readings[~np.isnat(readings)], source.thermography.clock_offset_s or 0.0
-    frames = camera_on_laser_clock(source.frame_times, offset_s)
-    covered = covered_share(readings, frames)
-    shift = likely_zone_shift(readings, frames)
-    laser = f"readings of {source.deviations.attrs.get('source', 'the laser')}"
-    span = f"frames {utc(frames[0])} to {utc(frames[-1])}, {laser} {utc(readings.min())} to {utc(readings.max())}"
-    if covered < _COVERED_NOW and shift is not None:
-        raise AlignmentError(
-            f"{path}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
-            f'between frames); write thermography.clock_offset = "{offset_s + shift:g} s" (camera clock minus laser '
-            "clock) if so, or give the times of both with their zone"
-        )
-    if covered == 0.0:
-        raise AlignmentError(
-            f"{path}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
-            "or check that both folders belong to the same test"
-        )
-
-
 # A record of one run or of several: every table read, the runs in the order of their times, held to the same columns.
 
 #: Time between runs that each count their seconds from zero, so that they can be laid one after the other: one day.
 _BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
-#: A run counts from its own zero where its first time is at most this share of its length.
-_OWN_ZERO = 0.01
+#: Times before this one count from a start that is not stated.
+_DATED = np.datetime64("1980-01-01", "ns")
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:
@@ -695,18 +663,20 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     tables = {path: read_run(campaign, path) for path in paths}
     _refuse_different_columns(tables)
     refuse_mixed_zones({path.name: table for path, table in tables.items()}, source=str(campaign.path))
-    # Every run gives seconds since its own zero, and nothing says when that was.
-    times = [table["time"].values for table in tables.values()]
-    own_zero = all(NO_START <= time[0] <= NO_START + _OWN_ZERO * (time[-1] - time[0]) for time in times)
+    ordered = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
+    overlaps = _overlaps(ordered)
+    # Times without a date that overlap: every run counts from its own zero, and nothing says when that was.
+    own_zero = bool(overlaps) and all(table["time"].values[-1] < _DATED for table in tables.values())
     if own_zero:
         start = NO_START
         for path, table in tables.items():
             moved = table["time"].values + (start - table["time"].values[0])
             tables[path] = table.assign_coords(time=("time", moved, table["time"].attrs))
             start = moved[-1] + _BETWEEN
+    elif overlaps:
+        raise TableError(overlaps[0])
     else:
-        tables = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
-        _refuse_overlap(tables)
+        tables = ordered
     test = set(campaign.test_paths()) or {list(tables)[-1]}
     numbered = [
         table.assign_coords(run=("time", np.full(table.sizes["time"], k))) for k, table in enumerate(tables.values())
@@ -748,12 +718,14 @@ def _refuse_different_columns(tables: dict[Path, xr.Dataset]) -> None:
                 )
 
 
-def _refuse_overlap(tables: dict[Path, xr.Dataset]) -> None:
-    """Refuse runs of which one begins before the other has ended."""
+def _overlaps(tables: dict[Path, xr.Dataset]) -> list[str]:
+    """Say which runs, in the order of their times, begin before the one before has ended."""
+    found = []
     for (before, earlier), (path, later) in pairwise(tables.items()):
         first, last = later["time"].values[0], earlier["time"].values[-1]
         if first <= last:
-            raise TableError(
+            found.append(
                 f"{path}: the run begins at {np.datetime_as_string(first, unit='s')}, before {before.name} has ended "
                 f"({np.datetime_as_string(last, unit='s')}); name every run once, and correct its times or record.start"
             )
+    return found

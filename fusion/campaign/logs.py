@@ -340,7 +340,8 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
     if table is None or plan is None or plan.size_mm is None:
         return None
     path = campaign.resolve(table.file)
-    logged = bring_to_utc(read_drivers(path), campaign.zone_of("sensors"), file=table.file)
+    zone = campaign.zone_of("sensors")
+    logged = bring_to_utc(read_drivers(path), zone, file=table.file, late_s=table.clock_offset_s)
     names = [str(name) for name in logged.data_vars]
     places = _read_places(campaign.resolve(table.places), names, plan.size_mm)
     columns = [

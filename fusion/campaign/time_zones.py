@@ -18,24 +18,26 @@ def utc(time: np.datetime64) -> str:
     return f"{np.datetime_as_string(time, unit='s')}Z"
 
 
-def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Dataset:
-    """Bring times that a file gives without a zone from the stated one to UTC; others, and those without a stated zone, are kept."""
-    if zone is None or not lacks_zone(table):
+def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str, late_s: float = 0.0) -> xr.Dataset:
+    """Bring times that a file gives without a zone from the stated one to UTC, and take off by how much its clock is late."""
+    time = table["time"]
+    stamps = pd.DatetimeIndex(time.values.ravel())
+    if zone is not None and lacks_zone(table):
+        placed = stamps.tz_localize(ZoneInfo(zone), ambiguous="NaT", nonexistent="NaT").tz_convert(None)
+        lost = np.flatnonzero(np.isnat(placed.values) & ~np.isnat(stamps.values))
+        if lost.size:
+            first = np.datetime_as_string(stamps.values[lost[0]], unit="s")
+            raise CampaignError(
+                f"{file}: {lost.size} times, the first {first}, occur twice or not at all in {zone}, where clocks are changed for summer; "
+                'export the times in UTC, and write time_zone = "UTC"'
+            )
+        time = time.assign_attrs(reference=f"converted to UTC from {zone}")
+        stamps = placed
+    elif not late_s:
         return table
-    local = table["time"].values
-    stamps = pd.DatetimeIndex(local.ravel())
-    placed = stamps.tz_localize(ZoneInfo(zone), ambiguous="NaT", nonexistent="NaT")
-    lost = np.flatnonzero(np.isnat(placed.tz_convert(None).values) & ~np.isnat(stamps.values))
-    if lost.size:
-        first = np.datetime_as_string(stamps.values[lost[0]], unit="s")
-        raise CampaignError(
-            f"{file}: {lost.size} times, the first {first}, occur twice or not at all in {zone}, where clocks are changed for summer; "
-            'export the times in UTC, and write time_zone = "UTC"'
-        )
-    utc = placed.tz_convert(None).values.astype("datetime64[ns]").reshape(local.shape)
-    attributes = {**table["time"].attrs, "reference": f"converted to UTC from {zone}"}
+    utc = (stamps - pd.Timedelta(seconds=late_s)).values.astype("datetime64[ns]").reshape(time.shape)
     place = table.assign_coords if "time" in table.dims else table.assign
-    return place(time=(table["time"].dims, utc, attributes))
+    return place(time=(time.dims, utc, time.attrs))
 
 
 def lacks_zone(table: xr.Dataset) -> bool:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
+from fusion.analysis.consistency.checks import Check, ContradictionError, Severity, open_doubts, refuse_contradictions
+from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, camera_names, read_source
-from fusion.campaign.logs import read_drivers
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_source
+from fusion.campaign.logs import NO_START, read_drivers
 from fusion.common import FusionError
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import check_source
@@ -23,9 +26,12 @@ from fusion.results.results import Notice
 from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations, read_environment
 from thermography.common import ThermographyError
+from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 from thermography.registration.projection import read_lens
 
+#: Bars of runs that are drawn.
+_MOST_BARS = 10
 #: What the readers raise for input that cannot be used.
 BAD_INPUT = (FusionError, ThermographyError, InterferometryError, OSError)
 
@@ -45,8 +51,8 @@ class CampaignCheck:
 
     @property
     def doubts(self) -> list[Check]:
-        """Checks that are not passed, nor accepted, and that a run would name first."""
-        return open_doubts(self.checks, self.accepted)
+        """Checks that are not passed, nor accepted, and that a run would name first; contradictions are faults."""
+        return [one for one in open_doubts(self.checks, self.accepted) if one.severity is Severity.DOUBT]
 
     def lines(self, *, quiet: bool = False) -> list[str]:
         """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only."""
@@ -79,7 +85,7 @@ class CampaignCheck:
             "faults": list(self.faults),
             "doubts": [{"code": one.code, "evidence": one.evidence, "remedy": one.remedy} for one in self.doubts],
             "notices": [{"code": one.code, "message": one.message, "remedy": one.remedy} for one in self.notices],
-            "checks_passed": len(self.checks) - len(self.doubts),
+            "checks_passed": sum(check.passed for check in self.checks),
         }
 
 
@@ -94,7 +100,7 @@ def check_campaign(path: Path) -> CampaignCheck:
         if campaign.record is not None:
             return _check_record(campaign)
         source = read_source(campaign)
-        checks = tuple(check_source(source))
+        checks = tuple(without_consequences(check_source(source), campaign.accept.doubts))
     except BAD_INPUT as error:
         faults = dict.fromkeys([_words(error), *_faults_of_files(campaign)])
         return CampaignCheck(campaign.path, title, faults=tuple(faults))
@@ -123,8 +129,19 @@ def _check_record(campaign: Campaign) -> CampaignCheck:
         f"record: {counted(runs, 'run')}, {counted(len(source.health.names), 'temperature')}, "
         f"{counted(table.sizes['channel'], 'displacement')}, {counted(table.sizes['time'], 'row')}",
     )
-    recordings = (Recording("record", table["time"].values),)
+    recordings = tuple(_record_bars(table))
     return CampaignCheck(campaign.path, campaign.campaign.title, content, recordings, notices=tuple(source.notices))
+
+
+def _record_bars(table: xr.Dataset) -> Iterator[Recording]:
+    """Return a record on its times; of runs that each count from their own zero the first ones, side by side from there."""
+    time = table["time"].values
+    if not table.attrs.get("own_zero"):
+        yield Recording("record", time)
+        return
+    for number, name in enumerate(json.loads(table.attrs["runs"])[:_MOST_BARS]):
+        of_run = time[table["run"].values == number]
+        yield Recording(name, NO_START + (of_run - of_run[0]))
 
 
 def _content(source: Inputs) -> Iterator[str]:

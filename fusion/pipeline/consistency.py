@@ -7,24 +7,23 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.alignment.readings import ReadingsError, read_fused
 from fusion.analysis.consistency.camera import (
+    check_coverage,
     check_frames,
     check_gaps,
     check_order,
     check_phase,
     check_place,
     check_registration,
+    compare_phase,
 )
 from fusion.analysis.consistency.checks import CODES, Check
-from fusion.analysis.consistency.clocks import (
-    check_camera_clock,
-    check_load_clock,
-    check_load_scale,
-    check_material_clock,
-)
+from fusion.analysis.consistency.clocks import Evidence, Recording, check_clocks
+from fusion.analysis.consistency.courses import check_load_scale, compare_drift, compare_load, compare_material
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.logs import (
     check_contact_sensors,
@@ -59,14 +58,53 @@ def check_source(source: Inputs) -> list[Check]:
         checks += check_order(source.frames)
         if isinstance(source, Source) and source.thermography.table == "still":
             # Frames of a moving table estimate the offset of the clocks themselves.
-            times = camera_on_laser_clock(source.frame_times, source.thermography.clock_offset_s or 0.0)
-            checks += check_phase(times, source.deviations)
+            checks += check_phase(_frame_times(source), source.deviations)
+        if isinstance(source, Source):
+            offset_s = source.thermography.clock_offset_s or 0.0
+            checks += check_coverage(_frame_times(source), source.deviations, offset_s=offset_s)
         stated, stack = set(overridden_parameters(source.thermography)), source.thermography.stack
         # Temperatures whose emissivity is not stated are taken as they are: a notice of its own, and no doubt about a stored value.
         if isinstance(source.frames[0], TemperatureFrame) and (stack is None or stack.emissivity is None):
             stated.add("emissivity")
         checks += check_frames(source.frames, overridden=stated)
-    return checks
+    return [*checks, *check_clocks(_recordings(source), _of_stamps(source))]
+
+
+def _frame_times(source: CameraInputs, fields: xr.Dataset | None = None) -> NDArray[np.datetime64]:
+    """Times of the frames on the laser's clock: those of the fields, before as the campaign file states."""
+    if fields is not None:
+        return np.asarray(fields["time"].values)
+    return camera_on_laser_clock(source.frame_times, source.thermography.clock_offset_s or 0.0)
+
+
+def _of_stamps(source: Inputs, fields: xr.Dataset | None = None) -> list[Evidence]:
+    """What the stamps of the frames of a still table say of the camera's clock."""
+    if isinstance(source, Source) and source.thermography.table == "still":
+        return compare_phase(_frame_times(source, fields), source.deviations)
+    return []
+
+
+def _recordings(source: Inputs, fields: xr.Dataset | None = None) -> list[Recording]:
+    """All recordings of a test; the frames on the clock of the fields, where those are known."""
+    campaign, found = source.campaign, list[Recording]()
+    laser, drivers = campaign.interferometry, campaign.drivers
+    if isinstance(source, LaserInputs):
+        table, times = source.interferometry, source.deviations["time"].values.ravel()
+        found.append(Recording("laser", table.deviations, times, "interferometry", offset_s=table.clock_offset_s))
+    if isinstance(source, CameraInputs):
+        stated_s = source.thermography.clock_offset_s or 0.0
+        found.append(Recording("camera", "the frames", _frame_times(source, fields), "thermography", offset_s=stated_s))
+    if source.environment is not None and laser is not None and laser.environment is not None:
+        times, key = source.environment["time"].values, "environment_clock_offset"
+        stated_s = laser.environment_clock_offset_s
+        found.append(Recording("environment", laser.environment, times, "interferometry", key, stated_s))
+    if source.drivers is not None and drivers is not None:
+        times = source.drivers["time"].values
+        found.append(Recording("drivers", drivers.file, times, "drivers", offset_s=drivers.clock_offset_s))
+    if source.sensors is not None and campaign.sensors is not None:
+        times, stated_s = source.sensors.temperature["time"].values, campaign.sensors.clock_offset_s
+        found.append(Recording("sensors", source.sensors.file, times, "sensors", offset_s=stated_s))
+    return found
 
 
 def _log_files(campaign: Campaign) -> tuple[str, str]:
@@ -107,17 +145,20 @@ def _compare_sensors(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
 def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[Check]:
     """Check the fields in themselves, and against logs and drift."""
     try:
-        clock = check_camera_clock(read_fused(fused))
+        compared = compare_drift(read_fused(fused))
     except ReadingsError:
         # It takes three cycles at three targets with readings among the frames.
-        clock = []
+        compared = []
     field, place_mm = thin_fields(fields), source.interferometry.material_sensor_mm
     near = field if place_mm is None else field_at(fields, place_mm)
     environment_file, drivers_file = _log_files(source.campaign)
+    compared += [
+        *_of_stamps(source, fields),
+        *compare_material(near, source.environment),
+        *compare_load(field, source.drivers),
+    ]
     return [
-        *clock,
-        *check_material_clock(near, source.environment, file=environment_file),
-        *check_load_clock(field, source.drivers, file=drivers_file),
+        *check_clocks(_recordings(source, fields), compared),
         *check_load_scale(field, source.drivers, file=drivers_file),
         *check_material(near, source.environment, stated=place_mm is not None, file=environment_file),
         *_compare_sensors(source, fields),
@@ -130,7 +171,7 @@ def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
     """Check the fields in themselves, and against the logged loads, where there is no laser."""
     field, (_, drivers_file) = thin_fields(fields), _log_files(source.campaign)
     return [
-        *check_load_clock(field, source.drivers, file=drivers_file),
+        *check_clocks(_recordings(source, fields), compare_load(field, source.drivers)),
         *check_load_scale(field, source.drivers, file=drivers_file),
         *_compare_sensors(source, fields),
         *check_place(fields),

@@ -6,6 +6,7 @@ import codecs
 import csv
 import itertools
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
@@ -34,6 +35,7 @@ from thermography.inspection import (
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
 from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader, name_unread
+from thermography.io.sequence import camera_names
 from thermography.radiometry.planck import ZERO_CELSIUS_K
 from thermography.registration.plan import read_fiducials
 
@@ -650,36 +652,46 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
     frames, rejected = index_frames(paths)
     if not frames:
         raise ThermographyError(f"{label}: no frame can be read; {rejected[0].reason}")
-    sizes = join(sorted({f"{frame.shape[1]} x {frame.shape[0]}" for frame in frames}))
-    lines = [
-        f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} of {sizes}",
-        f"  camera {_cameras(frames)}",
-        *(f"  {line}" for line in _times(frames)),
-        f"  settings {_settings(frames)}",
-    ]
-    try:
-        evaluation = tabulate_regions(frames)
-        rejected += evaluation.rejected
-    except ThermographyError:
-        evaluation = None
-    lines += [f"  {line}" for line in describe_evaluation(evaluation)]
-    if len({frame.shape for frame in frames}) > 1:
-        lines.append("  warning: frames of several sizes; a run keeps those of the commonest")
+    names = camera_names(frames).astype(str)
+    cameras = Counter(names.tolist())
+    of_what = (
+        f"of {frames[0].shape[1]} x {frames[0].shape[0]}"
+        if len(cameras) == 1
+        else f"of {len(cameras)} cameras or sizes"
+    )
+    lines = [f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} {of_what}"]
+    for name, count in cameras.most_common():
+        chosen = frames.choose(names == name)
+        if len(cameras) > 1:
+            lines.append(f"  {counted(count, 'frame')} of {name}")
+        try:
+            evaluation = tabulate_regions(chosen)
+            rejected += evaluation.rejected
+        except ThermographyError:
+            evaluation = None
+        about = [
+            f"camera {_camera(chosen)}",
+            *_times(chosen),
+            f"settings {_settings(chosen)}",
+            *describe_evaluation(evaluation),
+        ]
+        lines += [f"  {'' if len(cameras) == 1 else '  '}{line}" for line in about]
+    if len(cameras) > 1:
+        lines.append(
+            "  warning: frames of several cameras or sizes are no series; a campaign takes those of the one with most of them"
+        )
     if rejected:
         reasons = listed(f"{one.path.name}: {one.reason.removeprefix(f'{one.path}').lstrip(': ')}" for one in rejected)
         lines.append(f"  warning: {counted(len(rejected), 'frame')} left out: {reasons}")
-    return lines + [f"  warning: {each.message} {each.remedy}" for each in check_series(frames)]
+    of_series = check_series(frames) if len(cameras) == 1 else []
+    return lines + [f"  warning: {each.message} {each.remedy}" for each in of_series]
 
 
-def _cameras(frames: Sequence[FrameReference]) -> str:
-    """Say which cameras, with serial number and lens, recorded the frames."""
-    cameras = dict.fromkeys(
-        f"{frame.camera.model or 'unknown'}"
-        + (f", serial {frame.camera.serial}" if frame.camera.serial else "")
-        + (f", lens {frame.camera.lens_model}" if frame.camera.lens_model else "")
-        for frame in frames
-    )
-    return next(iter(cameras)) if len(cameras) == 1 else f"{len(cameras)}: {'; '.join(cameras)}"
+def _camera(frames: Sequence[FrameReference]) -> str:
+    """Say which camera, with serial number and lenses, recorded the frames."""
+    camera = frames[0].camera
+    lenses = join(sorted({frame.camera.lens_model for frame in frames} - {""}))
+    return f"{camera.model or 'unknown'}{f', serial {camera.serial}' if camera.serial else ''}{f', lens {lenses}' if lenses else ''}"
 
 
 def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
@@ -692,9 +704,10 @@ def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
     length_s = float((timed[-1] - timed[0]) / np.timedelta64(1, "s"))
     zones = sorted({frame.utc_offset_minutes or 0 for frame in frames})
     zone = join([f"{minutes / 60:+g} h" if minutes else "UTC" for minutes in zones])
-    yield f"{moment(timed[0])} to {moment(timed[-1])}, {duration(length_s)} (camera set to {zone})"
     if timed.size < 2:
+        yield f"{moment(timed[0])} (camera set to {zone})"
         return
+    yield f"{moment(timed[0])} to {moment(timed[-1])}, {duration(length_s)} (camera set to {zone})"
     gaps = [
         f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
         for (_, end), (start, _) in itertools.pairwise(Recording("frames", timed).stretches())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial, reduce
@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from fusion.analysis.alignment.align import describe_sensors, join_sensors
 from fusion.analysis.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
+from fusion.analysis.consistency.clocks import FOLLOWING_NOTICES, is_doubted_clock, without_consequences
 from fusion.analysis.effects.effect import plugins
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import (
@@ -51,7 +52,7 @@ from fusion.pipeline.thermograms import evaluate_thermograms
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
-from fusion.results.results import Outcome, Results, assemble
+from fusion.results.results import Notice, Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
 from thermography.fields.cycle_fields import plan_unit
 from thermography.io.sequence import FrameList
@@ -154,7 +155,7 @@ def _run_loaded(
         source = read_source(campaign)
         checks = check_source(source)
         with naming(campaign.path):
-            refuse_contradictions(checks)
+            refuse_contradictions(without_consequences(checks, campaign.accept.doubts))
         made["source"] = source
         made |= {"camera": source} if isinstance(source, CameraInputs) else {}
         made |= {"laser": source} if isinstance(source, LaserInputs) else {"alone": source}
@@ -174,8 +175,9 @@ def _run_loaded(
             run.notices.extend(made["source"].notices if "source" in made else ())
             run_stages(run, RUN, made)
             if "source" in made:
-                checks += made["checks"]
-                run.notices = [*doubt_notices(checks, campaign.accept.doubts), *run.notices]
+                checks = without_consequences([*checks, *made["checks"]], campaign.accept.doubts)
+                doubts = doubt_notices(checks, campaign.accept.doubts)
+                run.notices = [*doubts, *_without_following(run.notices, checks)]
                 run.parts["inputs"] = inputs_part(
                     checks,
                     campaign.accept.doubts,
@@ -187,6 +189,12 @@ def _run_loaded(
             # Nobody is left behind who writes into the folder.
             worker.end()
             raise
+
+
+def _without_following(notices: Sequence[Notice], checks: Sequence[Check]) -> list[Notice]:
+    """Take the remedy from notices of what a doubted clock does by itself."""
+    doubted = any(is_doubted_clock(check) for check in checks)
+    return [replace(one, remedy="") if doubted and one.code in FOLLOWING_NOTICES else one for one in notices]
 
 
 def run_stages(run: Run, stages: Mapping[str, Callable[..., Any]], made: dict[str, Any]) -> None:

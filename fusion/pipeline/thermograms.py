@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import RegionTable, relative_name
-from fusion.campaign.inputs import CameraInputs, camera_names
+from fusion.campaign.inputs import CameraInputs
 from fusion.campaign.time_zones import utc
 from fusion.pipeline.thermal import counter, overridden_parameters, register_campaign, stated_uncertainty
 from fusion.results.progress import Report, counted, listed
@@ -29,6 +29,7 @@ from thermography.evaluation import (
 from thermography.io.flir import FlirFrameReference, read_visible_picture
 from thermography.io.frame import FlirFormatError, FrameReference
 from thermography.io.region import Region, RegionKind
+from thermography.io.sequence import camera_names
 from thermography.radiometry.planck import Overrides
 from thermography.radiometry.uncertainty import rise_scale_contributions, temperature_uncertainty
 from thermography.registration.displacement import picture_displacements

@@ -772,7 +772,8 @@ class _RunningTest:
         table = self._campaign.interferometry
         assert table is not None
         try:
-            cycles = bring_to_utc(arrived.cycles, self._campaign.zone_of("interferometry"), file=table.deviations)
+            zone = self._campaign.zone_of("interferometry")
+            cycles = bring_to_utc(arrived.cycles, zone, file=table.deviations, late_s=table.clock_offset_s)
         except CampaignError as error:
             self._warnings.append(str(error))
             cycles = arrived.cycles

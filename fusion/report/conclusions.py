@@ -64,13 +64,19 @@ def action(step: StepPart, time: TimePart | None, *, record: bool) -> str:
 # What to do next, in the order of importance; every action names the place, the time or the part that it is about.
 
 
+def _clock_doubted(results: Results) -> bool:
+    """Whether a clock is doubted: what remains may then be its doing."""
+    doubts = results.inputs.doubts if results.inputs else ()
+    return any(check.code == "clocks" or check.code.endswith("_clock") for check in doubts)
+
+
 def next_steps(results: Results) -> list[str]:
     """Return what to do next: doubted inputs, what the loop found, positions that stand out, the place, remedies of the warnings."""
     steps = [check.remedy for check in results.inputs.doubts] if results.inputs else []
     loop, correlation = results.loop, results.correlation
     if loop is not None:
         steps += [action(step, results.time, record=results.registration is None) for step in loop.steps]
-        if loop.verdict in {"partial", "unexplained", "no_skill"}:
+        if loop.verdict in {"partial", "unexplained", "no_skill"} and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
     steps += [
         f"{position_words(anomaly.target, anomaly.position_mm)}: {anomaly.evidence.check}"

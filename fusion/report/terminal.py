@@ -86,7 +86,8 @@ def _loop_rows(loop: Loop) -> list[tuple[str, str, Figures]]:
     errors = " -> ".join(
         f"{error} [{low} to {high}]" for error, low, high in zip(numbers, numbers, numbers, strict=True)
     )
-    names, words = dict.fromkeys(("last_value", "mean", loop.best_baseline)), baseline_words(loop)
+    words = baseline_words(loop)
+    names = dict.fromkeys(name for name in ("last_value", "mean", "mean_run", loop.best_baseline) if name in words)
     plain = alike([getattr(loop.baselines, name).rmse_um for name in names], distinct=False)
     baselines = ", ".join(f"{words[name]} {error}" for name, error in zip(names, plain, strict=True))
     return [

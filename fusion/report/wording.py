@@ -146,6 +146,7 @@ BASELINES = {
     "least_squares": "least squares on all that was logged",
     "ridge": "ridge regression on the same",
     "ridge_with_lags": "ridge regression with lagged copies",
+    "mean_run": "mean course of the other runs",
 }
 
 
@@ -443,11 +444,12 @@ def worse_channels(loop: Loop) -> list[tuple[str, ChannelErrors]]:
 
 
 def baseline_words(loop: Loop) -> dict[str, str]:
-    """Return plain predictions in words, by their key in ``loop.baselines``: along an axis cycles are repeated, of a record values."""
+    """Return plain predictions in words, by their key in ``loop.baselines``: along an axis cycles, of a record values."""
     record = isinstance(loop, RecordLoop)
     return {
         name: words.replace("cycles before", "time before").replace("cycle", "value") if record else words
         for name, words in BASELINES.items()
+        if getattr(loop.baselines, name) is not None
     }
 
 

@@ -82,6 +82,8 @@ class Baselines(ResultPart):
     """Ridge regression on the same."""
     ridge_with_lags: ErrorInterval
     """Ridge regression on the same and on lagged copies of it."""
+    mean_run: ErrorInterval | None = None
+    """The mean course of the other runs; null where there is one run."""
 
 
 class StepPart(ResultPart):
@@ -358,7 +360,7 @@ class Loop(HoldOutErrors):
     """The errors before and after with their intervals."""
     baselines: Baselines
     """Errors of plain predictions with their intervals."""
-    best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags"]
+    best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags", "mean_run"]
     """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
     steps: tuple[StepPart, ...]
     """Effects that were added, in turn."""

@@ -38,6 +38,7 @@ _PREDICTIONS = {
     "least_squares": "least squares",
     "ridge": "ridge regression",
     "ridge_with_lags": "ridge regression with lags",
+    "mean_run": "mean course of the other runs",
 }
 
 

@@ -5,28 +5,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.alignment.align import AxisGeometry, align
-from fusion.analysis.alignment.readings import read_fused
+from fusion.analysis.alignment.align import AxisGeometry
 from fusion.analysis.consistency.camera import check_phase
 from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.clocks import (
-    check_camera_clock,
-    check_load_clock,
-    check_load_scale,
-    check_material_clock,
-)
+from fusion.analysis.consistency.courses import check_load_scale
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.logs import check_material
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
-from tests.fusion.analysis.consistency.twin_fields import Recorded, late, scaled
+from tests.fusion.analysis.consistency.twin_fields import FILES, Recorded, clocks, scaled, with_late, without_ends
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import sound_recipe
 from thermography.fields.survey import stray_frames
@@ -61,17 +56,9 @@ def of_logs(test: Recorded, *, stated: bool) -> list[Check]:
     field = thin_fields(test.fields)
     near = field_at(test.fields, PROBE_MM) if stated else field
     return [
-        *check_material_clock(near, test.environment, file="environment.csv"),
-        *check_load_clock(field, test.drivers, file="drivers.csv"),
         *check_load_scale(field, test.drivers, file="drivers.csv"),
         *check_material(near, test.environment, stated=stated, file="environment.csv"),
     ]
-
-
-def of_camera(test: Recorded) -> list[Check]:
-    """The checks of the camera's clock by the drift and by the motion of the axis."""
-    fused = align(test.deviations, test.fields, test.axis)
-    return check_camera_clock(read_fused(fused)) + check_phase(test.fields["time"].values, test.deviations)
 
 
 def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,7 +67,13 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         test = record(varied_recipe(seed))
         failed = [
             check
-            for check in (*of_logs(test, stated=True), *of_logs(test, stated=False), *of_camera(test))
+            for check in (
+                *of_logs(test, stated=True),
+                *of_logs(test, stated=False),
+                *check_phase(test.fields["time"].values, test.deviations),
+                *clocks(test).values(),
+                *clocks(without_ends(test)).values(),
+            )
             if not check.passed
         ]
         doubted += bool(failed)
@@ -90,23 +83,25 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
     assert wilson(doubted, runs)[0] <= 0.01
 
 
-@pytest.mark.parametrize("minutes", [-120.0, -60.0, -30.0, -20.0, 20.0, 30.0, 60.0, 120.0])
-def test_late_clocks(minutes: float, capsys: pytest.CaptureFixture[str]) -> None:
-    runs, noticed, possible, errors = campaigns(40), Counter[str](), Counter[str](), list[float]()
+@pytest.mark.parametrize("loads", ["varying", "constant"])
+@pytest.mark.parametrize("together", [True, False])
+def test_the_odd_clock(together: bool, loads: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each of four recordings late and early; recordings that begin and end together, and recordings that do not."""
+    runs, told = campaigns(40), Counter[tuple[float, str]]()
     for seed in range(first_seed(53000), first_seed(53000) + runs):
-        recipe = Recipe().vary(campaign={"seed": seed}, duty={"mean_hold_min": 25.0})
-        test = record(recipe)
-        logs = replace(test, environment=late(test.environment, minutes), drivers=late(test.drivers, minutes))
-        checks = of_logs(logs, stated=False) + of_camera(replace(test, fields=late(test.fields, minutes)))
-        for check in checks:
-            if check.code.endswith("_clock") or check.code == "camera_phase":
-                possible[check.code] += 1
-                noticed[check.code] += not check.passed
-                errors += [check.value - minutes] if check.code.endswith("_clock") and not check.passed else []
+        duty = {"mean_hold_min": 25.0} if loads == "varying" else {"kind": "constant"}
+        test = record(Recipe().vary(campaign={"seed": seed}, duty=duty))
+        test = test if together else without_ends(test)
+        for name, minutes in product(FILES, (-120.0, -60.0, -15.0, 15.0, 60.0, 120.0)):
+            doubts = [check for check in clocks(with_late(test, name, minutes)).values() if not check.passed]
+            named = doubts[0].code.removesuffix("_clock") if doubts else "silent"
+            right = "named" if named == name and doubts[0].value == minutes else "its file, another shift"
+            told[abs(minutes), right if named == name else named if named in ("silent", "clocks") else "wrong"] += 1
     with capsys.disabled():
-        told = ", ".join(f"{code} {rate(noticed[code], possible[code])}" for code in sorted(possible))
-        middle = f"{np.median(np.abs(errors)):.0f} min" if errors else "-"
-        print(f"\n{minutes:+.0f} min: {told}; median error of the shift {middle}")
+        for minutes in (15.0, 60.0, 120.0):
+            every = {word: count for (size, word), count in told.items() if size == minutes}
+            print(f"\nloads {loads}, begun together {together}, {minutes:.0f} min: {every}")
+    assert not any(word == "wrong" for _, word in told)
 
 
 @pytest.mark.parametrize("gain_s_per_h", [3.0, 6.0, 10.0, 60.0, 600.0])

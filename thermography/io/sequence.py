@@ -537,3 +537,15 @@ def frame_times(frames: Sequence[FrameReference]) -> Array:
 def frame_shapes(frames: Sequence[FrameReference]) -> NDArray[np.int64]:
     """Return rows and columns of frames, (n, 2)."""
     return frames.shapes() if isinstance(frames, FrameList) else np.array([frame.shape for frame in frames], np.int64)
+
+
+def camera_names(frames: Sequence[FrameReference]) -> NDArray[np.object_]:
+    """Return which camera took each frame, by model and serial number, with the size of its picture, (n,) of str."""
+
+    def name(frame: FrameReference) -> str:
+        serial = f" {frame.camera.serial}" if frame.camera.serial else ""
+        return f"{frame.camera.model or 'camera not stored'}{serial}, {frame.shape[1]} x {frame.shape[0]}"
+
+    if not isinstance(frames, FrameList):
+        return np.array([name(frame) for frame in frames], object)
+    return frames.column(lambda table: np.full(len(table), name(table.reference(0)), object), name, "object")

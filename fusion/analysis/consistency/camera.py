@@ -13,7 +13,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.analysis.alignment.align import covered_share, likely_zone_shift
 from fusion.analysis.consistency.checks import Check, Severity, judge
+from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
 from fusion.common import Array
 from thermography.common import ThermographyError
 from thermography.evaluation import share_outside_range
@@ -34,6 +36,8 @@ _LEAST_BURSTS, _LEAST_SHARE = 12, 0.6
 _LARGEST_STEP = 0.2
 #: Largest slip over the test, in cycles: a tenth of a cycle is what triggering by hand or by the axis makes.
 _LARGEST_SLIP = 0.1
+#: A shift by whole quarter hours counts as a wrong time zone where less than this share of the readings lies within the frames.
+_COVERED_NOW = 0.6
 #: Share of the frames that may be stamped while the axis was away from position 0.
 _AWAY_SHARE = 0.5
 #: Share of the steps from name to name that may go back in time before the names tell no order: nobody sets a clock at every fifth frame.
@@ -126,6 +130,47 @@ def check_phase(frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> l
             "table in the camera's view, accept camera_phase.",
         ),
     ]
+
+
+def check_coverage(frame_time: NDArray[np.datetime64], deviations: xr.Dataset, *, offset_s: float) -> list[Check]:
+    """Check that frames and readings were taken at the same time; `offset_s` is what the campaign file states of the camera's clock."""
+    readings = deviations["time"].values
+    readings = readings[~np.isnat(readings)]
+    covered, shift = covered_share(readings, frame_time), likely_zone_shift(readings, frame_time)
+    first, last, start, end = (
+        f"{np.datetime_as_string(time, unit='s')}Z" for time in (*frame_time[[0, -1]], readings.min(), readings.max())
+    )
+    laser = f"readings of {deviations.attrs.get('source', 'the laser')}"
+    span = f"frames {first} to {last}, {laser} {start} to {end}"
+    zones = covered < _COVERED_NOW and shift is not None
+    evidence = f"{100.0 * covered:.0f} % of the readings lie between the first and the last frame ({span})"
+    remedy = "Set thermography.clock_offset (camera clock minus laser clock), or check that both folders belong to the same test."
+    if zones and shift is not None:
+        evidence += f": the clocks look {abs(shift) / 3600:g} h apart, as in two time zones"
+        remedy = (
+            f'Write thermography.clock_offset = "{offset_s + shift:g} s" (camera clock minus laser clock) if the camera\'s is wrong, or '
+            "give the times of both with their zone."
+        )
+    return [
+        judge(
+            "frames_coverage",
+            covered,
+            _COVERED_NOW,
+            f"{evidence}.",
+            remedy,
+            passed=covered > 0.0 and not zones,
+            severity=Severity.CONTRADICTION,
+        )
+    ]
+
+
+def compare_phase(frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> list[Evidence]:
+    """Compare the stamps of the frames of a still table with the motion of the axis: what they say of the camera's clock."""
+    seconds, cycle_end, reading_s, position_mm = _motion(frame_time, deviations)
+    if cycle_end.size < _LEAST_BURSTS or _lock(seconds, cycle_end, float(np.median(np.diff(cycle_end)))) is None:
+        return []
+    away = np.array([_away_share(seconds - QUARTER_S * k, reading_s, position_mm) for k in QUARTERS]) / _AWAY_SHARE
+    return [Evidence("laser", "camera", away, away, TIMES, "place in the cycle")]
 
 
 def _motion(frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> tuple[Array, Array, Array, Array]:

@@ -101,16 +101,14 @@ CONDITIONS = {
     "camera_stamps": Condition("the times of the frames are right", _CAMERA, _FIELDS_AT_READINGS),
     "camera_rate": Condition("the camera's clock keeps its rate", _CLOCK, _FIELDS_AT_READINGS),
     "camera_phase": Condition("the table was in place when the frames were taken", _CAMERA, _FIELDS_AT_READINGS),
-    "camera_clock": Condition("the clocks of camera and laser agree as stated", _CLOCK, _FIELDS_AT_READINGS),
-    "environment_clock": Condition(
-        "the clock of the environment log is right",
-        _LOG,
-        f"{_COMPENSATION}; all fields, if the camera's clock is wrong",
-    ),
-    "drivers_clock": Condition(
-        "the clock of the drivers' log is right",
-        _LOG,
-        "every effect that follows a load; all fields, if the camera's clock is wrong",
+    "frames_coverage": Condition("frames and readings belong together", _CLOCK, _FIELDS_AT_READINGS),
+    "camera_clock": Condition("the clock of the camera is right", _CLOCK, _FIELDS_AT_READINGS),
+    "laser_clock": Condition("the clock of the laser is right", _CLOCK, _FIELDS_AT_READINGS),
+    "environment_clock": Condition("the clock of the environment log is right", _LOG, _COMPENSATION),
+    "drivers_clock": Condition("the clock of the drivers' log is right", _LOG, "every effect that follows a load"),
+    "sensors_clock": Condition("the clock of the contact sensors' log is right", _CLOCK, _SENSORS),
+    "clocks": Condition(
+        "all clocks agree as stated", _CLOCK, "whatever is brought to one time: " + _FIELDS_AT_READINGS
     ),
     "drivers_scale": Condition("the loads are logged in one unit throughout", _LOG, _LOADS),
     "material_course": Condition("frames and environment log are of one test and in order", _CAMERA, _SCALE),

@@ -26,7 +26,7 @@ from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualS
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
 from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems
 from fusion.analysis.drift_model.gains import by_width, profile_gains
-from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk
+from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk, rank_p_value
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
 from fusion.analysis.drift_model.search import (
     BASELINE_LAGS_MIN,
@@ -187,13 +187,34 @@ def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Arr
         here = train & np.isfinite(response)
         # The solution of smallest norm where columns depend on each other.
         least_squares[:, channel] = design @ np.linalg.lstsq(design[here], response[here], rcond=None)[0]
+    of_runs = {"mean_run": mean_course(record, train)} if record.runs else {}
     return {
+        **of_runs,
         "last_value": last_values(record, train),
         "mean": np.broadcast_to(known_mean(record.displacement[train], axis=0), record.displacement.shape),
         "least_squares": least_squares,
         "ridge": predict(record, now, train).predicted,
         "ridge_with_lags": predict(record, np.column_stack([now, *late]), train).predicted,
     }
+
+
+def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:
+    """Predict every block by the mean of the other training runs at the same time since their start, um (blocks, channels).
+
+    Beyond the end of all others their last mean is kept.
+    """
+    place = np.arange(record.seconds.size) - np.asarray(record.first)[record.run]
+    predicted = np.zeros(record.displacement.shape)
+    for run in range(len(record.runs)):
+        others = np.flatnonzero(train & (record.run != run))
+        course: Array = np.full((int(place.max()) + 1, len(record.channels)), np.nan)
+        for at in np.unique(place[others]):
+            course[at] = known_mean(record.displacement[others[place[others] == at]], axis=0)
+        for k in range(len(record.channels)):
+            known = np.flatnonzero(np.isfinite(course[:, k]))
+            course[:, k] = np.interp(np.arange(len(course)), known, course[known, k]) if known.size else 0.0
+        predicted[record.run == run] = course[place[record.run == run]]
+    return predicted
 
 
 # Hold-out set and declared model of a record.
@@ -478,7 +499,9 @@ def _step_event(record: Record, near: Candidate | None) -> Iterator[Candidate]:
 
 
 def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Candidate]:
-    """Waves in time."""
+    """Waves in time; of several runs none, as nothing says at which phase the next run begins."""
+    if record.runs:
+        return
     shortest = 4.0 * record.block_s / 60.0
     if near is None:
         periods = periods_min(record.view())
@@ -550,6 +573,10 @@ def needs_of(effect: Effect, record: Record) -> str | None:
         return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
     if effect.name == "sensor_fault" and not sensor_faults(record):
         return "no sensor jumps alone"
+    if effect.name == "periodic_disturbance" and record.runs:
+        return (
+            "of several runs, what restarts with each of them cannot be told from a rhythm; name one run as record.file"
+        )
     return None
 
 
@@ -865,6 +892,12 @@ _WORDS = {
     _COURSE: "changes that come and go within a few blocks, too quick for the drift",
     _SWITCHING: "quick responses where a driver is switched",
 }
+#: What a run shows of a wave that may be called a rhythm, in periods.
+_LEAST_WAVES = 2.0
+#: Fewest runs whose courses are compared, and draws of the comparison.
+_LEAST_ALIKE, _ALIKE_DRAWS = 3, 199
+_REPEATED = "a course that repeats with every run"
+_SLOW = "a slow change over the record"
 #: A wave that holds this share of the course's variance is a rhythm, whatever else is left.
 _RHYTHM_SHARE = 0.5
 _LAGS = 12
@@ -909,11 +942,33 @@ def _test(innovations: Array, switched: NDArray[np.bool_], rng: np.random.Genera
     )
 
 
+def _repeats(innovations: Array, record: Record, rng: np.random.Generator) -> bool:
+    """Whether the leading course is alike in all runs at the same time since their start, more than shifted ones are."""
+    if len(record.runs) < _LEAST_ALIKE:
+        return False
+    course = _leading_course(innovations)
+    runs = [course[rows] for rows in np.split(np.arange(course.size), record.first[1:])]
+    length = min(one.size for one in runs)
+
+    def alike(shifts: NDArray[np.integer]) -> float:
+        shifted = np.array([np.roll(one, shift)[:length] for one, shift in zip(runs, shifts, strict=True)])
+        return float((shifted.sum(axis=0) ** 2).sum())
+
+    drawn = [alike(rng.integers(0, length, len(runs))) for _ in range(_ALIKE_DRAWS)]
+    return rank_p_value(alike(np.zeros(len(runs), int)), np.array(drawn)) < LEVEL
+
+
 def _shapes(test: PermutationTest, innovations: Array, record: Record, rng: np.random.Generator) -> list[str]:
     """What a significant test shows, in words."""
+    if _repeats(innovations, record, rng):
+        return [_REPEATED]
     if test.p_values[_RHYTHM] >= LEVEL:
         return [_WORDS[test.strongest]]
     frequency, left, share = _without_wave(innovations)
+    longest = max(np.diff([*record.first, innovations.shape[0]]))
+    if frequency * longest < _LEAST_WAVES:
+        # No run shows it twice.
+        return [_WORDS.get(test.strongest, _WORDS[_COURSE]) if test.p_values[_COURSE] < LEVEL else _SLOW]
     rest = _test(left, record.switched(), rng)
     if share < _RHYTHM_SHARE and rest.p_values[_COURSE] < LEVEL:
         return [_WORDS[_COURSE if test.strongest == _RHYTHM else test.strongest]]
@@ -1025,8 +1080,13 @@ class RecordResult:
     @property
     def skill(self) -> bool:
         """Whether the final model predicts the hold-out set better than last value and mean of the training part."""
-        last, mean = (rmse(self.record, self.plain[name], self.hold_out) for name in ("last_value", "mean"))
+        last, mean = self._plain_errors(self.hold_out)
         return has_skill(float(known_mean(self.errors[-1])), last, mean, self.noise_um, RESIDUAL_SHARE)
+
+    def _plain_errors(self, here: NDArray[np.bool_]) -> tuple[float, float]:
+        """Errors of repeating the last value, and of the better mean: of all values, or of the other runs' courses, um."""
+        errors = {name: rmse(self.record, predicted, here) for name, predicted in self.plain.items()}
+        return errors["last_value"], min(errors["mean"], errors.get("mean_run", np.inf))
 
     @property
     def doubts(self) -> list[str]:
@@ -1051,7 +1111,7 @@ class RecordResult:
         last = declared = final = np.nan
         word: schema.Verdict | Literal[""] = ""
         if described.held_out:
-            last, mean = (rmse(self.record, self.plain[name], here) for name in ("last_value", "mean"))
+            last, mean = self._plain_errors(here)
             declared, final = (rmse(self.record, self.predictions[k].predicted, here) for k in (0, -1))
             doubts = [
                 doubt_of(final, rmse(self.record, one.predicted, here), self.noise_um, "in this run")

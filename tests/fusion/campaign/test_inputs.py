@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.analysis.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import (
     LaserInputs,
@@ -27,20 +26,9 @@ from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import change, keep_cycles, without
 from thermography.io.flir import index_frames
+from thermography.io.flir_writer import write_jpeg
+from thermography.io.frame import CameraIdentity
 from thermography.radiometry.planck import calibrate
-
-
-def shift_frames(folder: Path, hours: float) -> None:
-    """Let the laser's clock run ahead of the camera's by rewriting the times of the readings."""
-    path = folder / "laser.csv"
-    lines = path.read_text().splitlines()
-    shifted = [lines[0]]
-    for line in lines[1:]:
-        fields = line.split(",")
-        time = np.datetime64(fields[4].split("+")[0]) + np.timedelta64(round(hours * 3600), "s")
-        fields[4] = f"{time}+00:00"
-        shifted.append(",".join(fields))
-    path.write_text("\n".join(shifted) + "\n")
 
 
 def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
@@ -71,20 +59,6 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     assert missing.message.startswith("2 readings of 288 missing, in ")
     # One reading of 24 at two cells: u grows by 1 - sqrt(23 / 24) = 2.1 %.
     assert missing.effect_um == pytest.approx(0.021 * float(outcome.dataset["drift_profile_u"].max()), rel=0.2)
-
-
-def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: Path) -> None:
-    shift_frames(copied, 1.0)
-    with pytest.raises(AlignmentError, match=r"the clocks look 1 h apart, .* \(frames 2026-03-09T06:"):
-        read_source(load_campaign(copied / "campaign.toml"))
-    path = change(copied / "campaign.toml", 'clock_offset = "0 s"', 'clock_offset = "-1 h"')
-    assert read_source(load_campaign(path)).thermography.clock_offset_s == -3600
-
-
-def test_recordings_of_two_days_are_refused(copied: Path) -> None:
-    shift_frames(copied, 100.0)
-    with pytest.raises(AlignmentError, match=r"T06:32:44Z to 2026-03-09T07:41:44Z, readings of laser\.csv 2026-03-13T"):
-        read_source(load_campaign(copied / "campaign.toml"))
 
 
 def test_a_link_whose_frame_is_gone_is_named(copied: Path) -> None:
@@ -142,11 +116,34 @@ def test_a_region_that_cannot_be_used_is_refused(copied: Path, corners: str, kno
 
 
 def test_a_frame_of_another_size_is_not_called_damaged() -> None:
-    other = {"file": "b.seq", "index": 0, "reason": "b.seq: 640 x 480 pixels among frames of 640 x 512"}
+    other = {
+        "file": "b.seq",
+        "index": 0,
+        "reason": "FLIR E40 7, 160 x 120, taken 2012-11-21T10:00:00Z, among frames of FLIR T1020 9, 320 x 240",
+    }
     (notice,) = frames_notices([other])
     assert notice.remedy == "Name the frames of one camera and one size only in thermography.frames."
     (notice,) = frames_notices([other, {"file": "c.seq", "index": 0, "reason": "c.seq: cut off"}])
     assert notice.remedy.startswith("Copy damaged files again")
+
+
+def test_frames_of_another_camera_are_the_odd_ones_out(copied: Path) -> None:
+    path, frames = copied / "campaign.toml", sorted((copied / "thermal").glob("*.jpg"))
+    sound = read_source(load_campaign(path))
+    (first, _), _ = index_frames(frames[:2])
+    for k in range(2):
+        time = f"2012-11-21T10:00:0{k}"
+        other = CameraIdentity(model="FLIR A645sc", serial="55")
+        write_jpeg(copied / "thermal" / f"IR_other{k}.jpg", first.read().counts, first.parameters, time, camera=other)
+    source = read_source(load_campaign(path))
+    assert isinstance(source, Source) and isinstance(sound, Source)
+    assert source.frames == sound.frames
+    assert [one["file"] for one in source.frames_rejected] == ["thermal/IR_other0.jpg", "thermal/IR_other1.jpg"]
+    assert "FLIR A645sc 55, 640 x 480, taken 2012-11-21T10:00:00Z, among" in source.frames_rejected[0]["reason"]
+    for frame in frames[2:]:
+        frame.unlink()
+    with pytest.raises(SourceError, match=r"4 frames of 2 cameras, none of which .* 2 of FLIR A645sc 55, 640 x 480"):
+        read_source(load_campaign(path))
 
 
 def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:

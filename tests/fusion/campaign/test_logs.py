@@ -338,6 +338,20 @@ def test_runs_that_count_from_their_own_zero_follow_the_order_of_the_files(tmp_p
     assert [str(path) for path in load_campaign(campaign).files_of("record")] == ["b.csv", "a.csv"]
 
 
+def test_runs_that_begin_minutes_after_their_zero_are_no_reason_to_refuse(tmp_path: Path) -> None:
+    campaign = write_runs(tmp_path, 'files = "r*.csv"', time="time [s]", r1=elapsed(), r2=elapsed(90.0), r3=elapsed())
+    data = read_record(load_campaign(campaign))
+    assert json.loads(data.attrs["runs"]) == ["r1.csv", "r2.csv", "r3.csv"]
+    assert data.attrs["own_zero"] == 1 and data.sizes["time"] == 9
+
+
+def test_runs_on_one_clock_without_a_date_keep_it(tmp_path: Path) -> None:
+    campaign = write_runs(tmp_path, 'files = "r*.csv"', time="time [s]", r1=elapsed(600.0), r2=elapsed())
+    data = read_record(load_campaign(campaign))
+    assert json.loads(data.attrs["runs"]) == ["r2.csv", "r1.csv"] and data.attrs["own_zero"] == 0
+    assert data["time"].values[3] - data["time"].values[0] == np.timedelta64(600, "s")
+
+
 @pytest.mark.parametrize(
     ("runs", "message"),
     [

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from fusion.analysis.alignment.align import AlignmentError
@@ -55,6 +56,43 @@ def test_quiet_leaves_faults_and_doubts(copied):
     absent = check_campaign(copied / "absent.toml")
     (line,) = absent.lines(quiet=True)
     assert line.startswith(f"fault: {copied / 'absent.toml'}: no such campaign file")
+
+
+def shift_table(path, column, minutes):
+    """Write the times of a table as those of a clock that is late."""
+    table = pd.read_csv(path, dtype=str)
+    late = pd.to_datetime(table[column], utc=True, format="ISO8601") + pd.Timedelta(minutes=minutes)
+    table.assign(**{column: late.map(pd.Timestamp.isoformat)}).to_csv(path, index=False)
+
+
+@pytest.mark.parametrize(
+    ("file", "code", "heading", "key"),
+    [
+        ("laser.csv", "laser_clock", "interferometry", "clock_offset"),
+        ("environment.csv", "environment_clock", "interferometry", "environment_clock_offset"),
+        ("drivers.csv", "drivers_clock", "drivers", "clock_offset"),
+    ],
+)
+def test_a_table_an_hour_off_is_named_and_put_right_by_its_key(copied, file, code, heading, key):
+    path = copied / "campaign.toml"
+    shift_table(copied / file, "time", 60.0)
+    told = [*check_campaign(path).doubts, *check_campaign(path).faults]
+    assert len(told) == 1 and f'{key} = "3600 s" under [{heading}]' in str(told[0])
+    change(path, f"[{heading}]\n", f'[{heading}]\n{key} = "1 h"\n')
+    assert check_campaign(path).doubts == [] and check_campaign(path).faults == ()
+
+
+def test_a_camera_an_hour_off_is_named(copied):
+    path = change(copied / "campaign.toml", 'clock_offset = "0 s"', 'clock_offset = "1 h"')
+    (fault,) = check_campaign(path).faults
+    assert "The clock of the frames is 1 h early" in fault and "frames_coverage" in fault
+    assert 'clock_offset = "0 s" under [thermography]' in fault
+
+
+def test_recordings_of_two_days_are_refused(copied):
+    shift_table(copied / "laser.csv", "time", 6000.0)
+    told = check_campaign(copied / "campaign.toml").faults
+    assert any("0 % of the readings lie between the first and the last frame" in fault for fault in told)
 
 
 def test_a_doubt_is_named_and_does_not_refuse(copied):

@@ -313,13 +313,14 @@ def test_a_sound_series_is_ten_lines_at_most_and_a_few_frames_are_described_one_
 def test_two_cameras_a_gap_and_other_settings_are_named(tmp_path):
     counts = np.full((4, 6), 18_000, dtype=np.uint16)
     for k, minute in enumerate((0, 1, 2, 3, 4, 45, 46)):
-        parameters = PARAMETERS if k < 6 else replace(PARAMETERS, emissivity=0.8)
-        camera = CameraIdentity(model="SC660", serial="1" if k < 5 else "2")
+        parameters = PARAMETERS if k < 5 else replace(PARAMETERS, emissivity=0.8)
+        camera = CameraIdentity(model="SC660", serial="1" if k < 6 else "2")
         write_jpeg(tmp_path / f"{k}.jpg", counts, parameters, f"2026-03-09T06:{minute:02d}:00", camera=camera)
     (tmp_path / "9.jpg").write_bytes((tmp_path / "0.jpg").read_bytes()[:400])
     lines = describe_series(sorted(tmp_path.iterdir()), label="s")
     text = "\n".join(lines)
-    assert "  camera 2: SC660, serial 1; SC660, serial 2" in lines
+    assert "  6 frames of SC660 1, 6 x 4" in lines and "  1 frame of SC660 2, 6 x 4" in lines
+    assert "    camera SC660, serial 2" in lines
     assert "a frame every 60 s, 1 gap: 2026-03-09 06:04 UTC, 41 min" in text
     assert "of the first frame; not the same in all: emissivity" in text
     assert "  warning: 1 frame left out: 9.jpg: " in text

@@ -1,4 +1,4 @@
-"""Consistency checks of the clocks: a shift that is planted is said, delays that physics makes are none."""
+"""Consistency checks of the clocks: the recording that is late is named, delays that physics makes are none."""
 
 from __future__ import annotations
 
@@ -6,25 +6,19 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.clocks import (
-    check_camera_clock,
-    check_load_clock,
-    check_load_scale,
-    check_material_clock,
-)
+from fusion.analysis.consistency.checks import Severity, judge
+from fusion.analysis.consistency.clocks import QUARTERS, Recording, check_clocks, without_consequences
+from fusion.analysis.consistency.courses import check_load_scale, compare_drift, compare_load, compare_material
 from fusion.analysis.consistency.field_series import field_at, thin_fields
-from tests.fusion.analysis.consistency.twin_fields import SENSOR_MM, Recorded, late, recorded
-
-
-def logs(test: Recorded, *, environment: float = 0.0, drivers: float = 0.0, camera: float = 0.0) -> dict[str, Check]:
-    fields = late(test.fields, camera)
-    field, near = thin_fields(fields), field_at(fields, SENSOR_MM)
-    checks = [
-        *check_material_clock(near, late(test.environment, environment), file="environment.csv"),
-        *check_load_clock(field, late(test.drivers, drivers), file="drivers.csv"),
-    ]
-    return {check.code: check for check in checks}
+from tests.fusion.analysis.consistency.twin_fields import (
+    FILES,
+    SENSOR_MM,
+    clocks,
+    late,
+    recorded,
+    with_late,
+    without_ends,
+)
 
 
 @pytest.mark.parametrize("effect", ["", "unseen_heat_source", "thermal_lag"])
@@ -32,55 +26,86 @@ def test_sound_clocks_pass(effect: str) -> None:
     test = recorded(effect=effect)
     inputs = (test.environment, test.drivers, test.fields)
     kept = [one.copy(deep=True) for one in inputs]
-    assert all(check.passed and check.value == 0.0 for check in logs(test).values())
+    for one in (test, without_ends(test)):
+        assert all(check.passed and check.value == 0.0 for check in clocks(one).values())
     assert all(one.identical(before) for one, before in zip(inputs, kept, strict=True))
-    (camera,) = check_camera_clock(test.readings())
-    assert camera.passed
-    assert "detected beyond the thermal lag" in camera.evidence
 
 
-@pytest.mark.parametrize("minutes", [-60.0, 30.0])
-def test_a_late_log_is_doubted_and_the_shift_said(minutes: float) -> None:
-    found = logs(recorded(), environment=minutes, drivers=minutes)
-    # Shifts are tried in steps of 2 min.
-    assert found["environment_clock"].value == pytest.approx(minutes, abs=4.0)
-    assert found["drivers_clock"].value == pytest.approx(minutes, abs=4.0)
-    assert not found["environment_clock"].passed and not found["drivers_clock"].passed
+@pytest.mark.parametrize("minutes", [-60.0, 15.0, 120.0])
+@pytest.mark.parametrize("name", FILES)
+def test_the_odd_clock_is_named_and_no_other(name: str, minutes: float) -> None:
+    found = clocks(with_late(recorded(), name, minutes), drift=False)
+    assert [code for code, check in found.items() if not check.passed] == [f"{name}_clock"]
+    odd = found[f"{name}_clock"]
+    assert odd.value == minutes
+    assert f'clock_offset = "{60.0 * minutes:g} s" under [{name}]' in odd.remedy
 
 
-def test_only_the_log_that_is_late_is_doubted_and_named() -> None:
-    found = logs(recorded(), drivers=60.0)
-    assert found["environment_clock"].passed
-    minutes = found["drivers_clock"].value
-    assert f"drivers.csv is taken as {minutes:.0f} min late against the camera" in found["drivers_clock"].evidence
-    assert "Check the clock and the time zone of drivers.csv" in found["drivers_clock"].remedy
+@pytest.mark.parametrize("name", FILES)
+def test_where_recordings_are_not_begun_together_their_courses_tell(name: str) -> None:
+    found = clocks(with_late(without_ends(recorded()), name, 60.0))
+    assert [code for code, check in found.items() if not check.passed] == [f"{name}_clock"]
+    assert found[f"{name}_clock"].value == pytest.approx(60.0, abs=15.0)
 
 
-def test_a_camera_that_is_late_is_off_against_both_logs_and_the_drift() -> None:
+def test_two_recordings_have_no_majority() -> None:
     test = recorded()
-    found = logs(test, camera=60.0)
-    assert found["environment_clock"].value == pytest.approx(-60.0, abs=4.0)
-    assert found["drivers_clock"].value == pytest.approx(-60.0, abs=4.0)
-    moved = Recorded(test.axis, test.deviations, late(test.fields, 60.0), test.environment, test.drivers)
-    (camera,) = check_camera_clock(moved.readings())
-    assert not camera.passed and camera.value == pytest.approx(60.0, abs=10.0)
-    assert "the camera's clock is taken as" in camera.evidence and "clock_offset" in camera.remedy
+    two = [
+        Recording(name, FILES[name][1], getattr(test, FILES[name][0])["time"].values.ravel(), name) for name in FILES
+    ]
+    laser, _, environment, _ = two
+    late_log = Recording(
+        "environment", "environment.csv", late(test.environment, 60.0)["time"].values, "interferometry"
+    )
+    checks = {check.code: check for check in check_clocks([laser, late_log])}
+    assert [code for code, check in checks.items() if not check.passed] == ["clocks"]
+    assert checks["clocks"].value == 60.0
+    assert "laser.csv is taken as 1 h early or environment.csv is taken as 1 h late" in checks["clocks"].evidence
+    assert all(check.passed for check in check_clocks([laser, environment]))
+    assert check_clocks([laser]) == []
+
+
+def test_two_against_two_are_not_accused() -> None:
+    test = with_late(with_late(recorded(), "environment", 60.0), "drivers", 60.0)
+    found = clocks(test, drift=False)
+    assert [code for code, check in found.items() if not check.passed] == ["clocks"]
+    assert "no single clock explains it" in found["clocks"].evidence
 
 
 def test_where_nothing_varies_nothing_is_told() -> None:
-    test = recorded(duty="constant")
-    assert set(logs(test)) == {"environment_clock"}
-    assert check_load_clock(None, test.drivers, file="") == []
-    assert check_material_clock(thin_fields(test.fields), None, file="") == []
+    test = without_ends(recorded(duty="constant"))
+    found = clocks(with_late(test, "drivers", -15.0), drift=False)
+    assert all(check.passed for check in found.values())
+    assert "whether it is an hour off cannot be told" in found["drivers_clock"].evidence
+    field = thin_fields(test.fields)
+    assert compare_load(field, test.drivers) == [] == compare_load(None, test.drivers)
+    assert compare_material(field, None) == []
 
 
-def test_a_load_that_drives_nothing_seen_is_not_doubted_and_a_logged_temperature_is_no_load() -> None:
+def test_a_load_that_drives_nothing_seen_tells_nothing_and_a_logged_temperature_is_no_load() -> None:
     test = recorded()
     field = thin_fields(test.fields)
-    (check,) = check_load_clock(field, recorded(seed=6).drivers, file="drivers.csv")
-    assert check.passed
+    assert all(evidence.cost.max() <= 1.0 for evidence in compare_load(field, recorded(seed=6).drivers))
     coolant = test.drivers.assign(duty=test.drivers["duty"].assign_attrs(units="degC"))
-    assert check_load_clock(field, coolant, file="drivers.csv") == []
+    assert compare_load(field, coolant) == []
+
+
+def test_a_material_temperature_contradicts_every_delay_but_its_own() -> None:
+    test = recorded()
+    (evidence,) = compare_material(field_at(test.fields, SENSOR_MM), late(test.environment, 60.0))
+    assert [quarters for quarters in QUARTERS if evidence.cost[evidence.at("environment", quarters)] <= 1.0] == [3, 4]
+    (drift,) = compare_drift(test.readings())
+    assert drift.cost[drift.at("camera", 0)] <= 1.0
+
+
+def test_what_a_wrong_clock_makes_doubtful_waits_until_it_is_right() -> None:
+    clock = judge("laser_clock", 60.0, 0.0, "Late.", passed=False)
+    covered = judge("drivers_coverage", 0.5, 0.9, "Half.", passed=False, severity=Severity.CONTRADICTION)
+    other = judge("datum", 9.0, 5.0, "Jumps.", passed=False)
+    kept = without_consequences([clock, covered, other])
+    assert [check.code for check in kept] == ["laser_clock", "datum"]
+    assert kept[0].severity is Severity.CONTRADICTION and "drivers_coverage" in kept[0].evidence
+    assert without_consequences([clock, covered, other], ["laser_clock"]) == [clock, covered, other]
 
 
 def loads(values: np.ndarray, units: str = "1") -> xr.Dataset:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +10,11 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.consistency.camera import compare_phase
+from fusion.analysis.consistency.checks import Check
+from fusion.analysis.consistency.clocks import Recording, check_clocks
+from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
+from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
@@ -53,9 +58,52 @@ def recorded(seed: int = 5, *, cycles: int = 60, duty: str = "random", effect: s
     )
 
 
+#: Recordings of a campaign by the names of their checks: attribute, and file.
+FILES = {
+    "laser": ("deviations", "laser.csv"),
+    "camera": ("fields", "the frames"),
+    "environment": ("environment", "environment.csv"),
+    "drivers": ("drivers", "drivers.csv"),
+}
+
+
+def clocks(test: Recorded, *, drift: bool = True) -> dict[str, Check]:
+    """The checks of all clocks of a campaign; without the drift, which takes longest, where the others tell enough."""
+    field = thin_fields(test.fields)
+    compared = [
+        *(compare_drift(test.readings()) if drift else []),
+        *compare_phase(test.fields["time"].values, test.deviations),
+        *compare_material(field_at(test.fields, SENSOR_MM), test.environment),
+        *compare_load(field, test.drivers),
+    ]
+    recordings = [
+        Recording(name, file, getattr(test, part)["time"].values.ravel(), name) for name, (part, file) in FILES.items()
+    ]
+    return {check.code: check for check in check_clocks(recordings, compared)}
+
+
+def with_late(test: Recorded, name: str, minutes: float) -> Recorded:
+    """A campaign with one recording whose clock is late."""
+    part = FILES[name][0]
+    return replace(test, **{part: late(getattr(test, part), minutes)})
+
+
+def without_ends(test: Recorded) -> Recorded:
+    """A campaign whose recordings were begun and ended one after another, so that their first and last times tell nothing."""
+    cut = {"deviations": (6, 5), "fields": (0, 3), "environment": (4, 0), "drivers": (10, 19)}
+    dims = {"deviations": "cycle"}
+    parts = {}
+    for part, (begin, end) in cut.items():
+        whole = getattr(test, part)
+        dim = dims.get(part, "time")
+        parts[part] = whole.isel({dim: slice(begin, whole.sizes[dim] - end)})
+    return replace(test, **parts)
+
+
 def late(dataset: xr.Dataset, minutes: float) -> xr.Dataset:
     """The same on a clock that is late."""
-    return dataset.assign_coords(time=dataset["time"] + np.timedelta64(round(60.0 * minutes), "s"))
+    time = dataset["time"] + np.timedelta64(round(60.0 * minutes), "s")
+    return dataset.assign_coords(time=time) if "time" in dataset.dims else dataset.assign(time=time)
 
 
 def scaled(fields: xr.Dataset, factor: float) -> xr.Dataset:

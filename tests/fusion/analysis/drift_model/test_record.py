@@ -34,7 +34,7 @@ from fusion.analysis.drift_model.record import (
     search_record,
     sensor_faults,
 )
-from fusion.analysis.drift_model.record_data import Record, reduce_record
+from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
 from fusion.analysis.drift_model.search import Confirmed, Decision, Reason, Round, Score
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.library import LIBRARY, library
@@ -389,6 +389,14 @@ def test_a_rhythm_has_six_periods_and_four_blocks_in_each():
     closer = candidates("periodic_disturbance", of, near(period_min=50.0))
     frequencies = np.array([1.0 / c.parameters["period_min"] for c in closer])
     np.testing.assert_allclose(frequencies, 1.0 / 50.0 + np.linspace(-0.5, 0.5, 21) / span_min)
+
+
+def test_of_several_runs_no_rhythm_is_tried():
+    one = record()
+    runs = tuple(RecordedRun(f"r{k}", one.start, float(one.seconds[at]), k == 1) for k, at in enumerate((0, 200)))
+    several = replace(one, runs=runs, first=(0, 200))
+    assert candidates("periodic_disturbance", several) == []
+    assert "restarts with each of them" in needs_of(library()["periodic_disturbance"], several)
 
 
 def jumping(*, others: float = 0.0, load: bool = False, jumps: int = 1) -> Record:

@@ -22,7 +22,7 @@ from fusion.analysis.drift_model.record import (
     rmse,
     simulate_channels,
 )
-from fusion.analysis.drift_model.record_data import Record, RecordError, reduce_record
+from fusion.analysis.drift_model.record_data import Record, RecordedRun, RecordError, reduce_record
 from fusion.analysis.drift_model.search import PENALTIES
 from fusion.analysis.effects.effect import Candidate
 from tests.fusion.record_tables import record_of, runs_table, table_of, twin_table
@@ -346,6 +346,18 @@ def test_the_simplest_predictions_are_last_value_and_mean():
     assert list(predicted) == ["last_value", "mean", "least_squares", "ridge", "ridge_with_lags"]
     np.testing.assert_array_equal(predicted["last_value"], np.full((MANY, 1), one.displacement[119, 0]))
     np.testing.assert_allclose(predicted["mean"], np.full((MANY, 1), one.displacement[:120, 0].mean()))
+
+
+def test_of_several_runs_the_mean_course_of_the_others_is_one_too():
+    one, first = record(), (0, 50, 100)
+    course = np.sin(np.arange(60) / 9.0)[:, None]
+    runs = tuple(RecordedRun(f"r{k}", one.start, float(one.seconds[at]), k == 2) for k, at in enumerate(first))
+    measured = np.concatenate([course[:50], 3.0 * course[:50], 5.0 * course])
+    several = replace(one, displacement=measured, runs=runs, first=first)
+    predicted = plain_predictions(several, several.run < 2)["mean_run"]
+    # Of the two others for the run that is held out, kept beyond their end; of a training run the one other.
+    np.testing.assert_allclose(predicted[several.run == 2], 2.0 * course[np.minimum(np.arange(60), 49)])
+    np.testing.assert_allclose(predicted[several.run == 0], 3.0 * course[:50])
 
 
 def test_regressions_follow_temperatures_and_drivers():

@@ -22,7 +22,7 @@ from fusion.analysis.drift_model.record import (
     hold_out,
     withdraw_unreplicated,
 )
-from fusion.analysis.drift_model.record_data import Record, reduce_record
+from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
 from fusion.analysis.drift_model.search import Confirmation, Confirmed, Decision, LoopState, Reason, Round, Score, Step
 from fusion.analysis.effects.effect import Candidate
 from fusion.results.loop import Baselines, ChainedPart
@@ -372,6 +372,22 @@ def test_what_comes_and_goes_within_blocks_is_a_course_in_time():
     noise = np.random.default_rng(2).standard_normal(BLOCKS + 8)
     left = examined(record_with(1.0 * np.convolve(noise, np.ones(9), "valid") / 2.0))
     assert left.shape == "changes that come and go within a few blocks, too quick for the drift"
+
+
+def test_no_rhythm_is_longer_than_half_a_run():
+    # 1.5 waves over the record, 3 over each half of it.
+    slow = 3.0 * np.sin(2.0 * np.pi * 1.5 * BLOCK / BLOCKS)
+    assert "rhythm" not in examined(record_with(slow)).shape
+    quick = 3.0 * np.sin(2.0 * np.pi * 12.0 * BLOCK / BLOCKS)
+    assert examined(record_with(quick)).shape == "a rhythm of about 100 min"
+
+
+def test_what_restarts_with_every_run_repeats_and_is_no_rhythm():
+    of_run = 3.0 * np.sin(2.0 * np.pi * 3.0 * np.arange(60) / 60.0)
+    one, first = record_with(np.tile(of_run, 4)), (0, 60, 120, 180)
+    runs = tuple(RecordedRun(f"r{k}", one.start, float(one.seconds[at]), k == 3) for k, at in enumerate(first))
+    left = examined(replace(one, runs=runs, first=first))
+    assert left.shape == "a course that repeats with every run"
 
 
 def kicked() -> tuple[np.ndarray, np.ndarray]:
