@@ -46,7 +46,9 @@ _ALSO = {
         f"{_FIT}::test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra",
         f"{_FIT}::test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps",
         "tests/interferometry/drift/test_kalman.py",
-    )
+    ),
+    # The memory of the noise is held where profiles and anomalies meet it.
+    "interferometry/drift/gls.py": ("tests/interferometry/drift/test_estimate.py",),
 }
 #: Decorators that change no value, only speed and form.
 _FORM = re.compile("njit|dataclass")

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
@@ -31,6 +33,18 @@ def compact(picture: bytes) -> bytes:
         if small.tell() < _MOST_BYTES:
             return small.getvalue()
     raise SystemExit(f"a picture of {image.size} px is larger than {_MOST_BYTES} bytes; take less of the page")
+
+
+@contextmanager
+def open_app(folder: Path) -> Iterator[str]:
+    """Serve a folder in the application; return its address."""
+    command = [sys.executable, "-m", "thermofuse", "app", "."]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as app:
+        try:
+            assert app.stdout is not None
+            yield app.stdout.readline().removeprefix("app:").strip()
+        finally:
+            app.terminate()
 
 
 @contextmanager
@@ -57,21 +71,37 @@ def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> N
     copy = Path(tempfile.mkdtemp()) / "measurement"
     shutil.copytree(campaign, copy)
     shutil.copytree(results, copy / "results")
-    command = [sys.executable, "-m", "thermofuse", "app", "."]
-    with subprocess.Popen(command, cwd=copy, stdout=subprocess.PIPE, text=True) as app:
-        try:
-            assert app.stdout is not None
-            address = app.stdout.readline().removeprefix("app:").strip()
-            with open_page(browser, address, 900) as page:
-                page.set_default_timeout(_LOADING_MS)
-                page.get_by_text("Results", exact=True).first.click()
-                page.get_by_text("Open", exact=True).first.click()
-                page.locator("canvas").first.wait_for()
-                page.wait_for_timeout(8000)
-                (folder / "app.png").write_bytes(compact(page.screenshot()))
-        finally:
-            app.terminate()
-            shutil.rmtree(copy.parent)
+    try:
+        with open_app(copy) as address, open_page(browser, address, 900) as page:
+            page.set_default_timeout(_LOADING_MS)
+            page.get_by_text("Results", exact=True).first.click()
+            page.get_by_text("Open", exact=True).first.click()
+            page.locator("canvas").first.wait_for()
+            page.wait_for_timeout(8000)
+            (folder / "app.png").write_bytes(compact(page.screenshot()))
+    finally:
+        shutil.rmtree(copy.parent)
+
+
+def take_table(browser: Browser, folder: Path) -> None:
+    """Write a picture of the application that asks for the columns of a table."""
+    with tempfile.TemporaryDirectory() as name:
+        minutes = np.arange(0, 360, 0.5)
+        warm = 1 - np.exp(-minutes / 60)
+        columns = {
+            "Time": minutes, "TT_100": 21 + 9 * warm, "TT_101": 21 + 4 * warm**2, "speed": np.where(minutes < 240, 3000, 0),
+            "Z": 0.016 * warm, "sample": np.arange(minutes.size),
+        }  # fmt: skip
+        test = Path(name) / "Lathe 3"
+        test.mkdir()
+        pd.DataFrame(columns).round(4).to_csv(test / "lathe.csv", index=False)
+        with open_app(test) as address, open_page(browser, address, 735) as page:
+            page.set_default_timeout(_LOADING_MS)
+            place = page.get_by_text("Columns of the record")
+            place.wait_for()
+            place.evaluate("element => element.scrollIntoView({block: 'start'})")
+            page.wait_for_timeout(3000)
+            (folder / "table.png").write_bytes(compact(page.screenshot()))
 
 
 if __name__ == "__main__":
@@ -80,4 +110,5 @@ if __name__ == "__main__":
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         take_report(browser, results / "report.html", pictures)
         take_app(browser, campaign, results, pictures)
+        take_table(browser, pictures)
         browser.close()

@@ -637,23 +637,101 @@ class DriversTable(Table):
         return self
 
 
-class RecordTable(Table):
-    """``[record]``: temperature sensors and displacement channels over time, in one table per run (CSV or XLSX).
+class ColumnTable(Table):
+    """A line of ``[record.columns]``: what a column holds, and its unit; ``"degC"`` alone states the unit, from which the role follows."""
 
-    Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` matches any text. ``test`` names the runs
-    that are held out; left out: the last one.
+    role: Literal["temperature", "displacement", "driver"] | None = None
+    unit: str = ""
+
+
+#: A unit alone, or a table with role and unit.
+StatedColumn = Annotated[
+    ColumnTable,
+    BeforeValidator(
+        lambda value: {"unit": value} if isinstance(value, str) else value, json_schema_input_type=str | ColumnTable
+    ),
+]
+
+
+class HeaderRows(Table):
+    """``header_rows`` of a record: lines of the file, from 1, that hold the names, the units and the first values."""
+
+    names: int | None = Field(default=None, ge=1)
+    units: int | None = Field(default=None, ge=1)
+    values: int = Field(ge=1)
+
+    @model_validator(mode="after")
+    def _values_come_last(self) -> HeaderRows:
+        if self.values <= max(self.names or 0, self.units or 0):
+            raise ValueError(f"the values begin at line {self.values}, above the names or the units; correct the lines")
+        return self
+
+
+#: One heading, or two of a date and a time of day.
+Headings = Annotated[
+    tuple[str, ...],
+    Field(min_length=1, max_length=2),
+    BeforeValidator(
+        lambda value: (value,) if isinstance(value, str) else value, json_schema_input_type=str | tuple[str, ...]
+    ),
+]
+
+
+class LongTable(Table):
+    """``long`` of a record: headings of a table with a line for every change, its time, its channel and its value."""
+
+    time: Headings
+    channel: str
+    value: str
+
+
+class RecordTable(Table):
+    """``[record]``: temperature sensors and displacement channels over time, in one table per run (text or XLSX).
+
+    Columns are named as in the file's heading; ``*`` matches any text. Roles are stated either by ``temperatures``, ``displacements`` and
+    ``drivers`` or by ``columns``. ``test`` names the runs that are held out; left out: the last one.
     """
 
     file: ExistingFile | None = None
     files: RunPatterns = ()
     test: RunPatterns = ()
     sheet: str | None = None
-    time: str
+    time: Headings | None = None
+    every_s: PositiveSeconds | None = None
+    long: LongTable | None = None
+    time_format: str | None = None
+    time_unit: Literal["ms", "s", "min", "h"] | None = None
     start: str | None = None
     time_zone: TimeZone | None = None
-    temperatures: tuple[str, ...] = Field(min_length=1)
-    displacements: tuple[str, ...] = Field(min_length=1)
+    header_rows: HeaderRows | None = None
+    missing: tuple[float | str, ...] = ()
+    temperatures: tuple[str, ...] = ()
+    displacements: tuple[str, ...] = ()
     drivers: tuple[str, ...] = ()
+    columns: dict[str, StatedColumn] = {}
+
+    @model_validator(mode="after")
+    def _times_are_stated_once(self) -> RecordTable:
+        if sum(way is not None for way in (self.time, self.every_s, self.long)) != 1:
+            raise ValueError(
+                'write one of time = "heading of the times", every = "60 s" (a table without times, from one row to the next), or '
+                'long = {time = "...", channel = "...", value = "..."} (a line for every change)'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _roles_are_stated_once(self) -> RecordTable:
+        if self.temperatures and self.displacements:
+            named = next((name for name, column in self.columns.items() if column.role is not None), None)
+            if named is not None:
+                raise ValueError(
+                    f'columns gives "{named}" a role, and temperatures and displacements give roles too; state them in one of both places'
+                )
+        elif self.temperatures or self.displacements or self.drivers or not self.columns:
+            raise ValueError(
+                'a record needs temperatures = [...] and displacements = [...], or the roles in [record.columns], for example "T1" = "degC"'
+            )
+        return self
 
     @model_validator(mode="after")
     def _runs_are_whole(self, info: ValidationInfo) -> RecordTable:

@@ -7,7 +7,7 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,17 +17,20 @@ import xarray as xr
 from pandas.io.parsers import TextParser  # type: ignore[attr-defined]
 
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
-from fusion.campaign.config import Campaign, CampaignError, RecordTable
+from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LongTable, RecordTable
 from fusion.campaign.time_zones import bring_to_utc
-from fusion.campaign.values import QuantityError, conversion, name_and_unit
+from fusion.campaign.values import QuantityError, column_conversion, name_and_unit, role_of_unit, unit_name
 from fusion.common import Array, FusionError
 from interferometry.io.faults import Numerals, RejectedLine, raise_if_mostly_invalid
-from interferometry.io.spreadsheets import cell_text, read_cells
+from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     BadReading,
+    DateOrder,
     decode_text,
     delimiter_of,
+    delimiter_of_values,
     describe_time_zone,
+    fields_of,
     find_header,
     parse_time,
     read_table,
@@ -43,8 +46,11 @@ _TAKEN = (
     "cycle", "direction", "target", "position", "time", "deviation", "quality_flag", "inside_frames", "effect", "period", "mean_rise",
     "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral", "driver_time", "environment_time", "frame_time",
 )  # fmt: skip
-#: Seconds beyond these are damaged numbers: a century.
-_LONGEST_RECORD_S = 3.2e9
+#: Seconds beyond these are damaged numbers: LabVIEW counts from 1904, 4.5e9 s reach to 2046.
+_LONGEST_RECORD_S = 4.5e9
+_DECIMAL_COMMA = re.compile(r"\d,\d")
+#: A unit of each role, for a message.
+_EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: Where seconds count from in a table whose start is not stated.
 NO_START = np.datetime64("1970-01-01", "ns")
 
@@ -130,38 +136,47 @@ def read_drivers(path: str | Path) -> xr.Dataset:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A logged table as text and numbers, by lines of its file; its row of units by heading, and lines that do not fit."""
+
+    frame: pd.DataFrame
+    units: Mapping[str, str]
+    left_out: list[RejectedLine]
+
+
 def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
     """Read one table of a ``[record]``: temperatures, displacements and drivers over time."""
     record = campaign.record
     if record is None:
         raise TableError(f"{campaign.path}: there is no [record] in this campaign")
-    frame, misfits = _read_frame(path, record)
-    columns = list(frame.columns)
-    if record.time not in columns:
-        raise TableError(f'{path}: no column is named "{record.time}"; the file has: {", ".join(columns)}')
-    others = [column for column in columns if column != record.time]
-    time, reference, left_out = _times(path, frame[record.time], record)
-    left_out = [*misfits, *left_out]
+    rows = read_rows(path, sheet=record.sheet, header=record.header_rows, missing=record.missing)
+    frame = rows.frame
+    time, reference, left_out = _times(path, rows, record)
+    left_out = [*rows.left_out, *left_out]
+    if record.long is not None:
+        frame, time, without_number = _by_channel(path, frame, time, record.long)
+        left_out += without_number
+    columns = columns_of(path, [name for name in frame.columns if name not in (record.time or ())], rows.units, record)
     keep = ~np.isnat(time)
     order = np.argsort(time[keep], kind="stable")
 
-    def block(patterns: Iterable[str], unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
+    def block(role: str, unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
         names, units, values = [], [], []
-        for column in match_columns(patterns, others):
-            name, given = split_heading(path, column)
-            numbers = _numbers(frame[column])[keep][order]
+        for heading, (name, given) in columns[role].items():
+            numbers = numbers_in(frame[heading])[keep][order]
             if np.isnan(numbers).all():
                 raise TableError(
-                    f'{path}: the column "{column}" contains no numbers; name another one in the campaign file'
+                    f'{path}: the column "{heading}" contains no numbers; name another one in the campaign file'
                 )
             names.append(name)
             units.append(given if unit is None else unit)
-            values.append(numbers if unit is None else in_unit(numbers, given, unit, column=column, path=path))
+            values.append(numbers if unit is None else in_unit(numbers, given, unit, column=heading, path=path))
         return names, units, np.array(values).reshape(len(names), int(keep.sum())).T
 
-    sensors, _, temperature = block(record.temperatures, "degC")
-    channels, _, displacement = block(record.displacements, "um")
-    drivers, driver_units, driver = block(record.drivers, None)
+    sensors, _, temperature = block("temperature", "degC")
+    channels, _, displacement = block("displacement", "um")
+    drivers, driver_units, driver = block("driver", None)
     celsius = {"units": "degC", "units_metadata": "temperature: on_scale"}
     table = xr.Dataset(
         {
@@ -177,62 +192,119 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
     return bring_to_utc(table, campaign.zone_of("record"), file=path.name)
 
 
-def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[RejectedLine]]:
-    """Return the whole table as text and numbers, whatever the file's kind, and the lines that do not fit its header."""
-    left_out: list[RejectedLine] = []
-    if path.suffix.lower() in {".xlsx", ".xlsm"}:
-        frame = _read_sheet(path, record)
-    else:
-        try:
-            frame, left_out = _read_text(path)
-        except (ValueError, OSError, pd.errors.ParserError) as error:
+def columns_of(
+    path: Path, headings: list[str], units: Mapping[str, str], record: RecordTable
+) -> dict[str, dict[str, tuple[str, str]]]:
+    """Return the name and the unit of every column that a record uses, by role and heading."""
+    stated: dict[str, ColumnTable] = {}
+    # A column that is named goes before one that a pattern matches.
+    for pattern, column in sorted(record.columns.items(), key=lambda item: "*" not in item[0]):
+        stated |= dict.fromkeys(match_columns([pattern], headings), column)
+    roles: dict[str, dict[str, tuple[str, str]]] = {"temperature": {}, "displacement": {}, "driver": {}}
+    listed = {"temperature": record.temperatures, "displacement": record.displacements, "driver": record.drivers}
+    role_by_heading = {
+        heading: role for role, patterns in listed.items() for heading in match_columns(patterns, headings)
+    } or dict.fromkeys(stated)
+    for heading in filter(role_by_heading.__contains__, headings):
+        column, (name, in_heading) = stated.get(heading, ColumnTable()), name_and_unit(heading)
+        elsewhere = unit_name(column.unit or units.get(heading, ""))
+        unit = elsewhere or in_heading
+        role = role_by_heading[heading] or column.role or role_of_unit(unit)
+        if not unit and name == heading.strip():
             raise TableError(
-                f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX"
-            ) from None
-    return frame.rename(columns=lambda name: str(name).strip()), left_out
+                f'{path}: the column "{heading}" has no unit; write it under [record.columns]: "{heading}" = {_EXAMPLES[role]}'
+            )
+        # TC(1) and TC(2) of a logger are two names, whose units stand elsewhere.
+        roles[role][heading] = (heading if elsewhere and in_heading not in ("", elsewhere) else name, unit)
+    for role in ("temperature", "displacement"):
+        if not roles[role]:
+            raise TableError(
+                f'{path}: no column is a {role}; write one under [record.columns], such as "{headings[-1]}" = {_EXAMPLES[role]}'
+            )
+    return roles
 
 
-def _read_sheet(path: Path, record: RecordTable) -> pd.DataFrame:
+def read_rows(
+    path: Path, *, sheet: str | None = None, header: HeaderRows | None = None, missing: Sequence[float | str] = ()
+) -> Rows:
+    """Read a whole table, text or a sheet of a spreadsheet; without `header` its first line that is no comment holds the names."""
+    with path.open("rb") as file:
+        workbook = is_workbook(file.read(8))
+    if workbook:
+        return _read_sheet(path, sheet, header, list(missing))
+    try:
+        return _read_text(path, header, list(missing))
+    except (ValueError, OSError, pd.errors.ParserError) as error:
+        raise TableError(f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX") from None
+
+
+def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None, missing: list[float | str]) -> Rows:
     """Read one sheet of a spreadsheet, the first without a name, with the types that pandas gives the columns."""
     sheets = read_cells(path, as_stored=True)
-    name = record.sheet or next(iter(sheets))
+    name = sheet or next(iter(sheets))
     if name not in sheets:
         raise TableError(f"{path}: there is no sheet {name!r}; the sheets are {', '.join(map(repr, sheets))}")
-    (_, headings), *rows = sheets[name]
-    frame = TextParser([[cell_text(cell) for cell in headings], *(row for _, row in rows)]).read()
+    first = sheets[name][0][0]
+    header = header or HeaderRows(names=first, values=first + 1)
+    by_line = {line: [cell_text(cell) for cell in cells] for line, cells in sheets[name] if line < header.values}
+    below = [(line, cells) for line, cells in sheets[name] if line >= header.values]
+    names = by_line.get(header.names or 0) or [str(k + 1) for k in range(len(sheets[name][0][1]))]
+    frame = TextParser([names, *(cells for _, cells in below)], na_values=missing).read()
     # Lines are counted in the file.
-    frame.index = pd.Index([line - 2 for line, _ in rows])
-    return frame
+    frame.index = pd.Index([line for line, _ in below])
+    return _named(frame, by_line.get(header.units or 0, []), [])
 
 
-def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
-    """Read delimited text with the dialect that its header line shows."""
-    text = decode_text(path, path.read_bytes())
-    before, header = find_header(io.StringIO(text))
-    delimiter = delimiter_of(header)
+def text_lines(path: Path) -> list[str]:
+    """Return the lines of a text, each with its end."""
+    return list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
+
+
+def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]) -> Rows:
+    """Read delimited text with the dialect that its header line, or without one its first line of values, shows."""
+    lines = text_lines(path)
+    if header is None:
+        before, _ = find_header(lines)
+        header = HeaderRows(names=before + 1, values=before + 2)
+    below = lines[header.values - 1 :]
+    if header.names:
+        names = "".join(lines[header.names - 1 : header.names])
+        delimiter = delimiter_of(names)
+    else:
+        delimiter = delimiter_of_values("".join(below[:1]))
+        width = max((len(fields_of(line, delimiter)) for line in below), default=0)
+        names = (delimiter or " ").join(str(k + 1) for k in range(width))
+    decimal_comma = delimiter == ";" or (delimiter != "," and _DECIMAL_COMMA.search("".join(below[:1])) is not None)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
-        frame = pd.read_csv(
-            io.StringIO(text),
-            sep=delimiter,
-            # Spreadsheets that part fields by semicolons write decimal commas.
-            decimal="," if delimiter == ";" else ".",
-            skiprows=before,
+        frame = pd.read_csv(  # type: ignore[call-overload] # numbers may be marks too
+            io.StringIO("".join([names.strip("\n"), "\n", *below])),
+            sep=delimiter or r"\s+",
+            decimal="," if decimal_comma else ".",
             skipinitialspace=True,
             index_col=False,
             on_bad_lines="warn",
+            na_values=missing,
         )
     if any("loss of data" in str(warning.message) for warning in caught):
         raise FusionError("the lines hold more fields than the header names; name every column")
     # Lines are counted in the file.
-    frame.index += before
+    frame.index += header.values
     skipped = [fields for warning in caught for fields in _SKIPPED.findall(str(warning.message))]
-    return frame, [
-        RejectedLine(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
+    left_out = [
+        RejectedLine(path.name, int(line) + header.values - 2, f"{saw} fields", f"{due} were expected")
+        for line, due, saw in skipped
     ]
+    return _named(frame, fields_of(lines[header.units - 1], delimiter) if header.units else [], left_out)
 
 
-def _numbers(column: pd.Series) -> np.ndarray:
+def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) -> Rows:
+    """Return rows with the names of their columns, and their units, without the spaces around them."""
+    frame = frame.rename(columns=lambda name: str(name).strip())
+    return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
+
+
+def numbers_in(column: pd.Series) -> np.ndarray:
     """Return the numbers of a column, NaN where a row has none."""
     if pd.api.types.is_numeric_dtype(column):
         return column.to_numpy(dtype="f8", na_value=np.nan)
@@ -248,42 +320,98 @@ def _numbers(column: pd.Series) -> np.ndarray:
     return np.array([number(text) for text in texts])
 
 
-def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, str, list[RejectedLine]]:
+def _by_channel(
+    path: Path, frame: pd.DataFrame, time: np.ndarray, long: LongTable
+) -> tuple[pd.DataFrame, np.ndarray, list[RejectedLine]]:
+    """Return a column for every channel, which keeps its value until its next line; their times, and the lines without a number."""
+    values = pd.Series(numbers_in(frame[long.value]), frame.index)
+    channels = frame[long.channel].astype(str).str.strip()
+    bad = values.isna() & channels.isin(channels[values.notna()].unique())
+    left_out = [
+        RejectedLine(path.name, int(line), str(frame.at[line, long.value]), "is not a number")
+        for line in frame.index[bad]
+    ]
+    changes = pd.DataFrame({"time": time, "channel": channels, "value": values}).dropna()
+    wide = changes.groupby(["time", "channel"])["value"].last().unstack().ffill()
+    return wide, wide.index.to_numpy("M8[ns]"), left_out
+
+
+def _times(path: Path, rows: Rows, record: RecordTable) -> tuple[np.ndarray, str, list[RejectedLine]]:
     """Return times, NaT where a row has none, how they came to UTC in words, and the list of the rows without a time."""
-    seconds = pd.Series(_numbers(column), column.index)
-    left_out: list[RejectedLine] = []
+    frame = rows.frame
+    headings = record.time or (record.long.time if record.long else ())
+    for heading in (*headings, *((record.long.channel, record.long.value) if record.long else ())):
+        if heading not in frame.columns:
+            raise TableError(f'{path}: no column is named "{heading}"; the file has: {", ".join(frame.columns)}')
+    if record.every_s is not None:
+        return _after_start(np.arange(len(frame)) * record.every_s, record, path)
+    column = frame[headings[0]] if len(headings) == 1 else frame[list(headings)].astype(str).agg(" ".join, axis=1)
+    seconds = numbers_in(column) if record.time_format is None else np.full(len(frame), np.nan)
     zones: dict[str, int] = {}
-    if seconds.notna().mean() > 0.5:
-        _, unit = split_heading(path, record.time)
-        start, zone = NO_START, "+0000"
-        if record.start is not None:
-            try:
-                start, zone = parse_time(record.start)  # type: ignore[assignment]
-            except BadReading as fault:
-                raise TableError(f'record.start = "{record.start}": {fault.reason}, needed for {path}') from None
-        zones[zone] = 0
-        elapsed = in_unit(seconds.to_numpy(dtype="f8"), unit, "s", column=record.time, path=path)
-        elapsed[~(np.abs(elapsed) < _LONGEST_RECORD_S)] = np.nan
-        time = start + np.where(np.isfinite(elapsed), np.round(elapsed * 1e9), 0).astype("m8[ns]")
-        time[~np.isfinite(elapsed)] = np.datetime64("NaT")
+    if np.isfinite(seconds).mean() > 0.5:
+        unit = record.time_unit or rows.units.get(headings[0], "") or name_and_unit(headings[0])[1]
+        if not unit:
+            raise TableError(
+                f'{path}: the times in the column "{headings[0]}" are numbers without a unit; write time_unit = "s" (or "ms", "min", "h") '
+                "under [record]"
+            )
+        elapsed = in_unit(seconds, unit, "s", column=headings[0], path=path)
+        time, words, _ = _after_start(elapsed, record, path)
+    elif record.time_format is not None:
+        time, zone = _formatted_times(path, column, record)
+        words = describe_time_zone(path, {zone: 0})
     else:
-        time = np.full(len(column), np.datetime64("NaT", "ns"))
-        for at, value in enumerate(column):
+        texts = ["" if pd.isna(value) else str(value) for value in column]
+        order = DateOrder.of(path, zip(column.index, texts, strict=True))
+        time = np.full(len(texts), np.datetime64("NaT", "ns"))
+        for at, text in enumerate(texts):
             try:
-                time[at], zone = parse_time("" if pd.isna(value) else str(value))
+                time[at], zone = parse_time(text, order)
             except BadReading:
                 continue
-            zones.setdefault(zone, int(column.index[at]) + 2)
-    for at in np.flatnonzero(np.isnat(time)):
-        left_out.append(RejectedLine(path.name, int(column.index[at]) + 2, str(column.iloc[at]), "is not a time"))
+            zones.setdefault(zone, int(column.index[at]))
+        words = describe_time_zone(path, zones) if zones else ""
+    left_out = [
+        RejectedLine(path.name, int(column.index[at]), str(column.iloc[at]), "is not a time")
+        for at in np.flatnonzero(np.isnat(time))
+    ]
     raise_if_mostly_invalid(path, int((~np.isnat(time)).sum()), left_out)
-    return time, describe_time_zone(path, zones), left_out
+    return time, words, left_out
+
+
+def _after_start(elapsed: np.ndarray, record: RecordTable, path: Path) -> tuple[np.ndarray, str, list[RejectedLine]]:
+    """Return the times that lie `elapsed` seconds after the start of a record, NaT where that is no number of a time."""
+    start, zone = NO_START, "+0000"
+    if record.start is not None:
+        try:
+            start, zone = parse_time(record.start)  # type: ignore[assignment]
+        except BadReading as fault:
+            raise TableError(f'record.start = "{record.start}": {fault.reason}, needed for {path}') from None
+    known = np.abs(elapsed) < _LONGEST_RECORD_S
+    time = start + np.where(known, np.round(np.where(known, elapsed, 0.0) * 1e9), 0).astype("m8[ns]")
+    time[~known] = np.datetime64("NaT")
+    return time, describe_time_zone(path, {zone: 0}), []
+
+
+def _formatted_times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, str]:
+    """Return the times of ``time_format``, NaT where a row has none, and their zone; times of day count from midnight of the first day."""
+    form = str(record.time_format)
+    try:
+        times = pd.to_datetime(column.astype(str).str.strip(), format=form, errors="coerce", utc="%z" in form)
+    except ValueError as error:
+        raise TableError(f'{path}: record.time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
+    if not set(re.findall(r"%-?([a-zA-Z])", form)) & set("dDjcxs"):
+        days = (times.diff() < pd.Timedelta(-12, "h")).cumsum()
+        elapsed = ((times - times.dt.normalize()) + pd.to_timedelta(days, unit="D")).dt.total_seconds()
+        return _after_start(elapsed.to_numpy(), record, path)[0], "+0000"
+    aware = times.dt.tz is not None
+    return times.dt.tz_localize(None).to_numpy("M8[ns]"), "+0000" if aware else ""
 
 
 def in_unit(values: np.ndarray, unit: str, target: str, *, column: str, path: Path) -> np.ndarray:
     """Return the values of a column in the canonical unit `target`."""
     try:
-        factor, offset = conversion(unit, target)
+        factor, offset = column_conversion(unit, target)
     except QuantityError as error:
         raise TableError(f'{path}: the column "{column}": {error}') from None
     return values * factor + offset

@@ -7,8 +7,9 @@ import math
 import os
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
@@ -43,6 +44,11 @@ _WORDS = {
     "micrometre": "um", "micrometres": "um", "millimeter": "mm", "millimetre": "mm", "second": "s", "seconds": "s", "minute": "min",
     "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
 }  # fmt: skip
+#: Other units, and what loggers write in a row of units for their own columns.
+_OF_LOGGERS = (
+    "TS", "RN", "V", "mV", "Volts", "A", "mA", "W", "kW", "N", "kN", "Nm", "rpm", "RPM", "1/min", "bar", "hPa", "mbar", "kPa", "Pa", "%",
+    "%RH", "m/s", "g", "m/s^2", "Hz", "-", "1",
+)  # fmt: skip
 _EXAMPLES = {
     "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
     "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min", "px": "4 px",
@@ -84,6 +90,29 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     if name not in known:
         raise QuantityError(f'"{unit}" is not a unit of {_KINDS[target]}; use one of {", ".join(known)}')
     return known[name]
+
+
+def column_conversion(unit: str, target: str) -> tuple[float, float]:
+    """Return ``(factor, offset)`` of a column in `unit`, which may be that of one count: ``"0.0125 mm"``."""
+    count = _QUANTITY.fullmatch(unit)
+    if count is not None and unit_name(count[2] or "") in _UNITS[target]:
+        factor, offset = conversion(count[2], target)
+        return float(count[1]) * factor, offset
+    return conversion(unit, target)
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit that columns of loggers have."""
+    return any(unit_name(text) in units for units in _UNITS.values()) or text.strip() in _OF_LOGGERS
+
+
+def role_of_unit(unit: str) -> Literal["temperature", "displacement", "driver"]:
+    """Return what a column in a unit holds where nothing else says so: a temperature, a displacement, or anything else."""
+    for target, role in (("degC", "temperature"), ("um", "displacement")):
+        with suppress(QuantityError):
+            column_conversion(unit, target)
+            return role  # type: ignore[return-value]
+    return "driver"
 
 
 def read_quantity(value: object, target: str) -> float:

@@ -6,21 +6,18 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from fusion.campaign.values import QuantityError, read_quantity
+from fusion.campaign.values import QuantityError, column_conversion, read_quantity, role_of_unit
 from fusion.common import FusionError
+from fusion.pipeline.columns import ROLES, ColumnsError, TableProposal, propose_runs
 from fusion.pipeline.inspect import (
     FolderContent,
     Kind,
     Recognised,
-    column_unit,
-    is_displacement,
-    is_temperature,
-    is_time,
     scan_folder,
 )
 from fusion.results.progress import counted
@@ -41,10 +38,10 @@ Ask = Callable[[str, str], str]
 
 @dataclass(frozen=True)
 class Asker:
-    """Answers to questions from the terminal, or from defaults where ``ask`` is None; ``complain`` shows why an answer is refused."""
+    """Answers to questions from the terminal, or from defaults where ``ask`` is None; ``say`` shows what a question is about."""
 
     ask: Ask | None
-    complain: Callable[[str], None] = lambda text: None
+    say: Callable[[str], None] = lambda text: None
 
     def text(self, question: str, default: str) -> str:
         """Return an answer of any text."""
@@ -61,9 +58,20 @@ class Asker:
             except QuantityError as error:
                 if self.ask is None:
                     raise
-                self.complain(str(error))
+                self.say(str(error))
                 continue
             return json.dumps(answer, ensure_ascii=False)
+
+    def unit(self, question: str, target: str, default: str) -> str:
+        """Return the unit of a column that can be converted to `target`."""
+        while True:
+            answer = self.text(question, default).strip()
+            try:
+                column_conversion(answer, target)
+            except QuantityError as error:
+                self.say(str(error))
+                continue
+            return answer
 
     def choice(self, question: str, names: tuple[str, ...]) -> str:
         """Return one of several names; the first where nothing is asked."""
@@ -71,7 +79,7 @@ class Asker:
             answer = self.text(f"{question} ({', '.join(names)})", names[0]) if len(names) > 1 else names[0]
             if answer in names:
                 return answer
-            self.complain(f'"{answer}" is not one of the choices')
+            self.say(f'"{answer}" is not one of the choices')
 
 
 _FILE = "campaign.toml"
@@ -132,7 +140,9 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     """Yield what names and asks for everything that the campaign uses."""
     readings, records = content.of(Kind.DEVIATIONS), content.of(Kind.RECORD)
     if not (content.frames or readings or records):
-        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason}" for one in content.unknown[:3])
+        others = [one for kind, files in content.files.items() if kind not in _NO_INPUT for one in files]
+        told = [*content.unknown, *others][:3]
+        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason or one.kind}" for one in told)
         raise DraftError(
             f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
             + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
@@ -334,20 +344,55 @@ def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker)
     """Yield a record: all files with the columns of the first are runs of one test."""
     first = records[0]
     runs = [one for one in records if one.headings == first.headings]
-    headings = first.headings
-    time = next(name for name in headings if is_time(name))
-    temperatures = [name for name in headings if is_temperature(name) and name != time]
-    displacements = [name for name in headings if is_displacement(name) and name != time]
-    others = [name for name in headings if name not in (time, *temperatures, *displacements) and column_unit(name)]
+    name = content.relative(first.path)
+    table = _confirmed(propose_runs([one.path for one in runs]), name, asker)
     yield from ("", "[record]                                 # temperatures and displacements over time")
     names = [_quoted(content.relative(one.path)) for one in runs]
     yield f"files = [{', '.join(names)}]" if len(names) > 1 else f"file = {names[0]}"
-    yield f"time = {_quoted(time)}"
-    yield f"temperatures = {_list(temperatures)}"
-    yield f"displacements = {_list(displacements)}"
-    if others:
-        yield f"drivers = {_list(others)}   # heat sources only: remove the others"
+    yield from (f"{key} = {_toml(value)}" for key, value in table.keys.items())
     yield from _others("file", content, [one for one in records if one not in runs], all_of_them=True)
+    yield from ("", "[record.columns]                         # a column without a line here is left out")
+    for column in table.columns:
+        remark = f"   # {_plain(', '.join(filter(None, (column.span, column.remark))))}".rstrip("# ")
+        if column.role in ROLES[1:-1]:
+            yield f"{_quoted(column.heading)} = {_toml({'role': column.role, 'unit': column.unit})}{remark}"
+        elif column.role == "out":
+            unit = column.unit or "1"
+            example = _toml({"role": role_of_unit(unit), "unit": unit})
+            yield f"# {_quoted(_plain(column.heading))} = {example}{remark}"
+
+
+def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
+    """Return a table as somebody wants its columns to be taken: as proposed, or corrected, with what its file does not tell."""
+    while asker.ask is not None:
+        asker.say(f"{name}, {counted(table.rows, 'row')}:")
+        for line in (*table.lines(), *filter(None, [table.lacks])):
+            asker.say(line)
+        answer = asker.text('Columns as shown; or corrections, such as "3-5 = temperature degC; 7 = out"', "").strip()
+        try:
+            table = table.corrected(answer)
+        except ColumnsError as error:
+            asker.say(str(error))
+            continue
+        if not answer:
+            break
+    keys = dict(table.keys)
+    for key, shown in table.asked.items():
+        if key == "time_format":
+            keys[key] = asker.choice(f"Times such as {table.of('time')[0].first[0]} are written", (keys[key], shown))
+        elif key == "time_unit":
+            units = (keys[key], *(unit for unit in ("s", "min", "h") if unit != keys[key]))
+            keys[key] = asker.choice(f"Unit of the times in {table.of('time')[0].heading}, {shown}", units)
+        else:
+            keys[key] = json.loads(asker.quantity("Time from one row to the next", "s", "60 s" if asker.ask else ""))
+    guessed = [column for column in table.of("displacement") if column.remark]
+    for unit in dict.fromkeys(column.unit for column in guessed):
+        group = [column for column in guessed if column.unit == unit]
+        about = ", ".join(f"{column.heading} ({column.span})" for column in group)
+        answer = asker.unit(f"Unit of {about}; of counts one count, such as 0.0125 mm", "um", unit)
+        taken = {column: replace(column, unit=answer) for column in group}
+        table = replace(table, columns=tuple(taken.get(column, column) for column in table.columns))
+    return replace(table, keys=keys)
 
 
 def _optional(key: str, content: FolderContent, kind: Kind, *, lacking: str = "") -> Iterator[str]:
@@ -389,8 +434,13 @@ def _direction(asker: Asker) -> str:
     return known[asker.choice("How that point moves over the plan as the axis position grows", tuple(known))]
 
 
-def _list(names: Sequence[str]) -> str:
-    return f"[{', '.join(_quoted(name) for name in names)}]"
+def _toml(value: object) -> str:
+    """Return a value as TOML writes it on one line."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_toml(inner)}' for key, inner in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return _quoted(value) if isinstance(value, str) else str(value)
 
 
 def _quoted(text: str) -> str:

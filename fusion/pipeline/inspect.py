@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import csv
 import itertools
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
@@ -42,6 +41,8 @@ from thermography.registration.plan import read_fiducials
 if TYPE_CHECKING:
     import xarray as xr
 
+    from fusion.pipeline.columns import TableProposal
+
 
 # What kind of file something is, recognised by its content: the campaign's own files, recordings, logs and plans.
 
@@ -51,12 +52,6 @@ _START = 65_536
 _LONGEST_REASON = 160
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
-_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
-#: Reason of a table whose columns nobody can know.
-_BARE = (
-    "a table of numbers without headings; write a first line that names every column with its unit, such as "
-    "time [s],spindle [degC],nose [um]"
-)
 
 
 class Kind(StrEnum):
@@ -114,6 +109,7 @@ def recognise(path: Path) -> Recognised:
     from interferometry.io.readings import is_environment_log, read_deviations
     from interferometry.io.tables import read_table
 
+    headings: tuple[str, ...] = ()
     try:
         headings = _headings(text) if text is not None else _sheet_headings(path)
         kind = _by_headings(headings)
@@ -131,9 +127,11 @@ def recognise(path: Path) -> Recognised:
         # Text may be one frame of temperatures; what is neither is refused as the table that it is not.
         if isinstance(reader, TextReader) and reader.holds_a_frame(path):
             return Recognised(path, Kind.STACK)
-        first = () if text is None else _headings(text)
-        if len(first) > 1 and all(_NUMBER.fullmatch(number.lstrip("\ufeff")) for number in first):
-            return Recognised(path, Kind.UNKNOWN, _BARE)
+        table = None if _of_a_laser(headings) else _logged_table(path)
+        if table is not None and table.may_be_record:
+            return Recognised(path, Kind.RECORD, headings=tuple(column.heading for column in table.columns))
+        if table is not None:
+            return Recognised(path, Kind.UNKNOWN, table.lacks)
         reason = str(error).removeprefix(f"{path}").lstrip(":, ")
         shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
         return Recognised(path, Kind.UNKNOWN, shortened)
@@ -160,6 +158,24 @@ def is_time(heading: str) -> bool:
     from interferometry.io.tables import read_heading
 
     return read_heading(heading).role in ("time", "date") or column_unit(heading) in ("s", "ms", "min", "h")
+
+
+def _of_a_laser(headings: Sequence[str]) -> bool:
+    """Return whether headings are those of a table of readings, whatever it lacks."""
+    from interferometry.io.tables import read_heading
+
+    roles = {read_heading(name).role for name in headings}
+    return len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
+
+
+def _logged_table(path: Path) -> TableProposal | None:
+    """Return the proposal for a table of something over time, None where a file is no table."""
+    from fusion.pipeline.columns import propose_table
+
+    try:
+        return propose_table(path)
+    except (FusionError, InterferometryError):
+        return None
 
 
 def _holds_deviations(path: Path) -> bool:
@@ -290,18 +306,17 @@ def _describe_log(found: Recognised) -> list[str]:
 
 
 def _describe_record(found: Recognised) -> list[str]:
-    from interferometry.io.tables import read_grids
+    from fusion.pipeline.columns import propose_table
 
-    time = next(name for name in found.headings if is_time(name))
-    columns: dict[str, list[str]] = {"temperature": [], "displacement": [], "other column": []}
-    for name in found.headings:
-        if is_temperature(name) or is_displacement(name):
-            columns["temperature" if is_temperature(name) else "displacement"].append(name)
-        elif name != time:
-            columns["other column"].append(name)
-    rows = len(read_grids(found.path)[0].rows) - 1
+    table = propose_table(found.path)
+    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}
+    columns = {kind: [column.heading for column in table.of(role)] for role, kind in roles.items()}
     described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
-    return [f"record, {counted(rows, 'row')}, time in the column {time}", *described]
+    held = join([column.heading for column in table.of("time")])
+    time = (
+        f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
+    )
+    return [f"record, {counted(table.rows, 'row')}, {time}", *described]
 
 
 def _describe_fiducials(found: Recognised) -> list[str]:

@@ -43,10 +43,23 @@ def read_source(campaign: Campaign) -> RecordSource:
     health = examine_record(table, declared)
     record = reduce_record(health.table)
     declare(declared, record)
-    left_out = [*pipe_notices(campaign), *left_out_notices(table, "record_rows_left_out")]
+    left_out = [*pipe_notices(campaign), *left_out_notices(table, "record_rows_left_out"), *_unread_notices(table)]
     return RecordSource(
         record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
     )
+
+
+def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
+    """Notice of the samples that hold no reading: empty fields, texts, and marks of ``record.missing``."""
+    counts = {
+        str(name): int(np.isnan(values).sum())
+        for kind, names in (("temperature", "sensor"), ("displacement", "channel"), ("driver", "driver_name"))
+        for name, values in zip(table[names].values, table[kind].values.T, strict=True)
+    }
+    named = [f"{name} ({count} of {table.sizes['time']})" for name, count in counts.items() if count]
+    if named:
+        message = f"Samples without a reading: {listed(named)}. They are left out of the means over blocks."
+        yield Notice("record_readings_missing", message, "Look at contact and cable, or at record.missing.")
 
 
 def model_record(source: RecordSource, *, report: Report) -> Outcome:

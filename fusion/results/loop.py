@@ -199,6 +199,19 @@ class ResidualDrift(ResultPart):
     """What the stretch of an integrated random walk reaches in one hour, um."""
 
 
+class NoisePart(ResultPart):
+    """Noise of a single reading: what neighbouring readings and successive cycles share of it."""
+
+    reading_um: Number
+    """Standard deviation, um."""
+    shared_share: Number
+    """Share of its variance that neighbouring readings of a pass share, 1."""
+    correlation_time_s: Number
+    """Time over which that share falls to 37 %, s; null where nothing is shared."""
+    cycle_correlation: Number
+    """Correlation of a reading with that of the cycle before at the same place and approach, 1."""
+
+
 class HoldOutQuestion(ResultPart):
     """Hold-out test of the strongest undecided candidate."""
 
@@ -388,6 +401,8 @@ class AxisLoop(Loop):
     """What is left."""
     residual_drift: ResidualDrift
     """Drift without a cause in the final model."""
+    noise: NoisePart | None = None
+    """Noise of the final model; null in results of earlier versions."""
     held_out_test: HoldOutQuestion | Nothing
     """Hold-out test of the strongest undecided candidate."""
     search: tuple[tuple[AxisScore, ...], ...]

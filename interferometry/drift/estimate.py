@@ -26,9 +26,7 @@ from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
 from interferometry.drift.gls import (
     DriftFit,
     average_drift,
-    drift_covariance,
     estimate,
-    estimate_air_noise,
     typical_memory,
     von_neumann_p_value,
 )
@@ -361,7 +359,7 @@ def _fit(
     design = np.zeros((cell.size, len(cells)))
     design[np.arange(cell.size), cell] = 1.0
     seconds, deviation = readings["seconds"].values, readings["deviation"].values
-    fit = estimate(seconds, loadings, deviation, design, order=order, robust=robust, settling=True)
+    fit = estimate(seconds, loadings, deviation, design, order=order, robust=robust, settling=True, memory=True)
     named = (*components, *(f"shape_{k + 1}" for k in range(shapes.shape[1])))
     return JointFit(readings, cells, cell, named, shapes, fit)
 
@@ -384,7 +382,7 @@ def _missing_components(joint: JointFit) -> tuple[str, ...]:
     """Return the further components whose contrast in the noise of each cycle is serially dependent over the cycles."""
     readings = joint.readings
     sign, position = readings["sign"].values.astype(float), readings["position"].values
-    weighted_noise = joint.fit.noise()[0] / joint.fit.system.variance
+    weighted_noise = joint.fit.noise()[0] / joint.fit.system.independent
     by_cycle = np.argsort(readings["cycle"].values, kind="stable")
     starts = np.flatnonzero(np.diff(readings["cycle"].values[by_cycle])) + 1
     missing = []
@@ -475,21 +473,11 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     weights = state_weights(fit.system.seconds, joint.readings["cycle"].values, state)
     at_state = _drift_at_state(joint, columns, weights)
     drift, covariance = _drift_from_state(joint, smoothed, at_state)
-    readings = joint.readings
-    air = estimate_air_noise(
-        fit.residual(),
-        fit.system.seconds,
-        fit.system.loadings,
-        number=readings["cycle"].values * 2 + (readings["sign"].values > 0),
-        position=readings["position"].values,
-    )
-    if air is not None:
-        covariance = covariance + drift_covariance(fit.system, air, fit.sigma)
     deletion = fit.deletion_residuals()
     scatter, freedom = _scatter(joint, smoothed, deletion)
     standardised = grid.per_reading(deletion)
     standardised[grid.is_left_out(deviations)] = np.inf
-    noise = fit.system.variance * _smoothing_errors(joint, smoothed)
+    noise = fit.system.independent * _smoothing_errors(joint, smoothed)
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
     loadings = fit.system.loadings
     drift_variance = np.einsum("kc,kce,ke->k", loadings, covariance, loadings)
@@ -567,7 +555,8 @@ def _scatter(joint: JointFit, smoothed: Smoothed, standardised: Array) -> tuple[
     with np.errstate(divide="ignore", invalid="ignore"):
         remaining = expected / D
         deletion = _smoothing_errors(joint, smoothed) / D
-        square = deletion**2 / remaining - fit.sigma**2 * (1.0 / D - fit.system.variance)
+        shared = fit.system.memory.share if fit.system.memory else 0.0
+        square = deletion**2 / remaining - fit.sigma**2 * (1.0 / D - fit.system.independent - shared)
     # Median absolute deviation from zero, the expectation of a residual, as a normal standard deviation.
     medians = [np.median(np.abs(standardised[joint.cell == cell])) for cell in range(cells)]
     typical = np.array(medians) / special.ndtri(0.75)

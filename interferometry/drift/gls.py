@@ -5,6 +5,8 @@ integrated random walk, which enter every reading with a known loading::
 
     y_k = x_k' beta + sum_c loading_kc * d_c(t_k) + e_k        e_k ~ N(0, sigma^2 * v_k)
 
+The noise e may have a memory: a part of it with an exponential correlation in time, as turbulent air along a laser's beam makes it.
+
 For a positioning test the components are a common shift (loading 1) and a stretch (loading = position); for a record of several
 displacement channels there is one component per channel. All components start at zero: their start is a fixed effect, and
 :func:`~interferometry.drift.kalman.start_columns` gives the columns that a design must span for that. The variances of the
@@ -25,100 +27,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import linalg, optimize, special
+from scipy import linalg, optimize, signal, special
 from scipy.linalg import lapack
 
 from interferometry.common import Array
 from interferometry.drift import kalman
-from interferometry.drift.kalman import MANY_COLUMNS, DriftModelError, DriftSystem, Order, drift_system, start_columns
-
-# Noise that neighbouring readings of a pass share, as turbulent air along the beam makes it.
-
-#: Correlation times that are tried, s; longer ones are a drift within the pass.
-CORRELATION_TIMES_S = (5.0, 10.0, 20.0, 40.0)
-#: Standard errors by which the correlation must be known before it is taken into account.
-LEAST_SIGNIFICANCE = 4.0
-#: Fewest complete passes from which a correlation is estimated.
-LEAST_PASSES = 20
-_REALISATIONS = 32
-_SEED = 0
-
-
-@dataclass(frozen=True)
-class AirNoise:
-    """Noise with an exponential correlation in time, in addition to independent noise.
-
-    Attributes
-    ----------
-    variance_um2 : float
-        Of the correlated part.
-    correlation_time_s : float
-    independent_um2 : float
-        Variance of the independent part.
-    """
-
-    variance_um2: float
-    correlation_time_s: float
-    independent_um2: float
-
-
-def estimate_air_noise(
-    residual: Array, seconds: Array, loadings: Array, *, number: NDArray[np.int64], position: Array
-) -> AirNoise | None:
-    """Estimate the correlated noise from the covariance of the readings within a pass."""
-    # Index of every reading of the complete passes, by position, (pass, target).
-    _, index, readings = np.unique(number, return_inverse=True, return_counts=True)
-    targets = np.unique(position).size
-    rows = np.flatnonzero(readings[index.ravel()] == targets)
-    rows = rows[np.lexsort((position[rows], index.ravel()[rows]))].reshape(-1, targets)
-    count, targets = rows.shape
-    if count < LEAST_PASSES or targets < loadings.shape[1] + 3:
-        return None
-    passes = residual[rows]
-    for odd in (0, 1):
-        direction = number[rows[:, 0]] % 2 == odd
-        if direction.any():
-            passes[direction] -= np.median(passes[direction], axis=0)
-    known = loadings[rows[0]]
-    free = np.eye(targets) - known @ np.linalg.pinv(known)
-    remainder = passes @ free
-    covariance = remainder.T @ remainder / count
-    # Both directions visit the targets in opposite order; only times between readings enter.
-    elapsed = np.median(np.abs(seconds[rows] - seconds[rows[:, :1]]), axis=0)
-    lag = np.abs(elapsed[:, None] - elapsed)
-    fits = []
-    for correlation_time in CORRELATION_TIMES_S:
-        air = free @ np.exp(-lag / correlation_time) @ free
-        basis = np.column_stack([free.ravel(), air.ravel()])
-        scale = np.linalg.norm(basis, axis=0)
-        weights, misfit = optimize.nnls(basis / scale, covariance.ravel())
-        fits.append((misfit, correlation_time, weights / scale, air))
-    _, correlation_time, (independent, variance), air = min(fits, key=lambda fit: fit[0])
-    # The part of the correlation that independent noise cannot make: its mean over the passes is zero without correlation.
-    contrast = air - free * float((air * free).sum() / (free * free).sum())
-    by_pass = np.einsum("pi,ij,pj->p", remainder, contrast, remainder)
-    if variance <= 0.0 or by_pass.mean() <= LEAST_SIGNIFICANCE * by_pass.std() / np.sqrt(count):
-        return None
-    return AirNoise(float(variance), float(correlation_time), float(independent))
-
-
-def drift_covariance(system: DriftSystem, air: AirNoise, sigma_um: float) -> Array:
-    """Return what correlated noise adds to the covariance of the drift levels."""
-    rng = np.random.default_rng(_SEED)
-    shape = (system.seconds.size, _REALISATIONS)
-    kept = np.exp(-np.diff(system.seconds) / air.correlation_time_s)
-    correlated = rng.standard_normal(shape)
-    for k, share in enumerate(kept, start=1):
-        correlated[k] = share * correlated[k - 1] + np.sqrt(1.0 - share**2) * correlated[k]
-    white = rng.standard_normal(shape)
-    true = np.sqrt(air.variance_um2) * correlated + np.sqrt(air.independent_um2) * white
-    levels = system.smooth(np.hstack([true, sigma_um * white])).levels
-    of_true, assumed = (
-        np.einsum("kcr,ker->ce", part, part) / (shape[0] * _REALISATIONS) for part in np.split(levels, 2, axis=2)
-    )
-    values, vectors = np.linalg.eigh(of_true - assumed)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
+from interferometry.drift.kalman import (
+    MANY_COLUMNS,
+    DriftModelError,
+    DriftSystem,
+    Memory,
+    Order,
+    drift_system,
+    start_columns,
+)
 
 #: Search limits of log10(process noise over reading variance) of either order, in units that make the drift of one hour comparable to the
 #: noise of one reading: from a drift far below the noise to one that hides everything else. A random walk that is a hundred times the noise
@@ -148,6 +70,16 @@ _SETTLING_MARGIN = 8.0
 _SETTLING_SHARE, _SETTLING_LIMITS = 1.0 / 15.0, (1.0 / 100.0, 1.0)
 #: Largest exponent of the settling.
 _FASTEST_SETTLING = 6.0
+#: Correlation times of the noise at which a search starts, and its limits, in median times between readings: what lasts longer than a
+#: pass is a drift. Shares of the variance at which it starts, and their limits.
+_MEMORY_TIMES, _MEMORY_TIME_LIMITS = (1.0, 2.0, 4.0), (0.3, 10.0)
+_MEMORY_SHARES, _MEMORY_SHARE_LIMITS = (0.3, 0.8), (0.0, 0.98)
+#: Where the memory is not in the model the drift stands in for it: the search starts from so many decades less of drift, too.
+_LESS_DRIFT = (0.0, -2.0, -4.0)
+#: The memory has two parameters more, as the settling.
+_MEMORY_MARGIN = 8.0
+#: Autocorrelations by which innovations are tested, and the level above which they are white and need no memory.
+_WHITE_LAGS, _WHITE_LEVEL = 6, 0.05
 #: Searches of the variances after the first one, and re-weightings before each, of a robust fit.
 _ROBUST_ROUNDS = 2
 _ROBUST_PASSES = 3
@@ -227,13 +159,25 @@ class DriftFit:
     def noise(self) -> tuple[Array, Array]:
         """Each reading's estimated noise (n,) and its relative variance (n,): sum(noise^2) / sum(variance) estimates sigma^2."""
         smoothed = self.system.smooth(self.residual()[:, None])
-        return self.system.variance * smoothed.u[:, 0], self.system.variance**2 * smoothed.D
+        return self.system.independent * smoothed.u[:, 0], self.system.independent**2 * smoothed.D
+
+    def innovations(self) -> Array:
+        """Each observed reading minus its prediction from those before it, in standard deviations of the prediction."""
+        return np.asarray(self.system.whiten(self.residual()[:, None])[0][:, 0] / self.sigma)
+
+    def white_noise(self) -> Array:
+        """Noise of every reading in standard deviations, without the part that it shares with others (n,)."""
+        if self.system.memory is not None:
+            # Estimates from all readings are correlated where the noise has a memory; errors of predicting from those before are not.
+            return self.innovations()
+        noise, share = self.noise()
+        return np.asarray(noise / (self.sigma * np.sqrt(np.maximum(share, 1e-12))))
 
     def deletion_residuals(self) -> Array:
         """Each reading minus its prediction from all others, in standard deviations of an ordinary reading (n,); NaN if not observed."""
         smoothed = self.system.smooth(self.residual()[:, None])
         with np.errstate(divide="ignore", invalid="ignore"):
-            ordinary = 1.0 / smoothed.D - self.system.variance + 1.0
+            ordinary = 1.0 / smoothed.D + (1.0 - self.system.variance) * self.system.independent / self.system.variance
             standardised = (smoothed.u[:, 0] / smoothed.D) / (self.sigma * np.sqrt(ordinary))
         return np.where(smoothed.D > 0, standardised, np.nan)
 
@@ -424,6 +368,70 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     return _solve(replace(system, process_noise_scale=scale), problem)
 
 
+def _is_white(innovations: Array) -> bool:
+    """Whether the first autocorrelations of innovations are those of white noise (Ljung and Box 1978, Biometrika 65, 297)."""
+    n = innovations.size
+    if n <= 2 * _WHITE_LAGS:
+        return True
+    # A few readings far from the others would hide what all share.
+    centred = np.clip(innovations, -_OUTLIER_LIMIT, _OUTLIER_LIMIT)
+    centred = centred - centred.mean()
+    lagged = np.array([centred[lag:] @ centred[:-lag] for lag in range(1, _WHITE_LAGS + 1)]) / (centred @ centred)
+    statistic = n * (n + 2.0) * float((lagged**2 / (n - np.arange(1.0, _WHITE_LAGS + 1))).sum())
+    return bool(special.chdtrc(_WHITE_LAGS, statistic) > _WHITE_LEVEL)
+
+
+def _fit_memory(fit: DriftFit) -> DriftFit:
+    """Return the fit with noise that neighbouring readings share, if that raises the restricted log-likelihood by at least 8."""
+    system, problem = fit.system, _Problem.of(fit.response, fit.design)
+    between_s = float(np.median(np.diff(system.seconds)))
+    if between_s <= 0.0 or _is_white(fit.innovations()):
+        return fit
+    searched, few = _for_search(system, problem)
+    constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
+    low, high = (limit + _log_ratio_unit(system) for limit in _LOG_RATIO_LIMITS[system.order])
+    bounds = [*zip(low, high, strict=True), _MEMORY_SHARE_LIMITS, tuple(np.log10(_MEMORY_TIME_LIMITS))]
+
+    def with_memory(x: Array, over: DriftSystem) -> DriftSystem:
+        share, time_s = float(np.clip(x[-2], *_MEMORY_SHARE_LIMITS)), between_s * 10.0 ** float(x[-1])
+        return replace(over, ratios=10.0 ** np.clip(x[:-2], low, high), memory=Memory(share, time_s))
+
+    def likelihood(x: Array) -> float:
+        try:
+            return float(_solve(with_memory(x, searched), few).log_likelihood)
+        except DriftModelError:
+            return -np.inf
+
+    drift = np.log10(np.maximum(system.ratios, 1e-300))
+    starts = [
+        np.r_[np.clip(drift + less, low, high), share, np.log10(time)]
+        for less in _LESS_DRIFT
+        for share in _MEMORY_SHARES
+        for time in _MEMORY_TIMES
+    ]
+    likely = [likelihood(start) for start in starts]
+    guess = starts[int(np.argmax(likely))]
+    # The search gains some units over the best start at most; without a start near the margin there is nothing to find.
+    if max(likely) < constant:
+        return fit
+    step = np.r_[np.where(drift > high - 1.0, -1.0, 1.0), 0.1 if guess[-2] > 0.5 else 0.2, 0.3]
+    optimum = optimize.minimize(
+        lambda x: -likelihood(x),
+        guess,
+        method="Nelder-Mead",
+        bounds=bounds,
+        options={
+            "initial_simplex": np.vstack([guess, guess + np.diag(step)]),
+            "xatol": 0.01,
+            "fatol": 1e-2,
+            "maxfev": 60 * guess.size,
+        },
+    )
+    if -optimum.fun < constant + _MEMORY_MARGIN:
+        return fit
+    return _solve(with_memory(optimum.x, system), problem)
+
+
 def estimate(
     seconds: Array,
     loadings: Array,
@@ -433,6 +441,7 @@ def estimate(
     order: Order | None = None,
     robust: bool = False,
     settling: bool = False,
+    memory: bool = False,
     start: Array | None = None,
     observed: NDArray[np.bool_] | None = None,
     variance: Array | None = None,
@@ -469,6 +478,8 @@ def estimate(
             if (fit.system.variance == 1.0).all():
                 break
             fit = _maximise(fit.system, response, columns, fit.system.ratios)
+    if memory:
+        fit = _fit_memory(fit)
     return _fit_settling(fit) if settling else fit
 
 
@@ -477,8 +488,10 @@ def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[
     weights = np.ascontiguousarray(weights, float)
     columns = np.ascontiguousarray(columns, float)
     state, covariance, predicted, gains = _filter_with_average(*system.arrays, weights, columns)
-    m = system.loadings.shape[1] * system.order
-    with_drift = _covariance_with_average(system.seconds, system.loadings, system.order, weights, predicted, gains)
+    m = state.shape[0] - system.loadings.shape[1]
+    with_drift = _covariance_with_average(
+        system.seconds, system.loadings, system.order, system.memory_array, weights, predicted, gains
+    )
     return state[m:], covariance[m:, m:], with_drift
 
 
@@ -488,6 +501,7 @@ def _filter_with_average(
     loadings: Array,
     order: int,
     ratios: Array,
+    memory: Array,
     process_noise_scale: Array,
     variance: Array,
     observed: NDArray[np.bool_],
@@ -496,23 +510,23 @@ def _filter_with_average(
 ) -> tuple[Array, Array, Array, Array]:
     """Filter with the average as part of the state."""
     n, components = loadings.shape
-    m = components * order
-    size = m + components
+    covariance = kalman.start_covariance(components * order, memory, components)
+    size = covariance.shape[0]
+    m = size - components
     state = np.zeros((size, columns.shape[1]))
-    covariance = np.zeros((size, size))
     cross_covariance, innovation = np.zeros(size), np.empty(columns.shape[1])
     predicted = np.zeros((n, components, size))
     gains = np.zeros((n, size))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        kalman.predict_state(state[:m], order, step)
-        kalman.predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
+        kalman.predict_state(state, components, order, memory, step)
+        kalman.predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
         for c in range(components):
             predicted[k, c] = covariance[c * order]
         if observed[k]:
-            total = kalman.innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
+            total = kalman.innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
             kalman.update_covariance(covariance, cross_covariance, total)
-            kalman.update_state(state, order, loadings, k, columns[k], cross_covariance, total, innovation)
+            kalman.update_state(state, order, loadings, k, memory, columns[k], cross_covariance, total, innovation)
             for i in range(size):
                 gains[k, i] = cross_covariance[i] / total
         if weights[k] != 0.0:
@@ -525,19 +539,22 @@ def _filter_with_average(
 
 @njit(cache=True)
 def _covariance_with_average(
-    seconds: Array, loadings: Array, order: int, weights: Array, predicted: Array, gains: Array
+    seconds: Array, loadings: Array, order: int, memory: Array, weights: Array, predicted: Array, gains: Array
 ) -> Array:
     """Covariance (n, components, components) of the drift at every reading with the average, in units of sigma^2."""
     n, components = loadings.shape
-    m = components * order
+    last = components * order
+    m = last + (1 if memory.size else 0)
     size = m + components
     with_drift = np.zeros((n, components, components))
     onward = np.zeros((components, size))
     for c in range(components):
         onward[c, m + c] = 1.0
     for k in range(n - 1, -1, -1):
-        if k < n - 1 and order == 2:
-            step = seconds[k + 1] - seconds[k]
+        step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
+        if memory.size:
+            onward[:, last] *= np.exp(-step / memory[1])
+        if order == 2:
             for c in range(components):
                 for i in range(components):
                     onward[i, 2 * c + 1] += step * onward[i, 2 * c]
@@ -549,6 +566,8 @@ def _covariance_with_average(
                 effect_of_innovation += onward[i, j] * gains[k, j]
             for c in range(components):
                 onward[i, c * order] -= effect_of_innovation * loadings[k, c]
+            if memory.size:
+                onward[i, last] -= effect_of_innovation
         for c in range(components):
             for i in range(components):
                 for j in range(size):
@@ -608,10 +627,57 @@ class Autoregression:
         whitened[:, :order] = values[:, :order] * np.sqrt(self.innovation_share)
         return np.asarray(whitened - whitened.mean(axis=1, keepdims=True))
 
+    def with_memory(self, white: Array) -> Array:
+        """Give white series (cycles, series) this memory, their variance kept."""
+        if not self.weights.size:
+            return white
+        return np.asarray(signal.lfilter([np.sqrt(self.innovation_share)], [1.0, *-self.weights], white, axis=0))
+
+
+NO_MEMORY = Autoregression(np.empty(0), 1.0)
+#: Patterns of a motion in common that are taken from series before their own memory is estimated.
+_COMMON_PATTERNS = 2
+#: Memories from one cycle to the next that are simulated, so often, to learn what the patterns and the means take of them.
+_SIMULATED_MEMORY, _SIMULATIONS = np.linspace(0.0, 0.9, 10), 10
+#: Standard deviations by which an estimate must exceed what independent noise gives.
+_LEAST_MEMORY = 4.0
+
+
+def memory_of_each(values: Array) -> Autoregression:
+    """Estimate the memory from one cycle to the next that series (series, cycles) have alike and each by itself.
+
+    What series do together is a motion and no noise: their leading patterns are taken out first. That takes slow noise, too, and a short
+    series knows its mean badly; simulated series of the same shape tell how much (indirect inference).
+    """
+    if min(values.shape) <= 4 * _COMMON_PATTERNS:
+        return NO_MEMORY
+    rng = np.random.default_rng(0)
+    estimates = np.empty((_SIMULATED_MEMORY.size, _SIMULATIONS))
+    for row, weight in zip(estimates, _SIMULATED_MEMORY, strict=True):
+        for k in range(_SIMULATIONS):
+            simulated = Autoregression(np.array([weight]), 1.0 - weight**2).with_memory(
+                rng.normal(size=values.shape[::-1])
+            )
+            row[k] = _lag_one(simulated.T)
+    measured, independent = _lag_one(values), estimates[0]
+    if measured < independent.mean() + _LEAST_MEMORY * independent.std(ddof=1):
+        return NO_MEMORY
+    weight = float(np.interp(measured, np.maximum.accumulate(estimates.mean(axis=1)), _SIMULATED_MEMORY))
+    return Autoregression(np.array([weight]), 1.0 - weight**2)
+
+
+def _lag_one(values: Array) -> float:
+    """Median correlation of successive values of series (series, cycles) beside their leading patterns."""
+    u, s, vt = np.linalg.svd(values - values.mean(axis=1, keepdims=True), full_matrices=False)
+    s[:_COMMON_PATTERNS] = 0.0
+    own = (u * s) @ vt
+    squares = (own**2).sum(axis=1)
+    return float(np.median((own[:, 1:] * own[:, :-1]).sum(axis=1)[squares > 0] / squares[squares > 0]))
+
 
 def typical_memory(values: Array) -> Autoregression:
     """Estimate the memory that series have alike."""
-    none = Autoregression(np.empty(0), 1.0)
+    none = NO_MEMORY
     squares = (values**2).sum(axis=1)
     rows, squares = values[squares > 0], squares[squares > 0]
     cycles = values.shape[1]

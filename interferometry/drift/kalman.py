@@ -9,7 +9,12 @@ The state alpha holds one level per drift component (order 1: random walk, T = 1
 T = [[1, h], [0, 1]] over a step of h seconds). Z holds the loadings, at the levels. All variances are in units of sigma^2. The book writes
 the gain K = T P Z' / F, transition included; here the gain is M = P Z' / F and the transition is a step of its own.
 
-Arrays share these shapes: n readings, p columns that are filtered alike (response and design), c components, m = c * order states.
+Noise that neighbouring readings share, as turbulent air along the beam makes it, is one more state, the last, with loading 1 and
+T = exp(-h / correlation time): an autoregression at irregular times. ``memory`` holds its stationary variance and correlation time,
+or nothing.
+
+Arrays share these shapes: n readings, p columns that are filtered alike (response and design), c components, m = c * order states, one more
+where the noise has a memory.
 """
 
 from __future__ import annotations
@@ -25,9 +30,18 @@ from interferometry.common import Array, InterferometryError
 
 
 @njit(cache=True)
-def predict_covariance(covariance: Array, order: int, ratios: Array, process_noise_scale: float, step: float) -> None:
+def predict_covariance(
+    covariance: Array, order: int, ratios: Array, memory: Array, process_noise_scale: float, step: float
+) -> None:
     """Prediction step of the state covariance, in place: P = T P T' + Q (Durbin and Koopman 2012, eq. 4.24)."""
     m = covariance.shape[0]
+    if memory.size:
+        last, kept = ratios.size * order, np.exp(-step / memory[1])
+        for j in range(m):
+            covariance[last, j] *= kept
+        for j in range(m):
+            covariance[j, last] *= kept
+        covariance[last, last] += memory[0] * (1.0 - kept**2)
     for c in range(ratios.size):
         level, ratio = c * order, ratios[c] * process_noise_scale
         if order == 2:
@@ -46,15 +60,15 @@ def predict_covariance(covariance: Array, order: int, ratios: Array, process_noi
 
 @njit(cache=True)
 def innovation_variance(
-    covariance: Array, order: int, loadings: Array, k: int, variance: float, cross_covariance: Array
+    covariance: Array, order: int, loadings: Array, k: int, memory: Array, variance: float, cross_covariance: Array
 ) -> float:
     """Innovation variance of one reading, F = Z P Z' + v (Durbin and Koopman 2012, eq. 4.24)."""
     components = loadings.shape[1]
     for i in range(covariance.shape[0]):
-        cross_covariance[i] = 0.0
+        cross_covariance[i] = covariance[i, components * order] if memory.size else 0.0
         for c in range(components):
             cross_covariance[i] += covariance[i, c * order] * loadings[k, c]
-    total = variance
+    total = variance + (cross_covariance[components * order] if memory.size else 0.0)
     for c in range(components):
         total += loadings[k, c] * cross_covariance[c * order]
     return total
@@ -71,10 +85,14 @@ def update_covariance(covariance: Array, cross_covariance: Array, innovation_var
 
 
 @njit(cache=True)
-def predict_state(state: Array, order: int, step: float) -> None:
+def predict_state(state: Array, components: int, order: int, memory: Array, step: float) -> None:
     """Prediction step of the expected state of every column, in place: a = T a (Durbin and Koopman 2012, eq. 4.24)."""
+    if memory.size:
+        shared, kept = state[components * order], np.exp(-step / memory[1])
+        for j in range(shared.size):
+            shared[j] *= kept
     if order == 2:
-        for c in range(state.shape[0] // 2):
+        for c in range(components):
             level, rate = state[2 * c], state[2 * c + 1]
             for j in range(level.size):
                 level[j] += step * rate[j]
@@ -86,6 +104,7 @@ def update_state(
     order: int,
     loadings: Array,
     k: int,
+    memory: Array,
     reading: Array,
     cross_covariance: Array,
     innovation_variance: float,
@@ -98,10 +117,24 @@ def update_state(
         level, loading = state[c * order], loadings[k, c]
         for j in range(innovation.size):
             innovation[j] -= loading * level[j]
+    if memory.size:
+        shared = state[loadings.shape[1] * order]
+        for j in range(innovation.size):
+            innovation[j] -= shared[j]
     for i in range(cross_covariance.size):
         gain, expected = cross_covariance[i] / innovation_variance, state[i]
         for j in range(innovation.size):
             expected[j] += gain * innovation[j]
+
+
+@njit(cache=True)
+def start_covariance(drift_states: int, memory: Array, others: int) -> Array:
+    """Covariance of the state before the first reading: the drift starts at zero, the memory of the noise is stationary."""
+    size = drift_states + (1 if memory.size else 0) + others
+    covariance = np.zeros((size, size))
+    if memory.size:
+        covariance[drift_states, drift_states] = memory[0]
+    return covariance
 
 
 @njit(cache=True)
@@ -110,6 +143,7 @@ def filter_covariance(
     loadings: Array,
     order: int,
     ratios: Array,
+    memory: Array,
     process_noise_scale: Array,
     variance: Array,
     observed: NDArray[np.bool_],
@@ -117,19 +151,21 @@ def filter_covariance(
 ) -> tuple[Array, Array, Array]:
     """Run the covariance half of the filter over all readings (Durbin and Koopman 2012, section 4.3); it does not need their values."""
     n, components = loadings.shape
-    m = components * order
+    covariance = start_covariance(components * order, memory, 0)
+    m = covariance.shape[0]
     gains = np.zeros((n, m))
     innovation_variances = np.empty(n)
     covariances = np.zeros((n if keep else 1, components, m))
-    covariance = np.zeros((m, m))
     cross_covariance = np.zeros(m)
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
+        predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
         if keep:
             for c in range(components):
                 covariances[k, c] = covariance[c * order]
-        innovation_variances[k] = innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
+        innovation_variances[k] = innovation_variance(
+            covariance, order, loadings, k, memory, variance[k], cross_covariance
+        )
         if observed[k]:
             for i in range(m):
                 gains[k, i] = cross_covariance[i] / innovation_variances[k]
@@ -139,7 +175,7 @@ def filter_covariance(
 
 @njit(cache=True)
 def filter_columns(
-    seconds: Array, loadings: Array, order: int, gains: Array, columns: Array, keep: bool
+    seconds: Array, loadings: Array, order: int, memory: Array, gains: Array, columns: Array, keep: bool
 ) -> tuple[Array, Array]:
     """Run the state half of the filter: the innovations of every column under the same gains."""
     n, components = loadings.shape
@@ -150,14 +186,14 @@ def filter_columns(
     state = np.zeros((m, p))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict_state(state, order, step)
+        predict_state(state, components, order, memory, step)
         if keep:
             for c in range(components):
                 states[k, c] = state[c * order]
         # One loop over the columns for every term: the compiler then takes several columns at a time.
         innovation = innovations[k]
         for j in range(p):
-            innovation[j] = 0.0
+            innovation[j] = state[components * order, j] if memory.size else 0.0
         for c in range(components):
             loading, level = loadings[k, c], state[c * order]
             for j in range(p):
@@ -173,7 +209,15 @@ def filter_columns(
 
 @njit(cache=True)
 def whiten_rows(
-    seconds: Array, loadings: Array, order: int, gains: Array, roots: Array, first: int, state: Array, rows: Array
+    seconds: Array,
+    loadings: Array,
+    order: int,
+    memory: Array,
+    gains: Array,
+    roots: Array,
+    first: int,
+    state: Array,
+    rows: Array,
 ) -> None:
     """Standardise the innovations of some successive readings in place, going on from the state before them."""
     p = rows.shape[1]
@@ -181,16 +225,20 @@ def whiten_rows(
         k = first + row
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
         innovation = rows[row]
-        if loadings.shape[1] == 2 and order == 2:
+        if loadings.shape[1] == 2 and order == 2 and not memory.size:
             _whiten_under_two(
                 state[0], state[1], state[2], state[3], innovation, step, loadings[k], gains[k], 1.0 / roots[k]
             )
             continue
-        predict_state(state, order, step)
+        predict_state(state, loadings.shape[1], order, memory, step)
         for c in range(loadings.shape[1]):
             loading, level = loadings[k, c], state[c * order]
             for j in range(p):
                 innovation[j] -= loading * level[j]
+        if memory.size:
+            shared = state[loadings.shape[1] * order]
+            for j in range(p):
+                innovation[j] -= shared[j]
         for i in range(gains.shape[1]):
             gain, expected = gains[k, i], state[i]
             for j in range(p):
@@ -229,6 +277,7 @@ def smooth(
     seconds: Array,
     loadings: Array,
     order: int,
+    memory: Array,
     gains: Array,
     innovation_variances: Array,
     observed: NDArray[np.bool_],
@@ -246,9 +295,15 @@ def smooth(
     r = np.zeros((m, p))
     N = np.zeros((m, m))
     NM = np.zeros(m)
+    last = components * order
     for k in range(n - 1, -1, -1):
-        if k < n - 1 and order == 2:
-            step = seconds[k + 1] - seconds[k]
+        step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
+        if memory.size:
+            kept = np.exp(-step / memory[1])
+            r[last] *= kept
+            N[last] *= kept
+            N[:, last] *= kept
+        if order == 2:
             for c in range(components):
                 for j in range(p):
                     r[2 * c + 1, j] += step * r[2 * c, j]
@@ -277,6 +332,14 @@ def smooth(
                     N[j, level] -= loading * NM[j]
                 for e in range(components):
                     N[level, e * order] += loading * loadings[k, e] * D[k]
+            if memory.size:
+                r[last] += u[k]
+                N[last] -= NM
+                N[:, last] -= NM
+                N[last, last] += D[k]
+                for c in range(components):
+                    N[c * order, last] += loadings[k, c] * D[k]
+                    N[last, c * order] += loadings[k, c] * D[k]
         else:
             u[k] = 0.0
         _smooth_levels(order, covariances[k], r, N, levels[k], level_covariance[k])
@@ -307,6 +370,7 @@ def normal_equations(
     loadings: Array,
     order: int,
     ratios: Array,
+    memory: Array,
     process_noise_scale: Array,
     variance: Array,
     observed: NDArray[np.bool_],
@@ -315,21 +379,21 @@ def normal_equations(
     """Gram matrix of the standardised innovations of the observed readings, in one pass over the readings."""
     n, components = loadings.shape
     p = columns.shape[1]
-    covariance = np.zeros((components * order, components * order))
-    cross_covariance = np.zeros(components * order)
-    state = np.zeros((components * order, p))
+    covariance = start_covariance(components * order, memory, 0)
+    cross_covariance = np.zeros(covariance.shape[0])
+    state = np.zeros((covariance.shape[0], p))
     innovations, precision, held = np.zeros((4, p)), np.zeros(4), 0
     gram = np.zeros((p, p))
     log_determinant = 0.0
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
-        predict_state(state, order, step)
+        predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
+        predict_state(state, components, order, memory, step)
         if not observed[k]:
             continue
-        total = innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
+        total = innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
         update_covariance(covariance, cross_covariance, total)
-        update_state(state, order, loadings, k, columns[k], cross_covariance, total, innovations[held])
+        update_state(state, order, loadings, k, memory, columns[k], cross_covariance, total, innovations[held])
         log_determinant += np.log(total)
         precision[held] = 1.0 / total
         held += 1
@@ -402,7 +466,7 @@ class Smoothed(NamedTuple):
     level_covariance : (n, components, components) ndarray
         Covariance of the levels, the columns' coefficients being known.
     u : (n, p) ndarray
-        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``variance * u`` is the estimated noise of each reading, ``u / D`` its
+        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is each reading's own estimated noise, ``u / D`` its
         deletion residual, the reading minus its prediction from all others.
     D : (n,) ndarray
         Variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.
@@ -412,6 +476,21 @@ class Smoothed(NamedTuple):
     level_covariance: Array
     u: Array
     D: Array
+
+
+class Memory(NamedTuple):
+    """Noise that neighbouring readings share, with a correlation that falls exponentially in time.
+
+    Attributes
+    ----------
+    share : float
+        Of the variance of an ordinary reading, 0 to 1.
+    time_s : float
+        Correlation time, s.
+    """
+
+    share: float
+    time_s: float
 
 
 @dataclass(frozen=True)
@@ -434,6 +513,8 @@ class DriftSystem:
         False for a held-out reading: it does not update the drift and is predicted in open loop.
     process_noise_scale : (n,) ndarray or None
         Factor on the ratios in the step before each reading; None where the process noise is constant.
+    memory : Memory or None
+        Of the noise; None where the readings' noise is independent.
     """
 
     seconds: Array
@@ -443,6 +524,12 @@ class DriftSystem:
     variance: Array
     observed: NDArray[np.bool_]
     process_noise_scale: Array | None = None
+    memory: Memory | None = None
+
+    @property
+    def independent(self) -> Array:
+        """Relative variance of the noise of each reading that no other shares, (n,)."""
+        return self.variance if self.memory is None else (1.0 - self.memory.share) * self.variance
 
     @property
     def step_scales(self) -> Array:
@@ -450,15 +537,21 @@ class DriftSystem:
         return np.ones(self.seconds.size) if self.process_noise_scale is None else self.process_noise_scale
 
     @property
-    def arrays(self) -> tuple[Array, Array, Order, Array, Array, Array, NDArray[np.bool_]]:
+    def arrays(self) -> tuple[Array, Array, Order, Array, Array, Array, Array, NDArray[np.bool_]]:
         """What the recursions take of the system, in their order."""
-        return self.seconds, self.loadings, self.order, self.ratios, self.step_scales, self.variance, self.observed
+        own = self.ratios, self.memory_array, self.step_scales, self.independent, self.observed
+        return self.seconds, self.loadings, self.order, *own
+
+    @property
+    def memory_array(self) -> Array:
+        """Variance and correlation time of the shared noise as the recursions take them, or nothing."""
+        return np.array(self.memory or (), float)
 
     def innovations(self, columns: Array) -> tuple[Array, Array]:
         """One-step prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
         gains, innovation_variances, _ = filter_covariance(*self.arrays, False)
         innovations, _ = filter_columns(
-            self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), False
+            self.seconds, self.loadings, self.order, self.memory_array, gains, np.ascontiguousarray(columns), False
         )
         return innovations, innovation_variances
 
@@ -488,7 +581,7 @@ class DriftSystem:
     def smooth(self, columns: Array) -> Smoothed:
         """Smooth the drift that columns (n, p) imply, and the noise of every reading."""
         gains, innovation_variances, covariances = filter_covariance(*self.arrays, True)
-        filtered = self.seconds, self.loadings, self.order, gains
+        filtered = self.seconds, self.loadings, self.order, self.memory_array, gains
         parts = []
         # The states of all columns at all readings are needed on the way back, not afterwards: some columns at a time.
         for some in np.array_split(columns, max(1, columns.shape[1] // MANY_COLUMNS), axis=1):
@@ -527,7 +620,8 @@ class Whitening:
     def whiten(self, rows: Array) -> Array:
         """Standardised innovations of the next readings, (some, p); overwrites ``rows``."""
         system = self.system
-        whiten_rows(system.seconds, system.loadings, system.order, self.gains, self.roots, self.done, self.state, rows)
+        before = system.seconds, system.loadings, system.order, system.memory_array
+        whiten_rows(*before, self.gains, self.roots, self.done, self.state, rows)
         self.done += rows.shape[0]
         return rows
 

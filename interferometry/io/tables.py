@@ -540,8 +540,18 @@ def find_header(lines: Iterable[str]) -> tuple[int, str]:
 
 
 def delimiter_of(header: str) -> str:
-    """Return the delimiter of a header line: comma, semicolon or tab, whichever it contains most often."""
-    return max(",;\t", key=header.count)
+    """Return the delimiter of a header line: comma, semicolon or tab, whichever it contains most often; "" for spaces."""
+    return max(",;\t", key=header.count) if any(mark in header for mark in ",;\t") else ""
+
+
+def delimiter_of_values(line: str) -> str:
+    """Return the delimiter of a line of numbers, in which commas may be decimal: tab, semicolon or comma; "" for spaces."""
+    return next((mark for mark in "\t;," if mark in line), "")
+
+
+def fields_of(line: str, delimiter: str) -> list[str]:
+    """Return the fields of one line of text."""
+    return next(csv.reader([line.strip("\r\n")], delimiter=delimiter), []) if delimiter else line.split()
 
 
 def read_timed_rows(

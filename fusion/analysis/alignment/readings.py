@@ -166,6 +166,13 @@ class Readings:
         both = np.array([np.unique(self.sign[self.target_index == k]).size == 2 for k in range(self.targets.size)])
         return np.column_stack([one_hot, approach[:, both]])
 
+    def by_site(self, values: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """Return the cycles, the sites, and values (n,) by both (cycles, sites), NaN where a reading is missing."""
+        (cycles, cycle), (sites, site) = (np.unique(own, return_inverse=True) for own in (self.cycle, self.site))
+        matrix = np.full((cycles.size, sites.size), np.nan)
+        matrix[cycle, site] = values
+        return cycles, sites, matrix
+
     def at(self, series: Series) -> Array:
         """Return a series at the time of every reading (and at its target, where the series has one value per target)."""
         if series.values.ndim == 1:

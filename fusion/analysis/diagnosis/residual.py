@@ -21,7 +21,7 @@ from fusion.analysis.drift_model.null_simulation import family_wise, rank_p_valu
 from fusion.analysis.effects.events import off_the_cycle
 from fusion.common import Array
 from fusion.results.loop import ResidualPart
-from interferometry.drift.gls import DriftFit
+from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
 from thermography.fields.large_arrays import empty_arrays, give_back
 
 _PERMUTATIONS = 400
@@ -110,15 +110,21 @@ class Remainder(ResidualStructure):
 
 
 def examine(
-    readings: Readings, fit: DriftFit, rng: np.random.Generator, *, set_aside: Collection[tuple[int, str]] = ()
+    readings: Readings,
+    fit: DriftFit,
+    rng: np.random.Generator,
+    *,
+    memory: Autoregression = NO_MEMORY,
+    set_aside: Collection[tuple[int, str]] = (),
 ) -> Remainder:
-    """Test what the fit leaves for structure and describe the largest of it."""
-    noise, share = fit.noise()
-    standard = noise / (fit.sigma * np.sqrt(np.maximum(share, 1e-12)))
-    cycles, sites, matrix = _matrix(readings, np.clip(standard, -4.0, 4.0))
+    """Test what the fit leaves for structure and describe the largest of it; ``memory`` is that of each site's noise over the cycles."""
+    cycles, numbers, matrix = readings.by_site(np.clip(fit.white_noise(), -4.0, 4.0))
+    sites = [(int(readings.targets[k // 2]), "negative" if k % 2 else "positive") for k in numbers]
     kept = [k for k, site in enumerate(sites) if site not in set(set_aside)]
     tested = matrix[:, kept]
     tested = (tested - np.nanmean(tested, axis=0)) / np.maximum(np.nanstd(tested, axis=0), 1e-9)
+    # Permuted cycles have no memory: noise that has one would pass for a pattern.
+    tested = memory.innovations(np.nan_to_num(tested).T).T if memory.weights.size else tested
     signs = np.array([1.0 if sites[k][1] == "positive" else -1.0 for k in kept])
     share_of = readings.positions_mm / readings.span_mm
     place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
@@ -131,7 +137,7 @@ def examine(
         names=("pattern", "slow_pattern", "single_target", "direction", "direction_along_axis", "curvature"),
     )
     unwhitened = _freed(readings, fit.residual()[:, None])[:, 0]
-    _, _, residual = _matrix(readings, unwhitened)
+    _, _, residual = readings.by_site(unwhitened)
     along_time, along_sites, rms = _leading(residual[:, kept])
     named_sites = [sites[k] for k in kept]
     shape = ""
@@ -166,17 +172,6 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
         series=drift[:, largest],
         free=lambda columns: columns - basis @ (basis.T @ columns),
     )
-
-
-def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[tuple[int, str]], Array]:
-    """Values per cycle and site (cycles, sites); NaN where a reading is missing."""
-    cycles = np.unique(readings.cycle)
-    index = readings.site
-    present = np.unique(index)
-    matrix = np.full((cycles.size, present.size), np.nan)
-    matrix[np.searchsorted(cycles, readings.cycle), np.searchsorted(present, index)] = values
-    sites = [(int(readings.targets[k // 2]), "negative" if k % 2 else "positive") for k in present]
-    return cycles, sites, matrix
 
 
 def _statistics(matrix: Array, signs: Array, place: Array) -> Array:
@@ -347,8 +342,7 @@ class ResidualTests(ResidualPart):
 def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests:
     """Test the residual of a model for structure."""
     readings, fit = model.readings.subset(model.used), model.fit
-    whitened, _ = fit.system.whiten(fit.residual()[:, None])
-    innovations = np.asarray(whitened[:, 0] / fit.sigma)
+    innovations = fit.innovations()
     clipped = np.clip(innovations, -_CLIP, _CLIP)
     window = max(2, round(readings.seconds.size / np.unique(readings.cycle).size))
     periods = _periods_min(readings.seconds)
@@ -366,7 +360,7 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
         "autocorrelation": rank_p_value(memory[0], memories),
         "event": rank_p_value(shift[0].max(), shifts),
         "periodicity": rank_p_value(power[0].max(), strongest),
-        **examine(readings, fit, rng).p_values,
+        **examine(readings, fit, rng, memory=model.memory).p_values,
     }
     drift, _ = unexplained_drift(fit)
     sizes = np.sqrt(np.mean(drift**2, axis=0))

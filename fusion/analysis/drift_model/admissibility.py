@@ -372,7 +372,7 @@ class CandidateScorer:
         early = np.searchsorted(numbers, training.cycle) < _EARLY_SHARE * numbers.size
         return cls(
             model.fit,
-            simulate_null(model.fit, rng),
+            simulate_null(model.fit, rng, memory=model.memory, site=training.site),
             early,
             training.target_index % 2 == 0,
             model.used,
@@ -478,7 +478,8 @@ def evaluate_on_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.G
     """Put one candidate to the hold-out readings, predicted in open loop."""
     fit, whole, design = model.fit, model.whole_system(), model.whole_design()
     priors = prior_rows(model, rng)
-    null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(whole.observed)))
+    everywhere = replace(whole, observed=np.ones_like(whole.observed))
+    null = simulate_null(fit, rng, over=everywhere, memory=model.memory, site=model.readings.site)
     columns = np.column_stack([design, candidate.columns])
     # Some columns at a time, in files where there are many, so that one matrix is read without the others.
     count = 1 + null.size // _VALUES_AT_ONCE

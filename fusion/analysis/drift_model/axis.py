@@ -523,7 +523,8 @@ def reject_inconsistent_patterns(problem: AxisProblem, state: AxisState) -> Axis
 
 def examine_remainder(model: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> remainder.Remainder:
     """Describe what a model leaves: a shape among the sites or, where there is none, an unexplained drift of all of them."""
-    left = remainder.examine(model.readings, model.fit, np.random.default_rng(seed), set_aside=set_aside)
+    rng = np.random.default_rng(seed)
+    left = remainder.examine(model.readings, model.fit, rng, memory=model.memory, set_aside=set_aside)
     return left if left.shape else remainder.with_drift(left, model.fit)
 
 
@@ -960,6 +961,7 @@ class LoopResult:
             unconfirmed_effects=self.unnamed,
             unexplained=self._unexplained(),
             residual_drift=self.residual_drift,
+            noise=_noise_of(self.after),
             held_out_test=self.state.question or schema.Nothing(),
             search=[[_score_of(score) for score in scored.scores] for scored in self.state.rounds],
             identifiability=[limit for scored in self.state.rounds for limit in scored.detection_limits],
@@ -1081,6 +1083,17 @@ def _size(model: ModelFit, term: Term) -> float:
 def rmse(errors: Array) -> float:
     """Root mean square of errors, those of sites without a prediction left out."""
     return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def _noise_of(model: ModelFit) -> schema.NoisePart:
+    """Noise of a reading with its memory within a pass and over the cycles."""
+    within = model.fit.system.memory
+    return schema.NoisePart(
+        reading_um=model.fit.sigma,
+        shared_share=within.share if within else 0.0,
+        correlation_time_s=within.time_s if within else None,
+        cycle_correlation=float(model.memory.weights.sum()),
+    )
 
 
 def residual_drift_size(model: ModelFit) -> schema.ResidualDrift:

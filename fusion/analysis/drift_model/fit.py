@@ -15,7 +15,14 @@ from scipy.special import gammaln
 from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.common import Array
-from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
+from interferometry.drift.gls import (
+    NO_MEMORY,
+    Autoregression,
+    DriftFit,
+    estimate,
+    fit_fixed_effects,
+    memory_of_each,
+)
 from interferometry.drift.kalman import DriftModelError, DriftSystem
 
 # How much drift there may be: the grids of drift variances over which a likelihood is maximised or drawn from.
@@ -109,6 +116,7 @@ class ModelFit:
     terms : the named effects
     fit : the generalised least-squares fit to the used readings
     profile : (n, k) static columns that the used readings determine
+    memory : of the noise of every site over the cycles
     """
 
     readings: Readings
@@ -116,6 +124,7 @@ class ModelFit:
     terms: tuple[Term, ...]
     fit: DriftFit
     profile: Array
+    memory: Autoregression = NO_MEMORY
 
     def place(self, term: Term) -> slice:
         """Where the coefficients of a term stand in the fit."""
@@ -163,6 +172,7 @@ class ModelFit:
             self.fit.system.ratios,
             variance,
             self.used,
+            memory=self.fit.system.memory,
         )
 
     def open_loop_errors(self) -> tuple[Array, Array]:
@@ -188,9 +198,20 @@ def fit_model(readings: Readings, terms: Sequence[Term], *, used: NDArray[np.boo
     first = estimate(seconds, loadings, response, design, robust=True)
     variance = _site_variance(readings.subset(used), first) * first.system.variance
     fit = estimate(
-        seconds, loadings, response, design, order=first.system.order, start=first.system.ratios, variance=variance
+        seconds,
+        loadings,
+        response,
+        design,
+        order=first.system.order,
+        memory=True,
+        start=first.system.ratios,
+        variance=variance,
     )
-    model = ModelFit(readings, used, tuple(terms), fit, profile)
+    _, _, noise = readings.subset(used).by_site(np.clip(fit.white_noise(), -4.0, 4.0))
+    memory = memory_of_each(np.nan_to_num(noise).T)
+    # Coefficients of slow columns are means over many cycles, which noise with a memory makes less certain.
+    fit = replace(fit, covariance=fit.covariance * max(memory.long_run, 1.0))
+    model = ModelFit(readings, used, tuple(terms), fit, profile, memory)
     for place, prior in model.priors():
         fit = condition(fit, place, prior)
     return replace(model, fit=fit)

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Iterator
 from copy import deepcopy
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.analysis.drift_model.fit import plausible_ratios
 from fusion.common import Array
-from interferometry.drift.gls import DriftFit
+from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
 from interferometry.drift.kalman import DriftSystem
 from thermography.fields.large_arrays import empty_array, give_back
 
@@ -19,17 +20,37 @@ _READINGS_AT_ONCE = 256
 
 
 def simulate_null(
-    fit: DriftFit, rng: np.random.Generator, *, draws: int = DRAWS, over: DriftSystem | None = None
+    fit: DriftFit,
+    rng: np.random.Generator,
+    *,
+    draws: int = DRAWS,
+    over: DriftSystem | None = None,
+    memory: Autoregression = NO_MEMORY,
+    site: NDArray[np.int64] | None = None,
 ) -> Array:
-    """Simulate responses in which only the model's drift and noise act; the noise is resampled from the fit's residuals."""
-    noise, share = fit.noise()
+    """Simulate responses in which only the model's drift and noise act; the noise is resampled from the fit's residuals.
+
+    ``memory`` is that of the noise of every site over the cycles, ``site`` (n,) that of every simulated reading.
+    """
     system = fit.system if over is None else over
-    relative = noise / np.sqrt(np.maximum(share, 1e-12))
+    relative = fit.white_noise() * fit.sigma
     # Some readings at a time, and those of a long test on disk: these are its largest numbers.
-    drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.variance)[:, None]
+    drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.independent)[:, None]
     for rows in _blocks(system.seconds.size):
         drawn[rows] = rng.choice(relative, size=(rows.stop - rows.start, draws)) * scale[rows]
         give_back(drawn)
+    if memory.weights.size and site is not None:
+        for number in np.unique(site):
+            drawn[site == number] = memory.with_memory(drawn[site == number])
+            give_back(drawn)
+    if system.memory is not None:
+        kept = np.exp(-np.diff(system.seconds, prepend=-np.inf) / system.memory.time_s)[:, None]
+        shared = np.zeros((1, draws))
+        for rows in _blocks(system.seconds.size):
+            for k in range(rows.start, rows.stop):
+                shared = kept[k] * shared + np.sqrt(1.0 - kept[k] ** 2) * rng.standard_normal((1, draws))
+                drawn[k] += fit.sigma * np.sqrt(system.memory.share) * shared[0]
+            give_back(drawn)
     ratios = plausible_ratios(fit, rng, draws=draws)
     for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
         walks = random_walk(system, _normal_numbers(system, draws, rng))

@@ -188,13 +188,14 @@ class Field(NamedTuple):
     needed: bool = False
 
 
-_TEST, _CAMERA, _PLAN, _LASER, _REPORT = (
-    ("campaign",), ("thermography",), ("plan",), ("interferometry",), ("report",)
+_TEST, _CAMERA, _PLAN, _LASER, _RECORD, _REPORT = (
+    ("campaign",), ("thermography",), ("plan",), ("interferometry",), ("record",), ("report",)
 )  # fmt: skip
 _AXIS = ("plan", "axis")
 #: Headings of the tables, in order.
 GROUPS = {
-    _TEST: "Test", _CAMERA: "Camera", _PLAN: "Plan", _AXIS: "Axis on the plan", _LASER: "Laser", _REPORT: "Report"
+    _TEST: "Test", _CAMERA: "Camera", _PLAN: "Plan", _AXIS: "Axis on the plan", _LASER: "Laser", _RECORD: "Record",
+    _REPORT: "Report"
 }  # fmt: skip
 _AS_STORED, _SPINDLE = "as stored in the frames", "Spindle at axis position 0"
 FIELDS = {
@@ -213,6 +214,8 @@ FIELDS = {
     "direction": Field(_AXIS, "direction", "It moves, as the position grows", hint="left", needed=True),
     "expansion": Field(_LASER, "expansion_coefficient", "Expansion coefficient", "ppm/K", "11.7 ppm/K"),
     "dead_path": Field(_LASER, "dead_path", "Dead path of the laser", "mm", "0 mm"),
+    "every": Field(_RECORD, "every", "Time from one row to the next", "s", "60 s"),
+    "time_unit": Field(_RECORD, "time_unit", "Unit of the times", options=("s", "min", "h", "ms")),
     "machine": Field(_REPORT, "machine", "Machine, as the report names it", hint="not stated"),
 }
 
@@ -224,10 +227,13 @@ def is_picture(campaign: CampaignText) -> bool:
 
 def read_fields(campaign: CampaignText) -> dict[str, str]:
     """Return the fields of a campaign file with their present texts, empty where nothing is written."""
+    # Only a table without times, or with times without a unit, has these keys.
+    record = tomllib.loads(campaign.text).get("record", {})
     return {
         name: _shown(campaign.value(*field.table, field.key), field)
         for name, field in FIELDS.items()
-        if field.table == _REPORT or campaign.value(*field.table) is not None
+        if field.table == _REPORT
+        or (field.key in record if field.table == _RECORD else campaign.value(*field.table) is not None)
         if field.table != _PLAN or not is_picture(campaign)
     }
 

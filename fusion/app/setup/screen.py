@@ -28,10 +28,12 @@ from fusion.app.setup.campaign import (
     store_upload,
     write_fields,
 )
+from fusion.app.setup.columns import ColumnsView
 from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView, corners_of
 from fusion.app.setup.times import TimesView, recordings_of
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.pipeline.check import BAD_INPUT, CampaignCheck, check_campaign
+from fusion.pipeline.columns import TableProposal, propose_table
 from fusion.pipeline.inspect import FolderContent, Kind, Recording, scan_folder
 from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations
@@ -42,7 +44,7 @@ from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 @dataclass(frozen=True)
 class Opened:
     """What was read from a folder: its campaign file or the draft of one, the first thermogram (row, column; degC) with the fiducials
-    found in it, what was recorded when, the axis positions of the targets, and what could not be shown.
+    found in it, what was recorded when, the axis positions of the targets, the table of a record, and what could not be shown.
     """
 
     folder: Path
@@ -51,6 +53,7 @@ class Opened:
     placed: Placed
     recordings: list[Recording]
     positions_mm: tuple[float, ...]
+    table: TableProposal | None
     remarks: list[str]
 
 
@@ -66,7 +69,10 @@ def open_folder(root: Path, folder: Path) -> Opened:
             placed = places.find(frame, listed, grid_of(campaign)) if listed else places.place([], frame.shape)
         except BAD_INPUT as error:
             remarks.append(str(error))
-    return Opened(folder, campaign, frame, placed, recordings_of(content), positions_of(content), remarks)
+    table = None
+    if campaign.value("record", "columns") is not None and content.of(Kind.RECORD):
+        table = propose_table(content.of(Kind.RECORD)[0].path)
+    return Opened(folder, campaign, frame, placed, recordings_of(content), positions_of(content), table, remarks)
 
 
 def listed_fiducials(root: Path, campaign: CampaignText) -> list[Fiducial]:
@@ -108,6 +114,7 @@ class SetUpScreen:
         self._form = Form(self._on_field)
         self._frame = FrameView(self._draw_plan)
         self._regions = RegionsView(self._draw_plan)
+        self._columns = ColumnsView()
         self._plan = PlanView(
             lambda x, y: self._form.write({"origin_x": f"{round(x):g} mm", "origin_y": f"{round(y):g} mm"}),
             lambda dx, dy: self._form.write({"direction": direction_text(dx, dy)}),
@@ -119,7 +126,7 @@ class SetUpScreen:
         self._dropped, self._found, self._checked = ui.column(), ui.column(), ui.column()
         pictures = (self._times.view, self._frame.view, self._plan.view, self._regions.view)
         buttons = pn.FlexBox(self._save, self._go)
-        self._work = ui.column(*pictures, self._form.view, buttons, self._checked, visible=False)
+        self._work = ui.column(*pictures, self._columns.view, self._form.view, buttons, self._checked, visible=False)
         self._look.on_click(self.look)
         self._save.on_click(self._on_save)
         self._go.on_click(lambda event: setattr(state, "screen", "Run"))
@@ -153,6 +160,7 @@ class SetUpScreen:
         self._opened = opened
         self._found.extend(ui.paragraph(remark, kind="warning") for remark in opened.remarks)
         self._form.show(opened.campaign)
+        self._columns.show(opened.table, opened.campaign.value("record", "columns") or {})
         regions = opened.campaign.value("thermography", "region")
         picture = is_picture(opened.campaign)
         self._regions.show(list(regions) if isinstance(regions, list) else [], "px" if picture else "mm")
@@ -250,6 +258,8 @@ class SetUpScreen:
         stated = campaign.value("thermography", "region")
         if regions != (stated or []) and (regions or isinstance(stated, list)):
             campaign = campaign.with_values({("thermography", "region"): regions or None})
+        if opened.table is not None and self._columns.stated != campaign.value("record", "columns"):
+            campaign = campaign.with_values({("record", "columns"): self._columns.stated})
         placed = self._frame.placed
         if opened.frame is not None and placed.fiducials != opened.placed.fiducials:
             written = places.write_picked(opened.folder, placed)

@@ -1,6 +1,7 @@
 """Campaign files for folders: what the files tell, what is asked, and a check that says what is missing."""
 
 import os
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -108,8 +109,10 @@ def test_a_folder_without_measurements_is_refused(tmp_path):
     with pytest.raises(DraftError, match=r"in it \(notes.csv: "):
         write_campaign(tmp_path, Asker(None))
     assert not (tmp_path / "campaign.toml").exists()
-    (tmp_path / "notes.csv").write_text("\ufeff0,20.1,4.41E-05\n1,20.2,4.3E-05\n", encoding="utf-8")
-    with pytest.raises(DraftError, match=r"notes.csv: a table of numbers without headings; write a first line"):
+    (tmp_path / "notes.csv").write_text("\ufeff0.1,20.1,21.5\n1,20.2,21.6\n2,20.4,21.8\n", encoding="utf-8")
+    with pytest.raises(
+        DraftError, match=r"notes.csv: a table of 3 columns and 3 rows without a displacement, which a record needs"
+    ):
         write_campaign(tmp_path, Asker(None))
     with pytest.raises(DraftError, match="no such folder"):
         write_campaign(tmp_path / "absent", Asker(None))
@@ -132,8 +135,9 @@ def test_runs_of_a_record_are_one_campaign(tmp_path):
     write_campaign(tmp_path, Asker(None))
     record = load_campaign(path).record
     assert record.files == ("run_1.csv", "run_2.csv")
-    columns = (*record.temperatures, *record.displacements, *record.drivers)
-    assert columns == ("t1 [degC]", "ch1 [um]", "speed [1/min]")
+    assert {name: column.role for name, column in record.columns.items()} == {
+        "t1 [degC]": "temperature", "ch1 [um]": "displacement", "speed [1/min]": "driver",
+    }  # fmt: skip
     assert check_campaign(path).faults == ()
 
 
@@ -153,7 +157,11 @@ def test_the_public_spindle_record_is_ready_at_once(real_file, tmp_path):
     path, missing = write_campaign(tmp_path, Asker(None))
     record = load_campaign(path).record
     assert missing == []
-    assert (len(record.temperatures), len(record.displacements), record.drivers) == (16, 5, ("spindle(RPM)",))
+    assert Counter(column.role for column in record.columns.values()) == {
+        "temperature": 16,
+        "displacement": 5,
+        "driver": 1,
+    }
     assert check_campaign(path).faults == ()
 
 

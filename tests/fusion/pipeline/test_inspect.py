@@ -131,7 +131,7 @@ def test_regions_lenses_recipes_and_records(tmp_path):
         f"{tmp_path / 'run.csv'}: record, 2 rows, time in the column time [s]",
         "  1 temperature: t1 [degC]",
         "  1 displacement: ch1 [um]",
-        "  1 other column: speed [1/min]",
+        "  1 driver: speed [1/min]",
     ]
 
 

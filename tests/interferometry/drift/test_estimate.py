@@ -15,8 +15,7 @@ from interferometry.drift.estimate import (
     flag_outliers,
     state_weights,
 )
-from interferometry.drift.gls import AirNoise, drift_covariance, estimate_air_noise
-from interferometry.drift.kalman import drift_system
+from interferometry.drift.gls import DriftFit, estimate
 from tests.interferometry.simulated_campaigns import SIGMA_UM, schedule, simulate, with_memory
 
 pytestmark = pytest.mark.long
@@ -292,44 +291,31 @@ def correlated(rng: np.random.Generator, seconds: np.ndarray, correlation_time_s
     return placed.reshape(seconds.shape)
 
 
-def estimate(noise: np.ndarray, seconds: np.ndarray) -> AirNoise | None:
-    cycles = noise.shape[0]
+def joint(noise: np.ndarray, seconds: np.ndarray) -> DriftFit:
+    """Noise of some cycles (cycle, direction, target) alone, under a shift and a stretch that wander."""
     order = np.argsort(seconds.ravel())
     place = np.broadcast_to(np.linspace(0, 1, TARGETS), noise.shape).ravel()[order]
-    number = np.repeat(np.arange(2 * cycles), TARGETS)[order]
     loadings = np.column_stack([np.ones(place.size), place])
-    return estimate_air_noise(
-        noise.ravel()[order], seconds.ravel()[order], loadings, number=number, position=300.0 * place
-    )
+    return estimate(seconds.ravel()[order], loadings, noise.ravel()[order], loadings, memory=True)
 
 
-def test_correlated_noise_is_estimated(rng):
-    seconds = schedule(100)
-    air = estimate(0.4 * correlated(rng, seconds, 20.0), seconds)
-    # 200 passes of 16 readings with four correlation times each; shift and stretch of every pass are lost.
-    assert air.correlation_time_s in (10.0, 20.0, 40.0)
-    assert air.variance_um2 == pytest.approx(0.16, rel=0.5)
+@pytest.mark.parametrize(("share", "time_s"), [(1.0, 8.0), (0.5, 20.0)])
+def test_noise_with_a_memory_within_a_pass_is_estimated_and_is_no_drift(rng, share, time_s):
+    seconds = schedule(40)
+    white = rng.normal(0, 0.35, seconds.shape)
+    noise = np.sqrt(share) * 0.35 * correlated(rng, seconds, time_s) + np.sqrt(1.0 - share) * white
+    fit = joint(noise, seconds)
+    # 1280 readings of some hundred correlation times: the share is known to about a tenth, the time to about a fifth.
+    assert fit.system.memory.share == pytest.approx(share, abs=0.3)
+    assert fit.system.memory.time_s == pytest.approx(time_s, rel=0.5)
+    assert fit.sigma == pytest.approx(0.35, rel=0.1)
+    # um in an hour: as large as the noise of a mean over the readings of one, where a walk in its place is ten times as fast.
+    assert fit.drift_rate[0] < 0.1
 
 
-def test_independent_noise_and_too_few_passes_are_not_called_correlated(rng):
-    seconds = schedule(100)
-    assert all(estimate(rng.normal(0, 0.4, seconds.shape), seconds) is None for _ in range(10))
-    seconds = schedule(5)
-    assert estimate(correlated(rng, seconds, 20.0), seconds) is None
-
-
-def test_what_is_added_is_the_smoothed_noise(rng):
-    seconds = schedule(20).ravel()
-    seconds = np.sort(seconds)
-    loadings = np.ones((seconds.size, 1))
-    system = drift_system(seconds, loadings, order=1, ratios=np.array([1e-4]))
-    air = AirNoise(0.16, 20.0, 0.0)
-    added = drift_covariance(system, air, 0.4)[0, 0]
-    levels = system.smooth(np.column_stack([0.4 * correlated(rng, seconds, 20.0) for _ in range(200)])).levels
-    plain = system.smooth(0.4 * rng.standard_normal((seconds.size, 200))).levels
-    # 32 and 200 realisations of some tens of independent stretches each.
-    assert added == pytest.approx((levels**2).mean() - (plain**2).mean(), rel=0.25)
-    assert drift_covariance(system, AirNoise(0.0, 20.0, 0.16), 0.4)[0, 0] == pytest.approx(0.0, abs=1e-12)
+def test_independent_noise_has_no_memory(rng):
+    seconds = schedule(40)
+    assert all(joint(rng.normal(0, 0.35, seconds.shape), seconds).system.memory is None for _ in range(5))
 
 
 def test_the_drift_keeps_its_coverage_in_turbulent_air(rng):

@@ -7,14 +7,16 @@ import pytest
 
 from interferometry.drift import gls
 from interferometry.drift.gls import (
+    Autoregression,
     average_drift,
     estimate,
     fit_fixed_effects,
+    memory_of_each,
     settling_noise_scale,
     typical_memory,
     von_neumann_p_value,
 )
-from interferometry.drift.kalman import DriftModelError, drift_system, start_columns
+from interferometry.drift.kalman import DriftModelError, Memory, drift_system, start_columns
 from tests.interferometry.simulated_campaigns import with_memory
 
 POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
@@ -26,23 +28,27 @@ def readings(rng, n=60):
     return seconds, loadings, rng.normal(size=n)
 
 
-def dense_covariance(seconds, loadings, order, ratios, variance):
+def dense_covariance(seconds, loadings, order, ratios, variance, memory=None):
     start = seconds - seconds[0]
     early, late = np.minimum.outer(start, start), np.maximum.outer(start, start)
     walk = early if order == 1 else early**2 * (3 * late - early) / 6
     drift = sum(ratio * walk * np.outer(column, column) for ratio, column in zip(ratios, loadings.T, strict=True))
-    return drift, drift + np.diag(variance)
+    if memory is None:
+        return drift, drift + np.diag(variance)
+    shared = np.exp(-np.abs(np.subtract.outer(seconds, seconds)) / memory.time_s)
+    return drift, drift + memory.share * shared + (1.0 - memory.share) * np.diag(variance)
 
 
+@pytest.mark.parametrize("memory", [None, Memory(0.6, 30.0)])
 @pytest.mark.parametrize(("order", "ratios"), [(1, [0.01, 0.02]), (2, [1e-6, 3e-6])])
-def test_agrees_with_dense_generalised_least_squares(rng, order, ratios):
+def test_agrees_with_dense_generalised_least_squares(rng, order, ratios, memory):
     seconds, loadings, y = readings(rng)
     variance = rng.uniform(0.5, 3.0, y.size)
     design = start_columns(seconds, loadings, order)
-    system = drift_system(seconds, loadings, order=order, ratios=ratios, variance=variance)
+    system = replace(drift_system(seconds, loadings, order=order, ratios=ratios, variance=variance), memory=memory)
     fit = fit_fixed_effects(system, y, design)
 
-    drift, total = dense_covariance(seconds, loadings, order, ratios, variance)
+    drift, total = dense_covariance(seconds, loadings, order, ratios, variance, memory)
     inverse = np.linalg.inv(total)
     unscaled = np.linalg.inv(design.T @ inverse @ design)
     beta = unscaled @ design.T @ inverse @ y
@@ -55,8 +61,9 @@ def test_agrees_with_dense_generalised_least_squares(rng, order, ratios):
     np.testing.assert_allclose(fit.covariance, sigma2 * unscaled, rtol=1e-8)
     assert fit.log_likelihood == pytest.approx(likelihood, abs=1e-8)
     noise, share = fit.noise()
-    np.testing.assert_allclose(noise, variance * (inverse @ residual), atol=1e-10)
-    np.testing.assert_allclose(share, variance**2 * np.diag(inverse), atol=1e-10)
+    alone = variance if memory is None else (1.0 - memory.share) * variance
+    np.testing.assert_allclose(noise, alone * (inverse @ residual), atol=1e-10)
+    np.testing.assert_allclose(share, alone**2 * np.diag(inverse), atol=1e-10)
     levels, covariance = fit.drift()
     np.testing.assert_allclose((levels * loadings).sum(1), drift @ inverse @ residual, atol=1e-9)
     projector = inverse - inverse @ design @ unscaled @ design.T @ inverse
@@ -143,17 +150,18 @@ def test_a_robust_fit_is_not_moved_by_gross_outliers(rng):
     assert error(robust) < 0.02 < error(plain)
 
 
+@pytest.mark.parametrize("memory", [None, Memory(0.6, 30.0)])
 @pytest.mark.parametrize(("order", "ratios"), [(1, [0.01, 0.02]), (2, [1e-6, 3e-6])])
-def test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra(rng, order, ratios):
+def test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra(rng, order, ratios, memory):
     """Two drifts at once, some readings held out, some without weight in the average."""
     seconds, loadings, y = readings(rng, 30)
     observed = rng.random(30) < 0.8
     weights = np.where(rng.random(30) < 0.5, rng.uniform(0.5, 1.0, 30), 0.0)
     weights /= weights.sum()
-    system = drift_system(seconds, loadings, order=order, ratios=ratios, observed=observed)
+    system = replace(drift_system(seconds, loadings, order=order, ratios=ratios, observed=observed), memory=memory)
     average, covariance, with_drift = average_drift(system, weights, y[:, None])
 
-    _, total = dense_covariance(seconds, loadings, order, ratios, np.ones(30))
+    _, total = dense_covariance(seconds, loadings, order, ratios, np.ones(30), memory)
     gain = np.zeros((30, 30))
     gain[np.ix_(observed, observed)] = np.linalg.inv(total[np.ix_(observed, observed)])
     each = [dense_covariance(seconds, np.ones((30, 1)), order, [ratio], np.ones(30))[0] for ratio in ratios]
@@ -370,3 +378,25 @@ def test_memory_is_recognised_and_taken_out(rng):
 def test_series_without_values_or_too_few_cycles_have_no_memory():
     assert typical_memory(np.zeros((4, 50))).weights.size == 0
     assert typical_memory(np.ones((4, 3))).weights.size == 0
+
+
+@pytest.mark.parametrize("weight", [0.3, 0.6])
+def test_the_memory_of_each_site_is_estimated_beside_what_all_do_together(rng, weight):
+    """32 sites over 50 cycles, and a motion of all that is no noise."""
+    together = np.outer(rng.normal(size=32), np.sin(np.arange(50) / 5.0))
+    found = memory_of_each(with_memory(rng.normal(size=(50, 32)), weight).T + together)
+    # 1600 values: a correlation is known to 0.025, less what the patterns take.
+    assert found.weights[0] == pytest.approx(weight, abs=0.1)
+
+
+def test_independent_sites_have_no_memory_and_few_sites_are_not_asked(rng):
+    assert all(memory_of_each(rng.normal(size=(32, 50))).weights.size == 0 for _ in range(10))
+    together = np.outer(rng.normal(size=32), np.sin(np.arange(50) / 5.0))
+    assert memory_of_each(rng.normal(size=(32, 50)) + together).weights.size == 0
+    assert memory_of_each(with_memory(rng.normal(size=(50, 6)), 0.6).T).weights.size == 0
+
+
+def test_simulated_noise_has_the_memory_and_its_variance(rng):
+    noise = Autoregression(np.array([0.6]), 0.64).with_memory(rng.normal(size=(4000, 5)))
+    assert noise.std() == pytest.approx(1.0, abs=0.03)
+    assert np.mean(noise[1:] * noise[:-1]) == pytest.approx(0.6, abs=0.04)

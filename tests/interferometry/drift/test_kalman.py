@@ -10,7 +10,15 @@ from interferometry.drift.kalman import DriftModelError, DriftSystem, drift_syst
 def test_innovation_variances_of_a_unit_random_walk_are_ratios_of_fibonacci_numbers():
     n = 40
     gains, innovation_variances, _ = kalman.filter_covariance(
-        np.arange(float(n)), np.ones((n, 1)), 1, np.ones(1), np.ones(n), np.ones(n), np.ones(n, bool), False
+        np.arange(float(n)),
+        np.ones((n, 1)),
+        1,
+        np.ones(1),
+        np.empty(0),
+        np.ones(n),
+        np.ones(n),
+        np.ones(n, bool),
+        False,
     )
     np.testing.assert_allclose(innovation_variances[:5], [1.0, 2 / 1, 5 / 2, 13 / 5, 34 / 13])
     golden = (1 + np.sqrt(5)) / 2

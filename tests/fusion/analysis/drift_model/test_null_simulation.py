@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from fusion.analysis.drift_model.null_simulation import (
     simulate_null,
     tail_probability,
 )
-from interferometry.drift.gls import DriftFit, drift_system, fit_fixed_effects
+from interferometry.drift.gls import Autoregression, DriftFit, drift_system, fit_fixed_effects
+from interferometry.drift.kalman import Memory
 
 #: Uneven times from the first reading on, s.
 SECONDS = np.array([0.0, 10.0, 25.0, 26.0, 90.0, 200.0])
@@ -178,3 +180,17 @@ def test_simulating_a_long_test_takes_little_more_memory_than_its_readings(monke
         tracemalloc.stop()
     # Of 3.2 MB a tenth in some blocks, and the matrices of the fit; two of all readings were 2.0 times.
     assert peak < 1.5 * draws.nbytes
+
+
+def test_simulated_noise_has_the_memory_of_the_fit(rng):
+    """Within a pass by time, and of every site from cycle to cycle: five sites in turn, 10 s apart."""
+    fit = quiet_fit(rng.standard_normal(50))
+    within = fit_fixed_effects(replace(fit.system, memory=Memory(0.8, 20.0)), fit.response, fit.design)
+    draws = simulate_null(within, rng, draws=4000)
+    assert draws[20].var() == pytest.approx(within.sigma**2, rel=0.1)
+    assert np.corrcoef(draws[20], draws[21])[0, 1] == pytest.approx(0.8 * np.exp(-0.5), abs=0.05)
+    memory = Autoregression(np.array([0.6]), 0.64)
+    draws = simulate_null(fit, rng, draws=4000, memory=memory, site=np.arange(50) % 5)
+    # 4,000 draws know a correlation to 0.016; drift that could be there adds less than a tenth.
+    assert np.corrcoef(draws[30], draws[35])[0, 1] == pytest.approx(0.6, abs=0.1)
+    assert np.corrcoef(draws[30], draws[34])[0, 1] == pytest.approx(0.0, abs=0.1)

@@ -9,6 +9,7 @@ import pytest
 from fusion.app.parts import State
 from fusion.app.setup.campaign import open_campaign
 from fusion.app.setup.screen import SetUpScreen, grid_of, listed_fiducials, open_folder, told_of_check
+from fusion.campaign.config import load_campaign
 from fusion.pipeline.check import check_campaign
 from tests.fusion.app.texts import texts
 
@@ -32,6 +33,26 @@ def test_what_is_damaged_or_outside_becomes_a_remark(copied):
     (copied / "campaign.toml").unlink()
     (copied / "fiducials.csv").unlink()
     assert listed_fiducials(copied, open_campaign(copied)) == []
+
+
+def test_roles_and_units_of_a_record_are_chosen_on_the_screen(tmp_path):
+    rows = [f"{20 + k / 9:.2f},{k / 3:.2f},{k % 2 * 3000},{k}" for k in range(600)]
+    (tmp_path / "log.csv").write_text("\n".join(["T1,Z,speed,sample", *rows]) + "\n")
+    screen = SetUpScreen(State(root=tmp_path))
+    asyncio.run(screen.look())
+    assert {name: column["role"] for name, column in screen._columns.stated.items()} == {
+        "T1": "temperature", "Z": "displacement", "speed": "driver",
+    }  # fmt: skip
+    asyncio.run(screen._on_save(None))
+    assert 'every = "FILL IN"' in texts([screen.view])
+    screen._form.write({"every": "10 s"})
+    _, unit = screen._columns._widgets["Z"]
+    unit.value = "0.5 mm"
+    screen._columns._widgets["speed"][0].value = "out"
+    asyncio.run(screen._on_save(None))
+    record = load_campaign(tmp_path / "campaign.toml").record
+    assert record.every_s == 10.0 and record.columns["Z"].unit == "0.5 mm" and set(record.columns) == {"T1", "Z"}
+    assert "ready to run" in texts([screen.view])
 
 
 def test_a_check_is_told_with_its_faults_or_as_ready(copied):

@@ -1,0 +1,488 @@
+"""How a logged table is laid out and what its columns hold, proposed from names, units and values, for somebody to confirm."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pandas.tseries.api import guess_datetime_format
+
+from fusion.campaign.config import HeaderRows
+from fusion.campaign.logs import Rows, numbers_in, read_rows, text_lines
+from fusion.campaign.values import is_unit, name_and_unit, role_of_unit, unit_name
+from fusion.common import FusionError
+from fusion.pipeline.inspect import column_unit, is_time
+from fusion.results.progress import listed
+from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError
+from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
+from interferometry.io.tables import DateOrder, delimiter_of_values, fields_of, parse_time, read_heading
+
+#: What a column may hold; only the three in the middle are written into ``[record.columns]``.
+ROLES = ("time", "temperature", "displacement", "driver", "out")
+_NO_NUMBERS, _BY_VALUES, _NOT_KNOWN = "no numbers", "by its values", "not known"
+#: Lines in which the values of a table have begun.
+_HEAD = 200
+#: Rows of values, one below the other, that are no accident.
+_ROWS_OF_VALUES = 3
+_MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?\s+\S")
+_TIME_UNITS = ("ms", "s", "min", "h")
+_TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|datetime|last_changed$|时间|時間)", re.I)
+_VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
+#: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
+_MARKS = (
+    -127, -180, 999, -999, 999.9, -999.9, 9999, -9999, 6999, -6999, 7999, -7999, 3276.7, -3276.8, 32767, -32768, 65535,
+)  # fmt: skip
+#: A mark lies this far outside the other values of its column.
+_FAR = 50.0
+#: Times that neither ISO 8601 nor the guess of pandas covers.
+_FORMATS = (
+    "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
+    "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M",
+)  # fmt: skip
+#: Day and month of a date whose year comes last; with dots between them the day stands first.
+_SWAPPED = re.compile(r"^%([md])([-/])%([md])")
+_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
+#: Second of 1904-01-01 plus this many is in the years in which LabVIEW has written times, in seconds since 1970 in ours.
+_LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
+#: Shortest thermal test, by which a number without unit is told to be seconds or minutes.
+_SHORTEST_S = 1800.0
+#: Words of headings, the plain ones before those of one or two letters.
+_WORDS = (
+    ("out", "target setpoint soll cmd value comment humidity rh feuchte pressure druck rain wind level batt battery"),
+    ("temperature", "temp temps temperature temperatures temperatur temperatura température tmp thermo thermocouple rtd ntc pt100 温度"),
+    ("driver", "rpm speed drehzahl load last power leistung current strom voltage volt volts torque feed duty flow valve pump fan coolant "
+     "转速"),
+    ("displacement", "disp displ displacement displacements position pos deviation gap lvdt probe expansion elongation drift growth error "
+     "verschiebung verlagerung weg ausdehnung déplacement desplazamiento deformation 位移 误差"),
+    ("temperature", "t tt tc te ti pt"),
+    ("displacement", "x y z dx dy dz dl delta"),
+)  # fmt: skip
+#: Words of a column that counts, where no other word stands beside them.
+_COUNTING = "index sample record recno rn no nr n id row scan count counter nummer number unnamed"
+#: Units at the end of a heading, after a space or an underscore.
+_SUFFIXES = {"um": "um", "µm": "um", "mm": "mm", "nm": "nm", "degc": "degC", "°c": "degC", "c": "degC", "degf": "degF"}
+_UNIT_OF_WORD = {"rpm": "1/min", "drehzahl": "1/min", "转速": "1/min", "power": "W", "current": "A", "voltage": "V"}
+
+
+class ColumnsError(FusionError):
+    """A correction of proposed columns that is none; the message says how one is written."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column, what it is proposed to hold, its unit, its first values, the range of its numbers, and what is to be known of it."""
+
+    heading: str
+    role: str
+    unit: str = ""
+    first: tuple[str, ...] = ()
+    low: float = float("nan")
+    high: float = float("nan")
+    remark: str = ""
+
+    @property
+    def span(self) -> str:
+        """Range of the numbers in words, empty where the column has none."""
+        return f"{self.low:.5g} to {self.high:.5g}" if np.isfinite(self.low) else ""
+
+
+@dataclass(frozen=True)
+class TableProposal:
+    """A logged table: keys of ``[record]`` that say how it is laid out, and its columns; `asked` are keys that the file does not tell."""
+
+    path: Path
+    keys: dict[str, Any]
+    columns: tuple[Column, ...]
+    rows: int
+    asked: dict[str, str] = field(default_factory=dict)
+
+    def of(self, role: str) -> tuple[Column, ...]:
+        """Return the columns of a role."""
+        return tuple(column for column in self.columns if column.role == role)
+
+    @property
+    def lacks(self) -> str:
+        """What a record needs and this table does not have, in words; empty where it has all."""
+        lacking = [role for role in ("temperature", "displacement") if not self.of(role)]
+        if not lacking:
+            return ""
+        known = listed(f"{column.heading} ({column.role})" for column in self.columns if column.role != "out")
+        return (
+            f"a table of {len(self.columns)} columns and {self.rows} rows without a {' and a '.join(lacking)}, which a record needs"
+            f"{f'; found: {known}' if known else ''}; a column is named with its unit, such as T1 [degC] or Z [um]"
+        )
+
+    @property
+    def may_be_record(self) -> bool:
+        """Whether temperatures and displacements are found, or something that may be the displacement."""
+        unknown = any(column.remark == _NOT_KNOWN for column in self.columns)
+        return not self.lacks or (unknown and bool(self.of("temperature")))
+
+    def lines(self) -> Iterator[str]:
+        """Yield the columns as a table of text: number, heading, first values, role and unit."""
+        rows = [("", "column", "first values", "range", "role", "unit", "")]
+        rows += [
+            (str(k), one.heading, ", ".join(one.first), one.span, one.role, one.unit, one.remark)
+            for k, one in enumerate(self.columns, start=1)
+        ]
+        widths = [min(max(map(len, cells)), 36) for cells in zip(*rows, strict=True)]
+        for row in rows:
+            cells = (f"{cell[:width]:<{width}}" for cell, width in zip(row, [*widths[:-1], 99], strict=True))
+            yield "  ".join(cells).rstrip()
+
+    def corrected(self, text: str) -> TableProposal:
+        """Return it with other roles and units: ``3-5 = temperature degC; 7 = out``."""
+        columns = list(self.columns)
+        for part in filter(str.strip, text.split(";")):
+            match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*=\s*(\w+)\s*(.*?)\s*", part)
+            role = next((role for role in ROLES if match and role.startswith(match[3].lower())), None)
+            numbers = range(int(match[1]), int(match[2] or match[1]) + 1) if match else range(0)
+            if match is None or role is None or not numbers or not set(numbers) <= set(range(1, len(columns) + 1)):
+                raise ColumnsError(
+                    f'"{part.strip()}" is no correction; write number or range of the column, role ({", ".join(ROLES)}) and unit: '
+                    "3-5 = temperature degC; 7 = out"
+                )
+            for number in numbers:
+                before = columns[number - 1]
+                usual, remark = _usual_unit(role, before)
+                unit = match[4] or before.unit or usual
+                columns[number - 1] = replace(
+                    before, role=role, unit=unit, remark="" if match[4] or before.unit else remark
+                )
+        times = [column for column in columns if column.role == "time"]
+        if times == list(self.of("time")):
+            return replace(self, columns=tuple(columns))
+        kept = {
+            key: value
+            for key, value in self.keys.items()
+            if key not in ("time", "every", "time_unit", "time_format", "long")
+        }
+        if not times:
+            return replace(self, columns=tuple(columns), keys=kept, asked={"every": ""})
+        unit = {"time_unit": times[0].unit} if times[0].unit else {}
+        return replace(
+            self, columns=tuple(columns), keys=kept | {"time": [one.heading for one in times]} | unit, asked={}
+        )
+
+
+def propose_runs(paths: Sequence[Path]) -> TableProposal:
+    """Propose for several tables with the same headings: as for the first, without the columns that one of them cannot give."""
+    first, *others = map(propose_table, paths)
+    lost = {column.heading for other in others for column in other.of("out") if column.remark == _NO_NUMBERS}
+    columns = [
+        replace(one, role="out", remark="not in every run") if one.heading in lost else one for one in first.columns
+    ]
+    marks = sorted({mark for table in (first, *others) for mark in table.keys.get("missing", [])})
+    return replace(first, columns=tuple(columns), keys=first.keys | ({"missing": marks} if marks else {}))
+
+
+def propose_table(path: Path) -> TableProposal:
+    """Read a logged table, and propose how it is laid out and what its columns hold."""
+    head = _head(path)
+    keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(head)
+    rows = read_rows(path, header=HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None)
+    frame, asked = rows.frame, dict[str, str]()
+    if frame.empty:
+        raise LaserFormatError(f"{path}: no rows below the header")
+    keys |= {} if "long" in keys else _long(frame)
+    if "long" in keys:
+        channels = frame.groupby(frame[keys["long"]["channel"]].astype(str))
+        groups = {str(name): values[keys["long"]["value"]] for name, values in channels}
+        columns, marks = _columns(groups, {})
+        if all(column.remark == _BY_VALUES for column in columns if column.role == "temperature"):
+            # Channels have names: what none of them calls a temperature is a position, a count, a state.
+            columns = [replace(one, role="out") if one.remark == _BY_VALUES else one for one in columns]
+    else:
+        times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
+        columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
+        columns = [*(Column(name, "time", keys.get("time_unit", ""), _first(frame[name])) for name in times), *columns]
+    return TableProposal(path, keys | ({"missing": marks} if marks else {}), tuple(columns), len(frame), asked)
+
+
+def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
+    """Propose what every column holds, and which numbers are marks for no reading in all of them."""
+    numbers = {heading: _readings(series) for heading, series in groups.items()}
+    found = {heading: [mark for mark in _MARKS if _is_mark(mark, values)] for heading, values in numbers.items()}
+    columns = [
+        _column(heading, units.get(heading, ""), series, numbers[heading][~np.isin(numbers[heading], found[heading])])
+        for heading, series in groups.items()
+    ]
+    used = [column.heading for column in columns if column.role != "out"]
+    marks = {mark for heading in used for mark in found[heading]}
+    return columns, sorted(
+        mark for mark in marks if all(mark in found[name] or mark not in numbers[name] for name in used)
+    )
+
+
+def _readings(column: pd.Series) -> np.ndarray:
+    """Return the numbers of a column that can be readings."""
+    numbers = numbers_in(column)
+    return numbers[np.abs(numbers) < SENTINEL_MAGNITUDE]
+
+
+# Where names, units and values stand.
+
+
+def _head(path: Path) -> list[tuple[int, str, list[str]]]:
+    """Return the first lines that are not empty: number, text and fields."""
+    content = path.read_bytes()
+    if is_workbook(content):
+        rows = next(iter(read_cells(path, as_stored=True).values()))[:_HEAD]
+        return [(line, "", [cell_text(cell) for cell in cells]) for line, cells in rows]
+    lines = text_lines(path)[:_HEAD]
+    delimiter = delimiter_of_values(max(lines[len(lines) // 2 :], key=lambda line: len(line.strip()), default=""))
+    return [
+        (k, line, [text.strip() for text in fields_of(line, delimiter)])
+        for k, line in enumerate(lines, 1)
+        if line.strip()
+    ]
+
+
+def _of_labview(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
+    """Return the layout of a LabVIEW measurement file: two headers, the second with the unit, the step and the start of every channel."""
+    if not head or not head[0][1].startswith("LabVIEW Measurement"):
+        return {}
+    ends = [k for k, (_, text, _) in enumerate(head) if text.startswith("***End_of_Header***")]
+    stated = {fields[0]: (line, fields[1:]) for line, _, fields in head[: ends[-1] if ends else 0] if len(fields) > 1}
+    if not {"Date", "Time", "X_Columns"} <= stated.keys() or ends[-1] + 1 == len(head):
+        return {}
+    names = head[ends[-1] + 1][0]
+    header = {"names": names, "values": names + 1}
+    if "Y_Unit_Label" in stated:
+        header["units"] = stated["Y_Unit_Label"][0]
+    keys: dict[str, Any] = {"header_rows": header}
+    date, clock = (stated[name][1][0].replace("/", "-").replace(",", ".") for name in ("Date", "Time"))
+    keys["start"] = f"{date}T{clock[:15]}"
+    if stated["X_Columns"][1][0] == "No" and "Delta_X" in stated:
+        keys["every"] = f"{stated['Delta_X'][1][0].replace(',', '.')} s"
+    else:
+        keys |= {"time": "X_Value", "time_unit": "s"}
+    return keys
+
+
+def _of_campbell(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
+    """Return the layout of a table of Campbell's loggers, TOA5: station, names, units, kind of processing."""
+    is_toa5 = bool(head) and head[0][2][:1] == ["TOA5"]
+    return {"header_rows": {"names": 2, "units": 3, "values": 5}, "time": "TIMESTAMP"} if is_toa5 else {}
+
+
+def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
+    """Return the layout of what EPICS' camonitor prints: channel, date, time, value, state of the alarm."""
+    matching = [line for line, text, _ in head if _MONITORED.match(text)]
+    if len(matching) < max(_ROWS_OF_VALUES, len(head) / 2):
+        return {}
+    return {"header_rows": {"values": 1}, "long": {"time": ["2", "3"], "channel": "1", "value": "4"}}
+
+
+def _header_rows(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
+    """Return where the names, the units and the values of any other table stand, nothing where the names are its first line."""
+    rows = [(line, fields) for line, text, fields in head if not text.startswith("#")]
+    first = next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES])), None)
+    if first is None:
+        raise LaserFormatError("no rows of numbers below one another")
+    width = len(rows[first][1])
+    above = [(line, fields) for line, fields in rows[:first] if sum(map(bool, fields)) > width / 2]
+    if not above:
+        return {"header_rows": {"values": rows[first][0]}}
+    header = {"names": above[-1][0], "values": rows[first][0]}
+    given = [text for text in above[-1][1] if text]
+    if len(above) > 1 and sum(map(is_unit, given)) > len(given) / 2:
+        header |= {"names": above[-2][0], "units": above[-1][0]}
+    usual = {"names": rows[0][0], "values": rows[0][0] + 1}
+    return {} if header == usual else {"header_rows": header}
+
+
+def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
+    """Whether rows are equally wide and hold little but numbers and times, with a number in each."""
+    widths = {len(fields) for _, fields in rows}
+    texts = [[text.strip() for text in fields if text.strip()] for _, fields in rows]
+    numeric = [sum(_VALUE.fullmatch(text) is not None for text in row) for row in texts]
+    return len(widths) == 1 and all(count >= max(1, len(row) / 2) for count, row in zip(numeric, texts, strict=True))
+
+
+def _long(frame: pd.DataFrame) -> dict[str, Any]:
+    """Return the columns of a table with a line for every change: a time, a name that recurs, a number."""
+    if len(frame.columns) != 3:
+        return {}
+    time, channel, value = "", "", ""
+    for name, column in frame.items():
+        if pd.api.types.is_numeric_dtype(column):
+            value = str(name)
+        elif _clock(column.astype(str)) is not None:
+            time = str(name)
+        elif column.nunique() < len(column) / 3:
+            channel = str(name)
+    return {"long": {"time": time, "channel": channel, "value": value}} if time and channel and value else {}
+
+
+# Which column holds the times, and how they are written.
+
+
+def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
+    """Return the headings of the times; write into `keys` how they are to be read, and into `asked` what nothing tells."""
+    frame = rows.frame
+    texts = [name for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name])]
+    named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
+    # A first column without a name that grows, and does not count rows, is the time.
+    for name in [*named, *texts, *(["1"] if frame.columns[0] == "1" and not _counts(frame["1"]) else [])]:
+        if name not in texts:
+            if not _grows(frame[name]):
+                continue
+            keys["time"] = name
+            if {unit_name(rows.units.get(name, "")), column_unit(name)}.isdisjoint(_TIME_UNITS):
+                keys["time_unit"], start = _unit_of_times(frame[name].dropna().to_numpy(float))
+                keys |= {"start": start} if start else {}
+                asked |= (
+                    {} if start else {"time_unit": f"{_plain(frame[name].iloc[0])} to {_plain(frame[name].iloc[-1])}"}
+                )
+            return (name,)
+        of_day = [
+            two for two in named if two in texts and two != name and _OF_DAY.fullmatch(str(frame[two].iloc[0]).strip())
+        ]
+        for columns in ([name, *of_day[:1]], [name]):
+            form = _clock(frame[columns].astype(str).agg(" ".join, axis=1))
+            if form is not None:
+                asked |= {"time_format": form.pop("or")} if "or" in form else {}
+                keys |= {"time": columns if len(columns) > 1 else name} | form
+                return tuple(columns)
+    asked["every"] = ""
+    return ()
+
+
+def _is_time_name(heading: str, unit: str) -> bool:
+    """Whether a heading, or its unit in a row of units, is that of a time or a date."""
+    return is_time(heading) or unit_name(unit) in _TIME_UNITS or _TIME.match(heading.strip()) is not None
+
+
+def _grows(column: pd.Series) -> bool:
+    numbers = column.dropna().to_numpy(float)
+    return numbers.size > 1 and bool(numbers[-1] > numbers[0]) and float((np.diff(numbers) >= 0).mean()) > 0.98
+
+
+def _counts(column: pd.Series) -> bool:
+    return not pd.api.types.is_numeric_dtype(column) or bool((np.diff(column.dropna().to_numpy(float)) == 1.0).all())
+
+
+def _unit_of_times(numbers: np.ndarray) -> tuple[str, str]:
+    """Return the unit of times that are numbers without one, and where they count from, empty where nothing tells."""
+    for unit, (low, high), start in (
+        ("s", _LABVIEW_S, "1904-01-01T00:00:00Z"), ("s", _UNIX_S, "1970-01-01T00:00:00Z"), ("ms", _UNIX_MS, "1970-01-01T00:00:00Z"),
+    ):  # fmt: skip
+        if low < numbers[0] < high:
+            return unit, start
+    length = float(numbers[-1] - numbers[0])
+    return next((unit for unit, s in (("s", 1.0), ("min", 60.0)) if length * s >= _SHORTEST_S), "h"), ""
+
+
+def _clock(column: pd.Series) -> dict[str, str] | None:
+    """Return the key that says how times are written, and another way that fits as well; none where they are read without it; None where
+    the texts are no times.
+    """
+    texts = [text.strip() for text in column.iloc[:: max(1, len(column) // 50)]]
+    try:
+        order = DateOrder.of(Path(), enumerate(texts))
+        for text in texts:
+            parse_time(text, order)
+        return {}
+    except (BadReading, LaserFormatError):
+        pass
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the day stands first
+        guessed = guess_datetime_format(texts[0])
+    spans = {}
+    for form in (guessed, *_FORMATS) if re.search(r"\d[:_]?\d\d", texts[0]) else ():
+        # Day and month are told apart by the shorter test.
+        for written in (form, _SWAPPED.sub(r"%\3\2%\1", form)) if form else ():
+            with suppress(ValueError):
+                times = [datetime.strptime(text, written) for text in texts]
+                spans[written] = max(times) - min(times)
+    shortest = [form for form in spans if spans[form] == min(spans.values())]
+    return dict(zip(("time_format", "or"), shortest, strict=False)) if spans else None
+
+
+# What a column holds, and its unit.
+
+
+def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> Column:
+    """Propose role and unit of a column from its unit, the words of its heading, and its values."""
+    name, in_heading = name_and_unit(heading)
+    if in_heading.isdecimal() and "[" not in heading:
+        in_heading = ""  # TC(1), TC(2): a number, no unit
+    unit = unit_name(unit or in_heading or _SUFFIXES.get(read_heading(heading).unit or "", ""))
+    first = _first(series)
+    if not numbers.size:
+        return Column(heading, "out", unit, first, remark=_NO_NUMBERS)
+    low, high = float(numbers.min()), float(numbers.max())
+    known = Column(heading, "out", unit, first, low, high)
+    word, role = _word(name)
+    if unit:
+        of_unit = role_of_unit(unit)
+        setpoint = word in ("target", "setpoint", "soll", "cmd")
+        taken = setpoint or (role in ("out", "driver") and of_unit != "temperature")
+        return replace(known, role=role if taken else of_unit)
+    if role == "out":
+        return known
+    if low == high:
+        return replace(known, remark="constant")
+    if role == "driver":
+        return replace(known, role=role, unit=_UNIT_OF_WORD.get(word, "1"))
+    typical = float(np.median(numbers))
+    if role == "temperature" or (role == "" and 12.0 < typical < 80.0 and not (numbers == np.round(numbers)).all()):
+        return replace(
+            known, role="temperature", unit=_usual_unit("temperature", known)[0], remark="" if role else _BY_VALUES
+        )
+    if role == "displacement" or (role == "" and max(abs(low), abs(high)) < 1e-3):
+        unit, remark = _usual_unit("displacement", known)
+        return replace(known, role="displacement", unit=unit, remark=remark)
+    return replace(known, remark=_NOT_KNOWN)
+
+
+def _word(name: str) -> tuple[str, str]:
+    """Return the word of a name that tells its role, and the role; empty where none does."""
+    words = re.findall(r"[^\W\d_]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name.rpartition(":")[2]).casefold())
+    if words and set(words) <= set(_COUNTING.split()):
+        return words[0], "out"
+    for role, known in _WORDS:
+        found = next((word for word in words if word in known.split()), "")
+        if found:
+            return found, role
+    return "", ""
+
+
+def _usual_unit(role: str, column: Column) -> tuple[str, str]:
+    """Return the unit in which the numbers of a column are usual ones of a role, and what is to be known of it."""
+    span = column.high - column.low
+    if role == "temperature":
+        # Kelvins of a machine are above what its degrees Celsius reach.
+        return ("K" if column.low > 250.0 and column.high < 450.0 else "degC"), ""
+    if role != "displacement":
+        return ("" if role == "out" else "1"), ""
+    # Thermal displacements are micrometres to tenths of millimetres.
+    unit = "um" if span >= 2.0 else "mm" if span >= 2e-3 else "m"
+    whole = column.low.is_integer() and column.high.is_integer()
+    return unit, "whole numbers: counts? then one count with its unit, as 0.0125 mm" if whole else "unit by its values"
+
+
+def _is_mark(mark: float, numbers: np.ndarray) -> bool:
+    """Whether a number is a mark for no reading: far outside all others, or the only one of its column."""
+    others = numbers[numbers != mark]
+    if others.size in (0, numbers.size):
+        return others.size < numbers.size
+    far = _FAR + float(np.ptp(others))
+    return mark < float(others.min()) - far or mark > float(others.max()) + far
+
+
+def _first(series: pd.Series) -> tuple[str, ...]:
+    return tuple(_plain(value) for value in series.iloc[:3])
+
+
+def _plain(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)[:24]

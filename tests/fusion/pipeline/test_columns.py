@@ -1,0 +1,232 @@
+"""Logged tables of many layouts: what is proposed for them gives the record that the same data with headings written by hand give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.inputs import read_record
+from fusion.campaign.logs import TableError
+from fusion.pipeline.columns import ColumnsError, propose_table
+from fusion.pipeline.draft import Asker, DraftError, write_campaign
+
+#: Minutes, spindle, bearing [degC], nose [mm], speed [1/min]; two hours, a row every half minute.
+MINUTES = np.arange(240) / 2
+START = np.datetime64("2026-03-09T22:30:00")
+SPINDLE = np.round(21 + 8 * (1 - np.exp(-MINUTES / 40)), 2)
+BEARING = np.round(20 + 3 * (1 - np.exp(-MINUTES / 60)), 2)
+NOSE = np.round(0.004 * (SPINDLE - 21), 4)
+SPEED = np.where(MINUTES < 60, 3000, 1500)
+STAMPS = START + (60 * MINUTES).astype("m8[s]")
+
+
+def rows(pattern: str) -> str:
+    """Lines of the test by a pattern with the fields m, time, t1, t2, z and n."""
+    return "".join(
+        pattern.format(m=m, k=k, time=time, t1=t1, t2=t2, z=z, n=n) + "\n"
+        for k, (m, time, t1, t2, z, n) in enumerate(
+            zip(MINUTES, STAMPS.astype(object), SPINDLE, BEARING, NOSE, SPEED, strict=True)
+        )
+    )
+
+
+#: Campbell Scientific, LoggerNet manual, "TOA5": station, names, units, processing.
+TOA5 = (
+    '"TOA5","Mill","CR1000","12345","CR1000.Std.32.02","CPU:mill.CR1","1842","Table1"\n'
+    '"TIMESTAMP","RECORD","BattV_Min","TC_Avg(1)","TC_Avg(2)","LVDT_Avg"\n'
+    '"TS","RN","Volts","Deg C","Deg C","mm"\n"","","Min","Avg","Avg","Avg"\n'
+    + rows('"{time:%Y-%m-%d %H:%M:%S}",{k},12.6,{t1},{t2},{z}')
+)
+#: National Instruments, "Specification for the LabVIEW Measurement File (.lvm)"; as the samples of ladisk/lvm_read are written.
+LVM = (
+    "LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nSeparator\tTab\nDecimal_Separator\t,\nMulti_Headings\tNo\n"
+    "X_Columns\t{columns}\nTime_Pref\tAbsolute\nDate\t2026/03/09\nTime\t22:29:59,1970510124996275989\n***End_of_Header***\t\n\t\n"
+    "Channels\t3\t\t\t\nSamples\t240\t240\t240\t\nDate\t2026/03/09\t2026/03/09\t2026/03/09\t\nTime\t22:30:00,0000\t22:30:00,0000\t22:30:00,0000\t\n"
+    "Y_Unit_Label\t°C\t°C\tmm\t\nX_Dimension\tTime\tTime\tTime\t\nDelta_X\t30,000000\t30,000000\t30,000000\t\n***End_of_Header***\t\t\t\t\n"
+    "X_Value\tSpindel\tLager\tTaster\tComment\n"
+)
+LVM_ROWS = rows("{m}\t{t1}\t{t2}\t{z}").replace(".", ",")
+#: What EPICS' camonitor prints, as in the logs of anderssandstrom/ecmc_target_muts_logger: a line for every change.
+CHANNELS = {"MILL:TEMP-1": "t1", "MILL:TEMP-2": "t2", "MILL:DISP-Z": "z"}
+MONITOR = "".join(
+    f"{name:<30} {line}"
+    for lines in zip(*(rows(f"{{time:%Y-%m-%d %H:%M:%S.%f}} {{{key}}}  ").splitlines(True) for key in CHANNELS.values()), strict=True)
+    for name, line in zip(CHANNELS, lines, strict=True)
+) + "MILL:AIR                       *** Not connected (PV not found)\n"  # fmt: skip
+LAYOUTS: dict[str, str] = {
+    "toa5": TOA5,
+    "lvm": LVM.format(columns="One") + "".join(
+        f"{60 * m:.6f}".replace(".", ",") + "\t" + line.partition("\t")[2]
+        for m, line in zip(MINUTES, LVM_ROWS.splitlines(True), strict=True)
+    ),
+    "lvm without times": LVM.format(columns="No") + "".join("\t" + line.partition("\t")[2] for line in LVM_ROWS.splitlines(True)),
+    "camonitor": MONITOR,
+    # Klipper's logs of frame expansion, as in tanaes/whopping_Voron_mods; -180 is a sensor that is not there.
+    "klipper": "# id=x\nsample,time,pos_z,frame_t,bed_t,chamber_t,bed_target\n"
+    + rows("{k},{time:%Y/%m/%d-%H:%M:%S},{z},{t1},{t2},-180.0,105.0"),
+    "minutes without a unit": "Time,TT_100,TT_101,Z\n" + rows("{m},{t1},{t2},{z}"),
+    "no times": "T1\tT2\tdelta L\n" + rows("{t1}\t{t2}\t{z}"),
+    "times of day": "Uhrzeit;Spindel [°C];Lager [°C];Z [mm]\n" + rows("{time:%H:%M:%S};{t1};{t2};{z}").replace(".", ","),
+    "row of units": "Logger 7\n\ntime,spindle,bearing,nose\ns,degC,K,mm\n"
+    + "".join(f"{60 * m},{t1},{t2 + 273.15:.2f},{z}\n" for m, t1, t2, z in zip(MINUTES, SPINDLE, BEARING, NOSE, strict=True)),
+    "date and time": "Date,Time,T1,T2,Z\n" + rows("{time:%Y-%m-%d},{time:%H:%M:%S},{t1},{t2},{z}"),
+    "spaces, no headings": rows("{m}  {t1}  {t2}  {z}"),
+}  # fmt: skip
+DATED = {"toa5", "lvm", "lvm without times", "camonitor", "klipper", "date and time"}
+
+
+def drafted(folder: Path, content: str | bytes, name: str, answers: dict[str, str] | None = None) -> xr.Dataset:
+    """Read the record of a folder that somebody describes with Enter at every question but those in `answers`."""
+    folder.mkdir()
+    (folder / name).write_bytes(content.encode("cp1252") if isinstance(content, str) else content)
+
+    left = dict(answers or {})
+
+    def ask(question: str, default: str) -> str:
+        return next((left.pop(start) for start in list(left) if question.startswith(start)), default)
+
+    path, missing = write_campaign(folder, Asker(ask))
+    assert missing == []
+    return read_record(load_campaign(path))
+
+
+@pytest.fixture(scope="module")
+def by_hand(tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
+    """The test with headings that say everything."""
+    text = "time,t1 [degC],t2 [degC],z [mm]\n" + rows("{time:%Y-%m-%dT%H:%M:%S},{t1},{t2},{z}")
+    folder = tmp_path_factory.mktemp("by_hand")
+    (folder / "log.csv").write_text(text)
+    (folder / "campaign.toml").write_text(
+        '[campaign]\ntitle = "A"\n[record]\nfile = "log.csv"\ntime = "time"\ntemperatures = ["t*"]\ndisplacements = ["z*"]\n'
+    )
+    return read_record(load_campaign(folder / "campaign.toml"))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_layout_gives_the_record_of_headings_written_by_hand(
+    tmp_path: Path, by_hand: xr.Dataset, layout: str
+) -> None:
+    answers = {"Unit of the times": "min", "Time from one row": "30 s"}
+    if layout == "spaces, no headings":
+        answers["Columns as shown"] = "4 = displacement mm"
+    data = drafted(tmp_path / "folder", LAYOUTS[layout], "log.txt", answers)
+    np.testing.assert_allclose(data["temperature"].values, by_hand["temperature"].values, atol=1e-9)
+    np.testing.assert_allclose(data["displacement"].values, by_hand["displacement"].values, atol=1e-9)
+    times, expected = data["time"].values, by_hand["time"].values
+    if layout not in DATED:
+        times, expected = times - times[0], expected - expected[0]
+    np.testing.assert_array_equal(times, expected)
+
+
+def test_a_sheet_with_lines_above_its_table_is_read_too(tmp_path: Path, by_hand: xr.Dataset) -> None:
+    sheet = [["Mill 7", "", "", ""], ["Date", "spindle", "bearing", "Z"], ["", "°C", "°C", "mm"]]
+    sheet += [list(line) for line in zip(map(str, STAMPS), SPINDLE, BEARING, NOSE, strict=True)]
+    pd.DataFrame(sheet).to_excel(tmp_path / "log.xlsx", index=False, header=False)
+    data = drafted(tmp_path / "folder", (tmp_path / "log.xlsx").read_bytes(), "log.xlsx")
+    np.testing.assert_allclose(data["temperature"].values, by_hand["temperature"].values, atol=1e-9)
+    np.testing.assert_array_equal(data["time"].values, by_hand["time"].values)
+
+
+def test_counts_are_converted_and_marks_are_no_readings(tmp_path: Path) -> None:
+    lines = [
+        "time [s],steps,T1",
+        *(f"{60 * k},{8 * k - 127},{20 + k / 100 if k != 30 else -180:.2f}" for k in range(60)),
+    ]
+    lines += ["3600,n.c.,21"]
+    answers = {"Columns as shown": "2 = displacement", "Unit of": "0.0125 mm"}
+    data = drafted(tmp_path / "folder", "\n".join(lines), "log.csv", answers)
+    np.testing.assert_allclose(data["displacement"].values[:-1, 0], 12.5 * (8 * np.arange(60) - 127))
+    assert np.isnan(data["displacement"].values[-1, 0])
+    assert np.flatnonzero(np.isnan(data["temperature"].values[:, 0])).tolist() == [30]
+    assert load_campaign(tmp_path / "folder" / "campaign.toml").record.missing == (-180,)  # type: ignore[union-attr]
+
+
+def test_day_and_month_are_told_apart_by_the_shorter_test(tmp_path: Path) -> None:
+    """Two days of May: read with the month first they would be a month apart."""
+    lines = [f"{6 + k // 24:02d}/05/21-{k % 24:02d}:00:00,{20 + k / 10},{k}" for k in range(36)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,T1,Z", *lines]) + "\n")
+    table = propose_table(tmp_path / "log.csv")
+    assert table.keys["time_format"] == "%d/%m/%y-%H:%M:%S" and table.asked == {}
+    # One day says nothing of the order, and is asked about; a year that comes first does.
+    for written, asked in (("03/04/2026 {:02d}:00", {"time_format"}), ("2026/03/04-{:02d}:00", set())):
+        lines = [f"{written.format(k)},{20 + k / 10},{k}.5" for k in range(24)]
+        (tmp_path / "log.csv").write_text("\n".join(["time,T1,Z", *lines]) + "\n")
+        assert set(propose_table(tmp_path / "log.csv").asked) == asked
+
+
+RECORD = """\
+[campaign]
+title = "A"
+[record]
+file = "log.csv"
+{keys}
+"""
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "message"),
+    [
+        ('time = "t"\ntime_unit = "s"\ntemperatures = ["frame_t"]\ndisplacements = ["z"]', TableError,
+         r'"frame_t" has no unit; write it under \[record.columns\]: "frame_t" = "degC"'),
+        ('time = "t"\n[record.columns]\nframe_t = "degC"\nz = "mm"', TableError, 'time_unit = "s"'),
+        ('time = "t"\ntime_unit = "s"\n[record.columns]\nframe_t = "degC"', TableError, "no column is a displacement"),
+        ('time = "t"\nevery = "2 s"\n[record.columns]\nframe_t = "degC"', CampaignError, "write one of time"),
+        ('every = "2 s"\ntemperatures = ["frame_t"]', CampaignError, "needs temperatures = .* and displacements"),
+        ('every = "2 s"\nheader_rows = {names = 3, values = 2}\n[record.columns]\nframe_t = "degC"', CampaignError, "begin at line 2"),
+        ('every = "2 s"\ntemperatures = ["frame_t"]\ndisplacements = ["z"]\n[record.columns]\nz = {role = "driver", unit = "mm"}',
+         CampaignError, "in one of both places"),
+    ],
+)  # fmt: skip
+def test_what_a_record_does_not_say_is_refused_with_the_line_to_add(
+    tmp_path: Path, keys: str, error: type[Exception], message: str
+) -> None:
+    (tmp_path / "log.csv").write_text("t,frame_t,z\n0,20,1\n1,21,2\n")
+    (tmp_path / "campaign.toml").write_text(RECORD.format(keys=keys))
+    with pytest.raises(error, match=message):
+        read_record(load_campaign(tmp_path / "campaign.toml"))
+
+
+def test_columns_are_corrected_by_number_and_a_named_one_goes_before_a_pattern(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(
+        "t,T1,T2,z\n" + "".join(f"{k},{20 + k / 7:.2f},{21 + k / 9:.2f},{k}\n" for k in range(50))
+    )
+    table = propose_table(tmp_path / "log.csv").corrected("2-3 = temp K; 4 = out")
+    assert [(one.role, one.unit) for one in table.columns[1:]] == [
+        ("temperature", "K"),
+        ("temperature", "K"),
+        ("out", "um"),
+    ]
+    for wrong in ("9 = out", "2 = length", "T1 = out"):
+        with pytest.raises(ColumnsError):
+            table.corrected(wrong)
+    keys = 'every = "1 s"\n[record.columns]\n"T*" = "degC"\nT2 = "degF"\nz = "um"'
+    (tmp_path / "campaign.toml").write_text(RECORD.format(keys=keys))
+    data = read_record(load_campaign(tmp_path / "campaign.toml"))
+    assert data["temperature"].values[0].tolist() == pytest.approx([20.0, (21 - 32) / 1.8])
+
+
+def test_a_log_of_a_motion_test_is_not_taken_for_a_record(tmp_path: Path) -> None:
+    """Position of an axis and a laser's reading over time, by camonitor: no temperature, though one is called ILD_DownSample."""
+    lines = [
+        f"IOC:{name} 2022-04-06 12:{k // 60:02d}:{k % 60:02d}.1 {value}\n"
+        for k in range(600)
+        for name, value in (("ILD_DownSample", 70.0891 - 0.01 * k), ("X-PosAct", -20 + 0.01 * k))
+    ]
+    (tmp_path / "x.log").write_text("".join(lines))
+    with pytest.raises(DraftError, match=r"x.log: a table of 2 columns and 1200 rows without a temperature"):
+        write_campaign(tmp_path, Asker(None))
+
+
+@pytest.mark.real_data
+def test_a_battery_without_headings_is_asked_about(tmp_path: Path, real_file: Callable[[str], Path]) -> None:
+    """Samsung 30Q at 1 C: time, current, voltage, power, temperature, hoop strain, room; only two columns are temperatures."""
+    name = "ARTS-Laboratory__dataset-electrothermal-deformation-characterization-for-samsung-30Q-cell/data/S001/Q30_S001_1C.csv"
+    table = propose_table(real_file(name))
+    assert [one.heading for one in table.of("temperature")] == ["5", "7"]
+    assert table.keys["time"] == "1" and table.rows == 3548
