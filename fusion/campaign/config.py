@@ -41,13 +41,14 @@ from fusion.campaign.values import (
     PartsPerMillionU,
     PixelPatch,
     Pixels,
+    Point,
     PositiveMicrometres,
     PositiveMillimetres,
     PositiveSeconds,
     Seconds,
     ShareOfLengthU,
     TimeZone,
-    area_mm2,
+    area,
     check_pattern,
     corner_words,
     matching_files,
@@ -111,7 +112,10 @@ def _against_pixels(campaign: Campaign) -> Iterator[tuple[tuple[str, ...], str]]
         ("interferometry",): (campaign.interferometry, "[interferometry] needs the measured line on the plan, in mm"),
         ("sensors",): (campaign.sensors, "[sensors] needs the places of the sensors on the plan, in mm"),
         ("thermography", "lens"): (camera.lens, "a lens calibration is used only with a plan in mm"),
-        ("thermography", "region"): (camera.region, "the corners of a region are in mm"),
+        ("thermography", "region"): (
+            any(region.unit == "mm" for region in camera.region),
+            "a region is in mm; write its points in px",
+        ),
         ("thermography", "table"): (camera.table == "moving", 'it holds for a table at rest, and table = "moving"'),
     }
     for key, (given, why) in conflicts.items():
@@ -342,33 +346,49 @@ class StateTable(_Measured):
     temperature_u_K: KelvinU = 0.1
 
 
-class SurfaceTable(_Measured):
-    """``[[thermography.region]]``: a part of the table with an emissivity of its own, given or from two states."""
+#: Shape of a region -> fewest and most points that give it.
+_POINTS = {"spot": (1, 1), "line": (2, 2), "rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
+
+
+class RegionTable(_Measured):
+    """``[[thermography.region]]``: a place in the picture, or a part of the table, maybe with an emissivity of its own.
+
+    The emissivity is given or comes from two states.
+    """
 
     name: str = Field(min_length=1)
-    rectangle_mm: tuple[tuple[Millimetres, Millimetres], tuple[Millimetres, Millimetres]] | None = None
-    polygon_mm: tuple[tuple[Millimetres, Millimetres], ...] | None = None
+    spot: Point | None = None
+    line: tuple[Point, Point] | None = None
+    rectangle: tuple[Point, Point] | None = None
+    ellipse: tuple[Point, Point] | None = None
+    polygon: tuple[Point, ...] | None = None
     emissivity: Fraction | None = None
     emissivity_u: FractionU | None = None
     states: tuple[StateTable, StateTable] | None = None
 
     @model_validator(mode="after")
-    def _is_whole(self) -> SurfaceTable:
-        if (self.rectangle_mm is None) == (self.polygon_mm is None):
+    def _is_whole(self) -> RegionTable:
+        given = [shape for shape in _POINTS if getattr(self, shape) is not None]
+        if len(given) != 1:
             raise ValueError(
-                f"region {self.name} needs either rectangle (two opposite corners) or polygon (its corners in order)"
+                f"region {self.name} needs one of spot (a point), line (its ends), rectangle or ellipse (two opposite corners of the "
+                "rectangle around it), polygon (its corners in order)"
             )
-        if self.polygon_mm is not None and len(self.polygon_mm) < 3:
+        if len(self._points) < _POINTS[self.shape][0]:
+            raise ValueError(f"the polygon of region {self.name} has {len(self._points)} corners; it needs at least 3")
+        if len({length.unit for point in self._points for length in point}) > 1:
+            raise ValueError(f"region {self.name} mixes px of the picture and mm of the plan; write all in one unit")
+        if self.shape not in ("spot", "line") and area(self.corners) == 0.0:
             raise ValueError(
-                f"the polygon of region {self.name} has {len(self.polygon_mm)} corners; it needs at least 3"
+                f"region {self.name} with the corners {corner_words(self.corners)} {self.unit} has no area; give corners that enclose one"
             )
-        if (self.emissivity is None) == (self.states is None):
+        if self.emissivity is not None and self.states is not None:
             raise ValueError(
-                f'region {self.name} needs either emissivity, for example "0.35 +- 0.05", or states (two cycles of known temperature)'
+                f"region {self.name} states its emissivity and the two states that would show it; keep one"
             )
-        if area_mm2(self.corners_mm) == 0.0:
+        if self.states is not None and not self.is_surface:
             raise ValueError(
-                f"region {self.name} with the corners {corner_words(self.corners_mm)} has no area; give corners that enclose one"
+                f"the emissivity of region {self.name} comes from two states only on a plan in mm, for a rectangle or polygon"
             )
         if self.states is not None and self.states[0].cycle == self.states[1].cycle:
             raise ValueError(
@@ -378,13 +398,37 @@ class SurfaceTable(_Measured):
         return self
 
     @property
-    def corners_mm(self) -> tuple[tuple[float, float], ...]:
-        """Corners (x, y) of the region in order, mm."""
-        if self.polygon_mm is not None:
-            return self.polygon_mm
-        assert self.rectangle_mm is not None
-        (x0, y0), (x1, y1) = self.rectangle_mm
+    def shape(self) -> str:
+        """Which of the shapes it is."""
+        return next(shape for shape in _POINTS if getattr(self, shape) is not None)
+
+    @property
+    def unit(self) -> str:
+        """Unit of its points: px of the picture, or mm on the plan."""
+        return self._points[0][0].unit
+
+    @property
+    def points(self) -> tuple[tuple[float, float], ...]:
+        """The points that give it, (column, row) px or (x, y) mm."""
+        return tuple((across.value, down.value) for across, down in self._points)
+
+    @property
+    def _points(self) -> tuple[Point, ...]:
+        return (self.spot,) if self.spot is not None else getattr(self, self.shape)
+
+    @property
+    def corners(self) -> tuple[tuple[float, float], ...]:
+        """Corners of a rectangle, an ellipse's rectangle or a polygon in order."""
+        if self.polygon is not None:
+            return self.points
+        (x0, y0), (x1, y1) = self.points
         return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+    @property
+    def is_surface(self) -> bool:
+        """Whether it is a part of the table that the fields are calibrated on with an emissivity of its own."""
+        stated = self.emissivity is not None or self.states is not None
+        return stated and self.unit == "mm" and self.shape in ("rectangle", "polygon")
 
 
 class StackTable(Table):
@@ -431,13 +475,18 @@ class ThermographyTable(_Measured):
     camera_offset_u_K: KelvinU | None = None
     camera_scale_u: FractionU | None = None
     camera_drift_u_K: KelvinU | None = None
-    region: tuple[SurfaceTable, ...] = ()
+    region: tuple[RegionTable, ...] = ()
     clock_offset_s: Seconds | None = None
     window_s: PositiveSeconds | None = None
     table: Literal["still", "moving"] = "still"
     reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
     lens: ExistingFile | None = None
     stack: StackTable | None = None
+
+    @property
+    def surfaces(self) -> tuple[RegionTable, ...]:
+        """Regions of the table with an emissivity of their own."""
+        return tuple(region for region in self.region if region.is_surface)
 
     @model_validator(mode="after")
     def _recalculates_what_is_known(self) -> ThermographyTable:
@@ -733,6 +782,13 @@ class Campaign(Table):
     accept: AcceptTable = AcceptTable()
     acceptance: AcceptanceTable = AcceptanceTable()
     report: ReportTable = ReportTable()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _picture_is_the_plan(cls, content: Any) -> Any:
+        """Where a camera measures alone and no plan is given, the picture is the plan."""
+        alone = "thermography" in content and not {"plan", "interferometry", "sensors", "record"} & set(content)
+        return {**content, "plan": {"registration": "pixels"}} if alone else content
 
     @property
     def folder(self) -> Path:

@@ -129,10 +129,11 @@ def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameRefe
 
 # What a campaign was read into, before anything is calculated: the inputs of either instrument, or of both.
 
-#: Lengths of the windows that serve as cycles where no laser gives them, s: what a clock shows, from 10 s to a day.
-_WINDOWS_S = (10.0, 30.0, *(60.0 * m for m in (1, 2, 5, 10, 15, 30)), *(3600.0 * h for h in (1, 2, 4, 8, 24)))
-#: Lengths for a recording that is shorter than that, s.
-_SHORT_WINDOWS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+#: Lengths of the windows that serve as cycles where no laser gives them, s: what a clock shows, up to a day.
+_WINDOWS_S = (
+    0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0,
+    *(60.0 * m for m in (1, 2, 5, 10, 15, 30)), *(3600.0 * h for h in (1, 2, 4, 8, 24)),
+)  # fmt: skip
 #: So many windows a recording is divided into at most: as many maps as a reader pages through.
 _MOST_WINDOWS = 60
 
@@ -163,14 +164,12 @@ def cycles_of_frames(times: NDArray[np.datetime64], window_s: float) -> Cycles:
 
 
 def usual_window_s(times: NDArray[np.datetime64]) -> float:
-    """Return the length of the windows where the campaign file states none, s."""
+    """Return the length of the windows where the campaign file states none, s: one for each of a few frames."""
     length_s = float((times[-1] - times[0]) / np.timedelta64(1, "s"))
-    between_s = float(np.median(np.diff(times) / np.timedelta64(1, "s"))) if times.size > 1 else 0.0
-    least_s = max(between_s, length_s / _MOST_WINDOWS)
-    if 0.0 < length_s < _WINDOWS_S[0]:
-        short = [window for window in _SHORT_WINDOWS_S if window <= length_s] or [length_s]
-        return next((window for window in short if window >= least_s), short[-1])
-    return next((window for window in _WINDOWS_S if window >= least_s), _WINDOWS_S[-1])
+    if times.size > _MOST_WINDOWS:
+        return next((window for window in _WINDOWS_S if window >= length_s / _MOST_WINDOWS), _WINDOWS_S[-1])
+    between_s = float(np.median(np.diff(times) / np.timedelta64(1, "s"))) if times.size > 1 else _WINDOWS_S[-1]
+    return next((window for window in reversed(_WINDOWS_S) if window <= between_s), between_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,8 +205,9 @@ class LaserInputs(Inputs):
 class CameraInputs(Inputs):
     """Inputs of a campaign with the camera.
 
-    ``frames`` are the usable thermograms sorted by time, ``frames_rejected`` file, index and reason of the others; ``cycles`` are those of
-    the laser, or windows of the camera's time.
+    ``frames`` are the usable thermograms of one camera sorted by time, ``frames_rejected`` file, index and reason of those that cannot be
+    used; ``cycles`` are those of the laser, or windows of the camera's time. ``pictures`` are all usable thermograms, also those of other
+    cameras and without a time; where no camera took most of them they are no series, and ``frames`` is empty.
     """
 
     thermography: ThermographyTable
@@ -216,6 +216,7 @@ class CameraInputs(Inputs):
     fiducials: list[Fiducial]
     fiducials_file: str
     frames: Sequence[FrameReference]
+    pictures: FrameList
     frames_rejected: list[dict[str, Any]]
     cycles: Cycles
     regions: list[Region] = field(default_factory=list)
@@ -274,7 +275,7 @@ def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
             return laser
         if campaign.interferometry is None:
             camera = CameraInputs(**common, **_read_camera(campaign, None))
-            camera.notices[:0] = [*_camera_notices(camera), *_log_notices(camera), _window_notice(camera)]
+            camera.notices[:0] = [*_camera_notices(camera), *_log_notices(camera)]
             return camera
         source = _read_both(campaign, common)
         source.notices[:0] = [*_camera_notices(source), *_laser_notices(source)]
@@ -310,7 +311,6 @@ def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
     axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
     cycles = cycles_of_readings(common["deviations"])
     source = Source(**common, **_read_camera(campaign, cycles), axis=axis)
-    _raise_if_no_rise(campaign, source.frames, source.frames_rejected)
     # A line or a target that leaves the plan would end the long work.
     cells = xr.Dataset(coords={"x": source.grid.x_mm, "y": source.grid.y_mm})
     try:
@@ -398,11 +398,11 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
     """Read what `CameraInputs` holds; without cycles of a laser, windows of the camera's time replace them."""
     thermography, plan = campaign.thermography, campaign.plan
     assert thermography is not None and plan is not None
-    frames, rejected = _read_frames(campaign)
-    if cycles is None or plan.in_pixels:
-        _raise_if_no_rise(campaign, frames, rejected)
+    pictures, rejected = _read_frames(campaign, several_cameras=cycles is None)
+    frames = _series(pictures) if cycles is None else pictures
+    _raise_if_too_few_frames(campaign, pictures, rejected, least=1 if cycles is None else _LEAST_FRAMES)
     try:
-        grid = plan_grid(plan, frames[0].shape)
+        grid = plan_grid(plan, (frames or pictures)[0].shape)
     except ThermographyError as error:
         raise SourceError(f"{campaign.path}: plan.{error}") from None
     camera: dict[str, Any] = {
@@ -412,6 +412,7 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
         "fiducials": [] if plan.fiducials is None else read_fiducials(campaign.resolve(plan.fiducials)),
         "fiducials_file": plan.fiducials or "",
         "frames": frames,
+        "pictures": pictures,
         "frames_rejected": rejected,
         "cycles": cycles,
         "regions": [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)),
@@ -419,7 +420,8 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
     }
     if cycles is None:
         times = camera_on_laser_clock(frame_times(frames), thermography.clock_offset_s or 0.0)
-        camera["cycles"] = cycles_of_frames(times, thermography.window_s or usual_window_s(times))
+        windows = cycles_of_frames(times, thermography.window_s or usual_window_s(times)) if frames else None
+        camera["cycles"] = windows or Cycles(np.zeros(0, np.int64), np.zeros((0, 2), "datetime64[ns]"))
     return camera
 
 
@@ -431,20 +433,28 @@ def plan_grid(plan: PlanTable, shape: tuple[int, int]) -> PlanGrid:
     return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 
 
-def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
+def _read_frames(campaign: Campaign, *, several_cameras: bool) -> tuple[FrameList, list[dict[str, Any]]]:
     """Return the usable frames sorted by time, and file, index and reason of the others."""
     frames, rejected = index_recordings(campaign.frame_paths(), stack_options(campaign))
-    has_time = ~np.isnat(frames.times)
-    timed, odd = _of_one_camera(frames.choose(has_time), campaign.path)
-    left_out: list[tuple[Any, str]] = [
-        *((frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected),
-        *((frame, "the frame has no time") for frame in frames.choose(~has_time)),
-        *odd,
-    ]
-    return timed, [
+    left_out: list[tuple[Any, str]] = [(frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected]
+    if not several_cameras:
+        has_time = ~np.isnat(frames.times)
+        left_out += [(frame, "the frame has no time") for frame in frames.choose(~has_time)]
+        frames, odd = _of_one_camera(frames.choose(has_time), campaign.path)
+        left_out += odd
+    return frames, [
         {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
         for frame, reason in left_out
     ]
+
+
+def _series(pictures: FrameList) -> FrameList:
+    """Return the frames of the camera that took most of them, which have a time; none where it took no more than the others."""
+    names, timed = camera_names(pictures), ~np.isnat(pictures.times)
+    listed, first, counted = np.unique(names.astype(str), return_index=True, return_counts=True)
+    most = min(range(listed.size), key=lambda k: (-counted[k], first[k])) if listed.size else 0
+    chosen = timed & (names == listed[most]) if listed.size else timed
+    return pictures.choose(chosen & (2 * chosen.sum() > chosen.size))
 
 
 def _of_one_camera(frames: FrameList, path: Path) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
@@ -490,7 +500,7 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
     return [*notices, *camera_accuracy_notices(source.thermography, source.frames)]
 
 
-def _window_notice(source: CameraInputs) -> Notice:
+def window_notice(source: CameraInputs) -> Notice:
     """Return the notice that says what is used as cycles."""
     bounds, stated = source.cycles.bounds, source.thermography.window_s is not None
     seconds = float((bounds[0, 1] - bounds[0, 0]) / np.timedelta64(1, "s"))
@@ -550,16 +560,15 @@ def _raise_if_too_few_readings(deviations: xr.Dataset, left_out: Sequence[Notice
         )
 
 
-def _raise_if_no_rise(
-    campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[Mapping[str, Any]]
+def _raise_if_too_few_frames(
+    campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[Mapping[str, Any]], *, least: int
 ) -> None:
-    """Raise if too few frames are left to show a rise."""
-    if len(frames) < _LEAST_FRAMES:
+    """Raise if no frame is left, or beside a laser too few to show a rise."""
+    if len(frames) < least:
         reasons = listed(_reason(item) for item in rejected) if rejected else "none rejected"
-        single = f", or look at it with thermofuse inspect {frames[0].path}" if frames else ""
+        needed = f"at least {least} are needed, as a rise is the change since the first " if least > 1 else ""
         raise SourceError(
-            f"{campaign.path}: {counted(len(frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed, as a rise is the change since "
-            f"the first ({reasons}); check thermography.frames{single}"
+            f"{campaign.path}: {counted(len(frames), 'usable frame')}, {needed}({reasons}); check thermography.frames"
         )
 
 
@@ -580,10 +589,10 @@ def _raise_if_patch_outside(source: CameraInputs) -> None:
 def _raise_if_regions_unusable(source: CameraInputs) -> None:
     """Raise if a region of an emissivity of its own has no cell of the plan to itself, or a state in a cycle that was not measured."""
     grid, cycles = source.grid, source.cycles.number
-    for region in source.thermography.region:
+    for region in source.thermography.surfaces:
         where = f"{source.campaign.path}: [[thermography.region]]"
         try:
-            shares = Polygon(f"region {region.name}", np.array(region.corners_mm)).cell_shares(grid.x_mm, grid.y_mm)
+            shares = Polygon(f"region {region.name}", np.array(region.corners)).cell_shares(grid.x_mm, grid.y_mm)
         except PolygonError as error:
             raise SourceError(f"{where}: {error}; the plan is {grid.width_mm:g} x {grid.height_mm:g} mm") from error
         if not binary_erosion(shares == 1.0, np.ones((3, 3)), border_value=1).any():

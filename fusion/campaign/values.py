@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
@@ -272,7 +272,28 @@ def _patch(values: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
 PixelPatch = Annotated[tuple[int, int, int, int], AfterValidator(_patch)]
 
 
-def area_mm2(corners: tuple[tuple[float, float], ...]) -> float:
+class Length(NamedTuple):
+    """A coordinate: px of the picture, or mm on the plan."""
+
+    value: float
+    unit: str
+
+
+def _length(value: object) -> Length:
+    """Return a coordinate that is written with its unit."""
+    in_pixels = (
+        isinstance(value, str) and (match := _QUANTITY.fullmatch(value)) and unit_name(match.group(2) or "") == "px"
+    )
+    unit = "px" if in_pixels else "mm"
+    return Length(read_quantity(value, unit), unit)
+
+
+_Coordinate = Annotated[Length, BeforeValidator(_length), _written("120 px")]
+#: Column and row of the picture, or x and y on the plan.
+Point = tuple[_Coordinate, _Coordinate]
+
+
+def area(corners: tuple[tuple[float, float], ...]) -> float:
     """Return the area of a polygon by Gauss's formula, without its sense."""
     pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
     return abs(sum(x * y_next - x_next * y for (x, y), (x_next, y_next) in pairs)) / 2.0
@@ -280,7 +301,7 @@ def area_mm2(corners: tuple[tuple[float, float], ...]) -> float:
 
 def corner_words(corners: tuple[tuple[float, float], ...]) -> str:
     """Return the corners of a polygon for a message."""
-    return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"
+    return ", ".join(f"({x:g}, {y:g})" for x, y in corners)
 
 
 def not_a_file(path: Path) -> str:

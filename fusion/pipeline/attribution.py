@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import maximum_filter
 
 from fusion.analysis.attribution.correlate import (
     area_of,
@@ -68,10 +69,22 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     return Outcome(maps, parts, tuple(averaged))
 
 
-def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested."""
-    spots = enumerate(detect_hotspots(fields["temperature_rise"].isel(cycle=-1)), start=1)
-    return [{**_peak_part(f"hotspot {k}", spot, fields), **_UNTESTED} for k, spot in spots]
+def describe_hotspots(fields: xr.Dataset, shift_px: float = 0.0) -> list[dict[str, Any]]:
+    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested.
+
+    A picture that shifts makes an edge look as if it warmed beside and cooled behind: a hotspot stands out by more than that.
+    """
+    spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
+    if shift_px:
+        last = fields["temperature"].isel(cycle=-1)
+        down, across = np.gradient(last.values, *(float(np.median(np.diff(last[axis]))) for axis in "yx"))
+        steepest = xr.DataArray(maximum_filter(np.hypot(down, across), 5), last.coords, last.dims)
+        spots = [
+            spot
+            for spot in spots
+            if spot.prominence_K > shift_px * float(steepest.sel(x=spot.x_mm, y=spot.y_mm, method="nearest"))
+        ]
+    return [{**_peak_part(f"hotspot {k}", spot, fields), **_UNTESTED} for k, spot in enumerate(spots, start=1)]
 
 
 def _peak_part(name: str, spot: Hotspot, fields: xr.Dataset) -> dict[str, Any]:

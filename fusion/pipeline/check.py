@@ -26,6 +26,7 @@ from fusion.results.results import Notice
 from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations, read_environment
 from thermography.common import ThermographyError
+from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 from thermography.registration.projection import read_lens
 
@@ -152,13 +153,12 @@ def _content(source: Inputs) -> Iterator[str]:
             f"{position.min():g} to {position.max():g} mm, {int(readings.notnull().sum())} of {readings.size}"
         )
     if isinstance(source, CameraInputs):
-        first, grid = source.frames[0], source.grid
-        serial = f", serial {first.camera.serial}" if first.camera.serial else ""
-        yield (
-            f"frames: {len(source.frames)} of {first.shape[1]} x {first.shape[0]}, camera {first.camera.model or 'unknown'}{serial}, "
-            f"{len(source.frames_rejected)} left out"
-        )
-        if source.plan.in_pixels:
+        grid, names = source.grid, camera_names(source.pictures)
+        cameras = [f"{np.count_nonzero(names == name)} of {name}" for name in dict.fromkeys(names)]
+        yield f"frames: {'; '.join(cameras)}; {len(source.frames_rejected)} left out"
+        if not source.frames:
+            yield "no camera took most of them, or they have no time: a table of single pictures, not a series"
+        elif source.plan.in_pixels:
             yield (
                 f"plan: the picture of {grid.width_mm:g} x {grid.height_mm:g} px in cells of {grid.cell_size_mm:g} px, no scale in mm"
             )
@@ -173,7 +173,7 @@ def _content(source: Inputs) -> Iterator[str]:
 
 def _recordings(source: Inputs) -> Iterator[Recording]:
     """Return what was recorded when, on the laser's clock."""
-    if isinstance(source, CameraInputs):
+    if isinstance(source, CameraInputs) and source.frames:
         offset_s = source.thermography.clock_offset_s or 0.0
         yield Recording("frames", camera_on_laser_clock(source.frame_times, offset_s))
     if isinstance(source, LaserInputs):

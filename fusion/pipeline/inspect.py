@@ -675,17 +675,21 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
     size = f"{frames[0].shape[1]} x {frames[0].shape[0]}" if len(cameras) == 1 else f"{len(cameras)} cameras or sizes"
     lines = [f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} of {size}"]
     for name, count in cameras.most_common():
+        chosen = frames.choose(names == name)
         if len(cameras) > 1:
             lines.append(f"  {counted(count, 'frame')} of {name}")
-        of_one = frames.choose(names == name)
-        about = [f"camera {_camera(of_one)}", *_times(of_one), f"settings {_settings(of_one)}"]
+        try:
+            evaluation = tabulate_regions(chosen)
+            rejected += evaluation.rejected
+        except ThermographyError:
+            evaluation = None
+        about = [
+            f"camera {_camera(chosen)}",
+            *_times(chosen),
+            f"settings {_settings(chosen)}",
+            *describe_evaluation(evaluation),
+        ]
         lines += [f"  {'' if len(cameras) == 1 else '  '}{line}" for line in about]
-    try:
-        evaluation = tabulate_regions(frames)
-        rejected += evaluation.rejected
-    except ThermographyError:
-        evaluation = None
-    lines += [f"  {line}" for line in describe_evaluation(evaluation)]
     if len(cameras) > 1:
         lines.append(
             "  warning: frames of several cameras or sizes are no series; beside a laser those of the one with most of them are taken"

@@ -18,7 +18,15 @@ from fusion.analysis.consistency.checks import Check, doubt_notices, inputs_part
 from fusion.analysis.consistency.clocks import FOLLOWING_NOTICES, is_doubted_clock, without_consequences
 from fusion.analysis.effects.effect import plugins
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source, compensate_by_camera, read_source
+from fusion.campaign.inputs import (
+    CameraInputs,
+    Inputs,
+    LaserInputs,
+    Source,
+    compensate_by_camera,
+    read_source,
+    window_notice,
+)
 from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, thermal
 from fusion.pipeline import positioning as interferometry
@@ -40,11 +48,14 @@ from fusion.pipeline.stages import (
     stamp_run,
 )
 from fusion.pipeline.thermal import camera_corrected, describe_field
+from fusion.pipeline.thermograms import evaluate_thermograms
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
+from thermography.fields.cycle_fields import plan_unit
+from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
@@ -53,8 +64,10 @@ if TYPE_CHECKING:
 Maybe: TypeAlias = xr.Dataset | None
 #: The contact sensors, made from the logs in a moment.
 _SENSORS = "sensors.nc"
+#: The regions of every picture, a row for each.
+_TABLE = "thermograms.csv"
 #: What the report is made from.
-_DATASETS = ("fields", "deviations", "fusion", "sensors", "record")
+_DATASETS = ("thermograms", "fields", "deviations", "fusion", "sensors", "record")
 #: Fields above this size are not sent to a second process, which would hold them once more, bytes.
 _MOST_SENT = 200e6
 #: What a run writes last.
@@ -99,7 +112,7 @@ def run_campaign(
 
     Notes
     -----
-    Products in `out`: ``results.json``, ``report.html``, ``fields.nc``, ``deviations.nc``, ``fusion.nc``, ``maps/``,
+    Products in `out`: ``results.json``, ``report.html``, ``thermograms.nc``, ``fields.nc``, ``deviations.nc``, ``fusion.nc``, ``maps/``,
     ``provenance.json``; each is written whole or not at all. The method is described in docs/method/index.md.
 
     Every finding is an attribute of the result::
@@ -145,7 +158,7 @@ def _run_loaded(
             refuse_contradictions(without_consequences(checks, campaign.accept.doubts))
         made["source"] = source
         made |= {"camera": source} if isinstance(source, CameraInputs) else {}
-        made |= {"laser": source} if isinstance(source, LaserInputs) else {}
+        made |= {"laser": source} if isinstance(source, LaserInputs) else {"alone": source}
     report("reading and checking", 1, 1)
 
     readings = None if laser is None else campaign.resolve(laser.deviations)
@@ -194,6 +207,27 @@ def run_stages(run: Run, stages: Mapping[str, Callable[..., Any]], made: dict[st
         parameters = [one for one in signature(stage).parameters.values() if one.name != "run"]
         if all(one.default is None or made.get(one.name) is not None for one in parameters):
             made[makes] = stage(run, **{one.name: made.get(one.name) for one in parameters})
+
+
+def _evaluate_thermograms(run: Run, alone: CameraInputs) -> xr.Dataset:
+    """Every picture in degC, where a camera measures alone."""
+    thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, alone))
+    table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
+    claim(run.folder, _TABLE)
+    run.products.append(write_text(run.folder / _TABLE, table.to_dataframe().reset_index().to_csv(index=False)))
+    run.draw(partial(_draw, "pictures", thermograms, run.parts["thermograms"]["series"]))
+    return thermograms
+
+
+def _series_of(run: Run, camera: CameraInputs, alone: CameraInputs | None = None) -> CameraInputs | None:
+    """The camera whose frames are reduced to fields; None where its pictures show no course of one scene."""
+    if alone is None:
+        return camera
+    still = run.parts["thermograms"]["scene"] == "still" or not alone.plan.in_pixels
+    if not still or len(alone.cycles.number) < 2:
+        return None
+    run.notices.append(window_notice(alone))
+    return camera
 
 
 def _begin_evaluation(run: Run, laser: LaserInputs, camera: CameraInputs) -> Callable[[], xr.Dataset] | None:
@@ -309,7 +343,8 @@ def _find_hotspots(
     """Wait for the correlation, which tests the hotspots; describe them where there is none."""
     if correlation is not None:
         return correlation()
-    run.parts["hotspots"] = attribution.describe_hotspots(fields)
+    shift_px = run.parts["thermograms"]["largest_shift_px"] if plan_unit(fields) == "px" else None
+    run.parts["hotspots"] = attribution.describe_hotspots(fields, shift_px or 0.0)
     return None
 
 
@@ -366,6 +401,8 @@ def _model_record(run: Run, record_source: record_stage.RecordSource) -> xr.Data
 
 #: A run: what each stage makes. What the next ones do not wait for is begun first and waited for last.
 RUN: Mapping[str, Callable[..., Any]] = {
+    "thermograms": _evaluate_thermograms,
+    "camera": _series_of,
     "evaluation": _begin_evaluation,
     "fields": _reduce,
     "laser": _compensate,
@@ -388,12 +425,17 @@ RUN: Mapping[str, Callable[..., Any]] = {
 
 def _without_frames(source: Any) -> Any:
     """Return inputs as another process needs them where it reads no frame: there may be very many."""
-    return replace(source, frames=()) if isinstance(source, Source) else source
+    return replace(source, frames=(), pictures=FrameList([])) if isinstance(source, Source) else source
 
 
 def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
     """Remove products of an earlier run of another campaign in this folder: of an instrument that is gone, of cycles that are not there."""
-    of_stages = {"fields": "fields.nc", "deviations": "deviations.nc", "sensors": _SENSORS}
+    of_stages = {
+        "thermograms": "thermograms.nc",
+        "fields": "fields.nc",
+        "deviations": "deviations.nc",
+        "sensors": _SENSORS,
+    }
     stale = [name for dataset, name in of_stages.items() if dataset not in datasets]
     if not {"fusion", "record"} & set(datasets):
         stale.append("fusion.nc")
@@ -401,7 +443,7 @@ def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
     maps = {f"maps/{thermal.map_name(cycle)}" for cycle in cycles}
     stale += [name for name in read_manifest(run.folder) if name.startswith("maps/") and name not in maps]
     discard(run.folder, *stale)
-    for name in {"fields", "deviations"} - set(datasets):
+    for name in {"thermograms", "fields", "deviations"} - set(datasets):
         run.stamps.forget(name)
 
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 # there already.
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 5
+PRODUCT_LAYOUT = 6
 #: The stamp of a whole run, which its last stage gets.
 _REPORT = "report"
 
@@ -228,6 +228,7 @@ class Stage:
 _CORRELATED = ("plan", "interferometry", "drivers")
 _MODELLED = ("plan", "interferometry", "sensors", "drivers", "model")
 STAGES = {
+    "thermograms": Stage("thermograms", "thermograms.nc", ("thermography", "plan"), (), read_dataset),
     "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan", "interferometry"), (), open_dataset),
     "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), read_dataset),
     "correlation": Stage("correlation", ".stages/correlation.nc", _CORRELATED, ("fields", "deviations"), read_tree),

@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.campaign.config import SurfaceTable, ThermographyTable, relative_name
+from fusion.campaign.config import RegionTable, ThermographyTable, relative_name
 from fusion.campaign.inputs import CameraInputs, Source, SourceError, frames_notices
 from fusion.campaign.time_zones import utc
 from fusion.common import Array
@@ -285,7 +285,7 @@ _NO_SURROUNDINGS_IN_A_PICTURE = Notice(
     "camera_unchecked",
     "The whole picture is the plan, so that there are no surroundings to show steps and drift of the camera's zero, which look like a "
     "rise of the whole picture.",
-    'State the drift as thermography.camera_drift_u = "0.2 K", or give a plan in mm that leaves a margin of the picture.',
+    'State the drift, for example thermography.camera_drift_u = "0.2 K".',
 )
 
 
@@ -351,7 +351,7 @@ def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overri
     along = {"cycle": "cycle_time", "time": "time"}
     cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
     camera = cameras["cycle"][reference_cycle(fields["temperature"])]
-    regions = [_emissivity_region(one, fields, camera, inputs) for one in table.region]
+    regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
     if regions:
         fields = calibrate_surfaces(fields, surfaces, edge, cameras)
@@ -407,10 +407,10 @@ def _parameters_at(
 
 
 def _emissivity_region(
-    table: SurfaceTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+    table: RegionTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
 ) -> EmissivityRegion:
     """One region of the campaign file, its emissivity measured from two states where it is not given."""
-    outline = Polygon(f"region {table.name}", np.array(table.corners_mm))
+    outline = Polygon(f"region {table.name}", np.array(table.corners))
     if table.states is None:
         assert table.emissivity is not None
         u = inputs.emissivity if table.emissivity_u is None else table.emissivity_u
@@ -493,7 +493,7 @@ def _surface_part(
 ) -> dict[str, Any]:
     """One entry of ``radiometry.surfaces`` in results.json."""
     shown = find_range(fields, surface.cells)
-    sources = {f"region {one.name}": "stated" if one.states is None else "two states" for one in table.region}
+    sources = {f"region {one.name}": "stated" if one.states is None else "two states" for one in table.surfaces}
     ratio = scale = None
     if shown is not None:
         own = replace(inputs, emissivity=surface.emissivity_u)
@@ -533,7 +533,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
     first = clear_frames(survey, 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES)
     reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
-    registration = _register(source, reference)
+    registration = register_campaign(source, reference)
     report("registration", 1, 1)
     camera = examine_camera(source, survey, registration)
     source, notices = camera.source, camera.notices
@@ -567,7 +567,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     return Outcome(fields, parts, tuple(notices))
 
 
-def _register(source: CameraInputs, reference: np.ndarray) -> Registration:
+def register_campaign(source: CameraInputs, reference: np.ndarray) -> Registration:
     """Register the plan on the mean of the first frames; a refusal names the file of the fiducials."""
     if source.plan.in_pixels:
         return register_picture(reference.shape)

@@ -27,6 +27,7 @@ from fusion.report.numbers import (
     small,
     upper_first,
 )
+from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     CONTRIBUTORS,
     ISO230_TERMS,
@@ -466,6 +467,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
 
 #: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
 _SECTIONS = (
+    ("pictures", "thermograms", "Pictures"),
     ("iso230", "iso230", "ISO 230-2"),
     ("drift", "drift", "Drift"),
     ("anomalies", "anomalies", "Positions"),
@@ -502,6 +504,7 @@ def describe_campaign(
     """Return the facts of a campaign that the templates of its report state."""
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
     figures = figures_of(results)
+    doubts = results.inputs.doubts if results.inputs else ()
     laser = None if deviations is None else _laser(deviations)
     loop = None
     if isinstance(results.loop, AxisLoop):
@@ -520,7 +523,8 @@ def describe_campaign(
         "figures": figures,
         "verdict": results.loop.verdict if results.loop else "",
         "headline": headline(results),
-        "doubts": results.inputs.doubts if results.inputs else (),
+        # What a camera that measures alone shows beyond its range is counted with its temperatures.
+        "doubts": [one for one in doubts if results.thermograms is None or one.code != "camera_range"],
         "untouched": untouched(results.inputs, figures),
         "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
         "answers": conclude(results),
@@ -528,6 +532,8 @@ def describe_campaign(
         "contents": [(at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) is not None],
         "laser": laser,
         "camera": None if fields is None else _camera(fields),
+        "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
+        "drift_stated": (provenance["parameters"].get("thermography") or {}).get("camera_drift_u_K") is not None,
         "seen": "picture" if results.registration is not None and results.registration.is_picture else "table",
         "field_of": "cycle" if "positions" in figures else "window",
         "positions": None if results.drift is None or deviations is None else _positions_table(deviations),

@@ -101,14 +101,14 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def moment(time: np.datetime64 | str, zone: str | None = None) -> str:
-    """Return a UTC time to the minute with its zone, local to a zone of the IANA data base where one is named; NaT is a dash."""
+def moment(time: np.datetime64 | str, zone: str | None = None, *, seconds: bool = False) -> str:
+    """Return a UTC time to the minute or second with its zone, local to a zone of the IANA data base where one is named; NaT is a dash."""
     stamp = np.datetime64(time.removesuffix("Z")) if isinstance(time, str) else time
     if np.isnat(stamp):
         return "–"
     at = datetime.fromisoformat(np.datetime_as_string(stamp, unit="s")).replace(tzinfo=UTC)
     local = at if zone is None else at.astimezone(ZoneInfo(zone))
-    return f"{local:%Y-%m-%d %H:%M} {local.tzname()}"
+    return f"{local:{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}} {local.tzname()}"
 
 
 def place(x: float | None, y: float | None, unit: str = "mm") -> str:

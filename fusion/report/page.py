@@ -65,7 +65,7 @@ def _css_string(text: str) -> Markup:
 
 
 #: Products that a report draws, where a campaign has them.
-_DRAWN = ("fields", "deviations", "fusion", "sensors")
+_DRAWN = ("thermograms", "fields", "deviations", "fusion", "sensors")
 
 
 class ProductsError(FusionError):

@@ -10,7 +10,7 @@ import rich.table
 from fusion.messages import cell
 from fusion.report.conclusions import conclude, headline, next_steps
 from fusion.report.numbers import alike, number, p_words
-from fusion.report.wording import baseline_words, condition, figures_of, step_errors, untouched
+from fusion.report.wording import baseline_words, condition, figures_of, say, step_errors, untouched
 from fusion.results.axis import DriftPart, RegistrationPart
 from fusion.results.loop import Loop, RecordLoop
 from fusion.results.parts import Figures
@@ -31,11 +31,15 @@ def summary_table(results: Results) -> rich.table.Table:
 def summary_rows(results: Results) -> list[tuple[str, str]]:
     """Return names and texts of the findings of a run, in the order of the report."""
     rows: list[tuple[str, str]] = []
-    if results.inputs is not None:
+    if results.inputs is not None and not (results.thermograms and not results.thermograms.series):
         doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
         lines = [line for line in (*doubts, untouched(results.inputs, figures_of(results))) if line]
         rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
-    if results.registration is not None:
+    if results.thermograms is not None and results.regions is not None:
+        several = len(results.thermograms.cameras) > 1
+        shown = [one for one in results.regions if not several or one.name == "whole picture"]
+        rows += [(one.camera if several else one.name, say("region_line", one)) for one in shown]
+    if results.registration is not None and results.thermograms is None:
         rows.append(("registration", _registration(results.registration)))
     if results.drift is not None:
         scatter = _scatter_range(results.drift)
@@ -54,9 +58,7 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
 
 
 def _registration(part: RegistrationPart) -> str:
-    """Return the scatter of the fiducials; of four, which determine the plan exactly, the uncertainty; of a picture, that it is one."""
-    if part.is_picture:
-        return "none: the picture is the plan, lengths in px"
+    """Return the scatter of the fiducials; of four, which determine the plan exactly, the uncertainty."""
     if part.rms_mm is None or not math.isfinite(part.rms_mm):
         count = len(part.leave_one_out_mm)
         return f"standard uncertainty {number(part.position_u_mm, 2)} mm, not checked: {count} fiducials determine the plan exactly"

@@ -20,6 +20,7 @@ from fusion.messages import cell, printable
 from fusion.report.numbers import (
     alike,
     duration,
+    fixed,
     gain,
     join,
     lower_first,
@@ -258,7 +259,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None,
     )  # fmt: skip
     formats = (
-        condition, conditional, duration, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
+        condition, conditional, duration, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
         print_unit, quantity, region_words, small, upper_first,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}

@@ -324,6 +324,103 @@ class FieldPart(ResultPart):
     """Place of that cell from the upper edge of the picture, px; only where the picture is the plan."""
 
 
+class PicturePlace(ResultPart):
+    """A pixel of one picture."""
+
+    file: str
+    """File of the picture, as seen from the campaign file."""
+    frame: int
+    """Index of the picture in its file, from 0."""
+    time: str | None
+    """When it was taken, UTC; null where the file does not say it."""
+    column_px: int
+    """Column, from 0 at the left edge."""
+    row_px: int
+    """Row, from 0 at the upper edge."""
+
+
+class TemperatureRegionPart(ResultPart):
+    """The whole picture, or a spot, box, ellipse, line or polygon of it, over the pictures of one camera."""
+
+    name: str
+    """As the file or the campaign names it."""
+    kind: Literal["spot", "box", "ellipse", "line", "polygon"]
+    """What it is; the whole picture is a box."""
+    camera: str
+    """Camera and size of its pictures."""
+    pictures: int
+    """Pictures in which it is evaluated."""
+    emissivity: Number
+    """Emissivity with which it is evaluated, 1."""
+    maximum_degC: Quantity
+    """Highest temperature in any picture, degC; where pixels are above the calibrated range, the end of that range, without uncertainty."""
+    maximum_at: PicturePlace
+    """Where and when that is."""
+    minimum_degC: Quantity
+    """Lowest temperature in any picture, degC; where pixels are below the calibrated range, the end of that range, without uncertainty."""
+    minimum_at: PicturePlace
+    """Where and when that is."""
+    mean_degC: Quantity
+    """Mean over its pixels within the calibrated range and over the pictures, degC."""
+    overrange_pictures: int
+    """Pictures with pixels above the calibrated range."""
+    overrange_pixels: int
+    """Most such pixels in one picture."""
+    underrange_pictures: int
+    """Pictures with pixels below the calibrated range, or without a temperature."""
+    underrange_pixels: int
+    """Most such pixels in one picture."""
+
+
+class CameraPicturesPart(ResultPart):
+    """The pictures of one camera."""
+
+    name: str
+    """Model, serial number, and size in pixels."""
+    pictures: int
+    """Number of its pictures."""
+    first: str | None
+    """Time of the first, UTC; null where none has a time."""
+    last: str | None
+    """Time of the last, UTC."""
+
+
+class DifferencePart(ResultPart):
+    """The last picture of a series minus the first."""
+
+    seconds: float
+    """Time between them, s."""
+    mean_K: Quantity
+    """Mean over the pixels, K."""
+    largest_K: Quantity
+    """Largest change of a pixel in either direction, K; without uncertainty where the camera moved, or may have."""
+    largest_column_px: int
+    """Its column, from 0 at the left edge."""
+    largest_row_px: int
+    """Its row, from 0 at the upper edge."""
+
+
+class ThermogramsPart(ResultPart):
+    """Pictures of a camera that measures alone."""
+
+    pictures: int
+    """Pictures that were evaluated."""
+    cameras: tuple[CameraPicturesPart, ...]
+    """Cameras that took them."""
+    series: str
+    """Camera of the series; empty where no camera took most of them."""
+    scene: Literal["one picture", "still", "moved", "unlike", "no series"]
+    """What the series shows: the same from the same place, from another place, or something else."""
+    largest_shift_px: Number
+    """Largest shift of a picture against the first, px; null where pictures cannot be compared."""
+    emissivity: Number
+    """Emissivity with which the hottest picture is calibrated, 1."""
+    indicated_degC: Number
+    """Highest temperature that its pixels indicate, degC; not calibrated where it lies beyond the camera's range."""
+    difference: DifferencePart | None = None
+    """Last minus first; absent where they do not show the same."""
+
+
 class ContactSensorPart(ResultPart):
     """A contact sensor on the table."""
 

@@ -37,6 +37,8 @@ from fusion.results.parts import (
     Quantity,
     RadiometryPart,
     ResultPart,
+    TemperatureRegionPart,
+    ThermogramsPart,
     TimePart,
 )
 from fusion.results.store import Product, plain, require_own
@@ -126,6 +128,10 @@ class Results(ResultPart):
     """Consistency of the inputs."""
     time: TimePart | None = None
     """When the readings were taken; absent where the campaign states no time of day."""
+    thermograms: ThermogramsPart | None = None
+    """Pictures of a camera that measures alone."""
+    regions: tuple[TemperatureRegionPart, ...] | None = None
+    """Temperatures of the whole picture and of regions in it, by camera, where a camera measures alone."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
     camera: CameraPart | None = None

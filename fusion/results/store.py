@@ -342,6 +342,10 @@ def name_in_words(name: str) -> str:
 
 #: What every product of a kind holds, whatever the campaign: variable -> dims.
 PRODUCTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "thermograms": {
+        **dict.fromkeys(("maximum", "minimum", "mean"), ("time", "region")),
+        "thermogram": ("row", "column"),
+    },
     "fields": {name: dims for name, (dims, *_) in FIELDS.items()},
     **{kind: {name: dims for name, (dims, *_) in DEVIATIONS.items()} for kind in ("deviations", "fusion")},
     "record": {"displacement": ("time", "channel"), "temperature": ("time", "sensor"), "predicted_u": ("channel",)},

@@ -30,7 +30,14 @@ from thermography.common import Array
 from thermography.registration.discs import LocatedDisc
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import Projection, parameter_jacobian
-from thermography.registration.register import Registration, RegistrationError, locate_fiducials, register
+from thermography.registration.register import (
+    Registration,
+    RegistrationError,
+    locate_fiducials,
+    picture_grid,
+    register,
+    register_picture,
+)
 
 #: A displacement by more than this is a knock, px.
 KNOCK_PX = 0.5
@@ -313,6 +320,28 @@ def image_displacement(reference: Array, temperature: Array, registration: Regis
         if correlation >= _LEAST_CORRELATION and _common_share(mask, shift) >= _LEAST_COMMON:
             return np.array([*shift, 0.0, 0.0])
     return np.array(UNMEASURED)
+
+
+def picture_displacements(pictures: Iterable[Array]) -> Array:
+    """Shift (column, row) px of each picture against the first, (n, 2); NaN where it shows something else.
+
+    A part that warms makes a picture unlike the first, and changes little from one picture to the next: what cannot be compared with the
+    first is compared with the last picture that could.
+    """
+    known: list[tuple[Array, Array]] = []
+    shifts: list[Array] = []
+    for picture in pictures:
+        registration, grid = register_picture(picture.shape), picture_grid(picture.shape)
+        shift = np.zeros(2) if not known else np.full(2, np.nan)
+        for earlier, place in known:
+            moved = image_displacement(earlier, picture, registration, grid)[:2]
+            if np.isfinite(moved).all():
+                shift = place + moved
+                break
+        if np.isfinite(shift).all():
+            known = [*known[:1], (picture, shift)]
+        shifts.append(shift)
+    return np.array(shifts).reshape(-1, 2)
 
 
 def _common_share(mask: NDArray[np.uint8], shift_px: Array) -> float:

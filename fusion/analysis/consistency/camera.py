@@ -23,9 +23,6 @@ from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.large_arrays import median_of_pieces, piece_slices
 from thermography.inspection import FileWarning, check_series
 from thermography.io.frame import Frame, FrameReference
-from thermography.radiometry.planck import calibrate
-from thermography.registration.displacement import image_displacement
-from thermography.registration.register import picture_grid, register_picture
 
 # Checks of the times that the camera writes: order of the frames, rate of its clock, place in the motion of the axis.
 
@@ -259,7 +256,7 @@ def _range(frames: Sequence[Frame]) -> Check:
         outside,
         _OUTSIDE_SHARE,
         f"Up to {100.0 * outside:.3g} % of the pixels of a frame are outside the range in which the camera is calibrated.",
-        "Select the range of the camera that holds the temperatures of the table.",
+        "Select the range of the camera that holds these temperatures.",
     )
 
 
@@ -525,10 +522,6 @@ _LARGEST_AREA_RATIO = 1.05
 #: Least share of the plan that the fiducials span; beyond them the registration is extrapolated. Discs around a measured line span two
 #: thirds of its table; a plan twice as long and wide as the table leaves a quarter of that.
 _LEAST_SPAN = 0.25
-#: Largest shift of a picture that is its own plan, px: a part that warms shifts the best match of two pictures by up to one.
-_LARGEST_SHIFT_PX = 2.0
-#: Number of frames, spread over the series, that are compared.
-_COMPARED = 8
 
 
 def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Check]:
@@ -587,31 +580,4 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
             "Check the signs of x_mm and y_mm, and [plan.axis]; if the plan is drawn with y upwards, accept this doubt.",
             sound="The plan is not mirrored in the frames.",
         ),
-    ]
-
-
-def check_picture(frames: Sequence[FrameReference]) -> list[Check]:
-    """Check that the picture stays where it is, where the picture itself is the plan."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _COMPARED).round().astype(int))
-    first, *later = (calibrate(frames[k].read_counts(), frames[k].parameters) for k in chosen)
-    registration, grid = register_picture(first.shape), picture_grid(first.shape)
-    shifts_px = [float(np.linalg.norm(image_displacement(first, frame, registration, grid))) for frame in later]
-    measured = [shift for shift in shifts_px if np.isfinite(shift)]
-    largest, blind = max(measured, default=0.0), len(shifts_px) - len(measured)
-    compared = f"{len(later)} of {len(frames) - 1} later frames were compared with the first"
-    unlike = f"; {blind} of them correlate too weakly with the first to be compared" if blind else ""
-    return [
-        judge(
-            "camera_place",
-            largest,
-            _LARGEST_SHIFT_PX,
-            f"The picture shifts by up to {largest:.1f} px ({compared}{unlike})."
-            if measured
-            else f"Stability of the camera pose could not be verified: {compared}, and none of them correlates with it (too little "
-            "contrast, or another scene).",
-            "Fasten camera and table: without fiducials a cell is fixed in the picture, and shows another place when the camera moves.",
-            # Pictures of little contrast, or of what warms a lot, have little in common without a shift.
-            passed=bool(measured) and largest <= _LARGEST_SHIFT_PX,
-            endangers="what a cell shows, its rise, and the hotspots",
-        )
     ]

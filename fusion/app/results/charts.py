@@ -77,8 +77,7 @@ def reading_hours(products: Products) -> np.ndarray | None:
 
 def laser_charts(products: Products, selection: Selection, linker: Linker) -> ui.Parts:
     """Return the charts of the readings, and say which are missing."""
-    if products.deviations is None:
-        return [ui.note("This run has no readings of a laser: there is no profile, no drift and no ISO 230-2 value.")]
+    assert products.deviations is not None
     if products.drift is None:
         parts = [ui.note("The readings have no times: profile and drift cannot be told apart and are not shown.")]
     else:

@@ -56,6 +56,11 @@ class Products:
         return require_kind(open_in_file(path), "fields", path)
 
     @cached_property
+    def thermograms(self) -> xr.Dataset | None:
+        """Content of thermograms.nc; None where no camera measured alone."""
+        return read_product(self.folder, "thermograms") if (self.folder / "thermograms.nc").is_file() else None
+
+    @cached_property
     def deviations(self) -> xr.Dataset | None:
         """Content of deviations.nc; None without a laser."""
         return read_product(self.folder, "deviations") if (self.folder / "deviations.nc").is_file() else None

@@ -13,6 +13,7 @@ from fusion.app.results.again import RunAgain
 from fusion.app.results.charts import ThermalView, anomaly_cards, laser_charts, loop_steps, reading_hours
 from fusion.app.results.data import Linker, Products, Selection
 from fusion.common import FusionError
+from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.conclusions import headline, position_words
 
 
@@ -58,16 +59,18 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
     if hours is None and products.fields is not None:
         hours = products.field_hours
     linker = Linker(selection, targets, cycles, hours)
-    builders: dict[str, Callable[[], ui.Parts]] = {
-        "Map": lambda: _thermal(products, selection, linker),
-        "Laser": lambda: laser_charts(products, selection, linker),
-        "Positions": lambda: anomaly_cards(products, selection),
-        "Loop": lambda: loop_steps(products, linker),
-        "Run again": lambda: [RunAgain(state, products).view],
+    read, loop = products.deviations is not None, products.results.loop is not None
+    builders: dict[str, tuple[bool, Callable[[], ui.Parts]]] = {
+        "Pictures": (products.thermograms is not None, lambda: _pictures(products)),
+        "Map": (products.fields is not None, lambda: [ThermalView(products, selection, linker).view]),
+        "Laser": (read, lambda: laser_charts(products, selection, linker)),
+        "Positions": (read, lambda: anomaly_cards(products, selection)),
+        "Loop": (read or loop, lambda: loop_steps(products, linker)),
+        "Run again": (True, lambda: [RunAgain(state, products).view]),
     }
-    first = "Map" if products.fields is not None else "Laser" if products.deviations is not None else "Loop"
-    parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in builders.items()}
-    chooser, part = ui.switched("Part", parts, first)
+    shown = {name: build for name, (there, build) in builders.items() if there}
+    parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in shown.items()}
+    chooser, part = ui.switched("Part", parts, next(iter(parts)))
     lead = [ui.paragraph(products.results.campaign), ui.paragraph(headline(products.results))]
     if (products.folder / "report.html").is_file():
         lead.append(ui.link("Open the report", ui.report_link(state.root, products.folder)))
@@ -92,7 +95,9 @@ def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> ui.Parts:
     return [menu]
 
 
-def _thermal(products: Products, selection: Selection, linker: Linker) -> ui.Parts:
-    if products.fields is None:
-        return [ui.note("This run has no camera: there is no thermal map.")]
-    return [ThermalView(products, selection, linker).view]
+def _pictures(products: Products) -> ui.Parts:
+    """The hottest picture, the temperatures over time, and the difference of last and first."""
+    part = products.results.thermograms
+    assert products.thermograms is not None and part is not None
+    charts = draw_thermograms(products.thermograms, part.series)
+    return [pn.pane.Bokeh(chart.figure, sizing_mode="scale_width", max_width=820) for chart in charts.values()]

@@ -220,6 +220,11 @@ FIELDS = {
 }
 
 
+def is_picture(campaign: CampaignText) -> bool:
+    """Whether the picture itself is the plan, which has no size in mm."""
+    return campaign.value("plan", "registration") == "pixels" or campaign.value("plan") is None
+
+
 def read_fields(campaign: CampaignText) -> dict[str, str]:
     """Return the fields of a campaign file with their present texts, empty where nothing is written."""
     # Only a table without times, or with times without a unit, has these keys.
@@ -229,6 +234,7 @@ def read_fields(campaign: CampaignText) -> dict[str, str]:
         for name, field in FIELDS.items()
         if field.table == _REPORT
         or (field.key in record if field.table == _RECORD else campaign.value(*field.table) is not None)
+        if field.table != _PLAN or not is_picture(campaign)
     }
 
 

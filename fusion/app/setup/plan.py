@@ -375,14 +375,17 @@ class FrameView:
             self._add(*snapped(self._frame, event.x, event.y))
 
 
-_ORIGIN, _DIRECTION, _REGION = "Axis origin", "Axis direction", "Emissivity region"
+_ORIGIN, _DIRECTION, _REGION = "Axis origin", "Axis direction", "Region"
 #: Cells of the thermogram on the plan, along its longer side.
 _CELLS = 280
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is drawn on the plan: the point under the spindle at axis position 0, how it moves, targets, names and corners of regions."""
+    """What is drawn on the plan: the point under the spindle at axis position 0, how it moves, targets, names and corners of regions.
+
+    Where the picture is the plan, its lengths are in px.
+    """
 
     width_mm: float
     height_mm: float
@@ -390,6 +393,7 @@ class Plan:
     direction: tuple[float, float] | None = None
     positions_mm: tuple[float, ...] = ()
     regions: tuple[tuple[str, Array], ...] = ()
+    unit: str = "mm"
 
     @property
     def shown_positions_mm(self) -> tuple[float, ...]:
@@ -432,25 +436,33 @@ class PlanView:
         self._mode = pn.widgets.RadioButtonGroup(label="A click draws", options=[_ORIGIN, _DIRECTION, _REGION])
         self._picture = column()
         how = (
-            "Click the point under the spindle at axis position 0, then a point to which it moves as the position grows. An emissivity "
-            "region is dragged from corner to corner. The fields below take the same as numbers."
+            "Click the point under the spindle at axis position 0, then a point to which it moves as the position grows. A region is "
+            "dragged from corner to corner. The fields below take the same as numbers."
         )
-        self.view = column(heading("Axis and regions on the plan", level=3), note(how), self._mode, self._picture)
+        self._axis = column(note(how), self._mode)
+        self.view = column(heading("Axis and regions on the plan", level=3), self._axis, self._picture)
 
     def show(self, plan: Plan, placed: Placed, frame: NDArray[np.float64] | None) -> None:
         """Show a plan."""
         self._plan = plan
         size = (1100, min(round(1040 * plan.height_mm / plan.width_mm) + 60, 1100))
-        drawn = drawing((0, plan.width_mm), (plan.height_mm, 0), x="x (mm)", y="y (mm)", size_px=size)
-        if frame is not None and placed.registration is not None:
-            seen = on_plan(frame, placed.registration, plan)
+        in_px = plan.unit == "px"
+        self._axis.visible = not in_px
+        if in_px:
+            self._mode.value = _REGION
+        # The centre of the first pixel is (0, 0), the corner of a plan in mm too.
+        left = -0.5 if in_px else 0.0
+        ranges = (left, plan.width_mm + left), (plan.height_mm + left, left)
+        drawn = drawing(*ranges, x=f"x ({plan.unit})", y=f"y ({plan.unit})", size_px=size)
+        if frame is not None and (in_px or placed.registration is not None):
+            seen = frame if placed.registration is None else on_plan(frame, placed.registration, plan)
             if np.isfinite(seen).any():
                 low, high = np.nanpercentile(seen, (1, 99))
                 # Light greys, on which the lines are seen.
                 dark = low - 0.275 * max(high - low, 1e-6)
                 greys = LinearColorMapper("Greys256", low=dark, high=max(high, low + 1e-6), nan_color="#ffffff")
                 shown = seen.astype(np.float32)
-                drawn.image([shown], x=0, y=0, dw=plan.width_mm, dh=plan.height_mm, color_mapper=greys)
+                drawn.image([shown], x=left, y=left, dw=plan.width_mm, dh=plan.height_mm, color_mapper=greys)
         x, y = [one.x_mm for one in placed.fiducials], [one.y_mm for one in placed.fiducials]
         drawn.scatter(x, y, marker="circle", size=9, line_color=TEAL, fill_alpha=0, line_width=2)
         for name, corners in plan.regions:
@@ -495,9 +507,11 @@ def _draw_axis(drawn: Any, plan: Plan) -> None:
 
 
 def corners_of(region: dict[str, Any]) -> Array | None:
-    """Return the corners of a region as a campaign file writes it, (n, 2) mm; None where they cannot be read."""
+    """Return the corners of a region as a campaign file writes it, (n, 2) mm or px; None where they cannot be read."""
     try:
-        points = [[read_quantity(text, "mm") for text in one] for one in region.get("polygon") or region["rectangle"]]
+        written = region.get("polygon") or region["rectangle"]
+        unit = "px" if "px" in str(written) else "mm"
+        points = [[read_quantity(text, unit) for text in one] for one in written]
     except (QuantityError, KeyError, TypeError):
         return None
     if not region.get("polygon"):
@@ -506,23 +520,25 @@ def corners_of(region: dict[str, Any]) -> Array | None:
     return np.array(points, float)
 
 
-def region_table(name: str, emissivity: str, corners: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    """Return a rectangular region as a campaign file writes it."""
-    rectangle = [[f"{round(value, 1):g} mm" for value in corner] for corner in corners]
-    return {"name": name, "rectangle": rectangle, "emissivity": emissivity}
+def region_table(
+    name: str, emissivity: str, corners: Sequence[tuple[float, float]], unit: str = "mm"
+) -> dict[str, Any]:
+    """Return a rectangular region as a campaign file writes it; without an emissivity, that of the frames."""
+    rectangle = [[f"{round(value, 1):g} {unit}" for value in corner] for corner in corners]
+    return {"name": name, "rectangle": rectangle, **({"emissivity": emissivity} if emissivity else {})}
 
 
-# Regions of the table with an emissivity of their own, as a list that is added to and taken from.
+# Regions, maybe with an emissivity of their own, as a list that is added to and taken from.
 
-_CORNERS = ("x of one corner (mm)", "y of one corner (mm)", "x of the other (mm)", "y of the other (mm)")
+_CORNERS = ("x of one corner", "y of one corner", "x of the other", "y of the other")
 
 
 class RegionsView:
-    """Emissivity regions as the campaign file writes them; `on_change` is called whenever they have changed."""
+    """Regions as the campaign file writes them, in mm or px; `on_change` is called whenever they have changed."""
 
     def __init__(self, on_change: Callable[[], None]) -> None:
         self.regions: list[dict[str, Any]] = []
-        self._changed = on_change
+        self._changed, self._unit = on_change, "mm"
         self._name = pn.widgets.TextInput(label="Name of the region", width=190)
         self._emissivity = pn.widgets.TextInput(label="Its emissivity", placeholder="0.35 +- 0.05", width=190)
         self._corners = [pn.widgets.FloatInput(label=label, width=170, step=1.0) for label in _CORNERS]
@@ -532,12 +548,14 @@ class RegionsView:
         add.on_click(self._add)
         remove.on_click(self._remove)
         fields = pn.FlexBox(self._name, self._emissivity, *self._corners, add)
-        title = heading("Emissivity regions", level=3)
+        title = heading("Regions", level=3)
         self.view = column(title, fields, pn.FlexBox(self._chosen, remove), self._told)
 
-    def show(self, regions: list[dict[str, Any]]) -> None:
-        """Show regions."""
-        self.regions = regions
+    def show(self, regions: list[dict[str, Any]], unit: str | None = None) -> None:
+        """Show regions, whose unit stays where none is given."""
+        self.regions, self._unit = regions, unit or self._unit
+        for entry, label in zip(self._corners, _CORNERS, strict=True):
+            entry.label = f"{label} ({self._unit})"
         names = [str(one.get("name", "")) for one in regions]
         self._chosen.param.update(options=names, value=names[-1] if names else None)
 
@@ -545,20 +563,19 @@ class RegionsView:
         """Take the corners of a drawn rectangle."""
         for entry, value in zip(self._corners, (*one, *other), strict=True):
             entry.value = round(value, 1)
-        told = "The corners are taken; give the region a name and its emissivity, then add it."
+        told = "The corners are taken; give the region a name, and an emissivity where it has its own, then add it."
         self._told.object = paragraph_markup(told, kind="done")
 
     def _add(self, event: object) -> None:
         corners = [field.value for field in self._corners]
         name, emissivity = self._name.value.strip(), self._emissivity.value.strip()
         taken = name in [one.get("name") for one in self.regions]
-        if not name or not emissivity or taken or None in corners:
-            told = (
-                "A region needs a name of its own, an emissivity such as 0.35 +- 0.05, and two opposite corners in mm."
-            )
+        if not name or taken or None in corners:
+            told = f"A region needs a name of its own and two opposite corners in {self._unit}."
             self._told.object = paragraph_markup(told, kind="fault")
             return
-        self.show([*self.regions, region_table(name, emissivity, [(corners[0], corners[1]), (corners[2], corners[3])])])
+        places = [(corners[0], corners[1]), (corners[2], corners[3])]
+        self.show([*self.regions, region_table(name, emissivity, places, self._unit)])
         self._told.object = self._name.value = self._emissivity.value = ""
         self._changed()
 

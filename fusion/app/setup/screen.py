@@ -21,6 +21,7 @@ from fusion.app.setup.campaign import (
     Form,
     direction_text,
     found_in_folder,
+    is_picture,
     missing,
     open_campaign,
     read_direction,
@@ -161,9 +162,10 @@ class SetUpScreen:
         self._form.show(opened.campaign)
         self._columns.show(opened.table, opened.campaign.value("record", "columns") or {})
         regions = opened.campaign.value("thermography", "region")
-        self._regions.show(list(regions) if isinstance(regions, list) else [])
+        picture = is_picture(opened.campaign)
+        self._regions.show(list(regions) if isinstance(regions, list) else [], "px" if picture else "mm")
         for view in (self._frame, self._plan, self._regions):
-            view.view.visible = opened.frame is not None
+            view.view.visible = opened.frame is not None and not (picture and view is self._frame)
         self._times.show(opened.recordings, self._offset_s())
         if opened.frame is not None:
             self._frame.show(opened.frame, opened.placed, grid_of(opened.campaign))
@@ -194,7 +196,10 @@ class SetUpScreen:
     def _draw_plan(self) -> None:
         """Draw the plan from the fields, the fiducials and the regions; nothing where its sides are missing."""
         width, height, x, y = (self._quantity(name, "mm") for name in ("width", "height", "origin_x", "origin_y"))
-        if self._opened is None or not width or not height or width <= 0 or height <= 0:
+        opened = self._opened
+        if opened is not None and opened.frame is not None and is_picture(opened.campaign):
+            height, width = (float(size) for size in opened.frame.shape)
+        if opened is None or not width or not height or width <= 0 or height <= 0:
             return
         try:
             direction = read_direction(self._form.texts.get("direction", ""))
@@ -203,8 +208,9 @@ class SetUpScreen:
         outlines = ((str(one.get("name", "")), corners_of(one)) for one in self._regions.regions)
         regions = tuple((name, corners) for name, corners in outlines if corners is not None)
         origin = None if x is None or y is None else (x, y)
-        plan = Plan(width, height, origin, direction, self._opened.positions_mm, regions)
-        self._plan.show(plan, self._frame.placed, self._opened.frame)
+        unit = "px" if is_picture(opened.campaign) else "mm"
+        plan = Plan(width, height, origin, direction, opened.positions_mm, regions, unit)
+        self._plan.show(plan, self._frame.placed, opened.frame)
 
     def _on_drop(self, event: Any) -> None:
         """Write what was dropped into the folder; its content is not kept in memory, its line in the list of the page stays."""

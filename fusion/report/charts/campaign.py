@@ -15,6 +15,7 @@ from fusion.report.campaign import leading_region
 from fusion.report.charts import model, plan, readings
 from fusion.report.charts.plan import MapControls, plot_thermal_map
 from fusion.report.charts.style import Chart, EmbeddedChart, embed
+from fusion.report.charts.thermograms import draw_thermograms
 from fusion.results.results import Results
 from fusion.results.store import group, has
 from interferometry.plots import evaluate_common_start, hours_since_start
@@ -43,6 +44,8 @@ def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
     """Draw all charts of a campaign's report."""
     fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
     drawn = draw_measured(fields, deviations, None if fused is None else fused.to_dataset())
+    if results.thermograms is not None and "thermograms" in datasets:
+        drawn = drawn.with_more(draw_pictures(datasets["thermograms"], results.thermograms.series))
     correlation = results.correlation
     if fused is not None and correlation is not None and "correlation" in fused.children:
         drawn = drawn.with_more(draw_attributed(fused, correlation.source.part, correlation.p_resolution))
@@ -66,6 +69,11 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fuse
     if fused is not None:
         charts |= _clock_charts(fused, deviations)
     return Drawn(embed(charts))
+
+
+def draw_pictures(thermograms: xr.Dataset, series: str) -> Drawn:
+    """Draw the pictures of a camera that measures alone."""
+    return Drawn(embed(draw_thermograms(thermograms, series)))
 
 
 def draw_attributed(fused: xr.DataTree, channel: str, least_p: float | None) -> Drawn:

@@ -80,19 +80,39 @@ def add_names(drawn: figure, x: Any, y: Any, names: Any, **options: Any) -> None
     )  # fmt: skip
 
 
+def draw_picture(
+    values: np.ndarray,
+    low: float,
+    high: float,
+    label: str,
+    *,
+    colours: str = SEQUENTIAL,
+    block: int = 1,
+) -> figure:
+    """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey."""
+    rows, columns = (block * size for size in values.shape)
+    mapper = LinearColorMapper(palette(colours), low=low, high=high, nan_color="#e1e5e7")
+    ranges: dict[str, Any] = {"x_range": (-0.5, columns - 0.5), "y_range": (rows - 0.5, -0.5)}
+    # The width that axis and scale take beside the picture, and the height of the axis below it.
+    width, beside, below = 520, 120, 55
+    drawn = new_figure(x="column / px", y="row / px", height=round((width - beside) * rows / columns) + below, **ranges)
+    drawn.update(width=width, sizing_mode="scale_width")
+    drawn.grid.grid_line_color = None
+    rounded = np.round(values * _STEP_PER_K) / _STEP_PER_K
+    place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}
+    picture = drawn.image([rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
+    name, _, unit = label.partition(" / ")
+    add_hover(drawn, [("column", "$x{0}"), ("row", "$y{0}"), (name, f"@image{{0.00}} {unit}")], [picture])
+    add_colour_bar(drawn, mapper, label, place="right")
+    return drawn
+
+
 def plot_registration(fields: xr.Dataset) -> Chart:
     """Draw the reference frame, in sensor pixels, with every located fiducial."""
     frame = fields["reference_frame"].values
     rows, columns = frame.shape
     low, high = np.nanpercentile(frame[_on_plan(fields, frame.shape)], [1, 99])
-    mapper = LinearColorMapper(palette(), low=float(low), high=float(high))
-    drawn = new_figure(x="column / px", y="row / px", height=380, x_range=(0, columns), y_range=(rows, 0))
-    drawn.match_aspect = True
-    drawn.grid.grid_line_color = None
-    rounded = np.round(frame * _STEP_PER_K) / _STEP_PER_K
-    place = {"x": -0.5, "y": -0.5, "dw": columns, "dh": rows}
-    picture = drawn.image([rounded.astype(np.float32)], **place, color_mapper=mapper, level="image")
-    add_hover(drawn, [("column", "$x{0}"), ("row", "$y{0}"), ("temperature", "@image{0.00} °C")], [picture])
+    drawn = draw_picture(frame, float(low), float(high), "temperature / °C")
     names = [str(name) for name in fields["fiducial_name"].values]
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
     residual = fields["fiducial_residual"].values
@@ -101,7 +121,6 @@ def plot_registration(fields: xr.Dataset) -> Chart:
     rings = drawn.scatter("column", "row", source=source, **looks)
     add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
     add_hover(drawn, [("fiducial", "@name"), ("residual", "@residual{0.000} mm")], [rings])
-    add_colour_bar(drawn, mapper, "temperature / °C", place="right")
     seen = (
         f"Frame of {columns} by {rows} pixels with {len(names)} located fiducials; their residuals are up to "
         f"{number(float(np.nanmax(residual)), 2)} mm."
@@ -423,7 +442,7 @@ def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) ->
     if not hotspots:
         return
     x, y = ([getattr(spot, f"{axis}_{unit}") for spot in hotspots] for axis in "xy")
-    _add_marks(drawn, x, y, "circle", 19)
+    add_marks(drawn, x, y, "circle", 19)
     names = [spot.name or f"hotspot {place}" for place, spot in enumerate(hotspots, start=1)]
     middle = np.mean([drawn.x_range.start, drawn.x_range.end])
     add_names(drawn, x, y, names, y_offset=-13, text_align=["right" if at > middle else "left" for at in x])
@@ -436,12 +455,12 @@ def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
         if not shown:
             continue
         x, y = [sensor.x_mm for sensor in shown], [sensor.y_mm for sensor in shown]
-        _add_marks(drawn, x, y, marker, 11)
+        add_marks(drawn, x, y, marker, 11)
         names = [sensor.name for sensor in shown]
         add_names(drawn, x, y, names, y_offset=16, text_align="center", text_baseline="middle")
 
 
-def _add_marks(drawn: figure, x: Sequence[float], y: Sequence[float], marker: str, size: int) -> None:
+def add_marks(drawn: figure, x: Sequence[float], y: Sequence[float], marker: str, size: int) -> None:
     """Draw hollow marks, light on dark, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 2)):
         drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width)

@@ -232,6 +232,13 @@ STATES = 'states = [{ cycle = 7, temperature = "22 degC" }, { cycle = 7, tempera
             f'rectangle = [["100 mm", "50 mm"], ["200 mm", "90 mm"]]\n{STATES}',
             "both states of region chuck are cycle 7; ",
         ),
+        ("emissivity = 0.3", "region chuck needs one of spot"),
+        ('line = [["1 px", "2 px"], ["3 px", "4 mm"]]', "region chuck mixes px of the picture and mm of the plan"),
+        ('polygon = [["1 px", "2 px"], ["3 px", "4 px"]]', "the polygon of region chuck has 2 corners"),
+        (
+            f'ellipse = [["1 px", "2 px"], ["9 px", "8 px"]]\n{STATES}',
+            "the emissivity of region chuck comes from two states only",
+        ),
     ],
 )
 def test_a_region_that_tells_nothing_is_refused_at_its_line(folder: Path, lines: str, message: str) -> None:
@@ -284,7 +291,7 @@ def write(bare_folder: Path, *lines: str) -> Path:
         (LASER,),
         (LASER, SIZE),
         (CAMERA, PLAN),
-        (CAMERA, PIXELS),
+        (CAMERA,),
         (CAMERA, PIXELS, 'plan.cell_px = "4 px"'),
         (LASER, CAMERA, PLAN, AXIS),
         (LASER, SENSORS, SIZE, AXIS),
@@ -300,7 +307,7 @@ def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: t
     [
         ((), 1, "there is no instrument"),
         ((SENSORS, SIZE, AXIS), 1, "there is no instrument"),
-        ((CAMERA,), 2, "[thermography] needs the table [plan]"),
+        ((CAMERA, LASER), 2, "[thermography] needs the table [plan]"),
         ((LASER, SENSORS), 3, "[sensors] needs the table [plan]"),
         ((CAMERA, PLAN.replace("plan.fid", "# ")), 3, "[plan] lacks fiducials; add it"),
         ((LASER, CAMERA, PLAN), 4, "[plan] lacks axis; add it"),

@@ -19,6 +19,7 @@ from fusion.campaign.inputs import (
     read_source,
     stack_options,
     usual_window_s,
+    window_notice,
 )
 from fusion.pipeline.positioning import evaluate_interferometry
 from interferometry.io.readings import read_deviations
@@ -66,9 +67,11 @@ def test_a_link_whose_frame_is_gone_is_named(copied: Path) -> None:
         load_campaign(copied / "campaign.toml")
 
 
-def test_a_single_frame_is_not_enough(copied: Path) -> None:
+def test_a_single_frame_is_enough_for_a_camera_alone(copied: Path) -> None:
     for frame in sorted((copied / "thermal").glob("*.jpg"))[1:]:
         frame.unlink()
+    alone = without(copied / "campaign.toml", "interferometry", "plan", "model", "drivers", name="camera.toml")
+    assert len(read_source(load_campaign(alone)).frames) == 1
     with pytest.raises(
         SourceError, match=r"1 usable frame, at least 2 .* \(none rejected\); check thermography.frames"
     ):
@@ -78,7 +81,7 @@ def test_a_single_frame_is_not_enough(copied: Path) -> None:
 def test_windows_shorter_than_a_minute_are_told_in_seconds(copied: Path) -> None:
     path = without(copied / "campaign.toml", "interferometry", "plan.axis", "model", "drivers", name="camera.toml")
     change(path, 'table = "still"', 'window = "40 s"\ntable = "still"')
-    (notice,) = [one for one in read_source(load_campaign(path)).notices if one.code == "cycles_from_windows"]
+    notice = window_notice(read_source(load_campaign(path)))
     assert "windows of 40 s, as" in notice.message
 
 
@@ -262,9 +265,9 @@ def test_a_window_without_a_frame_is_left_out_and_the_number_says_so() -> None:
     [
         (frames(*np.arange(0, 240)), 300.0),  # four hours: 48 windows of 5 min
         (frames(*np.arange(0, 10, 1 / 60)), 10.0),  # ten minutes at 1 Hz: 60 windows of 10 s
-        (frames(0, 45, 90), 3600.0),  # a frame in 45 min: an hour is the first usual length that holds one
+        (frames(0, 18), 900.0),  # two frames 18 min apart: each has a window of its own
         (frames(0, 1), 60.0),
-        (frames(*np.arange(0, 0.004, 0.0005)), 0.05),  # 0.2 s at 33 Hz: shorter than every usual length
+        (frames(*np.arange(0, 0.004, 0.0005)), 0.02),  # 0.2 s at 33 Hz
         (frames(0, 0.0661), 2.0),  # two frames 4 s apart: two windows
         (frames(0, 1e-8), 6e-7),
     ],

@@ -6,14 +6,11 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
-from scipy import ndimage
 
-from fusion.analysis.consistency import camera as registration
 from fusion.analysis.consistency.camera import (
     check_frames,
     check_gaps,
@@ -406,37 +403,3 @@ def test_each_doubt_is_named(changed, code, evidence):
     ((named, text),) = doubts(**changed)
     assert named == code
     assert evidence in text
-
-
-def shifts(monkeypatch, *pictures):
-    """The check of pictures of temperatures, degC."""
-    monkeypatch.setattr(registration, "calibrate", lambda counts, parameters: counts)
-    frames = [SimpleNamespace(read_counts=lambda picture=picture: picture, parameters=None) for picture in pictures]
-    (check,) = registration.check_picture(frames)
-    return check
-
-
-def test_a_picture_that_stays_is_no_doubt_and_one_that_moves_is(monkeypatch):
-    rng = np.random.default_rng(5)
-    scene = 20.0 + 5.0 * ndimage.gaussian_filter(rng.normal(size=(96, 128)), 3.0)
-    still = [scene + rng.normal(scale=0.02, size=scene.shape) for _ in range(4)]
-    assert shifts(monkeypatch, *still).passed
-    moved = shifts(monkeypatch, *still, np.roll(scene, (3, 4), axis=(0, 1)))
-    # A shift of 5 px; the content that comes in at the edge costs a tenth of it.
-    assert not moved.passed and moved.value == pytest.approx(5.0, abs=0.5)
-    other = shifts(monkeypatch, scene, rng.normal(20.0, 1.0, scene.shape))
-    assert not other.passed and "none of them correlates with it" in other.evidence
-
-
-def test_discs_in_rows_are_not_taken_for_a_shift_by_a_row(monkeypatch):
-    row, column = np.mgrid[:120, :160]
-    scene = np.full((120, 160), 22.0)
-    for y in (15, 100):
-        for x in (20, 140):
-            scene[(row - y) ** 2 + (column - x) ** 2 < 16] -= 3.0
-    # What warms between the discs is unlike the first picture; a shift by 85 px would leave a third of it, with one row on the other.
-    warm = 4.0 * np.exp(-((column - 80) ** 2 + (row - 60) ** 2) / 800.0)
-    rng = np.random.default_rng(5)
-    pictures = [scene + share * warm + rng.normal(scale=0.05, size=scene.shape) for share in np.linspace(0.0, 1.0, 8)]
-    check = shifts(monkeypatch, *pictures)
-    assert check.passed and check.value < 1.0

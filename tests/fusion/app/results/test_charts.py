@@ -1,7 +1,5 @@
 """Parts of the screen *Results*: laser, closed loop, positions, and the thermal map."""
 
-import shutil
-
 import numpy as np
 import panel as pn
 import pytest
@@ -54,15 +52,6 @@ def test_the_readings_follow_the_choice(products):
     assert "Readings at 50 mm" in texts(parts)
     selection.target = 4
     assert "Readings at 150 mm" in texts(parts) and "Readings at 50 mm" not in texts(parts)
-
-
-def test_without_a_laser_it_says_so(results_folder, tmp_path):
-    folder = shutil.copytree(results_folder, tmp_path / "camera")
-    (folder / "deviations.nc").unlink()
-    camera, selection = Products(folder), Selection(cycle=1)
-    assert reading_hours(camera) is None
-    linker = Linker(selection, [], camera.cycles, None)
-    assert "no readings of a laser" in texts(laser_charts(camera, selection, linker))
 
 
 def parts_of(products):

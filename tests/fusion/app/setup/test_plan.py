@@ -187,7 +187,7 @@ def test_clicks_draw_origin_then_direction_and_a_drag_a_region():
     view._on_tap(SimpleNamespace(x=100.0, y=51.0))
     view._on_drag(SimpleNamespace(x=1.0, y=2.0))
     view._on_drop(SimpleNamespace(x=3.0, y=4.0))
-    view._mode.value = "Emissivity region"
+    view._mode.value = "Region"
     view._on_tap(SimpleNamespace(x=0.0, y=0.0))
     view._on_drag(SimpleNamespace(x=1.0, y=2.0))
     view._on_drop(SimpleNamespace(x=3.0, y=4.0))
@@ -218,3 +218,9 @@ def test_a_drawn_region_is_added_once_and_removed():
     assert view.regions[0]["rectangle"] == [["1 mm", "2 mm"], ["30 mm", "40 mm"]] and len(changes) == 1
     view._remove(None)
     assert view.regions == [] and len(changes) == 2
+    view.show([], "px")
+    view.take_corners((1.0, 2.0), (30.0, 40.0))
+    view._name.value, view._emissivity.value = "way", ""
+    view._add(None)
+    assert view.regions == [{"name": "way", "rectangle": [["1 px", "2 px"], ["30 px", "40 px"]]}]
+    assert corners_of(view.regions[0]).tolist()[2] == [30.0, 40.0]

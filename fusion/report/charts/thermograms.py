@@ -1,0 +1,131 @@
+"""Charts of a camera that measures alone: the hottest picture, temperatures over time, and what changed from first to last."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from bokeh.plotting import figure
+
+from fusion.report.charts.plan import add_marks, add_names, draw_picture
+from fusion.report.charts.style import DIVERGING, Chart, add_series, new_figure, of_rank, span_words
+from fusion.report.numbers import fixed
+from interferometry.plots import INK
+
+#: Regions that are drawn over time: more lines cannot be told apart.
+MOST_LINES = 8
+#: Share of the pixels that lie beyond the colour scale of a picture at either end, so that single ones do not set it.
+_BEYOND = 0.1
+#: Most pixels of a picture that is drawn, and of one whose values the reader can download; larger ones are averaged in blocks.
+_DRAWN, _DOWNLOADED = 400_000, 40_000
+#: Units of a time axis: from how many seconds, unit, seconds.
+_TIMES = ((7200.0, "h", 3600.0), (120.0, "min", 60.0), (0.0, "s", 1.0))
+
+
+def draw_thermograms(thermograms: xr.Dataset, series: str) -> dict[str, Chart]:
+    """Draw what the pictures show."""
+    charts = {"thermogram": plot_thermogram(thermograms)}
+    of_series = thermograms.isel(time=np.flatnonzero(thermograms["camera"].values == series))
+    if np.unique(of_series["time"].values).size > 1:
+        charts["region_history"] = plot_regions(of_series)
+    if "difference" in thermograms:
+        charts["difference"] = plot_difference(thermograms["difference"].values)
+    return charts
+
+
+def plot_thermogram(thermograms: xr.Dataset) -> Chart:
+    """Draw the hottest picture with its regions and the places of its extremes."""
+    values, flag = thermograms["thermogram"].values, thermograms["flag"].values
+    low, high = (float(value) for value in np.nanpercentile(values, (_BEYOND, 100.0 - _BEYOND)))
+    drawn = _draw(values, low, high if high > low else low + 1.0, "temperature / °C")
+    for outline in json.loads(thermograms.attrs["outlines"]):
+        _draw_outline(drawn, outline)
+    places = {}
+    for name, marker, at in (
+        ("highest", "triangle", np.nanargmax(values)),
+        ("lowest", "inverted_triangle", np.nanargmin(values)),
+    ):
+        row, column = np.unravel_index(int(at), values.shape)
+        places[name] = f"{fixed(float(values[row, column]), 1)} °C at column {column}, row {row}"
+        add_marks(drawn, [float(column)], [float(row)], marker, 9)
+    beyond = int(np.count_nonzero(flag))
+    seen = (
+        f"Thermogram {thermograms.attrs['hottest']} of {values.shape[1]} by {values.shape[0]} pixels: highest {places['highest']}, lowest "
+        f"{places['lowest']}; {beyond} pixels outside the calibrated range."
+    )
+    return Chart(drawn, seen, _columns(values, "temperature / °C"))
+
+
+def _draw(values: np.ndarray, low: float, high: float, label: str, **looks: Any) -> figure:
+    """Draw a picture of any size with its places in pixels of the sensor."""
+    means, block = _averaged(values, _DRAWN)
+    return draw_picture(means, low, high, label, block=block, **looks)
+
+
+def _averaged(values: np.ndarray, most: int) -> tuple[np.ndarray, int]:
+    """Return a picture of so many pixels at most, each the mean of a block, and the side of a block."""
+    block = int(np.ceil(np.sqrt(values.size / most)))
+    rows, columns = (size // block for size in values.shape)
+    whole = values[: rows * block, : columns * block]
+    return whole.reshape(rows, block, columns, block).mean(axis=(1, 3)), block
+
+
+def _columns(values: np.ndarray, label: str) -> dict[str, np.ndarray]:
+    """Return what the reader can download of a picture, one row per pixel or block."""
+    means, block = _averaged(values, _DOWNLOADED)
+    row, column = block * np.indices(means.shape) + (block - 1) / 2
+    return {"column / px": column.ravel(), "row / px": row.ravel(), label: means.ravel()}
+
+
+def _draw_outline(drawn: figure, outline: dict[str, Any]) -> None:
+    """Draw a region with its name."""
+    points = np.array(outline["points"], float)
+    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
+    if outline["kind"] == "spot":
+        add_marks(drawn, [left], [top], "cross", 13)
+    elif outline["kind"] == "ellipse":
+        turn = np.linspace(0.0, 2.0 * np.pi, 61)
+        points = np.column_stack(
+            [(left + right + (right - left) * np.cos(turn)) / 2, (top + bottom + (bottom - top) * np.sin(turn)) / 2]
+        )
+    elif outline["kind"] == "box":
+        points = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+    if outline["kind"] in ("box", "polygon"):
+        points = np.vstack([points, points[:1]])
+    if len(points) > 1:
+        for colour, width in ((INK, 4), ("#ffffff", 1.6)):
+            drawn.line(points[:, 0], points[:, 1], line_color=colour, line_width=width)
+    inside = right < 0.85 * drawn.x_range.end
+    offset, align = (6, "left") if inside else (-6, "right")
+    add_names(drawn, [right], [top], [outline["name"]], x_offset=offset, y_offset=-4, text_align=align)
+
+
+def plot_regions(thermograms: xr.Dataset) -> Chart:
+    """Draw maximum and mean of the whole picture and the mean of every region over time."""
+    seconds = (thermograms["time"].values - thermograms["time"].values[0]) / np.timedelta64(1, "s")
+    unit, scale = next((unit, scale) for least, unit, scale in _TIMES if seconds[-1] >= least)
+    drawn = new_figure(x=f"time since the first picture / {unit}", y="temperature / °C", height=380, legend_columns=3)
+    whole, *regions = thermograms["region"].values[: MOST_LINES - 1]
+    lines = [
+        ("highest of the picture", thermograms["maximum"].sel(region=whole)),
+        ("mean of the picture", thermograms["mean"].sel(region=whole)),
+        *((str(name), thermograms["maximum"].sel(region=name)) for name in regions),
+    ]
+    columns: dict[str, Any] = {f"time / {unit}": seconds / scale}
+    told = []
+    for rank, (name, values) in enumerate(lines):
+        marker = "circle" if seconds.size <= 100 else None
+        add_series(drawn, seconds / scale, values.values, name=name, marker=marker, size=4.0, **of_rank(rank))
+        columns[f"{name} / °C"] = values.values
+        told.append(f"{name} {span_words(values, '°C')}")
+    return Chart(drawn, f"Temperatures in {seconds.size} pictures: {'; '.join(told)}.", columns)
+
+
+def plot_difference(values: np.ndarray) -> Chart:
+    """Draw the last picture minus the first."""
+    most = float(np.nanpercentile(np.abs(values), 100.0 - _BEYOND)) or 1.0
+    drawn = _draw(values, -most, most, "change / K", colours=DIVERGING)
+    seen = f"Change of every pixel from the first picture to the last: {span_words(values, 'K')}."
+    return Chart(drawn, seen, _columns(values, "change / K"))

@@ -1,0 +1,157 @@
+"""A camera that measures alone: temperatures of every picture and of regions, what changed, and what is no series."""
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import ndimage
+
+from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import read_source
+from fusion.pipeline.run import run_campaign
+from fusion.pipeline.thermograms import evaluate_thermograms
+from fusion.report.page import report_of
+from fusion.results.progress import silent
+from tests.thermography.plan_scene import SC660
+from thermography.io.flir_writer import write_jpeg
+from thermography.io.frame import CameraIdentity
+from thermography.radiometry.planck import counts_from_temperature, temperature_from_counts
+
+FITTER = "frkatona__ThermalImageFitter/Nov19"
+START = np.datetime64("2026-03-09T06:30:00", "ms")
+LATE = START + np.timedelta64(900, "D")
+CAMERA = CameraIdentity(model="FLIR A645sc", serial="1")
+SHAPE = (96, 128)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Degrees Celsius: a workshop with a warm part."""
+    ground = 20.0 + 5.0 * ndimage.gaussian_filter(np.random.default_rng(5).normal(size=SHAPE), 3.0)
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    return ground + 30.0 * (np.hypot(column - 40, row - 30) < 8)
+
+
+def write(folder: Path, pictures, *, minutes=18.0, camera=CAMERA, lines="", start=START) -> Path:
+    """Write pictures (degC) as JPEG and a campaign that names nothing but them."""
+    folder.mkdir(exist_ok=True)
+    for k, picture in enumerate(pictures):
+        counts = np.round(counts_from_temperature(picture, SC660)).astype(np.uint16)
+        time = start + np.timedelta64(round(60_000 * minutes * k), "ms")
+        write_jpeg(folder / f"{camera.model.split()[-1]}_{k}.jpg", counts, SC660, time, camera=camera)
+    path = folder / "campaign.toml"
+    path.write_text(f'[campaign]\ntitle = "T"\n[thermography]\nframes = ["*.jpg"]\n{lines}', encoding="utf-8")
+    return path
+
+
+def evaluated(path: Path):
+    """The product and the parts of a campaign."""
+    found = evaluate_thermograms(read_source(load_campaign(path)), report=silent)
+    return (
+        found.dataset,
+        found.parts["thermograms"],
+        {one["name"]: one for one in found.parts["regions"]},
+        found.notices,
+    )
+
+
+def test_two_pictures_give_their_difference(tmp_path, scene):
+    dataset, part, regions, _ = evaluated(write(tmp_path, [scene, scene + 1.5]))
+    assert part["scene"] == "still" and part["difference"]["seconds"] == 18 * 60
+    assert part["difference"]["mean_K"]["value"] == pytest.approx(1.5, abs=0.01)
+    assert dataset["difference"].values == pytest.approx(1.5, abs=0.05)
+    assert regions["whole picture"]["maximum_degC"]["value"] == pytest.approx(scene.max() + 1.5, abs=0.02)
+    row, column = np.unravel_index(scene.argmax(), SHAPE)
+    place = regions["whole picture"]["maximum_at"]
+    assert (place["column_px"], place["row_px"], place["file"]) == (column, row, "A645sc_1.jpg")
+
+
+REGIONS = """
+[[thermography.region]]
+name = "part"
+rectangle = [["36 px", "26 px"], ["44 px", "34 px"]]
+
+[[thermography.region]]
+name = "dull"
+spot = ["100 px", "60 px"]
+emissivity = 0.5
+"""
+
+
+def test_regions_of_the_campaign_are_evaluated_with_their_own_emissivity(tmp_path, scene):
+    dataset, _, regions, _ = evaluated(write(tmp_path, [scene, scene + 1.0], lines=REGIONS))
+    assert dataset["region"].values.tolist() == ["whole picture", "part", "dull"]
+    inside = scene[26:35, 36:45].mean()
+    assert dataset["mean"].sel(region="part").values == pytest.approx([inside, inside + 1.0], abs=0.02)
+    counts = np.round(counts_from_temperature(scene[60, 100], SC660))
+    read = float(temperature_from_counts(counts, replace(SC660, emissivity=0.5)))
+    assert dataset["maximum"].sel(region="dull").values[0] == pytest.approx(read, abs=1e-3)
+    assert regions["dull"]["emissivity"] == 0.5
+
+
+def test_a_moved_picture_is_brought_onto_the_first_and_names_no_hotspots(tmp_path, scene):
+    path = write(
+        tmp_path / "in", [scene, np.roll(scene, (4, 6), axis=(0, 1)), np.roll(scene, (4, 6), axis=(0, 1)) + 1.0]
+    )
+    results = run_campaign(path, tmp_path / "out")
+    assert results.thermograms.scene == "moved" and results.thermograms.largest_shift_px == pytest.approx(7.2, abs=0.5)
+    # Pixel by pixel the edge of the part would differ by 30 K.
+    assert results.thermograms.difference.mean_K.value == pytest.approx(1.0, abs=0.1)
+    assert results.hotspots is None and results.field is None and not (tmp_path / "out" / "fields.nc").exists()
+    assert "picture_moved" in [notice.code for notice in results.warnings]
+
+
+def test_one_picture_is_a_thermogram(tmp_path, scene):
+    out = tmp_path / "out"
+    results = run_campaign(write(tmp_path / "in", [scene]), out)
+    assert results.thermograms.scene == "one picture" and results.thermograms.difference is None
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert 'id="drawing-thermogram"' in page and 'id="drawing-region_history"' not in page
+    assert report_of(out).count("°C") == page.count("°C")
+
+
+def test_pictures_of_several_cameras_are_a_table_by_camera(tmp_path, scene):
+    write(tmp_path / "in", [scene], camera=CameraIdentity(model="FLIR E40", serial="7"))
+    path = write(tmp_path / "in", [scene - 3.0], camera=CameraIdentity(model="FLIR T1020", serial="9"), start=LATE)
+    results = run_campaign(path, tmp_path / "out")
+    assert results.thermograms.series == ""
+    assert [one.name for one in results.thermograms.cameras] == ["FLIR E40 7, 128 x 96", "FLIR T1020 9, 128 x 96"]
+    assert "no_series" in {notice.code for notice in results.warnings}
+    assert results.field is None and results.registration is None
+    table = pd.read_csv(tmp_path / "out" / "thermograms.csv")
+    assert sorted(table["source"]) == sorted(path.name for path in (tmp_path / "in").glob("*.jpg"))
+
+
+def test_a_picture_of_another_camera_is_no_part_of_the_series(tmp_path, scene):
+    path = write(tmp_path, [scene] * 4)
+    write(tmp_path, [scene], camera=CameraIdentity(model="FLIR E40", serial="2"), start=LATE)
+    source = read_source(load_campaign(path))
+    assert len(source.frames) == 4 and len(source.pictures) == 5
+    _, part, _, notices = evaluated(path)
+    assert part["scene"] == "still" and [notice.code for notice in notices] == ["other_pictures"]
+
+
+@pytest.mark.real_data
+@pytest.mark.chain
+def test_a_part_that_leaves_the_range_of_the_camera_is_said_so(tmp_path, real_file):
+    """25 pictures of a part that a lamp heats (C3-X, 0 to 300 degC): beyond 300 degC in 8 of them."""
+    for number in range(2167, 2217, 2):
+        shutil.copy(real_file(f"{FITTER}/FLIR{number}.jpg"), tmp_path)
+    path = tmp_path / "campaign.toml"
+    path.write_text('[campaign]\ntitle = "T"\n[thermography]\nframes = ["*.jpg"]\n', encoding="utf-8")
+    out = tmp_path / "out"
+    results = run_campaign(path, out)
+    (whole,) = results.regions
+    assert results.thermograms.scene == "still" and whole.pictures == 25
+    assert whole.overrange_pictures == 8 and whole.maximum_degC.u is None
+    # The range holds for a black body; with an emissivity of 0.95 its end is 312 degC.
+    assert whole.maximum_degC.value == pytest.approx(311.7, abs=0.1)
+    assert results.thermograms.indicated_degC == pytest.approx(391.3, abs=0.1)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Highest temperature above 312 °C" in page and "data:image/jpeg;base64," in page
+    # No hotspot where a shift by a pixel makes as much at an edge.
+    assert re.search(r'id="pictures"', page) and len(results.hotspots) < 11
