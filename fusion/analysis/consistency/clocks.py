@@ -91,10 +91,10 @@ class Evidence:
 
     def at(self, recording: str, quarters: int) -> int:
         """Place in `cost` where a recording is taken as late by quarters of an hour, and the others are right."""
-        return _HOURS_ZERO + quarters * ((recording == self.second) - (recording == self.first))
+        return _ZERO + quarters * ((recording == self.second) - (recording == self.first))
 
 
-_HOURS_ZERO = int(np.flatnonzero(QUARTERS == 0)[0])
+_ZERO = int(np.flatnonzero(QUARTERS == 0)[0])
 
 
 def check_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] = ()) -> list[Check]:
@@ -102,8 +102,9 @@ def check_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] =
     known = [one for one in recordings if one.sorted.size]
     if len(known) < 2:
         return []
-    evidence = [*_of_times(known), *compared]
-    against = [one for one in evidence if one.cost[_HOURS_ZERO] > 1.0]
+    gathered = [*_of_times(known), *compared]
+    evidence = [one for one in gathered if not _outvoted(one, gathered)]
+    against = [one for one in evidence if one.cost[_ZERO] > 1.0]
     late: dict[str, list[int]] = {}
     if sum(one.weight for one in against) >= _ENOUGH:
         late = {one.name: quarters for one in known if (quarters := _lateness(one.name, evidence))}
@@ -113,6 +114,16 @@ def check_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] =
         for one in known
     ]
     return [*checks, _undecided(known, late, against, odd)]
+
+
+def _outvoted(one: Evidence, evidence: Sequence[Evidence]) -> bool:
+    """Whether the stated clocks are contradicted by one kind of evidence of two recordings, and confirmed by two others: an effect
+    that nobody declared looks like a delay.
+    """
+    admitted = one.cost <= 1.0
+    others = [each for each in evidence if each is not one and (each.first, each.second) == (one.first, one.second)]
+    confirming = [each for each in others if not admitted[_ZERO] and (each.cost[admitted] > 1.0).all()]
+    return sum(bool(each.cost[_ZERO] <= 1.0) for each in confirming) >= _ENOUGH
 
 
 def _lateness(name: str, evidence: Sequence[Evidence]) -> list[int]:
