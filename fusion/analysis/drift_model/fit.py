@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.special import gammaln
 
 from fusion.analysis.alignment.readings import Readings
@@ -79,6 +80,8 @@ def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> 
     return tried[rng.choice(weight.size, size=draws, p=weight / weight.sum())]
 
 
+#: Fewest cycles over which a growth of the noise is looked for, and standard errors of its logarithm by which it must be known.
+_FEWEST_CYCLES, _LEAST_GROWTH = 10, 4.0
 #: The scatter of a site is trusted like this many further readings with the scatter of all sites.
 _SHRINKAGE_READINGS = 20
 
@@ -196,7 +199,8 @@ def fit_model(readings: Readings, terms: Sequence[Term], *, used: NDArray[np.boo
     design = np.column_stack([profile, *(term.candidate.columns for term in terms)])[used]
     seconds, loadings, response = readings.seconds[used], readings.loadings[used], readings.response[used]
     first = estimate(seconds, loadings, response, design, robust=True)
-    variance = _site_variance(readings.subset(used), first) * first.system.variance
+    of_used = readings.subset(used)
+    variance = _site_variance(of_used, first) * _growth(of_used, first) * first.system.variance
     fit = estimate(
         seconds,
         loadings,
@@ -271,6 +275,22 @@ def _site_variance(readings: Readings, fit: DriftFit) -> Array:
         squares = float((noise[here] ** 2).sum()) / fit.sigma**2 + _SHRINKAGE_READINGS
         relative[site == number] = squares / (float(share[here].sum()) + _SHRINKAGE_READINGS)
     return relative / np.mean(relative)
+
+
+def _growth(readings: Readings, fit: DriftFit) -> Array:
+    """Relative variance of each reading from noise that grows or falls over the test, (n,), mean 1; ones where none is significant."""
+    noise, share = fit.noise()
+    ordinary = fit.system.variance == 1.0
+    cycles, cycle = np.unique(readings.cycle[ordinary], return_inverse=True)
+    if cycles.size < _FEWEST_CYCLES:
+        return np.ones(noise.size)
+    squares, expected = (np.bincount(cycle, values[ordinary]) for values in ((noise / fit.sigma) ** 2, share))
+    place = (cycles - cycles.mean()) / np.ptp(cycles)
+    slope, _, _, _, slope_u = stats.linregress(place, np.log(np.maximum(squares, 1e-12) / expected))
+    if abs(slope) < _LEAST_GROWTH * slope_u:
+        return np.ones(noise.size)
+    relative = np.exp(slope * (readings.cycle - cycles.mean()) / np.ptp(cycles))
+    return np.asarray(relative / relative.mean())
 
 
 #: How often errors of the camera and the declared coefficients are sized in turn.

@@ -248,6 +248,17 @@ def test_each_site_is_weighted_by_its_own_scatter(rng):
     assert by_site[2] / np.median(by_site) == pytest.approx(2.78, rel=0.1)
 
 
+def test_noise_that_grows_over_the_test_is_weighted_by_its_size(rng):
+    bare = campaign(cycles=60, positions_mm=tuple(np.linspace(100.0, 400.0, 12)))
+    size = 0.1 * np.exp(1.2 * (bare.cycle - 1) / 59)
+    noise = rng.standard_normal(bare.seconds.size)
+    of_cycle = [fit_model(replace(bare, response=one), []).fit.system.variance for one in (noise, size * noise)]
+    even, grown = ([one[bare.cycle == cycle].mean() for cycle in (1, 60)] for one in of_cycle)
+    assert even[1] == pytest.approx(even[0], rel=1e-9)
+    # exp(2.4) = 11; 24 readings of each of 60 cycles know the logarithm to 0.13.
+    assert np.log(grown[1] / grown[0]) == pytest.approx(2.4, abs=0.5)
+
+
 # Least squares of many candidates and many responses, against one `lstsq` each and against dense densities.
 
 
