@@ -117,21 +117,21 @@ def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) 
     --------
     >>> ax = plot_loop(close_loop(fused, ["axis_expansion", "table_offset"]))  # doctest: +SKIP
     """
-    errors: dict[str, ErrorInterval] = (
+    errors: dict[str, ErrorInterval | None] = (
         {**dict(loop.errors), **dict(loop.baselines)}
         if isinstance(loop, AxisLoop | RecordLoop)
         else dict(loop.hold_out)
     )
     ax = new_axes(ax)
-    size = {name: error.rmse_um for name, error in errors.items() if error.rmse_um is not None}
-    values = np.array(list(size.values()), float)
-    ends = np.array([[errors[name].low_um, errors[name].high_um] for name in size], float)
+    known = {name: error for name, error in errors.items() if error is not None and error.rmse_um is not None}
+    values = np.array([error.rmse_um for error in known.values()], float)
+    ends = np.array([[error.low_um, error.high_um] for error in known.values()], float)
     colours = {"declared": COLOURS["negative"], "final": COLOURS["positive"]}
     ax.barh(
-        [_PREDICTIONS[name] for name in size],
+        [_PREDICTIONS[name] for name in known],
         values,
         xerr=np.abs(ends - values[:, None]).T,
-        color=[colours.get(name, MUTED) for name in size],
+        color=[colours.get(name, MUTED) for name in known],
         ecolor="black",
     )
     if loop.noise_floor_um is not None:

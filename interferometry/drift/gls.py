@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import linalg, optimize, signal, special
+from scipy import linalg, optimize, special
 from scipy.linalg import lapack
 
 from interferometry.common import Array
@@ -631,6 +631,8 @@ class Autoregression:
         """Give white series (cycles, series) this memory, their variance kept."""
         if not self.weights.size:
             return white
+        from scipy import signal  # loads scipy.stats, which a short answer does without
+
         return np.asarray(signal.lfilter([np.sqrt(self.innovation_share)], [1.0, *-self.weights], white, axis=0))
 
 

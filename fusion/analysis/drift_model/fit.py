@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.special import gammaln
 
 from fusion.analysis.alignment.readings import Readings
@@ -286,8 +285,9 @@ def _growth(readings: Readings, fit: DriftFit) -> Array:
         return np.ones(noise.size)
     squares, expected = (np.bincount(cycle, values[ordinary]) for values in ((noise / fit.sigma) ** 2, share))
     place = (cycles - cycles.mean()) / np.ptp(cycles)
-    slope, _, _, _, slope_u = stats.linregress(place, np.log(np.maximum(squares, 1e-12) / expected))
-    if abs(slope) < _LEAST_GROWTH * slope_u:
+    logarithm = np.log(np.maximum(squares, 1e-12) / expected)
+    (slope, _), covariance = np.polyfit(place, logarithm, 1, cov=True)
+    if abs(slope) < _LEAST_GROWTH * np.sqrt(covariance[0, 0]):
         return np.ones(noise.size)
     relative = np.exp(slope * (readings.cycle - cycles.mean()) / np.ptp(cycles))
     return np.asarray(relative / relative.mean())
