@@ -299,7 +299,7 @@ def _scene_notices(source: CameraInputs, part: dict[str, Any]) -> Iterator[Notic
     elif others:
         yield Notice(
             "other_pictures",
-            f"{counted(others, 'picture')} of another camera or size, or without a time, are evaluated one by one and are no part of "
+            f"{counted(others, 'picture')} of another camera or size, or without a time: evaluated one by one, no part of "
             f"the series of {part['series']}.",
             "",
         )

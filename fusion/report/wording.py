@@ -449,7 +449,7 @@ def baseline_words(loop: Loop) -> dict[str, str]:
     return {
         name: words.replace("cycles before", "time before").replace("cycle", "value") if record else words
         for name, words in BASELINES.items()
-        if getattr(loop.baselines, name) is not None
+        if hasattr(loop.baselines, name)
     }
 
 

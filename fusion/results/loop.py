@@ -82,8 +82,13 @@ class Baselines(ResultPart):
     """Ridge regression on the same."""
     ridge_with_lags: ErrorInterval
     """Ridge regression on the same and on lagged copies of it."""
-    mean_run: ErrorInterval | None = None
-    """The mean course of the other runs; null where there is one run."""
+
+
+class RunBaselines(Baselines):
+    """The same where a record has several runs."""
+
+    mean_run: ErrorInterval
+    """The mean course of the other runs."""
 
 
 class StepPart(ResultPart):
@@ -371,7 +376,7 @@ class Loop(HoldOutErrors):
     """Standard deviation of a single reading or block mean that no model explains, um."""
     errors: ModelErrors
     """The errors before and after with their intervals."""
-    baselines: Baselines
+    baselines: RunBaselines | Baselines
     """Errors of plain predictions with their intervals."""
     best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags", "mean_run"]
     """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""

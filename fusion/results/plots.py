@@ -117,13 +117,13 @@ def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) 
     --------
     >>> ax = plot_loop(close_loop(fused, ["axis_expansion", "table_offset"]))  # doctest: +SKIP
     """
-    errors: dict[str, ErrorInterval | None] = (
+    errors: dict[str, ErrorInterval] = (
         {**dict(loop.errors), **dict(loop.baselines)}
         if isinstance(loop, AxisLoop | RecordLoop)
         else dict(loop.hold_out)
     )
     ax = new_axes(ax)
-    known = {name: error for name, error in errors.items() if error is not None and error.rmse_um is not None}
+    known = {name: error for name, error in errors.items() if error.rmse_um is not None}
     values = np.array([error.rmse_um for error in known.values()], float)
     ends = np.array([[error.low_um, error.high_um] for error in known.values()], float)
     colours = {"declared": COLOURS["negative"], "final": COLOURS["positive"]}

@@ -897,6 +897,6 @@ def errors_of_predictions(hold_out: Mapping[str, schema.ErrorInterval]) -> dict[
     plain = {name: one for name, one in hold_out.items() if name not in schema.ModelErrors.model_fields}
     return {
         "errors": schema.ModelErrors(declared=hold_out["declared"], final=hold_out["final"]),
-        "baselines": schema.Baselines(**plain),
+        "baselines": schema.RunBaselines(**plain) if "mean_run" in plain else schema.Baselines(**plain),
         "best_baseline": min(plain, key=lambda name: plain[name].rmse_um),  # type: ignore[arg-type, return-value]
     }
