@@ -216,10 +216,12 @@ def columns_of(
             )
         # TC(1) and TC(2) of a logger are two names, whose units stand elsewhere.
         roles[role][heading] = (heading if elsewhere and in_heading not in ("", elsewhere) else name, unit)
+    used = {heading for of_role in roles.values() for heading in of_role}
+    example = next((heading for heading in reversed(headings) if heading not in used), headings[-1])
     for role in ("temperature", "displacement"):
         if not roles[role]:
             raise TableError(
-                f'{path}: no column is a {role}; write one under [record.columns], such as "{headings[-1]}" = {_EXAMPLES[role]}'
+                f'{path}: no column is a {role}; write one under [record.columns], such as "{example}" = {_EXAMPLES[role]}'
             )
     return roles
 
