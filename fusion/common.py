@@ -150,7 +150,8 @@ def describe(item: ErrorDetails, model: type, place: Place) -> str:
 def _nearest(names: tuple[str, ...], model: type) -> str:
     """Return the hint that follows an unknown key: the nearest known one, and all that its table knows."""
     for name in names[:-1]:
-        model = _table_in(_keys(model)[name])
+        # A table that the user names, a column of a record, is no key that is known beforehand.
+        model = _table_in(_keys(model)[name]) if name in _keys(model) else model
     known = sorted(_keys(model))
     return f"{suggest(names[-1], known)}known here: {', '.join(known)}"
 

@@ -328,12 +328,16 @@ def _by_channel(
     """Return a column for every channel, which keeps its value until its next line; their times, and the lines without a number."""
     values = pd.Series(numbers_in(frame[long.value]), frame.index)
     channels = frame[long.channel].astype(str).str.strip()
-    bad = values.isna() & channels.isin(channels[values.notna()].unique())
+    # camonitor prints the value of a channel without a reading as 0, with the severity of its alarm behind it.
+    invalid = frame.drop(columns=[long.value, long.channel, *long.time]).isin(["INVALID"]).any(axis=1)
+    bad = (values.isna() | invalid) & channels.isin(channels[values.notna()].unique())
     left_out = [
-        RejectedLine(path.name, int(line), str(frame.at[line, long.value]), "is not a number")
+        RejectedLine(
+            path.name, int(line), str(frame.at[line, long.value]), "is INVALID" if invalid[line] else "is not a number"
+        )
         for line in frame.index[bad]
     ]
-    changes = pd.DataFrame({"time": time, "channel": channels, "value": values}).dropna()
+    changes = pd.DataFrame({"time": time, "channel": channels, "value": values.mask(invalid)}).dropna()
     wide = changes.groupby(["time", "channel"])["value"].last().unstack().ffill()
     return wide, wide.index.to_numpy("M8[ns]"), left_out
 

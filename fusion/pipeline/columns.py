@@ -426,7 +426,7 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     if unit:
         of_unit = role_of_unit(unit)
         setpoint = word in ("target", "setpoint", "soll", "cmd")
-        taken = setpoint or (role in ("out", "driver") and of_unit != "temperature")
+        taken = setpoint or (role in ("out", "driver") and of_unit not in ("temperature", "driver"))
         return replace(known, role=role if taken else of_unit)
     if role == "out":
         return known

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,6 +68,8 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         tables.append(every.assign_coords(camera=("time", of_camera), source=("time", np.array(files, object))))
         count(len(frames))
     rejected = [one for each in tables for one in json.loads(each.attrs["rejected"])]
+    damaged = {(str(one["path"]), one["index"]) for one in rejected}
+    source = replace(source, frames=[one for one in source.frames if (str(one.path), one.index) not in damaged])
     kinds = {str(region): str(kind) for each in tables for region, kind in each["kind"].to_series().items()}
     table = xr.concat(
         [each.drop_vars("kind") for each in tables], "time", join="outer", coords="minimal", compat="override"
@@ -282,7 +285,7 @@ def _rejected_notices(rejected: Sequence[dict[str, Any]], folder: Path) -> Itera
         yield Notice(
             "pictures_left_out",
             f"{counted(len(rejected), 'picture')} left out: {reasons}.",
-            "Copy them again from the camera.",
+            "Copy damaged pictures again from the camera.",
         )
 
 

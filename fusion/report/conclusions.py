@@ -86,4 +86,5 @@ def next_steps(results: Results) -> list[str]:
         steps.append(say("test_place", correlation.source))
     steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))
-    return unique or ["Nothing has to be done: use the profile and its uncertainty as they are."]
+    values = "profile" if results.drift is not None or results.iso230 is not None else "temperatures"
+    return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]

@@ -25,6 +25,8 @@ from interferometry.io.spreadsheets import is_workbook, read_sheets
 #: Attribute ``reference`` of times from a file that gives no zone.
 NO_ZONE = "no zone in the file: taken as UTC"
 #: Years of measurements; others are damage, and the first and last years of the calendar have no UTC.
+#: How PNG, JPEG, GIF and TIFF begin.
+_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*")
 _YEARS = (1950, 2199)
 
 _MONTHS = {
@@ -376,6 +378,10 @@ def decode_text(path: Path, content: bytes) -> str:
                 f"{path}: byte {fault.start} is not text in {encoding.upper()}, as which the file begins; it is damaged, copy it again"
             ) from None
         text = _in_a_code_page(content)
+    if content.startswith(_PICTURES):
+        raise LaserFormatError(
+            f"{path}: is a picture, no table; export its values as CSV, or remove it from the folder"
+        )
     place = text.find("\0")
     if place >= 0:
         raise LaserFormatError(

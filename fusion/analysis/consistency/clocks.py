@@ -164,12 +164,13 @@ def _named(odd: Recording, possible: Sequence[int], known: Sequence[Recording], 
     quarters, *others_possible = possible
     fit = f" ({', '.join(_words(k) for k in others_possible[:2])} would do as well)" if others_possible else ""
     why = _by_file(known, against, odd=odd.name)
-    others = [one.file for one in known if one.name != odd.name]
+    *first, last = (one.file for one in known if one.name != odd.name)
     return judge(
         f"{odd.name}_clock",
         15.0 * quarters,
         0.0,
-        f"The clock of {odd.file} is {_words(quarters)}{fit}: so taken, it agrees with {', '.join(others)}, which agree among themselves; "
+        f"The clock of {odd.file} is {_words(quarters)}{fit}: so taken, it agrees with {', '.join(first)} and {last}, which agree among "
+        "themselves; "
         f"as it stands, it contradicts {why}.",
         f"Check clock and time zone of {odd.file}; to take its clock as {_words(quarters)}, write {odd.moved(quarters)}. Leave the other "
         "files as they are.",

@@ -329,6 +329,11 @@ def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: t
         ((LASER, LOGGED), 3, "[record] cannot be combined with [interferometry]"),
         (('path = "x"',), 2, "unknown key path; remove it"),
         (
+            (LOGGED.replace(" }", ', columns = { "T" = { rol = "temperature" } } }'),),
+            2,
+            "unknown key record.columns.T.rol; did you mean role?",
+        ),
+        (
             (LASER, 'model.declared = ["axis_expansion"]'),
             3,
             'model.declared = "axis_expansion": this effect follows the',

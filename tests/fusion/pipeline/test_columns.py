@@ -58,7 +58,9 @@ MONITOR = "".join(
     f"{name:<30} {line}"
     for lines in zip(*(rows(f"{{time:%Y-%m-%d %H:%M:%S.%f}} {{{key}}}  ").splitlines(True) for key in CHANNELS.values()), strict=True)
     for name, line in zip(CHANNELS, lines, strict=True)
-) + "MILL:AIR                       *** Not connected (PV not found)\n"  # fmt: skip
+)  # fmt: skip
+MONITOR += f"MILL:TEMP-1                    {rows('{time:%Y-%m-%d %H:%M:%S.%f}').splitlines()[-1]} 0 UDF INVALID\n"
+MONITOR += "MILL:AIR                       *** Not connected (PV not found)\n"
 LAYOUTS: dict[str, str] = {
     "toa5": TOA5,
     "lvm": LVM.format(columns="One") + "".join(

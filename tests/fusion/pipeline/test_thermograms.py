@@ -114,6 +114,19 @@ def test_one_picture_is_a_thermogram(tmp_path, scene):
     assert report_of(out).count("°C") == page.count("°C")
 
 
+def test_a_damaged_picture_is_left_out_and_named(tmp_path, scene):
+    path = write(tmp_path, [scene, scene + 0.5, scene + 1.5], minutes=1.0)
+    damaged = tmp_path / "A645sc_1.jpg"
+    content = bytearray(damaged.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 400] = b"\x55" * 400
+    damaged.write_bytes(bytes(content))
+    _, part, _, notices = evaluated(path)
+    assert part["pictures"] == 2 and part["difference"]["mean_K"]["value"] == pytest.approx(1.5, abs=0.01)
+    (left_out,) = [one for one in notices if one.code == "pictures_left_out"]
+    assert "A645sc_1.jpg" in left_out.message
+
+
 def test_pictures_of_several_cameras_are_a_table_by_camera(tmp_path, scene):
     write(tmp_path / "in", [scene], camera=CameraIdentity(model="FLIR E40", serial="7"))
     path = write(tmp_path / "in", [scene - 3.0], camera=CameraIdentity(model="FLIR T1020", serial="9"), start=LATE)

@@ -161,6 +161,8 @@ def test_code_pages_are_recognised_and_what_is_no_text_is_refused():
     assert decode_text(PATH, b"a\x81b") == "a\x81b"
     with pytest.raises(LaserFormatError, match="character 3 is a zero byte, so the file is not text; save the table"):
         decode_text(PATH, b"ab\0c")
+    with pytest.raises(LaserFormatError, match="is a picture, no table"):
+        decode_text(PATH, b"\x89PNG\r\n\x1a\n\0\0")
     with pytest.raises(LaserFormatError, match=r"byte \d+ is not text in UTF-16, as which the file begins; it is"):
         decode_text(PATH, "abc".encode("utf-16") + b"\xd8")
 
