@@ -139,6 +139,8 @@ def describe(item: ErrorDetails, model: type, place: Place) -> str:
         return f"{where}: [{table}] lacks {names[-1]}; add it"
     if item["type"] == "value_error":
         remedy = str(item["ctx"]["error"])
+    elif item["type"] == "too_long":
+        remedy = f"it takes {item['ctx']['max_length']} values, not {item['ctx']['actual_length']}"
     else:
         remedy = _REMEDIES.get(item["type"], item["msg"][0].lower() + item["msg"][1:])
     if isinstance(item["input"], dict):

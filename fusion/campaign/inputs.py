@@ -587,10 +587,23 @@ def _raise_if_patch_outside(source: CameraInputs) -> None:
 
 
 def _raise_if_regions_unusable(source: CameraInputs) -> None:
-    """Raise if a region of an emissivity of its own has no cell of the plan to itself, or a state in a cycle that was not measured."""
+    """Raise if a region is not in the picture, or one of an emissivity of its own has no cell of the plan, or a state no measured cycle."""
     grid, cycles = source.grid, source.cycles.number
+    where = f"{source.campaign.path}: [[thermography.region]]"
+    names = Counter(region.name for region in source.thermography.region)
+    for region in source.thermography.region:
+        if names[region.name] > 1:
+            raise SourceError(
+                f"{where}: {names[region.name]} regions are called {region.name}; give each a name of its own"
+            )
+        height, width = source.pictures[0].shape
+        (left, top), (right, bottom) = np.min(region.points, axis=0), np.max(region.points, axis=0)
+        if region.unit == "px" and (right < 0 or bottom < 0 or left > width - 1 or top > height - 1):
+            raise SourceError(
+                f"{where}: region {region.name} lies outside the picture of {width} x {height} px; give column and row from 0, 0 to "
+                f"{width - 1}, {height - 1}"
+            )
     for region in source.thermography.surfaces:
-        where = f"{source.campaign.path}: [[thermography.region]]"
         try:
             shares = Polygon(f"region {region.name}", np.array(region.corners)).cell_shares(grid.x_mm, grid.y_mm)
         except PolygonError as error:

@@ -11,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.inputs import read_source
+from fusion.campaign.inputs import SourceError, read_source
 from fusion.pipeline.run import run_campaign
 from fusion.pipeline.thermograms import evaluate_thermograms
 from fusion.report.page import report_of
@@ -112,6 +112,21 @@ def test_one_picture_is_a_thermogram(tmp_path, scene):
     page = (out / "report.html").read_text(encoding="utf-8")
     assert 'id="drawing-thermogram"' in page and 'id="drawing-region_history"' not in page
     assert report_of(out).count("°C") == page.count("°C")
+
+
+@pytest.mark.parametrize(
+    ("regions", "fault"),
+    [
+        ('[{ name = "a", spot = ["500 px", "5 px"] }]', "region a lies outside the picture of 128 x 96 px"),
+        (
+            '[{ name = "a", spot = ["5 px", "5 px"] }, { name = "a", spot = ["6 px", "5 px"] }]',
+            "2 regions are called a",
+        ),
+    ],
+)
+def test_a_region_that_cannot_be_evaluated_is_refused_before_the_work(tmp_path, scene, regions, fault):
+    with pytest.raises(SourceError, match=fault):
+        read_source(load_campaign(write(tmp_path, [scene], lines=f"region = {regions}")))
 
 
 def test_a_damaged_picture_is_left_out_and_named(tmp_path, scene):
