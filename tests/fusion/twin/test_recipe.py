@@ -31,7 +31,7 @@ def test_vary_changes_the_named_values_only():
     ("tables", "message"),
     [
         ({"test": {"feed_mm_per_min": 0.0}}, r"test\.feed_mm_per_min = 0\.0: input should be greater than 0"),
-        ({"plan": {"origin_mm": (1.0, 2.0, 3.0)}}, r"plan\.origin_mm = \[1\.0, 2\.0, 3\.0\]: .* at most 2 items"),
+        ({"plan": {"origin_mm": (1.0, 2.0, 3.0)}}, r"plan\.origin_mm = \[1\.0, 2\.0, 3\.0\]: it takes 2 values, not 3"),
         ({"camera": {"file": "png"}}, r"camera\.file = \"png\": input should be 'jpg' or 'seq'"),
         ({"anomaly": (AnomalyRecipe(1), AnomalyRecipe(2, "odd"))}, r'^anomaly\.1\.kind: anomaly\.kind = "odd"'),
     ],
