@@ -23,6 +23,7 @@ Biometrika 58, 545 (restricted likelihood).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -629,11 +630,11 @@ class Autoregression:
 
     def with_memory(self, white: Array) -> Array:
         """Give white series (cycles, series) this memory, their variance kept."""
-        if not self.weights.size:
-            return white
-        from scipy import signal  # loads scipy.stats, which a short answer does without
-
-        return np.asarray(signal.lfilter([np.sqrt(self.innovation_share)], [1.0, *-self.weights], white, axis=0))
+        made = np.sqrt(self.innovation_share) * white
+        for cycle in range(1, len(made)):
+            for lag, weight in enumerate(self.weights[:cycle], start=1):
+                made[cycle] += weight * made[cycle - lag]
+        return np.asarray(made)
 
 
 NO_MEMORY = Autoregression(np.empty(0), 1.0)
@@ -653,19 +654,23 @@ def memory_of_each(values: Array) -> Autoregression:
     """
     if min(values.shape) <= 4 * _COMMON_PATTERNS:
         return NO_MEMORY
-    rng = np.random.default_rng(0)
-    estimates = np.empty((_SIMULATED_MEMORY.size, _SIMULATIONS))
-    for row, weight in zip(estimates, _SIMULATED_MEMORY, strict=True):
-        for k in range(_SIMULATIONS):
-            simulated = Autoregression(np.array([weight]), 1.0 - weight**2).with_memory(
-                rng.normal(size=values.shape[::-1])
-            )
-            row[k] = _lag_one(simulated.T)
+    estimates = _lag_one_by_memory(*values.shape)
     measured, independent = _lag_one(values), estimates[0]
     if measured < independent.mean() + _LEAST_MEMORY * independent.std(ddof=1):
         return NO_MEMORY
     weight = float(np.interp(measured, np.maximum.accumulate(estimates.mean(axis=1)), _SIMULATED_MEMORY))
     return Autoregression(np.array([weight]), 1.0 - weight**2)
+
+
+@lru_cache(maxsize=8)
+def _lag_one_by_memory(series: int, cycles: int) -> Array:
+    """What is estimated of every simulated memory, (memories, simulations); of one campaign all fits ask for the same shapes."""
+    rng = np.random.default_rng(0)
+    estimates = np.empty((_SIMULATED_MEMORY.size, _SIMULATIONS))
+    for row, weight in zip(estimates, _SIMULATED_MEMORY, strict=True):
+        memory = Autoregression(np.array([weight]), 1.0 - weight**2)
+        row[:] = [_lag_one(memory.with_memory(rng.normal(size=(cycles, series))).T) for _ in row]
+    return estimates
 
 
 def _lag_one(values: Array) -> float:
@@ -679,15 +684,14 @@ def _lag_one(values: Array) -> float:
 
 def typical_memory(values: Array) -> Autoregression:
     """Estimate the memory that series have alike."""
-    none = NO_MEMORY
     squares = (values**2).sum(axis=1)
     rows, squares = values[squares > 0], squares[squares > 0]
     cycles = values.shape[1]
     if not rows.size or cycles <= MOST_MEMORY_CYCLES:
-        return none
+        return NO_MEMORY
     lags = range(MOST_MEMORY_CYCLES + 1)
     typical = np.array([np.median((rows[:, lag:] * rows[:, : cycles - lag]).sum(axis=1) / squares) for lag in lags])
-    best, chosen = 0.0, none
+    best, chosen = 0.0, NO_MEMORY
     for order in range(1, MOST_MEMORY_CYCLES + 1):
         weights = linalg.solve_toeplitz(typical[:order], typical[1 : order + 1])
         share = 1.0 - float(weights @ typical[1 : order + 1])

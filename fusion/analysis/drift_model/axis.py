@@ -66,7 +66,6 @@ from fusion.analysis.drift_model.search import (
     Score,
     choose,
     doubt_of,
-    drop_superfluous,
     error_interval,
     errors_of_predictions,
     has_skill,
@@ -76,6 +75,7 @@ from fusion.analysis.drift_model.search import (
     refine,
     score_effects,
     search,
+    settled,
     verdict,
     withdraw,
 )
@@ -493,12 +493,10 @@ def second_search(problem: AxisProblem, state: AxisState) -> AxisState:
         model = size_camera_errors(
             fit_model(problem.readings, [*state.model.terms, Term(score.name, score.best)]), problem.effects
         )
-        before, state = (
-            state,
-            drop_superfluous(problem, state.entered(model, score, Confirmed.SECOND_SEARCH), first=decided),
-        )
-        if state.named_terms in state.held:
-            return before
+        entered = state.entered(model, score, Confirmed.SECOND_SEARCH)
+        before, state = state, settled(problem, state, entered, first=decided)
+        if state is before:
+            return state
     return state
 
 

@@ -573,9 +573,9 @@ def search(problem: Problem[M], state: LoopState[M], *, progress: Progress = no_
         state, score = choose(problem, state.scored(problem.score(state)))
         if score is None:
             return state
-        before, state = state, drop_superfluous(problem, enter(problem, state, score))
-        if state.named_terms in state.held:
-            return before
+        before, state = state, settled(problem, state, enter(problem, state, score))
+        if state is before:
+            return state
         if state.events > MOST_EVENTS:
             events = [place for place, step in enumerate(state.steps) if step.effect == "step_event"]
             evidence = {"most": MOST_EVENTS, "search_p": state.steps[-1].score.family_wise_p}
@@ -640,6 +640,12 @@ def enter(problem: Problem[M], state: LoopState[M], score: Score) -> LoopState[M
     assert score.confirmation is not None
     model = problem.refit(state.model, [*state.model.terms, Term(score.name, score.best)])
     return state.entered(model, score, score.confirmation.way)
+
+
+def settled(problem: Problem[M], before: LoopState[M], entered: LoopState[M], *, first: int = 0) -> LoopState[M]:
+    """The state without what the newest effect makes superfluous; that before it where this leads back to a model that was held."""
+    after = drop_superfluous(problem, entered, first=first)
+    return before if after.named_terms in after.held else after
 
 
 def drop_superfluous(problem: Problem[M], state: LoopState[M], *, first: int = 0) -> LoopState[M]:
