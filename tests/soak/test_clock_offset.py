@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from tests.thermography.table_motion import campaign
-from thermography.registration.clock_offset import estimate_clock_offset
+from thermography.registration.clock_offset import estimate_clock_offset as estimate_between_clocks
 
+#: The readings of these motions are taken just before the table goes on.
+estimate_clock_offset = partial(estimate_between_clocks, reading_phase=1.0)
 pytestmark = pytest.mark.slow
 
 

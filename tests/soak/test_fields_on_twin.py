@@ -107,6 +107,7 @@ def test_moving_table_and_its_clock(tmp_path: Path) -> None:
         fields["table_position_u"].values,
         deviations["time"].values,
         deviations["position"].broadcast_like(deviations["time"]).values.ravel(),
+        reading_phase=1.0,
     )
     cycle = filmed.truth.session.frame_s // filmed.truth.schedule.period_s
     mean = np.stack([filmed.cells_at(filmed.truth.session.frame_s[cycle == n]).mean(axis=0) for n in range(5)])

@@ -89,11 +89,15 @@ def estimate_clock_offset(
     target_mm: ArrayLike,
     *,
     feed_mm_per_min: float | None = None,
-    reading_phase: float = 1.0,
+    reading_phase: float | None = None,
     search_s: float = 900.0,
     expected_s: float = 0.0,
 ) -> ClockOffset:
-    """Estimate the offset of the camera's clock against the machine's from the observed and the commanded motion of the table."""
+    """Estimate the offset of the camera's clock against the machine's from the observed and the commanded motion of the table.
+
+    Where the instant of the reading within the stand is not known (`reading_phase` None: 0 on arrival, 1 just before the table moves on),
+    the offset is that of the middle of the stand and its uncertainty contains the whole stand.
+    """
     frame_s, origin = _seconds(frame_time)
     reading_s, _ = _seconds(reading_time, origin)
     table, table_u, target = (np.asarray(values, float) for values in (table_mm, table_u_mm, target_mm))
@@ -102,14 +106,17 @@ def estimate_clock_offset(
     order = order[np.isfinite(reading_s[order]) & np.isfinite(target[order])]
     _check_travel(table[located], np.nan_to_num(table_u[located], nan=1.0), target[order])
     feed = None if feed_mm_per_min is None else feed_mm_per_min / 60
-    motion = _Motion(frame_s[located], table[located], reading_s[order], target[order], feed, reading_phase)
+    phase = 1.0 if reading_phase is None else reading_phase
+    motion = _Motion(frame_s[located], table[located], reading_s[order], target[order], feed, phase)
     coarse_s, rivals_s = _search(motion, expected_s, search_s)
     best, u = _fit(motion, coarse_s)
     residual = motion.residual(best)
     inside = np.isfinite(residual)
+    # The motion does not show when within the stand the laser read: a rectangular distribution (JCGM 100:2008, 4.3.7).
+    stand_s = float(np.median(_stands_s(motion.reading_s, motion.target_mm, best[2]))) if reading_phase is None else 0.0
     return ClockOffset(
-        offset_s=float(best[0]),
-        offset_u_s=float(u[0]),
+        offset_s=float(best[0]) - stand_s / 2,
+        offset_u_s=float(np.hypot(u[0], stand_s / np.sqrt(12))),
         rate=float(best[3]),
         rate_u=float(u[3]),
         start_mm=float(-best[1]),
@@ -124,13 +131,17 @@ def commanded_position(
     time_s: Array, reading_s: Array, target_mm: Array, feed_mm_s: float, *, reading_phase: float = 1.0
 ) -> Array:
     """Axis position during a positioning test: dwell at a target position, take the reading, move on at the feed, dwell."""
-    interval = np.diff(reading_s)
-    dwell = np.maximum(interval - np.abs(np.diff(target_mm)) / feed_mm_s, 0.0)
+    dwell = _stands_s(reading_s, target_mm, feed_mm_s)
     leave = reading_s[:-1] + (1 - reading_phase) * dwell
     arrive = reading_s[1:] - reading_phase * dwell
     way_s = np.concatenate([[reading_s[0]], np.column_stack([leave, arrive]).ravel(), [reading_s[-1]]])
     way_mm = np.concatenate([[target_mm[0]], np.column_stack([target_mm[:-1], target_mm[1:]]).ravel(), [target_mm[-1]]])
     return np.interp(time_s, way_s, way_mm, left=np.nan, right=np.nan)
+
+
+def _stands_s(reading_s: Array, target_mm: Array, feed_mm_s: float) -> Array:
+    """How long the table stands between one reading and the next, s."""
+    return np.maximum(np.diff(reading_s) - np.abs(np.diff(target_mm)) / feed_mm_s, 0.0)
 
 
 def _seconds(times: ArrayLike, origin: np.datetime64 | None = None) -> tuple[Array, np.datetime64]:

@@ -1,11 +1,16 @@
 """One clock: offsets put in are found again with an uncertainty that covers, and what cannot be known is refused."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from tests.thermography.table_motion import FEED_MM_S, T0, campaign, positioning_test
-from thermography.registration.clock_offset import ClockError, commanded_position, estimate_clock_offset
+from thermography.registration.clock_offset import ClockError, commanded_position
+from thermography.registration.clock_offset import estimate_clock_offset as estimate_between_clocks
 
+#: The readings of these motions are taken just before the table goes on.
+estimate_clock_offset = partial(estimate_between_clocks, reading_phase=1.0)
 pytestmark = pytest.mark.long
 
 
@@ -21,6 +26,16 @@ def test_offset_of_37_s_is_found_and_its_uncertainty_covers():
     assert (np.abs(errors) < 2 * stated).sum() >= 10
     # and it is not covered by stating too much
     assert stated.mean() < 3 * np.sqrt(np.mean(errors**2))
+
+
+@pytest.mark.parametrize("read_after_s", [0.0, 1.0, 2.0])
+def test_instant_of_the_reading_within_the_stand_is_in_the_uncertainty(read_after_s):
+    """The table stands for 2 s: read on arrival, in the middle or before it goes on, the motion looks the same."""
+    frames, seen, u, readings, targets = campaign(np.random.default_rng(4), cycles=3)
+    earlier = np.round(1e3 * (2.0 - read_after_s)).astype(int) * np.timedelta64(1, "ms")
+    found = estimate_between_clocks(frames, seen, u, readings - earlier, targets, feed_mm_per_min=300)
+    assert abs(found.offset_s - 37.0) < 2 * found.offset_u_s
+    assert found.offset_u_s == pytest.approx(2.0 / np.sqrt(12), rel=0.05)
 
 
 def test_frames_at_few_phases_of_the_motion_leave_the_offset_open_and_say_so():
