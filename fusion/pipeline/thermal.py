@@ -795,6 +795,7 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
             }
             maps = {name: np.ascontiguousarray(values, dtype="f4") for name, values in named.items()}
             path = folder / map_name(cycle)
-            paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
+            write_maps(path, maps)
+            paths.append(path)
     report("OpenEXR maps", total, total)
     return paths

@@ -313,10 +313,9 @@ def _across_directions(
         ratios = likelihood_ratios(train, whiten_series(train, train.values[None, :]), regressors)
         chosen = regressors[:, [int(ratios[0].argmax())]]
         prediction = chosen[:, 0] * estimate_effects(train, chosen).coefficient[0]
-        project = test.fitted.project
-        before = project @ test.values
-        after = project @ (test.values - prediction)
-        gain += 0.5 * test.freedom * float(np.log((before @ before) / (after @ after)))
+        # The drift beside a candidate is that of the readings less its prediction: what it explains is no random walk.
+        left = fit_null(parts.grid, test.values - prediction)
+        gain += float(left.log_likelihood.max() - test.log_likelihood.max())
     return (positive, negative), gain
 
 
