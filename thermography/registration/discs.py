@@ -73,21 +73,31 @@ def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[tup
     least = float(np.median(top_hat)) + 6 * max(noise, 1e-3)
     marked = (top_hat > least).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(marked, connectivity=4)
-    rows, columns = top_hat.shape
     spots = []
     for label in range(1, count):
         left, top, w, h, area = boxes[label]
-        at_frame_edge = left == 0 or top == 0 or left + w == columns or top + h == rows
-        if area < _LEAST_AREA_PX or max(w, h) > width or at_frame_edge:
+        if area < _LEAST_AREA_PX or max(w, h) > width:
             continue
         window = (slice(top, top + h), slice(left, left + w))
         values = np.where(labels[window] == label, top_hat[window], 0.0)
         peak = float(np.percentile(values[values > 0], 80))
-        spot = _ellipse(values > peak / 2, sign * peak)
+        core = values > peak / 2
+        spot = None if _is_cut(core, left, top, top_hat.shape) else _ellipse(core, sign * peak)
         if spot is not None:
             placed = replace(spot, column_px=spot.column_px + left, row_px=spot.row_px + top)
             spots.append((least > peak / 2, placed))
     return spots
+
+
+def _is_cut(core: NDArray[np.bool_], left: int, top: int, shape: tuple[int, ...]) -> bool:
+    """Whether the frame's edge cuts a spot above half its height; below, the blur of a whole disc may reach it."""
+    rows, columns = np.nonzero(core)
+    return bool(
+        rows.min() + top == 0
+        or columns.min() + left == 0
+        or rows.max() + top == shape[0] - 1
+        or columns.max() + left == shape[1] - 1
+    )
 
 
 def _ellipse(mask: NDArray[np.bool_], contrast_K: float) -> LocatedDisc | None:

@@ -152,3 +152,16 @@ def test_without_markers_in_view_the_discs_do_alone(rng):
     frame = SCENE.render(rng)
     assert identify_plan(frame, [*DISCS, *MARKERS]) == DISCS
     assert identify_plan(frame, DISCS) == DISCS
+
+
+@pytest.mark.parametrize("noise_K", [0.01, 0.1])
+def test_discs_whose_blur_reaches_the_frames_edge_are_found(noise_K):
+    """Discs of 6 px, 3 px from the edge of an 80 x 60 picture: the less noise, the farther out a spot stands out of it."""
+    rows, columns = np.mgrid[0:480, 0:640] / 8.0
+    fine = np.full(rows.shape, 24.0)
+    for x in (6.0, 74.0):
+        for y in (6.0, 20.0, 34.0, 54.0):
+            fine[np.hypot(columns - x, rows - y) < 3.0] = 20.0
+    frame = fine.reshape(60, 8, 80, 8).mean(axis=(1, 3))
+    found = detect_discs(frame + np.random.default_rng(2).normal(0.0, noise_K, frame.shape))
+    assert len(found) == 8
