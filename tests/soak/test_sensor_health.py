@@ -63,24 +63,25 @@ def planted(table: xr.Dataset, kind: str, sensor: int, onset: int, rng: np.rando
 @pytest.mark.real_data
 def test_planted_faults_are_named_and_no_other_sensor(spindle: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     rng, seconds = np.random.default_rng(20261122), seconds_of(spindle)
-    assert examine_record(spindle, ["quasi_static"]).faults == ()
+    assert examine_record(spindle, ["quasi_static"]).findings == ()
     wrong = 0
     for kind in (*CHANGES, *OTHERS):
         clear, suspected, others, late_min, covered, with_um, without_um = 0, 0, 0, [], 0, [], []
         for _ in range(RUNS):
             sensor, onset = int(rng.integers(16)), int(rng.uniform(0.35, 0.95) * seconds.size)
             health = examine_record(planted(spindle, kind, sensor, onset, rng), ["quasi_static"])
-            for fault in health.faults:
-                if fault.sensor != sensor:
+            for fault in health.findings:
+                if fault.sensor != str(spindle["sensor"].values[sensor]):
                     others += 1
                     continue
-                clear, suspected = clear + fault.is_clear, suspected + (not fault.is_clear)
+                is_clear = fault.state == "left_out"
+                clear, suspected = clear + is_clear, suspected + (not is_clear)
                 late = fault.onset_s - seconds[onset]
                 late_min.append(late / 60.0)
                 covered += abs(late) <= 2.0 * fault.onset_u_s + 15.0
-                if fault.is_clear:
-                    with_um.append(health.errors_um[health.names[sensor]])
-                    without_um.append(health.sound_um)
+                if is_clear:
+                    with_um.append(fault.rmse_with_um)
+                    without_um.append(fault.rmse_without_um)
         wrong += others
         with capsys.disabled():
             print(
