@@ -98,17 +98,16 @@ def sensor_notices(health: SensorHealth) -> Iterator[Notice]:
     """Notices of sensors and displacements that were left out because they are faulty, and of those that are suspected."""
     for one in health.findings:
         finding = f"{one.sensor} {describe_fault(one)}" + (f" ({one.run})" if one.run else "")
-        is_known = np.isfinite(one.rmse_with_um or np.nan)
-        with_it = f"{number(one.rmse_with_um, 3)} µm with it" if is_known else "no model with it"
-        errors = f"{with_it}, {number(one.rmse_without_um, 3)} µm without."
+        with_it, without = (
+            f"{number(um, 3)} µm" if um is not None and np.isfinite(um) else "no model"
+            for um in (one.rmse_with_um, one.rmse_without_um)
+        )
+        errors = f"{with_it} with it, {without} without."
         look = f"Look at contact, cable and input of {one.sensor}"
         if one.computed_with:
-            left_out = (
-                "it is left out" if health.names_causes else "as all displacements are, so that no cause is named"
-            )
             yield Notice(
                 "record_displacement_computed",
-                f"{finding}; {one.reason or 'it is left out'}. Error of the declared model with the readings of {one.computed_with}: {errors}",
+                f"{finding}; {one.reason or 'it is left out'}. Error of the declared model with {one.computed_with}: {errors}",
                 f"Log {one.sensor} without its correction by temperature, or end the record before {one.computed_with} fails.",
             )
         elif one.readings:

@@ -308,12 +308,14 @@ _NOISE_SAMPLES = 20
 _NOISIER = 3.0
 #: Fewest blocks from which anything is concluded.
 _LEAST_BLOCKS = 60
-#: Difference from the running median, over the larger of its median absolute deviation, its 90 % quantile and the resolution, of a glitch:
-#: noise as heavy as Student's t with 4 degrees of freedom exceeds it twice in a million readings.
+#: Difference from the running median of a glitch, over the 90 % quantile of all or the resolution, whichever is larger: noise as heavy as
+#: Student's t with 4 degrees of freedom exceeds it twice in a million readings.
 _GLITCH = 20.0
-#: Readings of the shortest stretch that is looked for, the factor to the next longer one, and the longest as a share of the record.
-_GLITCH_READINGS, _LONGER, _GLITCH_SHARE = 5, 4, 0.02
-#: A driver that is switched on and off over so large a share of the readings explains no single excursion.
+#: Readings of the shortest stretch that is looked for, and the longest as a share of the record; the median is over twice as many.
+_GLITCH_READINGS, _GLITCH_SHARE = 5, 0.02
+#: It leaves the course, and comes back, by this share of its size from one reading to the next; what is smooth may be true.
+_ABRUPT = 0.5
+#: A driver that is switched at so large a share of the readings explains no single excursion.
 _OFTEN = 0.1
 
 
@@ -344,7 +346,7 @@ class SensorFault:
     ratio, limit : excursion over the next largest of the sensor, and the limit; nan where none is compared
     reason : why it is only suspected; empty where it is clear
     end_s : end of a jump or ramp, s; nan of others
-    readings, stretches : of a displacement the number of readings at fault, and the times of the first and last of each stretch, s
+    readings, stretches_s : of a displacement the number of readings at fault, and the times of the first and last of each stretch, s
     computed_with : faulty sensor that a displacement is computed with
     """
 
@@ -359,7 +361,7 @@ class SensorFault:
     reason: str = ""
     end_s: float = np.nan
     readings: int = 0
-    stretches: tuple[tuple[float, float], ...] = ()
+    stretches_s: tuple[tuple[float, float], ...] = ()
     computed_with: str = ""
 
     @property
@@ -433,10 +435,15 @@ def _without_signal(seconds: Array, temperature: Array) -> list[SensorFault]:
     return faults
 
 
+def _runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First places and lengths of all runs of equal values."""
+    starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
+    return starts, np.diff(np.r_[starts, values.size])
+
+
 def _longest_run(values: Array) -> tuple[int, int, int]:
     """Length of the longest run of equal values, its first place, and the length of the longest run of another value."""
-    starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
-    lengths = np.diff(np.r_[starts, values.size])
+    starts, lengths = _runs(values)
     longest = int(lengths.argmax())
     others = lengths[values[starts] != values[starts[longest]]]
     return int(lengths[longest]), int(starts[longest]), int(others.max(initial=0))
@@ -659,20 +666,17 @@ def examine_displacements(
     if grids is None:
         return []
     repeated = {fault.sensor: fault for fault in _stuck(seconds, every, grids[-1], kept)}
-    loads = np.empty((seconds.size, 0)) if drivers is None else np.nan_to_num(drivers)
-    loads = loads / np.maximum(np.ptp(loads, axis=0), 1e-300)
     faults = []
     for k, values in enumerate(displacement.T):
         at_fault = np.zeros(values.size, bool)
         if k in repeated:
             known = np.flatnonzero(np.isfinite(values))
             value = values[np.searchsorted(seconds, repeated[k].onset_s)]
-            starts = np.flatnonzero(np.r_[True, values[known][1:] != values[known][:-1]])
-            lengths = np.diff(np.r_[starts, known.size])
+            _, lengths = _runs(values[known])
             at_fault[known] = np.repeat(lengths >= _LEAST_REPEATED, lengths) & (values[known] == value)
             kind = Kind.CLIPPED if value in (values[known].min(), values[known].max()) else Kind.STUCK
             faults.append(_in_stretches(replace(repeated[k], kind=kind, size=np.nan), seconds, at_fault))
-        at_fault, largest = _glitches(np.where(at_fault, np.nan, values), loads)
+        at_fault, largest = _glitches(np.where(at_fault, np.nan, values), drivers)
         if at_fault.any():
             found = SensorFault(k, Kind.GLITCH, True, 0.0, float(np.median(np.diff(seconds))), largest)
             faults.append(_in_stretches(found, seconds, at_fault))
@@ -683,50 +687,41 @@ def _in_stretches(fault: SensorFault, seconds: Array, at_fault: NDArray[np.bool_
     """The fault with its onset, the number of its readings and the times of its stretches."""
     edges = np.flatnonzero(np.diff(np.r_[False, at_fault, False]))
     stretches = tuple(zip(seconds[edges[::2]].tolist(), seconds[edges[1::2] - 1].tolist(), strict=True))
-    return replace(fault, onset_s=stretches[0][0], readings=int(at_fault.sum()), stretches=stretches)
+    return replace(fault, onset_s=stretches[0][0], readings=int(at_fault.sum()), stretches_s=stretches)
 
 
-def _glitches(displacement: Array, loads: Array) -> tuple[NDArray[np.bool_], float]:
+def _glitches(displacement: Array, drivers: Array | None) -> tuple[NDArray[np.bool_], float]:
     """Readings that leave the course of a displacement within one sample and come back within one, and the largest distance from it."""
-    at_fault, largest, reach = np.zeros(displacement.size, bool), 0.0, _GLITCH_READINGS
-    while reach <= max(_GLITCH_READINGS, _GLITCH_SHARE * displacement.size):
+    at_fault, largest = np.zeros(displacement.size, bool), 0.0
+    loads = np.zeros((displacement.size, 1)) if drivers is None else np.nan_to_num(drivers)
+    longest = max(_GLITCH_READINGS, int(_GLITCH_SHARE * displacement.size))
+    for reach in np.unique(np.minimum(_GLITCH_READINGS * 4 ** np.arange(12), longest)):
         known = np.flatnonzero(np.isfinite(displacement) & ~at_fault)
         values = displacement[known]
         if values.size < _LEAST_BLOCKS or np.ptp(values) == 0.0:
             break
-        off = values - pd.Series(values).rolling(2 * reach + 1, center=True, min_periods=1).median().to_numpy()
-        scale = max(
-            float(np.median(np.abs(off - np.median(off)))),
-            float(np.quantile(np.abs(off), 0.9)),
-            float(np.diff(np.unique(values)).min()),
-        )
-        limit = _GLITCH * scale
-        beyond = np.abs(off) > limit
-        sound = values[~beyond]
-        edges = np.flatnonzero(np.diff(np.r_[False, beyond, False]))
+        off = np.abs(values - pd.Series(values).rolling(2 * reach + 1, center=True, min_periods=1).median().to_numpy())
+        limit = _GLITCH * max(float(np.quantile(off, 0.9)), float(np.diff(np.unique(values)).min()))
+        steepest = float(np.abs(np.diff(values[off <= limit])).max())
+        steps = np.abs(np.diff(values, prepend=values[0]))
+        switched = np.abs(np.diff(loads[known], axis=0, prepend=loads[known[:1]])) > _SWITCHED * np.ptp(loads, axis=0)
+        switched[:, switched.mean(axis=0) > _OFTEN] = False
+        edges = np.flatnonzero(np.diff(np.r_[False, off > limit, False]))
         for first, end in zip(edges[::2], edges[1::2], strict=True):
-            before, last = first - 1, end - 1
-            if first == 0 or end == values.size:
-                # A level that only one reading shows cannot be said to stay, unless the course is as steep elsewhere.
-                jump = abs(values[first] - values[end if first == 0 else before])
-                returns = end - first == 1 and jump > excursion_limit(1) * max(
-                    limit, float(np.abs(np.diff(sound)).max())
-                )
+            size = float(off[first:end].max())
+            # The median itself is off beside a long stretch, so that the steps say where it begins and ends.
+            borders = first + np.flatnonzero(steps[first : end + 1] > max(limit, _ABRUPT * size))
+            if borders.size == 0:
+                continue
+            begin, after = borders[0], borders[-1]
+            if begin < after:
+                returns = abs(values[after] - values[begin - 1]) <= _ABRUPT * min(steps[begin], steps[after])
             else:
-                left, back = values[first] - values[before], values[last] - values[end]
-                returns = end - first <= reach and min(abs(left), abs(back)) > limit >= abs(
-                    values[end] - values[before]
-                )
-                returns = returns and not _is_driven(loads[known], first, end)
-            if returns:
-                at_fault[known[first:end]] = True
-                largest = max(largest, float(np.abs(off[first:end]).max()))
-        reach *= _LONGER
+                # A level that a single reading shows cannot be said to stay, unless the course is as steep elsewhere.
+                alone = end - first == 1 and first in (0, values.size - 1)
+                returns = alone and steps[begin] > excursion_limit(1) * max(limit, steepest)
+                begin, after = first, end
+            if returns and after - begin <= reach and not switched[borders].all(axis=0).any():
+                at_fault[known[begin:after]] = True
+                largest = max(largest, size)
     return at_fault, largest
-
-
-def _is_driven(loads: Array, first: int, end: int) -> bool:
-    """Whether a driver is switched where a stretch begins and where it ends, and is not so all the time."""
-    switched = np.abs(np.diff(loads, axis=0)) > _SWITCHED
-    both = switched[: switched.shape[0] - (end - first)] & switched[end - first :]
-    return bool((both[first - 1] & (both.mean(axis=0) < _OFTEN)).any())

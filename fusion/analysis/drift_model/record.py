@@ -1349,8 +1349,8 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     if not left:
         # Every displacement needs the faulty sensor then: it stays, and nothing is named.
         kept += [one.computed_with for one in computed.values()]
-        told = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
-        computed = {name: one.model_copy(update=told) for name, one in computed.items()}
+        stays = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
+        computed = {name: one.model_copy(update=stays) for name, one in computed.items()}
     channels = left or list(computed)
     raw, cleaned = table.sel(channel=channels), cleaned.sel(channel=channels)
     before, after = errors(raw), errors(cleaned)
@@ -1367,26 +1367,18 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
 def _part(
     fault: SensorFault, name: str, run: str, with_um: float = np.nan, without_um: float = np.nan
 ) -> schema.SensorFaultPart:
-    optional = {
+    state = "readings_left_out" if fault.readings else "left_out" if fault.is_clear else "suspected"
+    errors = {"rmse_with_um": with_um, "rmse_without_um": without_um}
+    told: dict[str, Any] = {
+        **vars(fault),
+        **errors,
+        "sensor": name,
+        "kind": fault.kind.value,
         "run": run,
-        "readings": fault.readings,
-        "stretches_s": fault.stretches,
-        "computed_with": fault.computed_with,
+        "state": state,
     }
-    return schema.SensorFaultPart(
-        sensor=name,
-        kind=fault.kind.value,
-        state="readings_left_out" if fault.readings else "left_out" if fault.is_clear else "suspected",
-        **{key: value for key, value in optional.items() if value},
-        onset_s=fault.onset_s,
-        onset_u_s=fault.onset_u_s,
-        size=fault.size,
-        ratio=fault.ratio,
-        limit=fault.limit,
-        reason=fault.reason,
-        rmse_with_um=with_um,
-        rmse_without_um=without_um,
-    )
+    fields = schema.SensorFaultPart.model_fields
+    return schema.SensorFaultPart(**{key: told[key] for key in fields if told[key] or fields[key].is_required()})
 
 
 def _runs_of(table: xr.Dataset) -> Iterator[tuple[str, NDArray[np.bool_], Array]]:
@@ -1405,7 +1397,7 @@ def _without_faulty_readings(table: xr.Dataset) -> tuple[xr.Dataset, list[_Found
         rest = (table[name].values[here] for name in ("temperature", "driver"))
         for fault in examine_displacements(seconds, values[here], *rest):
             found.append((fault, str(table["channel"].values[fault.sensor]), run))
-            for first, last in fault.stretches:
+            for first, last in fault.stretches_s:
                 values[np.flatnonzero(here)[(seconds >= first) & (seconds <= last)], fault.sensor] = np.nan
     # Where no displacement is left at the end, the record ends before.
     last, ended = (np.flatnonzero(known.any(axis=1)).max(initial=0) for known in (np.isfinite(values), read))
