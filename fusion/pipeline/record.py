@@ -110,17 +110,16 @@ def sensor_notices(health: SensorHealth) -> Iterator[Notice]:
                 f"{finding}; {one.reason or 'it is left out'}. Error of the declared model with {one.computed_with}: {errors}",
                 f"Log {one.sensor} without its correction by temperature, or end the record before {one.computed_with} fails.",
             )
-        elif one.readings:
+        elif one.state != "suspected":
             times = listed(f"{first / 3600.0:.4g} h" for first, _ in one.stretches_s if first is not None)
-            yield Notice(
-                "record_displacement_faulty",
-                f"{finding}; left out at {times}. Held-out error of the declared model of {one.sensor}: {errors}",
-                f"{look}, and at what the machine did then.",
+            kind, where, model = (
+                ("displacement", f"they are left out at {times}", f" of {one.sensor}")
+                if times
+                else ("sensor", "it is left out of the whole record", "")
             )
-        elif one.state == "left_out":
             yield Notice(
-                "record_sensor_faulty",
-                f"{finding}; it is left out of the whole record. Held-out error of the declared model: {errors}",
+                f"record_{kind}_faulty",
+                f"{finding}; {where}. Held-out error of the declared model{model}: {errors}",
                 f"{look}.",
             )
         else:

@@ -92,7 +92,7 @@ def test_every_finding_is_noted_with_both_errors_or_its_reason():
     assert ramp.endswith("12.3 µm with it, 2.35 µm without.")
     assert "no model with it" in silent
     assert glitch.startswith("ch1 leaves its course by up to 4302 µm and comes back (3 readings) from 1.00 h on")
-    assert "left out at 1 h; 2.5 h. Held-out error of the declared model of ch1: 611 µm with it" in glitch
+    assert "they are left out at 1 h; 2.5 h. Held-out error of the declared model of ch1: 611 µm with it" in glitch
     assert computed.startswith("ch2 is computed with the faulty sensor t1 from 2.00 h on")
     assert "t3 jumps by 2 K from 1.00 h on" in suspected
     assert "suspected only (other sensors respond), and stays in the model" in suspected
