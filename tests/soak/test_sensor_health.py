@@ -127,18 +127,24 @@ def test_planted_faults_are_named_and_no_other_sensor(spindle: xr.Dataset, capsy
 @pytest.mark.real_data
 def test_sound_records_are_left_alone(spindle: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     rng, seconds = np.random.default_rng(7), seconds_of(spindle)
-    cuttings, twins = [], []
+    cuttings, twins, displacements = [], [], []
     for _ in range(6 * RUNS):
         hours = float(rng.choice([6.0, 12.0, 24.0]))
         first = rng.uniform(0.0, seconds[-1] - 3600.0 * hours)
         inside = (seconds >= first) & (seconds <= first + 3600.0 * hours)
         chosen = rng.choice(16, int(rng.choice([3, 6, 12])), replace=False)
         drivers = spindle["driver"].values[inside] if rng.uniform() < 0.5 else None
-        cuttings.append(examine_sensors(seconds[inside], spindle["temperature"].values[inside][:, chosen], drivers))
+        temperature = spindle["temperature"].values[inside][:, chosen]
+        cuttings.append(examine_sensors(seconds[inside], temperature, drivers))
+        displacements += examine_displacements(
+            seconds[inside], spindle["displacement"].values[inside], temperature, drivers
+        )
     for seed in range(50_000, 50_000 + 20 * RUNS):
         table = twin_table(seed=seed, hours=float(rng.choice([12.0, 24.0])))
         drivers = table["driver"].values if rng.uniform() < 0.5 else None
         twins.append(examine_sensors(seconds_of(table), table["temperature"].values, drivers))
+        examined = table["displacement"].values, table["temperature"].values, drivers
+        displacements += examine_displacements(seconds_of(table), *examined)
     with capsys.disabled():
         for name, records in (("cuttings of the spindle record", cuttings), ("records of the twin", twins)):
             told = [fault for faults in records for fault in faults]
@@ -148,6 +154,7 @@ def test_sound_records_are_left_alone(spindle: xr.Dataset, capsys: pytest.Captur
                 f"{[(f.kind.value, f.is_clear, round(f.ratio, 1), round(f.limit, 1), f.reason[:20]) for f in told]}",
                 flush=True,
             )
+    assert displacements == []
     # Two in a hundred, and three standard deviations of the count.
     for records in (cuttings, twins):
         named = sum(any(fault.is_clear for fault in one) for one in records)

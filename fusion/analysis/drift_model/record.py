@@ -1357,9 +1357,12 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     found = [
         _part(*one, before.get(one[1], np.nan), after.get(one[1], np.nan)) for one in readings if one[1] in channels
     ]
-    for one in sensors:
-        both = (errors(cleaned, one[1]), after) if one[0].is_clear else ({}, {})
-        found.append(_part(*one, *(float(known_mean(np.array([*each.values()]))) for each in both)))
+    for fault, name, run in sensors:
+        is_out = name not in kept
+        both = (errors(cleaned, name), after) if is_out else ({}, {})
+        if fault.is_clear and not is_out:
+            fault = replace(fault, is_clear=False, reason="every displacement is computed with it")
+        found.append(_part(fault, name, run, *(float(known_mean(np.array([*each.values()]))) for each in both)))
     sound = cleaned.sel(sensor=[name for name in names if name in kept])
     return SensorHealth(sound, (*computed.values(), *found), bool(left))
 
