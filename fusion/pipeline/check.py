@@ -126,7 +126,7 @@ def _check_record(campaign: Campaign) -> CampaignCheck:
     source = record_stage.read_source(campaign)
     runs, table = len(campaign.record_paths()), source.health.table
     content = (
-        f"record: {counted(runs, 'run')}, {counted(len(source.health.names), 'temperature')}, "
+        f"record: {counted(runs, 'run')}, {counted(table.sizes['sensor'], 'temperature')}, "
         f"{counted(table.sizes['channel'], 'displacement')}, {counted(table.sizes['time'], 'row')}",
     )
     recordings = tuple(_record_bars(table))

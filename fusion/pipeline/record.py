@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.drift_model.record import (
     RecordResult,
     SensorHealth,
@@ -65,9 +66,12 @@ def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
 def model_record(source: RecordSource, *, report: Report) -> Outcome:
     """Close the loop on a record."""
     result = close_record(
-        source.record, source.declared, progress=lambda done, total, what: report("closed loop", done, total)
+        source.record,
+        source.declared,
+        effects=None if source.health.names_causes else {},
+        progress=lambda done, total, what: report("closed loop", done, total),
     )
-    loop = result.described(source.health.described())
+    loop = result.described(source.health.findings)
     return Outcome(record_variables(source.record, result), {"loop": loop}, tuple(source.notices))
 
 
@@ -91,24 +95,38 @@ def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
 
 
 def sensor_notices(health: SensorHealth) -> Iterator[Notice]:
-    """Notices of sensors that were left out because they are faulty, and of those that are suspected."""
-    for fault in health.faults:
-        name = health.names[fault.sensor]
-        finding = f"{name} {fault.words}" + (f" ({health.runs[fault.sensor]})" if health.runs else "")
-        if fault.is_clear:
-            error = health.errors_um[name]
-            with_it = f"{number(error, 3)} µm with it" if np.isfinite(error) else "no model with it"
+    """Notices of sensors and displacements that were left out because they are faulty, and of those that are suspected."""
+    for one in health.findings:
+        finding = f"{one.sensor} {describe_fault(one)}" + (f" ({one.run})" if one.run else "")
+        with_it, without = (
+            f"{number(um, 3)} µm" if um is not None and np.isfinite(um) else "no model"
+            for um in (one.rmse_with_um, one.rmse_without_um)
+        )
+        errors = f"{with_it} with it, {without} without."
+        look = f"Look at contact, cable and input of {one.sensor}"
+        if one.computed_with:
             yield Notice(
-                "record_sensor_faulty",
-                f"{finding}; it is left out of the whole record. Held-out error of the declared model: {with_it}, "
-                f"{number(health.sound_um, 3)} µm without.",
-                f"Look at contact, cable and input of {name}.",
+                "record_displacement_computed",
+                f"{finding}; {one.reason or 'it is left out'}. Error of the declared model with {one.computed_with}: {errors}",
+                f"Log {one.sensor} without its correction by temperature, or end the record before {one.computed_with} fails.",
+            )
+        elif one.state != "suspected":
+            times = listed(f"{first / 3600.0:.4g} h" for first, _ in one.stretches_s if first is not None)
+            kind, where, model = (
+                ("displacement", f"they are left out at {times}", f" of {one.sensor}")
+                if times
+                else ("sensor", "it is left out of the whole record", "")
+            )
+            yield Notice(
+                f"record_{kind}_faulty",
+                f"{finding}; {where}. Held-out error of the declared model{model}: {errors}",
+                f"{look}.",
             )
         else:
             yield Notice(
                 "record_sensor_suspected",
-                f"{finding}. It is suspected only ({fault.reason}), and stays in the model.",
-                f"Look at contact, cable and input of {name}; take it out of record.temperatures if it is faulty.",
+                f"{finding}. It is suspected only ({one.reason}), and stays in the model.",
+                f"{look}; take it out of record.temperatures if it is faulty.",
             )
 
 
@@ -122,6 +140,10 @@ def record_notices(record: Record) -> Iterator[Notice]:
             "",
         )
     yield from _sample_notices(record)
+    if record.unusable:
+        named = [f"{name} {fault}" for name, fault in record.unusable.items()]
+        message = f"Displacements that cannot be modelled are left out: {listed(named)}."
+        yield Notice("record_channels_left_out", message, "Look at their probes and inputs.")
     if record.duplicates:
         yield Notice(
             "record_sensors_dependent",

@@ -86,7 +86,7 @@ def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
         ],
         "shown": list(enumerate(_shown_channels(record))),
         "omitted": max(0, record.sizes["channel"] - _MOST_CHANNELS),
-        "faults": [(one, describe_fault(one.kind, one.size, one.onset_s, one.onset_u_s)) for one in loop.sensor_faults],
+        "faults": [(one, describe_fault(one)) for one in loop.sensor_faults],
         "steps": steps_table(loop),
         "errors": errors_table(loop),
         "error_keys": _ERRORS,

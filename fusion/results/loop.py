@@ -447,14 +447,20 @@ class ChainedPart(HoldOutErrors):
 
 
 class SensorFaultPart(ResultPart):
-    """A temperature sensor that is faulty or suspected."""
+    """A temperature sensor or a displacement that is faulty or suspected."""
 
     sensor: str
-    """Name of the sensor."""
-    kind: Literal["no signal", "stuck", "jump", "ramp", "noise"]
-    """What it does."""
-    state: Literal["left_out", "suspected"]
-    """Whether it was left out of the whole record, or stays because a machine may do the same."""
+    """Name of the sensor, or of the displacement."""
+    kind: Literal["no signal", "stuck", "jump", "ramp", "noise", "glitch", "clipped", "computed"]
+    """What it does; the last three only displacements do."""
+    state: Literal["left_out", "readings_left_out", "suspected"]
+    """Whether it was left out of the whole record, its readings at fault alone, or nothing because a machine may do the same."""
+    readings: int = 0
+    """Readings of a displacement that were left out; absent where it is all of them or none."""
+    stretches_s: tuple[tuple[Number, Number], ...] = ()
+    """Times of the first and last reading of every stretch of these, s, counted as the onset; absent as above."""
+    computed_with: str = ""
+    """The faulty sensor that the displacement is computed with; absent where it is not."""
     run: str = ""
     """Run that shows it; absent in a record of one run."""
     onset_s: Number
@@ -462,17 +468,19 @@ class SensorFaultPart(ResultPart):
     onset_u_s: Number
     """Standard uncertainty of that, s."""
     size: Number
-    """Change beyond what the other sensors predict, K; of noise the ratio after to before; null where there is no signal."""
+    """Change beyond what the other sensors predict, K; of noise the ratio after to before; of glitches the largest, um; else null."""
     ratio: Number
-    """Its largest excursion over the next largest; null where none is compared."""
+    """Its largest excursion over the next largest; of a computed displacement the error without the sensor over that with it; else null."""
     limit: Number
     """Ratio from which it is named; null as above."""
     reason: str
     """Why it is suspected only; empty for one that was left out."""
     rmse_with_um: Number
-    """Error of the declared model on the hold-out set with it, um; null for a suspected one, and where it has too few readings."""
+    """Error of the declared model on the hold-out set with it, um; null for a suspected one, and where it has too few readings. Of a
+    displacement its own error; of a computed one with its faulty sensor, every part of the record predicted from the others.
+    """
     rmse_without_um: Number
-    """The same without all sensors that were left out, um; null for a suspected one."""
+    """The same without all that was left out, um; null for a suspected one."""
 
 
 class RunPart(HoldOutErrors):
@@ -504,6 +512,6 @@ class RecordLoop(Loop):
     search: tuple[tuple[RecordScorePart, ...], ...]
     """Scores of every round of the search."""
     sensor_faults: tuple[SensorFaultPart, ...] = ()
-    """Sensors that are faulty or suspected, examined before any model."""
+    """Sensors and displacements that are faulty or suspected, examined before any model."""
     runs: tuple[RunPart, ...] = ()
     """Runs of a record of several; absent where there is one."""

@@ -1,4 +1,4 @@
-"""Faults planted into a measured record, and sound records: docs/method/sensor-health.md.
+"""Faults of sensors and displacements planted into measured and simulated records, and sound records: docs/method/sensor-health.md.
 
 THERMOFUSE_RUNS sets the number of plants per kind of fault (5 by default); 20 times as many records of the twin, and 6 times as many
 cuttings of the measured record, are examined for false alarms.
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.alignment.sensor_health import examine_sensors
+from fusion.analysis.alignment.sensor_health import examine_displacements, examine_sensors
 from fusion.analysis.drift_model.record import examine_record
 from tests.fusion.record_tables import SPINDLE, spindle_table, twin_table
 from tests.soak.rates import campaigns
@@ -32,6 +32,10 @@ CHANGES = {
     "drift 3 K in 10 h": (3.0, 10.0),
 }
 OTHERS = ("stuck", "noise x 10", "open circuit")
+#: Sizes in um, and what of a displacement is at fault: so many stretches of so many readings, each as a share of the record or a number.
+SIZES = (5.0, 20.0, 100.0, 4300.0)
+GLITCHES = {"11 single readings": (11, 1), "4 stretches of 4 readings": (4, 4), "1 stretch of 1.5 %": (1, 0.015)}
+REPEATED = {"stuck for 3 %": (0.5, 0.53), "stuck to the end": (0.75, 1.0), "clipped above its 0.8 quantile": None}
 
 
 @pytest.fixture
@@ -41,6 +45,31 @@ def spindle(tmp_path: Path, real_file: Callable[[str], Path]) -> xr.Dataset:
 
 def seconds_of(table: xr.Dataset) -> np.ndarray:
     return (table["time"].values - table["time"].values[0]) / np.timedelta64(1, "s")
+
+
+def planted_displacement(
+    table: xr.Dataset, kind: str, size: float, channel: int, rng: np.random.Generator
+) -> tuple[xr.Dataset, np.ndarray]:
+    """The record with faulty readings of one displacement, and which these are."""
+    spoilt, at_fault = table.copy(deep=True), np.zeros(table.sizes["time"], bool)
+    values = spoilt["displacement"].values[:, channel]
+    if kind in GLITCHES:
+        number, length = GLITCHES[kind]
+        readings = max(1, int(length if length >= 1 else length * values.size))
+        # Begins lie at least two lengths apart, so that no two stretches are one.
+        for place in rng.choice(values.size // (3 * readings) - 1, number, replace=False) + 1:
+            at_fault[3 * readings * place : 3 * readings * place + readings] = True
+        values[at_fault] += size * rng.choice([-1.0, 1.0])
+        return spoilt, at_fault
+    if REPEATED[kind] is None:
+        highest = np.quantile(values, 0.8)
+        at_fault = values > highest
+        values[at_fault] = highest
+    else:
+        first, last = (int(share * values.size) for share in REPEATED[kind])
+        at_fault[first + 1 : last] = True
+        values[at_fault] = values[first]
+    return spoilt, at_fault
 
 
 def planted(table: xr.Dataset, kind: str, sensor: int, onset: int, rng: np.random.Generator) -> xr.Dataset:
@@ -63,24 +92,25 @@ def planted(table: xr.Dataset, kind: str, sensor: int, onset: int, rng: np.rando
 @pytest.mark.real_data
 def test_planted_faults_are_named_and_no_other_sensor(spindle: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     rng, seconds = np.random.default_rng(20261122), seconds_of(spindle)
-    assert examine_record(spindle, ["quasi_static"]).faults == ()
+    assert examine_record(spindle, ["quasi_static"]).findings == ()
     wrong = 0
     for kind in (*CHANGES, *OTHERS):
         clear, suspected, others, late_min, covered, with_um, without_um = 0, 0, 0, [], 0, [], []
         for _ in range(RUNS):
             sensor, onset = int(rng.integers(16)), int(rng.uniform(0.35, 0.95) * seconds.size)
             health = examine_record(planted(spindle, kind, sensor, onset, rng), ["quasi_static"])
-            for fault in health.faults:
-                if fault.sensor != sensor:
+            for fault in health.findings:
+                if fault.sensor != str(spindle["sensor"].values[sensor]):
                     others += 1
                     continue
-                clear, suspected = clear + fault.is_clear, suspected + (not fault.is_clear)
+                is_clear = fault.state == "left_out"
+                clear, suspected = clear + is_clear, suspected + (not is_clear)
                 late = fault.onset_s - seconds[onset]
                 late_min.append(late / 60.0)
                 covered += abs(late) <= 2.0 * fault.onset_u_s + 15.0
-                if fault.is_clear:
-                    with_um.append(health.errors_um[health.names[sensor]])
-                    without_um.append(health.sound_um)
+                if is_clear:
+                    with_um.append(fault.rmse_with_um)
+                    without_um.append(fault.rmse_without_um)
         wrong += others
         with capsys.disabled():
             print(
@@ -97,18 +127,24 @@ def test_planted_faults_are_named_and_no_other_sensor(spindle: xr.Dataset, capsy
 @pytest.mark.real_data
 def test_sound_records_are_left_alone(spindle: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     rng, seconds = np.random.default_rng(7), seconds_of(spindle)
-    cuttings, twins = [], []
+    cuttings, twins, displacements = [], [], []
     for _ in range(6 * RUNS):
         hours = float(rng.choice([6.0, 12.0, 24.0]))
         first = rng.uniform(0.0, seconds[-1] - 3600.0 * hours)
         inside = (seconds >= first) & (seconds <= first + 3600.0 * hours)
         chosen = rng.choice(16, int(rng.choice([3, 6, 12])), replace=False)
         drivers = spindle["driver"].values[inside] if rng.uniform() < 0.5 else None
-        cuttings.append(examine_sensors(seconds[inside], spindle["temperature"].values[inside][:, chosen], drivers))
+        temperature = spindle["temperature"].values[inside][:, chosen]
+        cuttings.append(examine_sensors(seconds[inside], temperature, drivers))
+        displacements += examine_displacements(
+            seconds[inside], spindle["displacement"].values[inside], temperature, drivers
+        )
     for seed in range(50_000, 50_000 + 20 * RUNS):
         table = twin_table(seed=seed, hours=float(rng.choice([12.0, 24.0])))
         drivers = table["driver"].values if rng.uniform() < 0.5 else None
         twins.append(examine_sensors(seconds_of(table), table["temperature"].values, drivers))
+        examined = table["displacement"].values, table["temperature"].values, drivers
+        displacements += examine_displacements(seconds_of(table), *examined)
     with capsys.disabled():
         for name, records in (("cuttings of the spindle record", cuttings), ("records of the twin", twins)):
             told = [fault for faults in records for fault in faults]
@@ -118,7 +154,46 @@ def test_sound_records_are_left_alone(spindle: xr.Dataset, capsys: pytest.Captur
                 f"{[(f.kind.value, f.is_clear, round(f.ratio, 1), round(f.limit, 1), f.reason[:20]) for f in told]}",
                 flush=True,
             )
+    assert displacements == []
     # Two in a hundred, and three standard deviations of the count.
     for records in (cuttings, twins):
         named = sum(any(fault.is_clear for fault in one) for one in records)
         assert named <= 0.02 * len(records) + 3.0 * np.sqrt(0.02 * len(records))
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("where", ["spindle", "twin"])
+def test_planted_displacement_faults_are_left_out_and_no_other_reading(
+    spindle: xr.Dataset, where: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng, wrong = np.random.default_rng(20261123), 0
+    for kind in (*GLITCHES, *REPEATED):
+        for size in SIZES if kind in GLITCHES else (0.0,):
+            found, readings, errors = 0, 0, ""
+            for run in range(RUNS):
+                table = spindle if where == "spindle" else twin_table(seed=60_000 + run)
+                channel = int(rng.integers(table.sizes["channel"]))
+                spoilt, at_fault = planted_displacement(table, kind, size, channel, rng)
+                seconds = seconds_of(spoilt)
+                values = (spoilt[name].values for name in ("displacement", "temperature", "driver"))
+                for fault in examine_displacements(seconds, *values):
+                    left_out = np.zeros(seconds.size, bool)
+                    for first, last in fault.stretches_s:
+                        left_out |= (seconds >= first) & (seconds <= last)
+                    right = left_out & at_fault & (fault.sensor == channel)
+                    found += int(right.sum())
+                    # The reading that the others repeat goes with them.
+                    wrong += int((left_out & ~right).sum() > (kind in REPEATED))
+                readings += int(at_fault.sum())
+                if run == 0:
+                    told = [one for one in examine_record(spoilt, ["quasi_static"]).findings if one.readings]
+                    errors = "; ".join(
+                        f"{one.rmse_with_um:.2f} um with, {one.rmse_without_um:.2f} um without" for one in told
+                    )
+            with capsys.disabled():
+                print(
+                    f"{where}: {kind}{f' of {size:g} um' if size else ''}: {found} of {readings} readings in {RUNS} records, wrong so far "
+                    f"{wrong}; held-out error {errors or 'not compared'}",
+                    flush=True,
+                )
+    assert wrong == 0

@@ -1,21 +1,24 @@
-"""Health of temperature sensors before any model: each one is predicted from the others, from the loads and from its own past.
+"""Health of every channel before any model: temperatures are predicted from the others, from the loads and from their own past.
 
 What a sensor does beyond that prediction is held against its own record. A fault is one excursion far above everything else the sensor
-does in the same time; what a machine does, its switchings included, comes back with similar size.
+does in the same time; what a machine does, its switchings included, comes back with similar size. Of a displacement, whose sudden steps
+may be true, only single readings are at fault: those that leave its course and come back, and those that repeat one value.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import sample_noise
 from fusion.common import Array
+from fusion.results.loop import SensorFaultPart
 
 # Changes of a temperature sensor over some time, and what others, loads and its own past leave of them.
 
@@ -281,6 +284,10 @@ _LEAST_IMPLAUSIBLE = 3
 _ENDED_SHARE = 0.02
 #: Equal readings in a row from which a sensor may stick.
 _LEAST_REPEATED = 20
+#: So many equal readings, and so many times the next longest run, are enough alone: with the tail of ratios above, one chance in 1e8.
+_FAR_LONGER = 100
+#: The others then pass through this share of their range: before a test is begun everything may stand still.
+_LEAST_MOVED = 0.1
 #: A sensor finer than its noise repeats a reading this often in a row at most.
 _ORDINARY_RUN = 3
 #: The others move where the sensor's prediction moves by so many times what the prediction misses otherwise (95 %).
@@ -301,6 +308,15 @@ _NOISE_SAMPLES = 20
 _NOISIER = 3.0
 #: Fewest blocks from which anything is concluded.
 _LEAST_BLOCKS = 60
+#: Difference from the running median of a glitch, over the 90 % quantile of all or the resolution, whichever is larger: noise as heavy as
+#: Student's t with 4 degrees of freedom exceeds it twice in a million readings.
+_GLITCH = 20.0
+#: Readings of the shortest stretch that is looked for, and the longest as a share of the record; the median is over twice as many.
+_GLITCH_READINGS, _GLITCH_SHARE = 5, 0.02
+#: It leaves the course, and comes back, by this share of its size from one reading to the next; what is smooth may be true.
+_ABRUPT = 0.5
+#: A driver that is switched at so large a share of the readings explains no single excursion.
+_OFTEN = 0.1
 
 
 class Kind(StrEnum):
@@ -311,6 +327,9 @@ class Kind(StrEnum):
     JUMP = "jump"
     RAMP = "ramp"
     NOISE = "noise"
+    GLITCH = "glitch"
+    CLIPPED = "clipped"
+    COMPUTED = "computed"
 
 
 @dataclass(frozen=True)
@@ -319,13 +338,16 @@ class SensorFault:
 
     Attributes
     ----------
-    sensor : place among the sensors
+    sensor : place among the sensors, or among the displacements
     kind : what it does
     is_clear : whether nothing that a machine does looks like it; else the sensor is suspected
     onset_s, onset_u_s : when it began, since the first sample, and the standard uncertainty of that, s
-    size : change beyond the prediction, K; of noise its ratio, 1; nan of a signal that is none
+    size : change beyond the prediction, K; of noise its ratio, 1; of glitches the largest, um; nan of a signal that is none
     ratio, limit : excursion over the next largest of the sensor, and the limit; nan where none is compared
     reason : why it is only suspected; empty where it is clear
+    end_s : end of a jump or ramp, s; nan of others
+    readings, stretches_s : of a displacement the number of readings at fault, and the times of the first and last of each stretch, s
+    computed_with : faulty sensor that a displacement is computed with
     """
 
     sensor: int
@@ -337,25 +359,32 @@ class SensorFault:
     ratio: float = np.nan
     limit: float = np.nan
     reason: str = ""
+    end_s: float = np.nan
+    readings: int = 0
+    stretches_s: tuple[tuple[float, float], ...] = ()
+    computed_with: str = ""
 
     @property
     def words(self) -> str:
         """What the sensor does and from when on, as it follows its name."""
-        return describe_fault(self.kind, self.size if np.isfinite(self.size) else None, self.onset_s, self.onset_u_s)
+        return describe_fault(self)
 
 
-def describe_fault(kind: str, size: float | None, onset_s: float | None, onset_u_s: float | None) -> str:
+def describe_fault(fault: SensorFault | SensorFaultPart) -> str:
     """Return what a sensor does and from when on, as it follows the sensor's name."""
-    amount = f"{abs(size or 0.0):.2g}"
+    size, readings = abs(fault.size or 0.0), f"{fault.readings} reading{'' if fault.readings == 1 else 's'}"
     words = {
         Kind.NO_SIGNAL: "gives no signal",
-        Kind.STUCK: "repeats one reading",
-        Kind.JUMP: f"jumps by {amount} K",
-        Kind.RAMP: f"ramps by {amount} K",
-        Kind.NOISE: f"has {amount} times its noise",
+        Kind.STUCK: "repeats one reading" + (f" ({readings})" if fault.readings else ""),
+        Kind.JUMP: f"jumps by {size:.2g} K",
+        Kind.RAMP: f"ramps by {size:.2g} K",
+        Kind.NOISE: f"has {size:.2g} times its noise",
+        Kind.GLITCH: f"leaves its course by up to {size:.4g} µm and comes back ({readings})",
+        Kind.CLIPPED: f"stays at the end of its range ({readings})",
+        Kind.COMPUTED: f"is computed with the faulty sensor {fault.computed_with}",
     }
-    onset_h, onset_u_h = (onset_s or 0.0) / 3600.0, (onset_u_s or 0.0) / 3600.0
-    return f"{words[Kind(kind)]} from {onset_h:.2f} h on (standard uncertainty {onset_u_h:.1g} h)"
+    onset_h, onset_u_h = (fault.onset_s or 0.0) / 3600.0, (fault.onset_u_s or 0.0) / 3600.0
+    return f"{words[Kind(fault.kind)]} from {onset_h:.2f} h on (standard uncertainty {onset_u_h:.1g} h)"
 
 
 def excursion_limit(tests: int) -> float:
@@ -369,7 +398,7 @@ def examine_sensors(seconds: Array, temperature: Array, drivers: Array | None = 
         return []
     lost = _without_signal(seconds, temperature)
     kept = [k for k in range(temperature.shape[1]) if k not in {fault.sensor for fault in lost}]
-    plausible = np.where(_implausible(temperature), np.nan, temperature)
+    plausible = np.where(is_implausible(temperature), np.nan, temperature)
     kept = [k for k in kept if np.isfinite(plausible[:, k]).sum() >= _LEAST_BLOCKS]
     grids = lay_grid(seconds, plausible, drivers)
     if not kept or grids is None:
@@ -382,7 +411,8 @@ def examine_sensors(seconds: Array, temperature: Array, drivers: Array | None = 
     return sorted(faults, key=lambda fault: fault.sensor)
 
 
-def _implausible(temperature: Array) -> NDArray[np.bool_]:
+def is_implausible(temperature: Array) -> NDArray[np.bool_]:
+    """Readings that no shop and no machine has."""
     with np.errstate(invalid="ignore"):
         return (temperature < PLAUSIBLE_DEGC[0]) | (temperature > PLAUSIBLE_DEGC[1])
 
@@ -392,28 +422,31 @@ def _without_signal(seconds: Array, temperature: Array) -> list[SensorFault]:
     step = float(np.median(np.diff(seconds)))
     faults = []
     for k in range(temperature.shape[1]):
-        outside = _implausible(temperature[:, k])
-        length, first, _ = _longest_run(outside.astype(float), wanted=1.0)
+        outside = is_implausible(temperature[:, k])
         readings = np.flatnonzero(np.isfinite(temperature[:, k]))
-        if length >= _LEAST_IMPLAUSIBLE:
+        in_a_row = np.convolve(outside[readings], np.ones(_LEAST_IMPLAUSIBLE))
+        if in_a_row.max(initial=0.0) >= _LEAST_IMPLAUSIBLE:
+            # What is missing before the first implausible reading is no signal either.
+            sound = readings[readings < np.argmax(outside)]
+            first = int(sound[-1]) + 1 if sound.size else 0
             faults.append(SensorFault(k, Kind.NO_SIGNAL, True, float(seconds[first]), step, np.nan))
         elif readings.size and seconds[-1] - seconds[readings[-1]] > _ENDED_SHARE * (seconds[-1] - seconds[0]):
             faults.append(SensorFault(k, Kind.NO_SIGNAL, True, float(seconds[readings[-1]]) + step, step, np.nan))
     return faults
 
 
-def _longest_run(values: Array, wanted: float | None = None) -> tuple[int, int, int]:
-    """Length of the longest run of equal values (of one value, where it is wanted), its first place, and the length of the next longest."""
+def _runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First places and lengths of all runs of equal values."""
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
-    lengths = np.diff(np.r_[starts, values.size])
-    if wanted is not None:
-        chosen = values[starts] == wanted
-        starts, lengths = starts[chosen], lengths[chosen]
-    if lengths.size == 0:
-        return 0, 0, 0
+    return starts, np.diff(np.r_[starts, values.size])
+
+
+def _longest_run(values: Array) -> tuple[int, int, int]:
+    """Length of the longest run of equal values, its first place, and the length of the longest run of another value."""
+    starts, lengths = _runs(values)
     longest = int(lengths.argmax())
-    rest = np.delete(lengths, longest)
-    return int(lengths[longest]), int(starts[longest]), int(rest.max(initial=0))
+    others = lengths[values[starts] != values[starts[longest]]]
+    return int(lengths[longest]), int(starts[longest]), int(others.max(initial=0))
 
 
 def _stuck(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]) -> list[SensorFault]:
@@ -433,10 +466,17 @@ def _stuck(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]) 
             continue
         first_s, last_s = float(seconds[run[0]]), float(seconds[run[-1]])
         inside = (grid.seconds >= first_s) & (grid.seconds <= last_s)
-        if ordinary <= _ORDINARY_RUN or _moved_alone(grid, k, moving, inside):
+        far_longer = length > _FAR_LONGER * max(1, ordinary) and _passed_through(temperature[:, others], run)
+        if ordinary <= _ORDINARY_RUN or far_longer or _moved_alone(grid, k, moving, inside):
             step, ratio = float(np.median(np.diff(seconds))), length / max(ordinary, 1)
             faults.append(SensorFault(k, Kind.STUCK, True, first_s, step, 0.0, ratio, limit))
     return faults
+
+
+def _passed_through(temperature: Array, run: NDArray[np.intp]) -> bool:
+    """Whether most columns pass through a good part of their range within a run."""
+    passed, whole = (np.nanmax(part, axis=0) - np.nanmin(part, axis=0) for part in (temperature[run], temperature))
+    return bool((passed > _LEAST_MOVED * whole).mean() > 0.5) if whole.size else True
 
 
 def _moved_alone(grid: Grid, sensor: int, others: list[int], inside: NDArray[np.bool_]) -> bool:
@@ -536,7 +576,16 @@ def _describe(
     reason = next((words for words, holds in reasons.items() if holds), "")
     limit = found.ratio / suspicion.excess
     return SensorFault(
-        suspicion.sensor, kind, not reason, ramp.begin_s, ramp.begin_u_s, ramp.size_K, found.ratio, limit, reason
+        suspicion.sensor,
+        kind,
+        not reason,
+        ramp.begin_s,
+        ramp.begin_u_s,
+        ramp.size_K,
+        found.ratio,
+        limit,
+        reason,
+        ramp.end_s,
     )
 
 
@@ -605,3 +654,74 @@ def _noisier(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]
             SensorFault(k, Kind.NOISE, not reason, onset, 0.5 * window_s, ratio, float(apart.max()), held_to, reason)
         )
     return faults
+
+
+def examine_displacements(
+    seconds: Array, displacement: Array, temperature: Array, drivers: Array | None = None
+) -> list[SensorFault]:
+    """Examine displacement channels: readings that repeat one value, and those that leave the course and come back."""
+    every = np.column_stack([displacement, np.where(is_implausible(temperature), np.nan, temperature)])
+    kept = [k for k in range(every.shape[1]) if np.isfinite(every[:, k]).sum() >= _LEAST_BLOCKS]
+    grids = lay_grid(seconds, every, drivers) if seconds.size >= _LEAST_BLOCKS else None
+    if grids is None:
+        return []
+    repeated = {fault.sensor: fault for fault in _stuck(seconds, every, grids[-1], kept)}
+    faults = []
+    for k, values in enumerate(displacement.T):
+        at_fault = np.zeros(values.size, bool)
+        if k in repeated:
+            known = np.flatnonzero(np.isfinite(values))
+            value = values[np.searchsorted(seconds, repeated[k].onset_s)]
+            _, lengths = _runs(values[known])
+            at_fault[known] = np.repeat(lengths >= _LEAST_REPEATED, lengths) & (values[known] == value)
+            kind = Kind.CLIPPED if value in (values[known].min(), values[known].max()) else Kind.STUCK
+            faults.append(_in_stretches(replace(repeated[k], kind=kind, size=np.nan), seconds, at_fault))
+        at_fault, largest = _glitches(np.where(at_fault, np.nan, values), drivers)
+        if at_fault.any():
+            found = SensorFault(k, Kind.GLITCH, True, 0.0, float(np.median(np.diff(seconds))), largest)
+            faults.append(_in_stretches(found, seconds, at_fault))
+    return faults
+
+
+def _in_stretches(fault: SensorFault, seconds: Array, at_fault: NDArray[np.bool_]) -> SensorFault:
+    """The fault with its onset, the number of its readings and the times of its stretches."""
+    edges = np.flatnonzero(np.diff(np.r_[False, at_fault, False]))
+    stretches = tuple(zip(seconds[edges[::2]].tolist(), seconds[edges[1::2] - 1].tolist(), strict=True))
+    return replace(fault, onset_s=stretches[0][0], readings=int(at_fault.sum()), stretches_s=stretches)
+
+
+def _glitches(displacement: Array, drivers: Array | None) -> tuple[NDArray[np.bool_], float]:
+    """Readings that leave the course of a displacement within one sample and come back within one, and the largest distance from it."""
+    at_fault, largest = np.zeros(displacement.size, bool), 0.0
+    loads = np.zeros((displacement.size, 1)) if drivers is None else np.nan_to_num(drivers)
+    longest = max(_GLITCH_READINGS, int(_GLITCH_SHARE * displacement.size))
+    for reach in np.unique(np.minimum(_GLITCH_READINGS * 4 ** np.arange(12), longest)):
+        known = np.flatnonzero(np.isfinite(displacement) & ~at_fault)
+        values = displacement[known]
+        if values.size < _LEAST_BLOCKS or np.ptp(values) == 0.0:
+            break
+        off = np.abs(values - pd.Series(values).rolling(2 * reach + 1, center=True, min_periods=1).median().to_numpy())
+        limit = _GLITCH * max(float(np.quantile(off, 0.9)), float(np.diff(np.unique(values)).min()))
+        steepest = float(np.abs(np.diff(values[off <= limit])).max())
+        steps = np.abs(np.diff(values, prepend=values[0]))
+        switched = np.abs(np.diff(loads[known], axis=0, prepend=loads[known[:1]])) > _SWITCHED * np.ptp(loads, axis=0)
+        switched[:, switched.mean(axis=0) > _OFTEN] = False
+        edges = np.flatnonzero(np.diff(np.r_[False, off > limit, False]))
+        for first, end in zip(edges[::2], edges[1::2], strict=True):
+            size = float(off[first:end].max())
+            # The median itself is off beside a long stretch, so that the steps say where it begins and ends.
+            borders = first + np.flatnonzero(steps[first : end + 1] > max(limit, _ABRUPT * size))
+            if borders.size == 0:
+                continue
+            begin, after = borders[0], borders[-1]
+            if begin < after:
+                returns = abs(values[after] - values[begin - 1]) <= _ABRUPT * min(steps[begin], steps[after])
+            else:
+                # A level that a single reading shows cannot be said to stay, unless the course is as steep elsewhere.
+                alone = end - first == 1 and first in (0, values.size - 1)
+                returns = alone and steps[begin] > excursion_limit(1) * max(limit, steepest)
+                begin, after = first, end
+            if returns and after - begin <= reach and not switched[borders].all(axis=0).any():
+                at_fault[known[begin:after]] = True
+                largest = max(largest, size)
+    return at_fault, largest

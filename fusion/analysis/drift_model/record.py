@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fusion.analysis.alignment.readings import known_mean
-from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
+from fusion.analysis.alignment.sensor_health import (
+    Kind,
+    SensorFault,
+    examine_displacements,
+    examine_sensors,
+    is_implausible,
+)
 from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
 from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems
@@ -163,6 +169,9 @@ def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tup
     levels = np.zeros((PENALTIES.size, len(record.channels)))
     for channel in range(len(record.channels)):
         here = train & np.isfinite(record.displacement[:, channel])
+        if not here.any():
+            levels[:, channel] = np.nan
+            continue
         x, y = standard[here], record.displacement[here, channel]
         # A channel that misses blocks has its mean where the columns of the others have theirs.
         offset, middle = x.mean(axis=0), float(y.mean())
@@ -1287,87 +1296,150 @@ def withdraw_unreplicated(
 
 @dataclass(frozen=True)
 class SensorHealth:
-    """Sensors that are faulty or suspected.
+    """Sensors and displacements that are faulty or suspected.
 
     Attributes
     ----------
-    table : the record without the faulty sensors; suspected ones stay
-    names : sensors of the record as it was read
-    faults : in the order of the sensors
-    errors_um : error of the declared model on the hold-out set with a faulty sensor, by sensor; NaN where it has too few readings
-    sound_um : the same without all faulty sensors, um
-    runs : of a record of several runs, the one that shows the fault, by place of the sensor; onsets count from its start
+    table : the record without faulty sensors, displacements and readings; what is suspected stays
+    findings : part ``loop.sensor_faults`` of results.json: displacements, then sensors
+    names_causes : whether any displacement is left in which a cause can be named
     """
 
     table: xr.Dataset
-    names: tuple[str, ...]
-    faults: tuple[SensorFault, ...]
-    errors_um: dict[str, float]
-    sound_um: float
-    runs: dict[int, str] = field(default_factory=dict)
+    findings: tuple[schema.SensorFaultPart, ...] = ()
+    names_causes: bool = True
 
-    def described(self) -> list[schema.SensorFaultPart]:
-        """Return the part ``loop.sensor_faults`` of results.json."""
-        return [
-            schema.SensorFaultPart(
-                sensor=self.names[fault.sensor],
-                kind=fault.kind.value,
-                state="left_out" if fault.is_clear else "suspected",
-                **({"run": self.runs[fault.sensor]} if self.runs else {}),
-                onset_s=fault.onset_s,
-                onset_u_s=fault.onset_u_s,
-                size=fault.size,
-                ratio=fault.ratio,
-                limit=fault.limit,
-                reason=fault.reason,
-                rmse_with_um=self.errors_um[self.names[fault.sensor]] if fault.is_clear else np.nan,
-                rmse_without_um=self.sound_um if fault.is_clear else np.nan,
-            )
-            for fault in self.faults
-        ]
+
+#: A fault, the name of its sensor or displacement, and of several runs the one that shows it.
+_Found = tuple[SensorFault, str, str]
+#: A displacement is computed with a faulty sensor where the readings of that sensor reduce its error by this factor.
+_COMPUTED = 2.0
 
 
 def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
-    """Examine the sensors of a record, and leave out those that are faulty."""
-    names = tuple(str(name) for name in table["sensor"].values)
-    faults, where = _examine_runs(table)
-    faulty = [fault.sensor for fault in faults if fault.is_clear]
-    if not faulty:
-        return SensorHealth(table, names, faults, {}, np.nan, where)
-    kept = [k for k in range(len(names)) if k not in faulty]
+    """Examine displacements and sensors of a record, and leave out what is faulty."""
+    cleaned, readings = _without_faulty_readings(table)
+    sensors = _examine_runs(cleaned)
+    names = [str(name) for name in table["sensor"].values]
+    faulty = [one for one in sensors if one[0].is_clear]
+    kept = [name for name in names if name not in {name for _, name, _ in faulty}]
     if not kept:
-        told = "; ".join(
-            f"{names[fault.sensor]}: {fault.kind} from {fault.onset_s / 3600.0:.2f} h on" for fault in faults
-        )
+        told = "; ".join(f"{name}: {fault.kind} from {fault.onset_s / 3600.0:.2f} h on" for fault, name, _ in sensors)
         raise RecordError(
             f"{table.attrs.get('source', 'record')}: no temperature sensor is sound ({told}); repeat the test"
         )
-    errors = {names[k]: _declared_error(table.isel(sensor=sorted([*kept, k])), declared) for k in faulty}
-    sound = table.isel(sensor=kept)
-    return SensorHealth(sound, names, faults, errors, _declared_error(sound, declared), where)
+    if not readings and not faulty:
+        return SensorHealth(table, tuple(_part(*one) for one in sensors))
+
+    def errors(of: xr.Dataset, *beside: str, left_out: bool = False) -> dict[str, float]:
+        used = of.sel(sensor=[name for name in names if name in kept or name in beside])
+        return _declared_errors(used, declared, left_out=left_out)
+
+    computed: dict[str, schema.SensorFaultPart] = {}
+    for fault, name, run in faulty:
+        alone, as_read = errors(cleaned, left_out=True), errors(cleaned, name, left_out=True)
+        # A sound displacement follows what the part does, which the sensor shows better without its fault.
+        repaired = errors(_repaired(cleaned, fault, name, run), name, left_out=True)
+        for channel, error in as_read.items():
+            ratio = min(alone[channel], repaired.get(channel, np.inf)) / max(error, 1e-12)
+            if ratio >= _COMPUTED:
+                same = replace(fault, kind=Kind.COMPUTED, size=np.nan, ratio=ratio, limit=_COMPUTED, computed_with=name)
+                computed.setdefault(channel, _part(same, channel, run, error, alone[channel]))
+    left = [str(name) for name in table["channel"].values if name not in computed]
+    if not left:
+        # Every displacement needs the faulty sensor then: it stays, and nothing is named.
+        kept += [one.computed_with for one in computed.values()]
+        stays = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
+        computed = {name: one.model_copy(update=stays) for name, one in computed.items()}
+    channels = left or list(computed)
+    raw, cleaned = table.sel(channel=channels), cleaned.sel(channel=channels)
+    before, after = errors(raw), errors(cleaned)
+    found = [
+        _part(*one, before.get(one[1], np.nan), after.get(one[1], np.nan)) for one in readings if one[1] in channels
+    ]
+    for fault, name, run in sensors:
+        is_out = name not in kept
+        both = (errors(cleaned, name), after) if is_out else ({}, {})
+        if fault.is_clear and not is_out:
+            fault = replace(fault, is_clear=False, reason="every displacement is computed with it")
+        found.append(_part(fault, name, run, *(float(known_mean(np.array([*each.values()]))) for each in both)))
+    sound = cleaned.sel(sensor=[name for name in names if name in kept])
+    return SensorHealth(sound, (*computed.values(), *found), bool(left))
 
 
-def _examine_runs(table: xr.Dataset) -> tuple[tuple[SensorFault, ...], dict[int, str]]:
-    """Faults, at most one per sensor, and of several runs the one that shows it, by sensor; every run is examined by itself."""
-    runs = json.loads(table.attrs.get("runs", '[""]'))
+def _part(
+    fault: SensorFault, name: str, run: str, with_um: float = np.nan, without_um: float = np.nan
+) -> schema.SensorFaultPart:
+    state = "readings_left_out" if fault.readings else "left_out" if fault.is_clear else "suspected"
+    errors = {"rmse_with_um": with_um, "rmse_without_um": without_um}
+    told: dict[str, Any] = {
+        **vars(fault),
+        **errors,
+        "sensor": name,
+        "kind": fault.kind.value,
+        "run": run,
+        "state": state,
+    }
+    fields = schema.SensorFaultPart.model_fields
+    return schema.SensorFaultPart(**{key: told[key] for key in fields if told[key] or fields[key].is_required()})
+
+
+def _runs_of(table: xr.Dataset) -> Iterator[tuple[str, NDArray[np.bool_], Array]]:
+    """Name of every run, empty where there is one, its samples, and their times since its start, s."""
     number = table["run"].values if "run" in table.coords else np.zeros(table.sizes["time"], int)
-    chosen: dict[int, tuple[SensorFault, str]] = {}
-    for k, run in enumerate(runs):
-        here = table.isel(time=number == k)
-        seconds = np.asarray((here["time"].values - here["time"].values[0]) / np.timedelta64(1, "s"), np.float64)
-        for fault in examine_sensors(seconds, here["temperature"].values, here["driver"].values):
+    for k, run in enumerate(json.loads(table.attrs.get("runs", '[""]'))):
+        time = table["time"].values[number == k]
+        yield run, number == k, np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
+
+
+def _without_faulty_readings(table: xr.Dataset) -> tuple[xr.Dataset, list[_Found]]:
+    """The record without the displacements that are no readings, and what was found, run by run."""
+    displacement, found = table["displacement"].copy(), []
+    values, read = displacement.values, np.isfinite(table["displacement"].values)
+    for run, here, seconds in _runs_of(table):
+        rest = (table[name].values[here] for name in ("temperature", "driver"))
+        for fault in examine_displacements(seconds, values[here], *rest):
+            found.append((fault, str(table["channel"].values[fault.sensor]), run))
+            for first, last in fault.stretches_s:
+                values[np.flatnonzero(here)[(seconds >= first) & (seconds <= last)], fault.sensor] = np.nan
+    # Where no displacement is left at the end, the record ends before.
+    last, ended = (np.flatnonzero(known.any(axis=1)).max(initial=0) for known in (np.isfinite(values), read))
+    return table.assign(displacement=displacement).isel(time=slice(last + 1 if last < ended else None)), found
+
+
+def _examine_runs(table: xr.Dataset) -> list[_Found]:
+    """Faults of the sensors, at most one per sensor; every run is examined by itself."""
+    chosen: dict[int, _Found] = {}
+    for run, here, seconds in _runs_of(table):
+        for fault in examine_sensors(seconds, *(table[name].values[here] for name in ("temperature", "driver"))):
             earlier = chosen.get(fault.sensor)
             if earlier is None or (fault.is_clear and not earlier[0].is_clear):
-                chosen[fault.sensor] = (fault, run)
-    faults = tuple(chosen[sensor][0] for sensor in sorted(chosen))
-    return faults, {sensor: run for sensor, (_, run) in chosen.items() if run}
+                chosen[fault.sensor] = fault, str(table["sensor"].values[fault.sensor]), run
+    return [chosen[sensor] for sensor in sorted(chosen)]
 
 
-def _declared_error(table: xr.Dataset, declared: Sequence[str]) -> float:
-    """Error of the declared model on the hold-out set, um; nan where a sensor has too few readings."""
+def _repaired(table: xr.Dataset, fault: SensorFault, name: str, run: str) -> xr.Dataset:
+    """The record with a faulty sensor as it would read without its jump, its ramp or its implausible readings."""
+    temperature = table["temperature"].copy()
+    values = temperature.values[:, table["sensor"].values.tolist().index(name)]
+    if fault.kind is Kind.NO_SIGNAL:
+        values[is_implausible(values)] = np.nan
+    if fault.kind in {Kind.JUMP, Kind.RAMP}:
+        here, seconds = next((here, seconds) for each, here, seconds in _runs_of(table) if each == run)
+        values[here] -= fault.size * np.interp(seconds, [fault.onset_s, fault.end_s], [0.0, 1.0])
+    return table.assign(temperature=temperature)
+
+
+def _declared_errors(table: xr.Dataset, declared: Sequence[str], *, left_out: bool = False) -> dict[str, float]:
+    """Error of the declared model by channel, um, on the hold-out set, or of every part predicted from the others; none without a model."""
     try:
         record = reduce_record(table)
         train, _ = hold_out(record)
     except RecordError:
-        return np.nan
-    return rmse(record, predict(record, columns_of(record, declare(declared, record)), train).predicted, ~train)
+        return {}
+    columns = columns_of(record, declare(declared, record))
+    predicted, asked = predict(record, columns, train), ~train
+    errors = channel_rmse(record, predicted.predicted, asked)
+    if left_out:
+        errors = channel_rmse(record, predict_left_out(record, columns, predicted.penalty), np.ones_like(train))
+    return dict(zip(record.channels, errors.tolist(), strict=True))

@@ -89,6 +89,7 @@ class Record:
     chained : (blocks,) number of the chronological block of each row for forward chaining, from 0
     gaps : values that were interpolated, by column
     impossible : samples beyond what can be measured, which count as missing, by column
+    unusable : channels that cannot be modelled and are left out, with the reason
     runs : of a record of several runs; empty where there is one
     first : number of the first block of every run
     driver_sizes : driver to its largest size and the unit of that
@@ -107,6 +108,7 @@ class Record:
     chained: NDArray[np.int64]
     gaps: Mapping[str, int]
     impossible: Mapping[str, int] = field(default_factory=dict)
+    unusable: Mapping[str, str] = field(default_factory=dict)
     runs: tuple[RecordedRun, ...] = ()
     first: tuple[int, ...] = (0,)
     driver_sizes: Mapping[str, tuple[float, str]] = field(default_factory=dict)
@@ -218,18 +220,26 @@ class _Blocks:
         """Blocks of every run."""
         return [slice(first, last) for first, last in pairwise([*self.first, self.seconds.size])]
 
-    def zeroed(self, channel: str, values: Array) -> Array:
+    def zeroed(self, values: Array) -> Array:
         """Block means of a channel; of several runs each minus its own first one, its zero."""
         mean = self.mean(values)
         if len(self.first) > 1:
-            for run, rows in enumerate(self.rows()):
-                known = mean[rows][np.isfinite(mean[rows])]
-                if not known.size:
-                    raise RecordError(
-                        f'{self.names[run]}: channel "{channel}" has no value in this run; leave the channel or the run out of [record]'
-                    )
-                mean[rows] -= known[0]
+            for rows in self.rows():
+                mean[rows] -= mean[rows][np.argmax(np.isfinite(mean[rows]))]
         return mean
+
+    def fault_of(self, mean: Array, chained: NDArray[np.int64]) -> str:
+        """Why a channel of these block means cannot be modelled; empty where it can."""
+        known = np.isfinite(mean)
+        empty = [name for name, rows in zip(self.names, self.rows(), strict=True) if not known[rows].any()]
+        if known.sum() < LEAST_BLOCKS:
+            return "holds too few values"
+        if np.ptp(mean[known]) == 0.0:
+            return "never moves"
+        if empty:
+            return f"has no value in {empty[0]}"
+        # The first prediction is made from the first two parts.
+        return "" if known[chained < 2].mean() >= 0.5 else "has too few values at the beginning"
 
 
 def reduce_record(table: xr.Dataset) -> Record:
@@ -238,15 +248,17 @@ def reduce_record(table: xr.Dataset) -> Record:
     elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
     table, impossible = _without_impossible(table)
     blocks = _lay_blocks(table, elapsed)
-    channels = tuple(str(name) for name in table["channel"].values)
-    displacement = np.column_stack(
-        [blocks.zeroed(name, table["displacement"].values[:, k]) for k, name in enumerate(channels)]
-    )
-    for k, name in enumerate(channels):
-        known = displacement[np.isfinite(displacement[:, k]), k]
-        if known.size < LEAST_BLOCKS or np.ptp(known) == 0.0:
-            fault = "never moves" if known.size >= LEAST_BLOCKS else "holds too few values"
-            raise RecordError(f'{blocks.source}: channel "{name}" {fault}; leave it out of [record]')
+    drivers, driver_sizes = _drivers(table, blocks)
+    chained = _chained_runs(blocks, [powers[1] for powers in drivers.values()])
+    means = {
+        str(name): blocks.zeroed(values)
+        for name, values in zip(table["channel"].values, table["displacement"].values.T, strict=True)
+    }
+    faults = {name: blocks.fault_of(mean, chained) for name, mean in means.items()}
+    channels = tuple(name for name in means if not faults[name])
+    if not channels:
+        told = "; ".join(f'channel "{name}" {fault}' for name, fault in faults.items())
+        raise RecordError(f"{blocks.source}: {told}; leave it out of [record]")
     sensors = [str(name) for name in table["sensor"].values]
     samples = table["temperature"].values
     temperature = np.column_stack([blocks.filled(name, samples[:, k]) for k, name in enumerate(sensors)])
@@ -256,12 +268,11 @@ def reduce_record(table: xr.Dataset) -> Record:
             f"{blocks.source}: no temperature changes; nothing that a displacement could follow; add sensors that warm"
         )
     per_block = max(1.0, elapsed.size / blocks.seconds.size)
-    drivers, driver_sizes = _drivers(table, blocks)
     return Record(
         start=time[0],
         seconds=blocks.seconds,
         block_s=blocks.length_s,
-        displacement=displacement,
+        displacement=np.column_stack([means[name] for name in channels]),
         temperature=temperature[:, kept],
         temperature_noise=np.array([sample_noise(samples[np.isfinite(samples[:, k]), k]) for k in kept])
         / np.sqrt(per_block),
@@ -269,9 +280,10 @@ def reduce_record(table: xr.Dataset) -> Record:
         channels=channels,
         sensors=tuple(sensors[k] for k in kept),
         duplicates=tuple(name for k, name in enumerate(sensors) if k not in kept),
-        chained=_chained_runs(blocks, [powers[1] for powers in drivers.values()]),
+        chained=chained,
         gaps=blocks.gaps,
         impossible=impossible,
+        unusable={name: fault for name, fault in faults.items() if fault},
         runs=_runs(table, blocks),
         first=blocks.first,
         driver_sizes=driver_sizes,

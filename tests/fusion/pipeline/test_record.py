@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fusion.analysis.alignment.sensor_health import Kind, SensorFault
 from fusion.analysis.drift_model.fit import Term
 from fusion.analysis.drift_model.record import SensorHealth
 from fusion.analysis.drift_model.record_data import Record
 from fusion.analysis.effects.effect import Candidate
 from fusion.pipeline.record import declared_effects, record_notices, record_variables, sensor_notices
+from fusion.results.loop import SensorFaultPart
 from tests.fusion.record_tables import record_of
 
 
@@ -50,6 +50,8 @@ def test_gaps_missing_displacements_sensors_and_drivers_are_noted():
     assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 blocks)."
     assert told["record_displacements_missing"].startswith("3 block means of 100 of the displacements missing")
     assert set(told) == {"record_gaps", "record_displacements_missing"}
+    told = notices_of(plain(unusable={"ch3": "never moves"}))
+    assert told["record_channels_left_out"] == "Displacements that cannot be modelled are left out: ch3 never moves."
     told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
     assert told["record_sensors_dependent"] == "Left out because they duplicate other sensors: t2; t3."
     assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
@@ -65,21 +67,35 @@ def test_a_pause_is_longer_than_one_and_a_half_blocks(longer_s, pauses):
         assert told["record_pauses"].startswith("Nothing was logged in 1 pause, the longest ")
 
 
-def test_a_faulty_sensor_is_noted_with_both_errors_and_a_suspected_one_with_its_reason():
-    faults = (
-        SensorFault(0, Kind.RAMP, True, 7200.0, 360.0, 28.0, 90.0, 10.0),
-        SensorFault(1, Kind.NO_SIGNAL, True, 7200.0, 60.0, np.nan),
-        SensorFault(2, Kind.JUMP, False, 3600.0, 60.0, -2.0, 12.0, 10.0, "other sensors respond"),
-    )
-    errors = {"t1": 12.34, "t2": np.nan}
-    ramp, silent, suspected = sensor_notices(SensorHealth(None, ("t1", "t2", "t3"), faults, errors, 2.345))
-    assert ramp.code == silent.code == "record_sensor_faulty"
-    assert ramp.message.startswith("t1 ramps by 28 K from 2.00 h on (standard uncertainty 0.1 h); it is left out")
-    assert ramp.message.endswith("12.3 µm with it, 2.35 µm without.")
-    assert "no model with it" in silent.message
-    assert suspected.code == "record_sensor_suspected"
-    assert "t3 jumps by 2 K from 1.00 h on" in suspected.message
-    assert "suspected only (other sensors respond), and stays in the model" in suspected.message
+def test_every_finding_is_noted_with_both_errors_or_its_reason():
+    ramp, silent, glitch, computed, suspected = (
+        SensorFaultPart(**{**one, "onset_u_s": 360.0, "limit": 10.0, "rmse_without_um": 2.345})
+        for one in (
+            {"sensor": "t1", "kind": "ramp", "state": "left_out", "onset_s": 7200.0, "size": 28.0, "ratio": 90.0, "reason": "",
+             "rmse_with_um": 12.34},
+            {"sensor": "t2", "kind": "no signal", "state": "left_out", "onset_s": 7200.0, "size": np.nan, "ratio": np.nan, "reason": "",
+             "rmse_with_um": np.nan},
+            {"sensor": "ch1", "kind": "glitch", "state": "readings_left_out", "onset_s": 3600.0, "size": 4302.5, "ratio": np.nan,
+             "reason": "", "rmse_with_um": 611.0, "readings": 3, "stretches_s": [(3600.0, 3604.0), (9000.0, 9000.0)]},
+            {"sensor": "ch2", "kind": "computed", "state": "left_out", "onset_s": 7200.0, "size": np.nan, "ratio": 3.0, "reason": "",
+             "rmse_with_um": 0.7, "computed_with": "t1"},
+            {"sensor": "t3", "kind": "jump", "state": "suspected", "onset_s": 3600.0, "size": -2.0, "ratio": 12.0,
+             "reason": "other sensors respond", "rmse_with_um": np.nan},
+        )
+    )  # fmt: skip
+    told = list(sensor_notices(SensorHealth(None, (ramp, silent, glitch, computed, suspected))))
+    assert [one.code.removeprefix("record_") for one in told] == [
+        "sensor_faulty", "sensor_faulty", "displacement_faulty", "displacement_computed", "sensor_suspected",
+    ]  # fmt: skip
+    ramp, silent, glitch, computed, suspected = (one.message for one in told)
+    assert ramp.startswith("t1 ramps by 28 K from 2.00 h on (standard uncertainty 0.1 h); it is left out")
+    assert ramp.endswith("12.3 µm with it, 2.35 µm without.")
+    assert "no model with it" in silent
+    assert glitch.startswith("ch1 leaves its course by up to 4302 µm and comes back (3 readings) from 1.00 h on")
+    assert "they are left out at 1 h; 2.5 h. Held-out error of the declared model of ch1: 611 µm with it" in glitch
+    assert computed.startswith("ch2 is computed with the faulty sensor t1 from 2.00 h on")
+    assert "t3 jumps by 2 K from 1.00 h on" in suspected
+    assert "suspected only (other sensors respond), and stays in the model" in suspected
 
 
 def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[float, float]]) -> SimpleNamespace:

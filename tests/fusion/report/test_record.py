@@ -54,7 +54,10 @@ def test_a_record_is_told_with_its_channels_and_its_driver():
     assert tables["Errors of forward chaining"][-1] == ["mean", "", "0.900", "0.600", "0.400"]
     assert ["not tried: dead path of the laser", "no air"] in tables["Effects that were not admitted or not tried"]
     assert tables["Candidates with their scores"][1][-2:] == ["0.700 to 0.500", "chosen"]
-    assert not {"Effects that were tested and rejected", "Sensors that are faulty or suspected"} & set(tables)
+    assert not {
+        "Effects that were tested and rejected",
+        "Sensors and displacements that are faulty or suspected",
+    } & set(tables)
 
 
 def test_the_page_stays_readable_with_many_channels():
@@ -81,7 +84,9 @@ def test_a_faulty_sensor_stands_with_the_error_with_and_without_it():
         "limit": 10.6, "reason": "", "rmse_with_um": 15.7, "rmse_without_um": 4.3,
     }  # fmt: skip
     suspected = {**fault, "state": "suspected", "reason": "other sensors respond", "rmse_with_um": None}
-    _, first, second = tables_of(page_of(sensor_faults=[fault, suspected]))["Sensors that are faulty or suspected"]
+    _, first, second = tables_of(page_of(sensor_faults=[fault, suspected]))[
+        "Sensors and displacements that are faulty or suspected"
+    ]
     assert "28 K from 2.50 h on (standard uncertainty 0.05 h)" in first[1]
     assert [first[0], *first[2:]] == ["t5", "214", "10.6", "left out", "15.7", "4.30"]
     assert second[1] == f"{first[1]}; other sensors respond"

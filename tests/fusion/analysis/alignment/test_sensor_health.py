@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from fusion.analysis.alignment.first_order_lag import respond
-from fusion.analysis.alignment.sensor_health import Kind, examine_sensors, excursion_limit, fit_ramp, lay_grid
+from fusion.analysis.alignment.sensor_health import (
+    Kind,
+    examine_displacements,
+    examine_sensors,
+    excursion_limit,
+    fit_ramp,
+    lay_grid,
+)
 from tests.fusion.record_tables import twin_table
 
 SEED = 31
@@ -61,6 +68,116 @@ def test_a_faulty_sensor_is_named_with_its_onset(sound, kind, spoil):
     assert (fault.sensor, fault.kind, fault.is_clear) == (sensor, kind, True)
     # Two standard uncertainties and a block of the coarse grid.
     assert abs(fault.onset_s - seconds[900]) <= 2.0 * fault.onset_u_s + 180.0
+
+
+def test_a_coarse_sensor_that_repeats_one_value_for_long_is_named(sound):
+    """No run of ordinary readings is short here, and the prediction of so coarse a sensor misses too much to move."""
+    seconds, temperature, _ = sound
+    coarse = temperature.copy()
+    coarse[:, 2] = np.round(seconds / 3600.0 + temperature[:, 2] * 1e-3 + np.arange(seconds.size) // 6 % 2)
+    coarse[700:, 2] = coarse[699, 2]
+    (fault,) = examine_sensors(seconds, coarse)
+    assert (fault.sensor, fault.kind) == (2, Kind.STUCK)
+    # Before a test is begun everything stands still, and coarse sensors repeat one reading.
+    still = temperature.copy()
+    still[:700, :] = temperature[0] + 0.001 * np.random.default_rng(4).standard_normal((700, temperature.shape[1]))
+    still[:, 2] = np.round(still[:, 2])
+    assert [fault for fault in examine_sensors(seconds, still) if fault.kind is Kind.STUCK] == []
+
+
+@pytest.mark.parametrize("missing", [slice(0, 0), slice(900, 905), slice(893, 900)])
+def test_no_signal_begins_with_the_first_implausible_reading_whatever_gaps_follow(sound, missing):
+    seconds, temperature, _ = sound
+    spoilt = temperature.copy()
+    spoilt[900:, 2] = np.where(np.arange(seconds.size - 900) % 3 == 2, np.nan, 850.0)
+    spoilt[1200:, 2] = 850.0
+    spoilt[missing, 2] = np.nan
+    (fault,) = examine_sensors(seconds, spoilt)
+    assert fault.kind is Kind.NO_SIGNAL
+    assert fault.onset_s == seconds[893 if missing.start == 893 else 900]
+
+
+# Displacements: what leaves the course and comes back is at fault; what stays, or takes its time, may be true.
+
+
+def drifting(seconds: np.ndarray, resolution: float = 0.0) -> np.ndarray:
+    values = 40.0 * np.sin(seconds / 9000.0) + np.random.default_rng(6).normal(0.0, 0.1, seconds.size)
+    return np.round(values / resolution) * resolution if resolution else values
+
+
+@pytest.mark.parametrize("resolution", [0.0, 1.0])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda at: np.isin(at, [0, 200, 201, 700, 1000, 1439]),
+        lambda at: (at >= 600) & (at < 625),
+        lambda at: (at >= 600) & (at < 606),
+    ],
+    ids=["single readings", "a stretch", "longer than half the median"],
+)
+def test_glitches_of_a_displacement_are_found_to_the_reading(sound, spoil, resolution):
+    seconds, temperature, load = sound
+    values, at_fault = drifting(seconds, resolution), spoil(np.arange(seconds.size))
+    (fault,) = examine_displacements(seconds, (values + 4300.0 * at_fault)[:, None], temperature, load)
+    assert (fault.kind, fault.readings) == (Kind.GLITCH, at_fault.sum())
+    found = np.zeros(seconds.size, bool)
+    for first, last in fault.stretches_s:
+        found |= (seconds >= first) & (seconds <= last)
+    np.testing.assert_array_equal(found, at_fault)
+    assert fault.size == pytest.approx(4300.0, abs=50.0)
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        lambda at: 500.0 * (at >= 600),
+        lambda at: 500.0 * (at >= 2),
+        lambda at: 500.0 * (at >= 1437),
+        lambda at: 500.0 * np.exp(-np.maximum(at - 600, 0) / 8.0) * (at >= 600),
+        lambda at: 500.0 * (1.0 - np.exp(-at / 3.0)),
+        lambda at: 500.0 * np.exp(-0.5 * ((at - 600) / 3.0) ** 2),
+    ],
+    ids=["step", "step at the beginning", "step at the end", "step that relaxes", "fast start", "smooth pulse"],
+)
+def test_a_true_event_is_no_glitch(sound, event):
+    seconds, temperature, load = sound
+    values = drifting(seconds) + event(np.arange(seconds.size))
+    assert examine_displacements(seconds, values[:, None], temperature, load) == []
+
+
+def test_what_a_driver_switches_on_and_off_is_no_glitch(sound):
+    seconds, temperature, _ = sound
+    pulses = (np.arange(seconds.size) % 200 < 4).astype(float)
+    values = (drifting(seconds) + 50.0 * pulses)[:, None]
+    assert examine_displacements(seconds, values, temperature, pulses[:, None]) == []
+    # A driver that is switched all the time explains none of them, nor does one that nothing logs.
+    for driver in (None, np.random.default_rng(8).uniform(size=(seconds.size, 1))):
+        (fault,) = examine_displacements(seconds, values, temperature, driver)
+        assert fault.readings >= 4 * 7
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "kind"), [(600, 640, Kind.STUCK), (900, 1440, Kind.STUCK), (0, 0, Kind.CLIPPED)]
+)
+def test_readings_of_a_displacement_that_repeat_one_value_are_found(sound, begin, end, kind):
+    seconds, temperature, load = sound
+    values, other = drifting(seconds), drifting(seconds)[::-1]
+    if kind is Kind.CLIPPED:
+        repeated = values > 30.0
+        values = np.minimum(values, 30.0)
+    else:
+        repeated = (np.arange(seconds.size) >= begin) & (np.arange(seconds.size) < end)
+        values[repeated] = values[begin]
+    (fault,) = examine_displacements(seconds, np.column_stack([other, values]), temperature, load)
+    assert (fault.sensor, fault.kind) == (1, kind)
+    # Short runs where noise crosses the end of the range are true within the noise.
+    assert fault.readings == pytest.approx(repeated.sum(), abs=20 if kind is Kind.CLIPPED else 0)
+
+
+def test_a_coarse_displacement_that_rests_before_the_test_is_not_stuck(sound):
+    seconds, temperature, load = sound
+    values = np.round(20.0 * np.maximum(0.0, np.sin((seconds - seconds[500]) / 9000.0)) * (seconds > seconds[500]))
+    assert examine_displacements(seconds, values[:, None], temperature, load) == []
 
 
 def test_a_sensor_that_becomes_noisy_is_named(sound):
