@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -48,6 +49,8 @@ _TAKEN = (
 )  # fmt: skip
 #: Seconds beyond these are damaged numbers: LabVIEW counts from 1904, 4.5e9 s reach to 2046.
 _LONGEST_RECORD_S = 4.5e9
+#: A log in which no channel writes for so many of their usual intervals is interrupted: at random, 1 in 2**10.
+_LONGEST_SILENCE = 10.0
 _DECIMAL_COMMA = re.compile(r"\d,\d")
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
@@ -152,12 +155,27 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         raise TableError(f"{campaign.path}: there is no [record] in this campaign")
     rows = read_rows(path, sheet=record.sheet, header=record.header_rows, missing=record.missing)
     frame = rows.frame
-    time, reference, left_out = _times(path, rows, record)
-    left_out = [*rows.left_out, *left_out]
+    lost = pd.Series(False, frame.index)
     if record.long is not None:
-        frame, time, without_number = _by_channel(path, frame, time, record.long)
+        # camonitor prints "*** Disconnected" or "*** Not connected (PV not found)" in place of a value, or of the time as well.
+        written = frame[frame.columns.intersection([*record.long.time, record.long.value])].astype(str)
+        lost = written.apply(lambda column: column.str.startswith("***")).any(axis=1)
+    time, reference, left_out = _times(path, rows, record)
+    left_out = [*rows.left_out, *(line for line in left_out if not lost.get(line.line, False))]
+    names, held = [str(name) for name in frame.columns if name not in (record.time or ())], list[dict[str, Any]]()
+    if record.long is not None:
+        channels = frame[record.long.channel].astype(str).str.strip()
+        numbers = pd.Series(numbers_in(frame[record.long.value]), frame.index)
+        names = sorted(channels[numbers.notna()].unique())
+    columns = columns_of(path, names, rows.units, record)
+    if record.long is not None:
+        stamps = pd.Series(time, frame.index)
+        # A connection that is lost without a time was lost after the line before.
+        stamps = stamps.fillna(stamps.ffill().where(lost))
+        lines = pd.DataFrame({"time": stamps, "channel": channels, "value": numbers})
+        used = {role: list(of_role) for role, of_role in columns.items()}
+        frame, time, held, without_number = _by_channel(path, frame, lines, lost, used, record.long)
         left_out += without_number
-    columns = columns_of(path, [name for name in frame.columns if name not in (record.time or ())], rows.units, record)
     keep = ~np.isnat(time)
     order = np.argsort(time[keep], kind="stable")
 
@@ -186,7 +204,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             "driver_units": (("driver_name",), np.array(driver_units, dtype=object)),
         },
         coords={"time": time[keep][order], "sensor": sensors, "channel": channels, "driver_name": drivers},
-        attrs={"source": path.name, "left_out": json.dumps([asdict(line) for line in left_out])},
+        attrs={"source": path.name, "left_out": json.dumps([asdict(line) for line in left_out]), "held": json.dumps(held)},
     )
     table["time"].attrs["reference"] = reference
     return bring_to_utc(table, campaign.zone_of("record"), file=path.name)
@@ -323,23 +341,52 @@ def numbers_in(column: pd.Series) -> np.ndarray:
 
 
 def _by_channel(
-    path: Path, frame: pd.DataFrame, time: np.ndarray, long: LongTable
-) -> tuple[pd.DataFrame, np.ndarray, list[RejectedLine]]:
-    """Return a column for every channel, which keeps its value until its next line; their times, and the lines without a number."""
-    values = pd.Series(numbers_in(frame[long.value]), frame.index)
-    channels = frame[long.channel].astype(str).str.strip()
+    path: Path, frame: pd.DataFrame, lines: pd.DataFrame, lost: pd.Series, used: Mapping[str, list[str]], long: LongTable
+) -> tuple[pd.DataFrame, np.ndarray, list[dict[str, Any]], list[RejectedLine]]:
+    """Return a column for every channel that is used, its times, how values were held between lines, and lines without a number."""
     # camonitor prints the value of a channel without a reading as 0, with the severity of its alarm behind it.
     invalid = frame.drop(columns=[long.value, long.channel, *long.time]).isin(["INVALID"]).any(axis=1)
-    bad = (values.isna() | invalid) & channels.isin(channels[values.notna()].unique())
+    lines["value"] = lines["value"].mask(invalid | lost)
+    not_connected = [f"{name} (line {line})" for line, name in lines["channel"][lost].items()]
+    lines = lines[lines["channel"].isin([name for names in used.values() for name in names]) & lines["time"].notna()]
+    bad = lines.index[lines["value"].isna() & ~lost[lines.index]]
     left_out = [
         RejectedLine(
             path.name, int(line), str(frame.at[line, long.value]), "is INVALID" if invalid[line] else "is not a number"
         )
-        for line in frame.index[bad]
+        for line in bad
     ]
-    changes = pd.DataFrame({"time": time, "channel": channels, "value": values.mask(invalid)}).dropna()
-    wide = changes.groupby(["time", "channel"])["value"].last().unstack().ffill()
-    return wide, wide.index.to_numpy("M8[ns]"), left_out
+    described: dict[str, Any] = {"file": path.name, "lost": not_connected}
+    # A value goes before an alarm of the same time.
+    each = {str(name): of_one.groupby("time")["value"].last() for name, of_one in lines.groupby("channel")}
+    wide = pd.DataFrame(each)
+    first = wide.index.to_numpy("M8[ns]")[0]
+    seconds = {name: (values.index.to_numpy("M8[ns]") - first) / np.timedelta64(1, "s") for name, values in each.items()}
+    usual = {name: _usual_step_s(seconds[name]) for role in ("displacement", "temperature") for name in used[role] if seconds[name].size > 1}  # fmt: skip
+    # Between two lines of the displacement that is logged most often nothing is measured that could be explained.
+    fastest = min((name for name in used["displacement"] if name in usual), key=usual.__getitem__, default="")
+    if wide.notna().all(axis=None) or not fastest:
+        return wide, wide.index.to_numpy("M8[ns]"), [described] if not_connected else [], left_out
+    at_all = np.unique(np.concatenate(list(seconds.values())))
+    start, end = seconds[fastest][0], at_all[-1]
+    # Bursts and long pauses: no more rows than lines.
+    step_s = max(usual[fastest], (end - start) / len(lines))
+    grid = start + step_s * np.arange(round((end - start) / step_s) + 1)
+    # A line belongs to the row that is nearest to it.
+    before = {name: np.searchsorted(at, grid + step_s / 2) - 1 for name, at in seconds.items()}
+    held = {name: np.where(row >= 0, each[name].to_numpy()[row], np.nan) for name, row in before.items()}
+    longest_s = _LONGEST_SILENCE * float(np.median(list(usual.values())))
+    kept = grid - at_all[np.searchsorted(at_all, grid + step_s / 2) - 1] <= longest_s
+    waits = {name: float(np.diff(at).max(initial=0.0)) for name, at in seconds.items()}
+    slowest = max(waits, key=waits.__getitem__)
+    described |= {"step_s": step_s, "longest_s": longest_s, "fastest": fastest, "slowest": slowest, "wait_s": waits[slowest]}  # fmt: skip
+    return pd.DataFrame(held)[kept], (first + np.round(grid * 1e9).astype("m8[ns]"))[kept], [described], left_out
+
+
+def _usual_step_s(seconds: Array) -> float:
+    """Return the time between two lines of a channel, s: the mean, where pauses count for as many as fit by the median."""
+    between = np.diff(seconds)
+    return float(between.sum() / max(1.0, np.rint(between / np.median(between)).sum()))
 
 
 def _times(path: Path, rows: Rows, record: RecordTable) -> tuple[np.ndarray, str, list[RejectedLine]]:

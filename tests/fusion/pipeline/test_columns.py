@@ -116,7 +116,7 @@ def test_a_layout_gives_the_record_of_headings_written_by_hand(
 ) -> None:
     answers = {"Unit of the times": "min", "Time from one row": "30 s"}
     if layout == "spaces, no headings":
-        answers["Columns as shown"] = "4 = displacement mm"
+        answers["Column of the displacement"] = "4 = displacement mm"
     data = drafted(tmp_path / "folder", LAYOUTS[layout], "log.txt", answers)
     np.testing.assert_allclose(data["temperature"].values, by_hand["temperature"].values, atol=1e-9)
     np.testing.assert_allclose(data["displacement"].values, by_hand["displacement"].values, atol=1e-9)
@@ -141,7 +141,7 @@ def test_counts_are_converted_and_marks_are_no_readings(tmp_path: Path) -> None:
         *(f"{60 * k},{8 * k - 127},{20 + k / 100 if k != 30 else -180:.2f}" for k in range(60)),
     ]
     lines += ["3600,n.c.,21"]
-    answers = {"Columns as shown": "2 = displacement", "Unit of": "0.0125 mm"}
+    answers = {"Column of the displacement": "2 = displacement", "Unit of": "0.0125 mm"}
     data = drafted(tmp_path / "folder", "\n".join(lines), "log.csv", answers)
     np.testing.assert_allclose(data["displacement"].values[:-1, 0], 12.5 * (8 * np.arange(60) - 127))
     assert np.isnan(data["displacement"].values[-1, 0])

@@ -52,7 +52,7 @@ def test_gaps_missing_displacements_sensors_and_drivers_are_noted():
     assert set(told) == {"record_gaps", "record_displacements_missing"}
     told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
     assert told["record_sensors_dependent"] == "Left out because they duplicate other sensors: t2; t3."
-    assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
+    assert told["no_drivers"].startswith("The record has no driver that changes, so a heat source that no sensor sees")
 
 
 @pytest.mark.parametrize(("longer_s", "pauses"), [(150.0, 0), (151.0, 1)])
