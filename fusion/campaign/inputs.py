@@ -40,11 +40,10 @@ from fusion.campaign.logs import (
     read_drivers,
     read_run,
     read_sensors,
-    split_heading,
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
-from fusion.campaign.values import matching_pipes
+from fusion.campaign.values import matching_pipes, name_and_unit
 from fusion.common import FusionError
 from fusion.messages import naming
 from fusion.results.progress import counted, left_out_notices, listed
@@ -289,12 +288,12 @@ def _read_drivers(campaign: Campaign) -> dict[str, Any]:
         return {}
     path = campaign.resolve(table.file)
     drivers = bring_to_utc(
-        read_drivers(path), campaign.zone_of("drivers"), file=table.file, late_s=table.clock_offset_s
+        read_drivers(path, table.layout), campaign.zone_of("drivers"), file=table.file, late_s=table.clock_offset_s
     )
     if table.mean_dwell_s is None:
         return {"drivers": drivers}
     law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
-    names = [split_heading(path, heading)[0] for heading in table.randomised]
+    names = [name_and_unit(heading)[0] for heading in table.randomised]
     return {"drivers": drivers, "duty": (read_duty(drivers, names, law, source=table.file), law)}
 
 

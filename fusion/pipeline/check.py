@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +191,7 @@ def _faults_of_files(campaign: Campaign) -> Iterator[str]:
     readers: tuple[tuple[Callable[[Path], object], object, str], ...] = (
         (read_deviations, campaign.interferometry, "deviations"),
         (read_environment, campaign.interferometry, "environment"),
-        (read_drivers, campaign.drivers, "file"),
+        (partial(read_drivers, layout=campaign.drivers and campaign.drivers.layout), campaign.drivers, "file"),
         (read_fiducials, campaign.plan, "fiducials"),
         (read_lens, campaign.thermography, "lens"),
     )

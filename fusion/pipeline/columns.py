@@ -334,13 +334,13 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
     names = {name: texts.nunique() for name, texts in written.items() if name not in (*numbers, *of_units)}
     channel = max(names, key=names.__getitem__, default="")
     values = [name for name in frame if name not in (*times, *names, *of_units) and frame[name].nunique() > 1]
-    values = [name for name in values if not _STATE.search(name)] or values
+    values = [name for name in values if not _STATE.search(str(name))] or values
     if not times or len(values) != 1 or not 1 < names.get(channel, 0) < len(frame) / 3:
         return {}
     asked |= open_
     if of_units:
         units |= dict(zip(written[channel], written[of_units[0]], strict=True))
-    return {"long": {"time": keys.pop("time"), "channel": channel, "value": values[0]}, **keys}
+    return {"long": {"time": keys.pop("time"), "channel": channel, "value": str(values[0])}, **keys}
 
 
 # Which column holds the times, and how they are written.

@@ -61,7 +61,11 @@ def _zone_notices(table: xr.Dataset) -> Iterator[Notice]:
     """Notice of times of day that nobody has given a zone."""
     if lacks_zone(table) and table["time"].values[0] > DATED:
         message = "The times of the record carry no zone: they are shown as they are in the file, as if they were UTC."
-        yield Notice("record_no_zone", message, 'Write their zone under [campaign], such as time_zone = "Europe/Vienna".')
+        yield Notice(
+            "record_no_zone",
+            message,
+            'Write the zone of the logged times under [campaign], such as time_zone = "Europe/Vienna".',
+        )
 
 
 def _held_notices(table: xr.Dataset) -> Iterator[Notice]:
@@ -74,7 +78,7 @@ def _held_notices(table: xr.Dataset) -> Iterator[Notice]:
                 f"{duration(one['step_s'])} (as {one['fastest']} is logged). The longest time between two lines of a channel is "
                 f"{duration(one['wait_s'])} ({one['slowest']}). Where no channel has a line for {duration(one['longest_s'])}, "
                 "the log counts as interrupted.",
-                "",
+                "Set the dead bands of the channels below their noise: a value that moves within its dead band looks constant, then late.",
             )
         if one["lost"]:
             yield Notice(
@@ -174,10 +178,10 @@ def record_notices(record: Record) -> Iterator[Notice]:
 def _sample_notices(record: Record) -> Iterator[Notice]:
     """Notices of samples that are missing or impossible, and of pauses."""
     if record.gaps:
-        named = [f"{name} ({number} blocks)" for name, number in record.gaps.items()]
+        named = [f"{name} ({counted(number, 'block')})" for name, number in record.gaps.items()]
         yield Notice(
             "record_gaps",
-            f"Blocks of {record.block_s:g} s without a value were interpolated: {listed(named)}.",
+            f"Blocks of {record.block_s:.4g} s without a value were interpolated: {listed(named)}.",
             "Look at the logger; effects that act within the gaps cannot be seen.",
         )
     if record.impossible:

@@ -47,7 +47,7 @@ def test_gaps_missing_displacements_sensors_and_drivers_are_noted():
     displacement = np.zeros((50, 2))
     displacement[3:6, 1] = np.nan
     told = notices_of(plain(gaps={"t1": 4, "speed": 1}, displacement=displacement))
-    assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 blocks)."
+    assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 block)."
     assert told["record_displacements_missing"].startswith("3 block means of 100 of the displacements missing")
     assert set(told) == {"record_gaps", "record_displacements_missing"}
     told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
