@@ -62,7 +62,8 @@ class CampaignCheck:
         if quiet:
             return [*doubts, *faults]
         title = [f"{self.path}: {self.title}"] if self.title else []
-        details = [f"  {line}" for line in (*self.content, *time_bars(self.recordings))]
+        zone = "no zone" if any(notice.code == "record_no_zone" for notice in self.notices) else "UTC"
+        details = [f"  {line}" for line in (*self.content, *time_bars(self.recordings, zone=zone))]
         notices = [f"note: {notice.message} {notice.remedy}".rstrip() for notice in self.notices]
         if faults:
             verdict = f"not ready: {counted(len(faults), 'fault')}"

@@ -28,6 +28,9 @@ from interferometry.io.tables import DateOrder, delimiter_of_values, fields_of, 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
 _NO_NUMBERS, _BY_VALUES, _NOT_KNOWN = "no numbers", "by its values", "not known"
+_COUNTS = "whole numbers: counts? then one count with its unit, as 0.0125 mm"
+#: Comment of Klipper's logs: millimetres of one step of the motor.
+_STEP = re.compile(r"#\s*step_dist\w*\s*=\s*([\d.]+)\s*$")
 #: Lines in which the values of a table have begun.
 _HEAD = 200
 #: Rows of values, one below the other, that are no accident.
@@ -217,6 +220,12 @@ def propose_table(path: Path) -> TableProposal:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
         columns = [*(Column(name, "time", keys.get("time_unit", ""), _first(frame[name])) for name in times), *columns]
+    steps = [match[1] for _, text, _ in head if (match := _STEP.match(text))]
+    if steps:
+        columns = [
+            replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist") if one.remark == _COUNTS else one
+            for one in columns
+        ]
     return TableProposal(path, keys | ({"missing": marks} if marks else {}), tuple(columns), len(frame), asked)
 
 
@@ -493,7 +502,7 @@ def _usual_unit(role: str, column: Column) -> tuple[str, str]:
     # Thermal displacements are micrometres to tenths of millimetres.
     unit = "um" if span >= 2.0 else "mm" if span >= 2e-3 else "m"
     whole = column.low.is_integer() and column.high.is_integer()
-    return unit, "whole numbers: counts? then one count with its unit, as 0.0125 mm" if whole else "unit by its values"
+    return unit, _COUNTS if whole else "unit by its values"
 
 
 def _is_unit_of(role: str, unit: str) -> bool:

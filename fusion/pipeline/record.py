@@ -60,7 +60,7 @@ def read_source(campaign: Campaign) -> RecordSource:
 def _zone_notices(table: xr.Dataset) -> Iterator[Notice]:
     """Notice of times of day that nobody has given a zone."""
     if lacks_zone(table) and table["time"].values[0] > DATED:
-        message = "The times of the record carry no zone: they are shown as they are in the file, as if they were UTC."
+        message = "The times of the record carry no zone: they are shown as logged; results.json and fusion.nc take them as UTC."
         yield Notice(
             "record_no_zone",
             message,

@@ -14,6 +14,7 @@ import xarray as xr
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_record
 from fusion.campaign.logs import TableError
+from fusion.pipeline.check import check_campaign
 from fusion.pipeline.columns import ColumnsError, propose_table
 from fusion.pipeline.draft import Asker, DraftError, write_campaign
 
@@ -184,6 +185,17 @@ def test_a_displacement_that_looks_like_a_temperature_is_asked_for(tmp_path: Pat
     with pytest.raises(DraftError, match="without a displacement"):
         (tmp_path / "folder" / "campaign.toml").unlink()
         write_campaign(tmp_path / "folder", Asker(None))
+
+
+@pytest.mark.parametrize(("zone", "label"), [("", "no zone  2026-03-09 22:30"), ("UTC", "UTC     2026-03-09 22:30")])
+def test_times_without_a_zone_are_said_to_have_none(tmp_path: Path, zone: str, label: str) -> None:
+    drafted(tmp_path / "folder", LAYOUTS["date and time"], "log.csv")
+    path = tmp_path / "folder" / "campaign.toml"
+    path.write_text(
+        path.read_text().replace("[campaign]", f'[campaign]\ntime_zone = "{zone}"' if zone else "[campaign]")
+    )
+    text = "\n".join(check_campaign(path).lines())
+    assert label in text and ("carry no zone" in text) == (not zone)
 
 
 def test_set_points_are_drivers_and_counters_none(tmp_path: Path) -> None:
