@@ -622,29 +622,6 @@ class InterferometryTable(_Measured):
         return self
 
 
-class DriversTable(Table):
-    """``[drivers]``: other logged quantities, and the law by which some of them were switched at random."""
-
-    file: ExistingFile
-    time_zone: TimeZone | None = None
-    clock_offset_s: Seconds = 0.0
-    randomised: tuple[str, ...] = ()
-    mean_dwell_s: PositiveSeconds | None = None
-    least_dwell_s: Seconds = 0.0
-
-    @model_validator(mode="after")
-    def _law_is_whole(self) -> DriversTable:
-        if bool(self.randomised) != (self.mean_dwell_s is not None):
-            raise ValueError(
-                "randomised and mean_dwell belong together: which columns were switched at random, and the mean time between"
-            )
-        if self.mean_dwell_s is not None and not 0.0 <= self.least_dwell_s < self.mean_dwell_s:
-            raise ValueError(
-                f"least_dwell {self.least_dwell_s:g} s must be shorter than mean_dwell {self.mean_dwell_s:g} s, and not negative"
-            )
-        return self
-
-
 class ColumnTable(Table):
     """A line of ``[record.columns]``: what a column holds, and its unit; ``"degC"`` alone states the unit, from which the role follows."""
 
@@ -693,7 +670,49 @@ class LongTable(Table):
     value: str
 
 
-class RecordTable(Table):
+class LoggedTable(Table):
+    """How a logged table is laid out, and role and unit of its columns, where the table does not say it itself."""
+
+    sheet: str | None = None
+    time: Headings | None = None
+    every_s: PositiveSeconds | None = None
+    time_format: str | None = None
+    time_unit: Literal["ms", "s", "min", "h"] | None = None
+    start: str | None = None
+    time_zone: TimeZone | None = None
+    header_rows: HeaderRows | None = None
+    missing: tuple[float | str, ...] = ()
+    columns: dict[str, StatedColumn] = {}
+
+
+class DriversTable(LoggedTable):
+    """``[drivers]``: other logged quantities, and the law by which some of them were switched at random."""
+
+    file: ExistingFile
+    clock_offset_s: Seconds = 0.0
+    randomised: tuple[str, ...] = ()
+    mean_dwell_s: PositiveSeconds | None = None
+    least_dwell_s: Seconds = 0.0
+
+    @property
+    def layout(self) -> LoggedTable | None:
+        """How its table is laid out, None where nothing is stated and its headings say everything."""
+        return self if self.model_fields_set & LoggedTable.model_fields.keys() - {"time_zone"} else None
+
+    @model_validator(mode="after")
+    def _law_is_whole(self) -> DriversTable:
+        if bool(self.randomised) != (self.mean_dwell_s is not None):
+            raise ValueError(
+                "randomised and mean_dwell belong together: which columns were switched at random, and the mean time between"
+            )
+        if self.mean_dwell_s is not None and not 0.0 <= self.least_dwell_s < self.mean_dwell_s:
+            raise ValueError(
+                f"least_dwell {self.least_dwell_s:g} s must be shorter than mean_dwell {self.mean_dwell_s:g} s, and not negative"
+            )
+        return self
+
+
+class RecordTable(LoggedTable):
     """``[record]``: temperature sensors and displacement channels over time, in one table per run (text or XLSX).
 
     Columns are named as in the file's heading; ``*`` matches any text. Roles are stated either by ``temperatures``, ``displacements`` and
@@ -703,20 +722,10 @@ class RecordTable(Table):
     file: ExistingFile | None = None
     files: RunPatterns = ()
     test: RunPatterns = ()
-    sheet: str | None = None
-    time: Headings | None = None
-    every_s: PositiveSeconds | None = None
     long: LongTable | None = None
-    time_format: str | None = None
-    time_unit: Literal["ms", "s", "min", "h"] | None = None
-    start: str | None = None
-    time_zone: TimeZone | None = None
-    header_rows: HeaderRows | None = None
-    missing: tuple[float | str, ...] = ()
     temperatures: tuple[str, ...] = ()
     displacements: tuple[str, ...] = ()
     drivers: tuple[str, ...] = ()
-    columns: dict[str, StatedColumn] = {}
 
     @model_validator(mode="after")
     def _times_are_stated_once(self) -> RecordTable:

@@ -40,11 +40,10 @@ from fusion.campaign.logs import (
     read_drivers,
     read_run,
     read_sensors,
-    split_heading,
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
-from fusion.campaign.values import matching_pipes
+from fusion.campaign.values import matching_pipes, name_and_unit
 from fusion.common import FusionError
 from fusion.messages import naming
 from fusion.results.progress import counted, left_out_notices, listed
@@ -289,12 +288,12 @@ def _read_drivers(campaign: Campaign) -> dict[str, Any]:
         return {}
     path = campaign.resolve(table.file)
     drivers = bring_to_utc(
-        read_drivers(path), campaign.zone_of("drivers"), file=table.file, late_s=table.clock_offset_s
+        read_drivers(path, table.layout), campaign.zone_of("drivers"), file=table.file, late_s=table.clock_offset_s
     )
     if table.mean_dwell_s is None:
         return {"drivers": drivers}
     law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
-    names = [split_heading(path, heading)[0] for heading in table.randomised]
+    names = [name_and_unit(heading)[0] for heading in table.randomised]
     return {"drivers": drivers, "duty": (read_duty(drivers, names, law, source=table.file), law)}
 
 
@@ -665,7 +664,7 @@ def _reason(item: Mapping[str, Any]) -> str:
 #: Time between runs that each count their seconds from zero, so that they can be laid one after the other: one day.
 _BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
 #: Times before this one count from a start that is not stated.
-_DATED = np.datetime64("1980-01-01", "ns")
+DATED = np.datetime64("1980-01-01", "ns")
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:
@@ -679,7 +678,7 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     ordered = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
     overlaps = _overlaps(ordered)
     # Times without a date that overlap: every run counts from its own zero, and nothing says when that was.
-    own_zero = bool(overlaps) and all(table["time"].values[-1] < _DATED for table in tables.values())
+    own_zero = bool(overlaps) and all(table["time"].values[-1] < DATED for table in tables.values())
     if own_zero:
         start = NO_START
         for path, table in tables.items():
@@ -698,10 +697,13 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     # A name that occurs twice is given with its folder.
     names = [path.name for path in tables]
     runs = [path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}" for path in tables]
-    left_out = [line for table in tables.values() for line in json.loads(table.attrs["left_out"])]
+    listed_of = {
+        name: json.dumps([one for table in tables.values() for one in json.loads(table.attrs[name])])
+        for name in ("left_out", "held")
+    }
     return joined.assign_attrs(
         source=", ".join(path.name for path in tables),
-        left_out=json.dumps(left_out),
+        **listed_of,
         runs=json.dumps(runs),
         test=json.dumps([number for number, path in enumerate(tables) if path in test]),
         own_zero=int(own_zero),

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,15 +18,17 @@ import xarray as xr
 from pandas.io.parsers import TextParser  # type: ignore[attr-defined]
 
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
-from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LongTable, RecordTable
+from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, LongTable, RecordTable
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.campaign.values import QuantityError, column_conversion, name_and_unit, role_of_unit, unit_name
 from fusion.common import Array, FusionError
 from interferometry.io.faults import Numerals, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
+    NO_ZONE,
     BadReading,
     DateOrder,
+    DelimitedTable,
     decode_text,
     delimiter_of,
     delimiter_of_values,
@@ -48,6 +51,8 @@ _TAKEN = (
 )  # fmt: skip
 #: Seconds beyond these are damaged numbers: LabVIEW counts from 1904, 4.5e9 s reach to 2046.
 _LONGEST_RECORD_S = 4.5e9
+#: A log in which no channel writes for so many of their usual intervals is interrupted: at random, 1 in 2**10.
+_LONGEST_SILENCE = 10.0
 _DECIMAL_COMMA = re.compile(r"\d,\d")
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
@@ -82,13 +87,15 @@ def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str
     return tuple(heading for heading in headings if heading in selected)
 
 
-def read_drivers(path: str | Path) -> xr.Dataset:
+def read_drivers(path: str | Path, layout: LoggedTable | None = None) -> xr.Dataset:
     """Read what was logged beside the instruments: loads, speeds, coolant.
 
     Parameters
     ----------
     path : str or Path
         Table with a column ``time`` and columns named ``"name [unit]"``.
+    layout : LoggedTable, optional
+        What a campaign file says of a table that is laid out in another way.
 
     Returns
     -------
@@ -110,7 +117,7 @@ def read_drivers(path: str | Path) -> xr.Dataset:
     >>> fused = align(deviations, fields, axis, drivers=read_drivers("drivers.csv"))  # doctest: +SKIP
     """
     path = Path(path)
-    table = read_table(path, ("time",))
+    table = read_table(path, ("time",)) if layout is None else _laid_out(path, layout)
     headings = {column: split_heading(path, column) for column in table.columns if column != "time"}
     if not headings:
         raise TableError(
@@ -136,6 +143,30 @@ def read_drivers(path: str | Path) -> xr.Dataset:
     )
 
 
+def _laid_out(path: Path, layout: LoggedTable) -> DelimitedTable:
+    """Return a table as a campaign file describes it, with the headings and times that it would have if it said everything itself."""
+    rows = read_rows(path, sheet=layout.sheet, header=layout.header_rows, missing=layout.missing)
+    named = layout.time or (() if layout.every_s is not None else ("time",))
+    time, reference, _ = _times(path, rows, layout, named)
+    zone = "" if reference == NO_ZONE else "Z"
+    written = [f"{stamp}{zone}" for stamp in np.datetime_as_string(time, unit="us")]
+    others = [str(name) for name in rows.frame.columns if name not in named]
+    used = match_columns(layout.columns, others) if layout.columns else others
+    stated = {
+        heading: column for pattern, column in layout.columns.items() for heading in match_columns([pattern], others)
+    }
+    headings = []
+    for heading in used:
+        name, in_heading = name_and_unit(heading)
+        unit = (stated[heading].unit if heading in stated else "") or rows.units.get(heading, "") or in_heading
+        headings.append(f"{name} [{unit_name(unit)}]" if unit else heading)
+    texts = rows.frame[list(used)].map(str).to_numpy().tolist()
+    lines = [
+        (int(line), [stamp, *fields]) for line, stamp, fields in zip(rows.frame.index, written, texts, strict=True)
+    ]
+    return DelimitedTable(path, ("time", *headings), lines, Numerals.of(text for fields in texts for text in fields))
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """A logged table as text and numbers, by lines of its file; its row of units by heading, and lines that do not fit."""
@@ -152,12 +183,29 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         raise TableError(f"{campaign.path}: there is no [record] in this campaign")
     rows = read_rows(path, sheet=record.sheet, header=record.header_rows, missing=record.missing)
     frame = rows.frame
-    time, reference, left_out = _times(path, rows, record)
-    left_out = [*rows.left_out, *left_out]
+    lost = pd.Series(False, frame.index)
     if record.long is not None:
-        frame, time, without_number = _by_channel(path, frame, time, record.long)
+        # camonitor prints "*** Disconnected" or "*** Not connected (PV not found)" in place of a value, or of the time as well.
+        written = frame[frame.columns.intersection([*record.long.time, record.long.value])].astype(str)
+        lost = written.apply(lambda column: column.str.startswith("***")).any(axis=1)
+        for heading in (record.long.channel, record.long.value):
+            _find(path, heading, frame)
+    time, reference, left_out = _times(path, rows, record, record.time or (record.long.time if record.long else ()))
+    left_out = [*rows.left_out, *(line for line in left_out if not lost.get(line.line, False))]
+    headings, held = [str(name) for name in frame.columns if name not in (record.time or ())], list[dict[str, Any]]()
+    if record.long is not None:
+        of_lines = frame[record.long.channel].astype(str).str.strip()
+        numbers = pd.Series(numbers_in(frame[record.long.value]), frame.index)
+        headings = sorted(of_lines[numbers.notna()].unique())
+    columns = columns_of(path, headings, rows.units, record)
+    if record.long is not None:
+        stamps = pd.Series(time, frame.index)
+        # A connection that is lost without a time was lost after the line before.
+        stamps = stamps.fillna(stamps.ffill().where(lost))
+        lines = pd.DataFrame({"time": stamps, "channel": of_lines, "value": numbers})
+        used = {role: list(of_role) for role, of_role in columns.items()}
+        frame, time, held, without_number = _by_channel(path, frame, lines, lost, used, record.long)
         left_out += without_number
-    columns = columns_of(path, [name for name in frame.columns if name not in (record.time or ())], rows.units, record)
     keep = ~np.isnat(time)
     order = np.argsort(time[keep], kind="stable")
 
@@ -186,7 +234,11 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             "driver_units": (("driver_name",), np.array(driver_units, dtype=object)),
         },
         coords={"time": time[keep][order], "sensor": sensors, "channel": channels, "driver_name": drivers},
-        attrs={"source": path.name, "left_out": json.dumps([asdict(line) for line in left_out])},
+        attrs={
+            "source": path.name,
+            "left_out": json.dumps([asdict(line) for line in left_out]),
+            "held": json.dumps(held),
+        },
     )
     table["time"].attrs["reference"] = reference
     return bring_to_utc(table, campaign.zone_of("record"), file=path.name)
@@ -323,32 +375,75 @@ def numbers_in(column: pd.Series) -> np.ndarray:
 
 
 def _by_channel(
-    path: Path, frame: pd.DataFrame, time: np.ndarray, long: LongTable
-) -> tuple[pd.DataFrame, np.ndarray, list[RejectedLine]]:
-    """Return a column for every channel, which keeps its value until its next line; their times, and the lines without a number."""
-    values = pd.Series(numbers_in(frame[long.value]), frame.index)
-    channels = frame[long.channel].astype(str).str.strip()
+    path: Path,
+    frame: pd.DataFrame,
+    lines: pd.DataFrame,
+    lost: pd.Series,
+    used: Mapping[str, list[str]],
+    long: LongTable,
+) -> tuple[pd.DataFrame, np.ndarray, list[dict[str, Any]], list[RejectedLine]]:
+    """Return a column for every channel that is used, its times, how values were held between lines, and lines without a number."""
     # camonitor prints the value of a channel without a reading as 0, with the severity of its alarm behind it.
     invalid = frame.drop(columns=[long.value, long.channel, *long.time]).isin(["INVALID"]).any(axis=1)
-    bad = (values.isna() | invalid) & channels.isin(channels[values.notna()].unique())
+    lines["value"] = lines["value"].mask(invalid | lost)
+    not_connected = [f"{name} (line {line})" for line, name in lines["channel"][lost].items()]
+    lines = lines[lines["channel"].isin([name for names in used.values() for name in names]) & lines["time"].notna()]
+    bad = lines.index[lines["value"].isna() & ~lost[lines.index]]
     left_out = [
         RejectedLine(
             path.name, int(line), str(frame.at[line, long.value]), "is INVALID" if invalid[line] else "is not a number"
         )
-        for line in frame.index[bad]
+        for line in bad
     ]
-    changes = pd.DataFrame({"time": time, "channel": channels, "value": values.mask(invalid)}).dropna()
-    wide = changes.groupby(["time", "channel"])["value"].last().unstack().ffill()
-    return wide, wide.index.to_numpy("M8[ns]"), left_out
+    described: dict[str, Any] = {"file": path.name, "lost": not_connected}
+    # A value goes before an alarm of the same time.
+    each = {str(name): of_one.groupby("time")["value"].last() for name, of_one in lines.groupby("channel")}
+    wide = pd.DataFrame(each)
+    first = wide.index.to_numpy("M8[ns]")[0]
+    seconds = {
+        name: (values.index.to_numpy("M8[ns]") - first) / np.timedelta64(1, "s") for name, values in each.items()
+    }
+    felt = [name for name in (*used["displacement"], *used["temperature"]) if seconds[name].size > 1]
+    usual = {name: _usual_step_s(seconds[name]) for name in felt}
+    # Between two lines of the displacement that is logged most often nothing is measured that could be explained.
+    fastest = min((name for name in used["displacement"] if name in usual), key=usual.__getitem__, default="")
+    if wide.notna().all(axis=None) or not fastest:
+        return wide, wide.index.to_numpy("M8[ns]"), [described] if not_connected else [], left_out
+    at_all = np.unique(np.concatenate(list(seconds.values())))
+    start, end = seconds[fastest][0], at_all[-1]
+    # Bursts and long pauses: no more rows than lines.
+    step_s = max(usual[fastest], (end - start) / len(lines))
+    grid = start + step_s * np.arange(round((end - start) / step_s) + 1)
+    # A line belongs to the row that is nearest to it.
+    before = {name: np.searchsorted(at, grid + step_s / 2) - 1 for name, at in seconds.items()}
+    held = {name: np.where(row >= 0, each[name].to_numpy()[row], np.nan) for name, row in before.items()}
+    longest_s = _LONGEST_SILENCE * float(np.median(list(usual.values())))
+    kept = grid - at_all[np.searchsorted(at_all, grid + step_s / 2) - 1] <= longest_s
+    waits = {name: float(np.diff(at).max(initial=0.0)) for name, at in seconds.items()}
+    slowest = max(waits, key=waits.__getitem__)
+    described |= {"step_s": step_s, "longest_s": longest_s, "fastest": fastest, "slowest": slowest, "wait_s": waits[slowest]}  # fmt: skip
+    return pd.DataFrame(held)[kept], (first + np.round(grid * 1e9).astype("m8[ns]"))[kept], [described], left_out
 
 
-def _times(path: Path, rows: Rows, record: RecordTable) -> tuple[np.ndarray, str, list[RejectedLine]]:
+def _usual_step_s(seconds: Array) -> float:
+    """Return the time between two lines of a channel, s: the mean, where pauses count for as many as fit by the median."""
+    between = np.diff(seconds)
+    return float(between.sum() / max(1.0, np.rint(between / np.median(between)).sum()))
+
+
+def _find(path: Path, heading: str, frame: pd.DataFrame) -> None:
+    """Refuse a table without a column that the campaign file names."""
+    if heading not in frame.columns:
+        raise TableError(f'{path}: no column is named "{heading}"; the file has: {", ".join(frame.columns)}')
+
+
+def _times(
+    path: Path, rows: Rows, record: LoggedTable, headings: Sequence[str]
+) -> tuple[np.ndarray, str, list[RejectedLine]]:
     """Return times, NaT where a row has none, how they came to UTC in words, and the list of the rows without a time."""
     frame = rows.frame
-    headings = record.time or (record.long.time if record.long else ())
-    for heading in (*headings, *((record.long.channel, record.long.value) if record.long else ())):
-        if heading not in frame.columns:
-            raise TableError(f'{path}: no column is named "{heading}"; the file has: {", ".join(frame.columns)}')
+    for heading in headings:
+        _find(path, heading, frame)
     if record.every_s is not None:
         return _after_start(np.arange(len(frame)) * record.every_s, record, path)
     column = frame[headings[0]] if len(headings) == 1 else frame[list(headings)].astype(str).agg(" ".join, axis=1)
@@ -359,7 +454,7 @@ def _times(path: Path, rows: Rows, record: RecordTable) -> tuple[np.ndarray, str
         if not unit:
             raise TableError(
                 f'{path}: the times in the column "{headings[0]}" are numbers without a unit; write time_unit = "s" (or "ms", "min", "h") '
-                "under [record]"
+                "in the campaign file, where it names this one"
             )
         elapsed = in_unit(seconds, unit, "s", column=headings[0], path=path)
         time, words, _ = _after_start(elapsed, record, path)
@@ -385,27 +480,27 @@ def _times(path: Path, rows: Rows, record: RecordTable) -> tuple[np.ndarray, str
     return time, words, left_out
 
 
-def _after_start(elapsed: np.ndarray, record: RecordTable, path: Path) -> tuple[np.ndarray, str, list[RejectedLine]]:
+def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[np.ndarray, str, list[RejectedLine]]:
     """Return the times that lie `elapsed` seconds after the start of a record, NaT where that is no number of a time."""
     start, zone = NO_START, "+0000"
     if record.start is not None:
         try:
             start, zone = parse_time(record.start)  # type: ignore[assignment]
         except BadReading as fault:
-            raise TableError(f'record.start = "{record.start}": {fault.reason}, needed for {path}') from None
+            raise TableError(f'start = "{record.start}": {fault.reason}, needed for {path}') from None
     known = np.abs(elapsed) < _LONGEST_RECORD_S
     time = start + np.where(known, np.round(np.where(known, elapsed, 0.0) * 1e9), 0).astype("m8[ns]")
     time[~known] = np.datetime64("NaT")
     return time, describe_time_zone(path, {zone: 0}), []
 
 
-def _formatted_times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, str]:
+def _formatted_times(path: Path, column: pd.Series, record: LoggedTable) -> tuple[np.ndarray, str]:
     """Return the times of ``time_format``, NaT where a row has none, and their zone; times of day count from midnight of the first day."""
     form = str(record.time_format)
     try:
         times = pd.to_datetime(column.astype(str).str.strip(), format=form, errors="coerce", utc="%z" in form)
     except ValueError as error:
-        raise TableError(f'{path}: record.time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
+        raise TableError(f'{path}: time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
     if not set(re.findall(r"%-?([a-zA-Z])", form)) & set("dDjcxs"):
         days = (times.diff() < pd.Timedelta(-12, "h")).cumsum()
         elapsed = ((times - times.dt.normalize()) + pd.to_timedelta(days, unit="D")).dt.total_seconds()

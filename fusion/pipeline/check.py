@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,8 @@ class CampaignCheck:
         if quiet:
             return [*doubts, *faults]
         title = [f"{self.path}: {self.title}"] if self.title else []
-        details = [f"  {line}" for line in (*self.content, *time_bars(self.recordings))]
+        zone = "no zone" if any(notice.code == "record_no_zone" for notice in self.notices) else "UTC"
+        details = [f"  {line}" for line in (*self.content, *time_bars(self.recordings, zone=zone))]
         notices = [f"note: {notice.message} {notice.remedy}".rstrip() for notice in self.notices]
         if faults:
             verdict = f"not ready: {counted(len(faults), 'fault')}"
@@ -190,7 +192,7 @@ def _faults_of_files(campaign: Campaign) -> Iterator[str]:
     readers: tuple[tuple[Callable[[Path], object], object, str], ...] = (
         (read_deviations, campaign.interferometry, "deviations"),
         (read_environment, campaign.interferometry, "environment"),
-        (read_drivers, campaign.drivers, "file"),
+        (partial(read_drivers, layout=campaign.drivers and campaign.drivers.layout), campaign.drivers, "file"),
         (read_fiducials, campaign.plan, "fiducials"),
         (read_lens, campaign.thermography, "lens"),
     )

@@ -28,12 +28,16 @@ from interferometry.io.tables import DateOrder, delimiter_of_values, fields_of, 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
 _NO_NUMBERS, _BY_VALUES, _NOT_KNOWN = "no numbers", "by its values", "not known"
+_COUNTS = "whole numbers: counts? then one count with its unit, as 0.0125 mm"
+#: Comment of Klipper's logs: millimetres of one step of the motor.
+_STEP = re.compile(r"#\s*step_dist\w*\s*=\s*([\d.]+)\s*$")
 #: Lines in which the values of a table have begun.
 _HEAD = 200
 #: Rows of values, one below the other, that are no accident.
 _ROWS_OF_VALUES = 3
 _MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?\s+\S")
 _TIME_UNITS = ("ms", "s", "min", "h")
+_PER = re.compile(r"/\s*(ms|s|min|h)$")
 _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|datetime|last_changed$|时间|時間)", re.I)
 _VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
@@ -45,18 +49,19 @@ _FAR = 50.0
 #: Times that neither ISO 8601 nor the guess of pandas covers.
 _FORMATS = (
     "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
-    "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M",
+    "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M", "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y %I:%M %p",
 )  # fmt: skip
 #: Day and month of a date whose year comes last; with dots between them the day stands first.
 _SWAPPED = re.compile(r"^%([md])([-/])%([md])")
-_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?(\.\d+)?")
+_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2})?([.,]\d+)?\s*([ap]\.?m\.?)?", re.I)
 #: Second of 1904-01-01 plus this many is in the years in which LabVIEW has written times, in seconds since 1970 in ours.
 _LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
 #: Shortest thermal test, by which a number without unit is told to be seconds or minutes.
 _SHORTEST_S = 1800.0
 #: Words of headings, the plain ones before those of one or two letters.
 _WORDS = (
-    ("out", "target setpoint soll cmd value comment humidity rh feuchte pressure druck rain wind level batt battery"),
+    ("setpoint", "target setpoint setpt soll cmd"),
+    ("out", "comment humidity rh feuchte pressure druck rain wind level batt battery"),
     ("temperature", "temp temps temperature temperatures temperatur temperatura température tmp thermo thermocouple rtd ntc pt100 温度"),
     ("driver", "rpm speed drehzahl load last power leistung current strom voltage volt volts torque feed duty flow valve pump fan coolant "
      "转速"),
@@ -67,6 +72,10 @@ _WORDS = (
 )  # fmt: skip
 #: Words of a column that counts, where no other word stands beside them.
 _COUNTING = "index sample record recno rn no nr n id row scan count counter nummer number unnamed"
+#: Most columns of a table with a line for every change: date, time, channel, value, unit, quality.
+_WIDEST_LONG = 6
+#: Columns of a table of changes that say how a value was read.
+_STATE = re.compile(r"quality|alarm|status|severity|state|flag|güte", re.I)
 #: Units at the end of a heading, after a space or an underscore.
 _SUFFIXES = {"um": "um", "µm": "um", "mm": "mm", "nm": "nm", "degc": "degC", "°c": "degC", "c": "degC", "degf": "degF"}
 _UNIT_OF_WORD = {"rpm": "1/min", "drehzahl": "1/min", "转速": "1/min", "power": "W", "current": "A", "voltage": "V"}
@@ -109,10 +118,14 @@ class TableProposal:
         return tuple(column for column in self.columns if column.role == role)
 
     @property
+    def lacking(self) -> list[str]:
+        """Roles that a record needs and no column of this table has."""
+        return [role for role in ("temperature", "displacement") if not self.of(role)]
+
+    @property
     def lacks(self) -> str:
         """What a record needs and this table does not have, in words; empty where it has all."""
-        lacking = [role for role in ("temperature", "displacement") if not self.of(role)]
-        if not lacking:
+        if not (lacking := self.lacking):
             return ""
         known = listed(f"{column.heading} ({column.role})" for column in self.columns if column.role != "out")
         return (
@@ -123,8 +136,10 @@ class TableProposal:
     @property
     def may_be_record(self) -> bool:
         """Whether temperatures and displacements are found, or something that may be the displacement."""
-        unknown = any(column.remark == _NOT_KNOWN for column in self.columns)
-        return not self.lacks or (unknown and bool(self.of("temperature")))
+        remarks, temperatures = [column.remark for column in self.columns], self.of("temperature")
+        # One of two temperatures that only their values tell may be the displacement.
+        guessed = _NOT_KNOWN in remarks or (_BY_VALUES in remarks and len(temperatures) > 1)
+        return not self.lacks or (guessed and bool(temperatures))
 
     def lines(self) -> Iterator[str]:
         """Yield the columns as a table of text: number, heading, first values, role and unit."""
@@ -153,10 +168,8 @@ class TableProposal:
             for number in numbers:
                 before = columns[number - 1]
                 usual, remark = _usual_unit(role, before)
-                unit = match[4] or before.unit or usual
-                columns[number - 1] = replace(
-                    before, role=role, unit=unit, remark="" if match[4] or before.unit else remark
-                )
+                unit = match[4] or (before.unit if _is_unit_of(role, before.unit) else "")
+                columns[number - 1] = replace(before, role=role, unit=unit or usual, remark="" if unit else remark)
         times = [column for column in columns if column.role == "time"]
         if times == list(self.of("time")):
             return replace(self, columns=tuple(columns))
@@ -167,10 +180,12 @@ class TableProposal:
         }
         if not times:
             return replace(self, columns=tuple(columns), keys=kept, asked={"every": ""})
-        unit = {"time_unit": times[0].unit} if times[0].unit else {}
-        return replace(
-            self, columns=tuple(columns), keys=kept | {"time": [one.heading for one in times]} | unit, asked={}
-        )
+        keys, asked = kept | {"time": [one.heading for one in times]}, dict[str, str]()
+        if times[0].unit:
+            keys["time_unit"] = times[0].unit
+        elif times[0].span:
+            _place_times(np.array([times[0].low, times[0].high]), keys, asked)
+        return replace(self, columns=tuple(columns), keys=keys, asked=asked)
 
 
 def propose_runs(paths: Sequence[Path]) -> TableProposal:
@@ -192,11 +207,12 @@ def propose_table(path: Path) -> TableProposal:
     frame, asked = rows.frame, dict[str, str]()
     if frame.empty:
         raise LaserFormatError(f"{path}: no rows below the header")
-    keys |= {} if "long" in keys else _long(frame)
+    units = dict[str, str]()
+    keys |= {} if "long" in keys else _long(rows, asked, units)
     if "long" in keys:
-        channels = frame.groupby(frame[keys["long"]["channel"]].astype(str))
+        channels = frame.groupby(frame[keys["long"]["channel"]].astype(str).str.strip())
         groups = {str(name): values[keys["long"]["value"]] for name, values in channels}
-        columns, marks = _columns(groups, {})
+        columns, marks = _columns(groups, units)
         if all(column.remark == _BY_VALUES for column in columns if column.role == "temperature"):
             # Channels have names: what none of them calls a temperature is a position, a count, a state.
             columns = [replace(one, role="out") if one.remark == _BY_VALUES else one for one in columns]
@@ -204,6 +220,12 @@ def propose_table(path: Path) -> TableProposal:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
         columns = [*(Column(name, "time", keys.get("time_unit", ""), _first(frame[name])) for name in times), *columns]
+    steps = [match[1] for _, text, _ in head if (match := _STEP.match(text))]
+    if steps:
+        columns = [
+            replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist") if one.remark == _COUNTS else one
+            for one in columns
+        ]
     return TableProposal(path, keys | ({"missing": marks} if marks else {}), tuple(columns), len(frame), asked)
 
 
@@ -308,19 +330,26 @@ def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
     return len(widths) == 1 and all(count >= max(1, len(row) / 2) for count, row in zip(numeric, texts, strict=True))
 
 
-def _long(frame: pd.DataFrame) -> dict[str, Any]:
-    """Return the columns of a table with a line for every change: a time, a name that recurs, a number."""
-    if len(frame.columns) != 3:
+def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
+    """Return the layout of a table with a line for every change: a time, a name that recurs, a number; add the units of its channels."""
+    frame, keys, open_ = rows.frame, dict[str, Any](), dict[str, str]()
+    written = {name: frame[name].astype(str).str.strip() for name in frame if not pd.api.types.is_numeric_dtype(frame[name])}  # fmt: skip
+    if not 3 <= len(frame.columns) <= _WIDEST_LONG or not written:
         return {}
-    time, channel, value = "", "", ""
-    for name, column in frame.items():
-        if pd.api.types.is_numeric_dtype(column):
-            value = str(name)
-        elif _clock(column.astype(str)) is not None:
-            time = str(name)
-        elif column.nunique() < len(column) / 3:
-            channel = str(name)
-    return {"long": {"time": time, "channel": channel, "value": value}} if time and channel and value else {}
+    times = _times(rows, keys, open_)
+    written = {name: texts for name, texts in written.items() if name not in times}
+    numbers = {name for name in written if np.isfinite(numbers_in(frame[name])).mean() > 0.5}
+    of_units = [name for name in written if all(map(is_unit, written[name].unique()))]
+    names = {name: texts.nunique() for name, texts in written.items() if name not in (*numbers, *of_units)}
+    channel = max(names, key=names.__getitem__, default="")
+    values = [name for name in frame if name not in (*times, *names, *of_units) and frame[name].nunique() > 1]
+    values = [name for name in values if not _STATE.search(str(name))] or values
+    if not times or len(values) != 1 or not 1 < names.get(channel, 0) < len(frame) / 3:
+        return {}
+    asked |= open_
+    if of_units:
+        units |= dict(zip(written[channel], written[of_units[0]], strict=True))
+    return {"long": {"time": keys.pop("time"), "channel": channel, "value": str(values[0])}, **keys}
 
 
 # Which column holds the times, and how they are written.
@@ -331,23 +360,21 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
     frame = rows.frame
     texts = [name for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name])]
     named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
+    days = [name for name in named if name in texts and _OF_DAY.fullmatch(str(frame[name].iloc[0]).strip())]
+    named = [*(name for name in named if name not in days), *days]
     # A first column without a name that grows, and does not count rows, is the time.
     for name in [*named, *texts, *(["1"] if frame.columns[0] == "1" and not _counts(frame["1"]) else [])]:
         if name not in texts:
             if not _grows(frame[name]):
                 continue
             keys["time"] = name
-            if {unit_name(rows.units.get(name, "")), column_unit(name)}.isdisjoint(_TIME_UNITS):
-                keys["time_unit"], start = _unit_of_times(frame[name].dropna().to_numpy(float))
-                keys |= {"start": start} if start else {}
-                asked |= (
-                    {} if start else {"time_unit": f"{_plain(frame[name].iloc[0])} to {_plain(frame[name].iloc[-1])}"}
-                )
+            per = _PER.search(name)
+            if per:
+                keys["time_unit"] = per[1]
+            elif {unit_name(rows.units.get(name, "")), column_unit(name)}.isdisjoint(_TIME_UNITS):
+                _place_times(frame[name].dropna().to_numpy(float), keys, asked)
             return (name,)
-        of_day = [
-            two for two in named if two in texts and two != name and _OF_DAY.fullmatch(str(frame[two].iloc[0]).strip())
-        ]
-        for columns in ([name, *of_day[:1]], [name]):
+        for columns in ([name, *[two for two in days if two != name][:1]], [name]):
             form = _clock(frame[columns].astype(str).agg(" ".join, axis=1))
             if form is not None:
                 asked |= {"time_format": form.pop("or")} if "or" in form else {}
@@ -371,15 +398,17 @@ def _counts(column: pd.Series) -> bool:
     return not pd.api.types.is_numeric_dtype(column) or bool((np.diff(column.dropna().to_numpy(float)) == 1.0).all())
 
 
-def _unit_of_times(numbers: np.ndarray) -> tuple[str, str]:
-    """Return the unit of times that are numbers without one, and where they count from, empty where nothing tells."""
+def _place_times(numbers: np.ndarray, keys: dict[str, Any], asked: dict[str, str]) -> None:
+    """Write the unit of times that are numbers without one into `keys`, and where they count from; into `asked` where nothing tells."""
     for unit, (low, high), start in (
         ("s", _LABVIEW_S, "1904-01-01T00:00:00Z"), ("s", _UNIX_S, "1970-01-01T00:00:00Z"), ("ms", _UNIX_MS, "1970-01-01T00:00:00Z"),
     ):  # fmt: skip
         if low < numbers[0] < high:
-            return unit, start
+            keys |= {"time_unit": unit, "start": start}
+            return
     length = float(numbers[-1] - numbers[0])
-    return next((unit for unit, s in (("s", 1.0), ("min", 60.0)) if length * s >= _SHORTEST_S), "h"), ""
+    keys["time_unit"] = next((unit for unit, s in (("s", 1.0), ("min", 60.0)) if length * s >= _SHORTEST_S), "h")
+    asked["time_unit"] = f"{_plain(float(numbers[0]))} to {_plain(float(numbers[-1]))}"
 
 
 def _clock(column: pd.Series) -> dict[str, str] | None:
@@ -423,11 +452,16 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     low, high = float(numbers.min()), float(numbers.max())
     known = Column(heading, "out", unit, first, low, high)
     word, role = _word(name)
+    if role == "setpoint":
+        # What is commanded acts as a load does; a commanded position does not.
+        place = "displacement" in (role_of_unit(unit) if unit else "", _word(name.casefold().replace(word, ""))[1])
+        if place or low == high:
+            return replace(known, remark="set point" if place else "constant")
+        return replace(known, role="driver", unit=unit or "1", remark="set point")
     if unit:
         of_unit = role_of_unit(unit)
-        setpoint = word in ("target", "setpoint", "soll", "cmd")
-        taken = setpoint or (role in ("out", "driver") and of_unit not in ("temperature", "driver"))
-        return replace(known, role=role if taken else of_unit)
+        taken = role == "out" or (role == "driver" and of_unit == "displacement")
+        return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
     if role == "out":
         return known
     if low == high:
@@ -464,11 +498,18 @@ def _usual_unit(role: str, column: Column) -> tuple[str, str]:
         # Kelvins of a machine are above what its degrees Celsius reach.
         return ("K" if column.low > 250.0 and column.high < 450.0 else "degC"), ""
     if role != "displacement":
-        return ("" if role == "out" else "1"), ""
+        return ("1" if role == "driver" else ""), ""
     # Thermal displacements are micrometres to tenths of millimetres.
     unit = "um" if span >= 2.0 else "mm" if span >= 2e-3 else "m"
     whole = column.low.is_integer() and column.high.is_integer()
-    return unit, "whole numbers: counts? then one count with its unit, as 0.0125 mm" if whole else "unit by its values"
+    return unit, _COUNTS if whole else "unit by its values"
+
+
+def _is_unit_of(role: str, unit: str) -> bool:
+    """Whether a column of a role may be in a unit."""
+    if role == "time":
+        return unit in _TIME_UNITS
+    return role in ("driver", "out") or role_of_unit(unit) == role
 
 
 def _is_mark(mark: float, numbers: np.ndarray) -> bool:

@@ -431,11 +431,16 @@ def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker)
 
 def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
     """Return a table as somebody wants its columns to be taken: as proposed, or corrected, with what its file does not tell."""
+    if asker.ask is None and table.lacks:
+        raise DraftError(f"{table.path}: {table.lacks}")
     while asker.ask is not None:
         asker.say(f"{name}, {counted(table.rows, 'row')}:")
         for line in (*table.lines(), *filter(None, [table.lacks])):
             asker.say(line)
-        answer = asker.text('Columns as shown; or corrections, such as "3-5 = temperature degC; 7 = out"', "").strip()
+        number, lacking = len(table.columns), next(iter(table.lacking), "")
+        example = f"{number} = {lacking}" if lacking else "3-5 = temperature degC; 7 = out"
+        question = f"Column of the {lacking}, such as" if lacking else "Columns as shown; or corrections, such as"
+        answer = asker.text(f'{question} "{example}"', "").strip()
         try:
             table = table.corrected(answer)
         except ColumnsError as error:
@@ -446,7 +451,9 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
     keys = dict(table.keys)
     for key, shown in table.asked.items():
         if key == "time_format":
-            keys[key] = asker.choice(f"Times such as {table.of('time')[0].first[0]} are written", (keys[key], shown))
+            written = " ".join(column.first[0] for column in table.of("time"))
+            question = f"Times such as {written} are written, %d the day and %m the month"
+            keys[key] = asker.choice(question, (keys[key], shown))
         elif key == "time_unit":
             units = (keys[key], *(unit for unit in ("s", "min", "h") if unit != keys[key]))
             keys[key] = asker.choice(f"Unit of the times in {table.of('time')[0].heading}, {shown}", units)

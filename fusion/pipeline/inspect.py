@@ -628,14 +628,14 @@ class Recording:
         return list(zip(times[starts], times[ends], strict=True))
 
 
-def time_bars(recordings: Sequence[Recording], *, width: int = 60) -> list[str]:
-    """Return a bar per recording, filled where it has samples, above one time axis."""
+def time_bars(recordings: Sequence[Recording], *, width: int = 60, zone: str = "UTC") -> list[str]:
+    """Return a bar per recording, filled where it has samples, above one time axis in a zone."""
     stretches = {recording.name: recording.stretches() for recording in recordings}
     ends = [end for parts in stretches.values() for part in parts for end in part]
     if not ends:
         return []
     first, last = min(ends), max(ends)
-    label = max(len(name) for name in (*stretches, "UTC"))
+    label = max(len(name) for name in (*stretches, zone))
     lines = []
     for name, parts in stretches.items():
         gaps = f"  {counted(len(parts) - 1, 'gap')}" if len(parts) > 1 else ""
@@ -645,7 +645,7 @@ def time_bars(recordings: Sequence[Recording], *, width: int = 60) -> list[str]:
         return [*lines, f"{'':<{label}}  {'start':<{width - len(length)}}{length}"]
     left, right = (np.datetime_as_string(time, unit="m").replace("T", " ") for time in (first, last))
     middle = f"{length:^{max(width - len(left) - len(right), 0)}}"
-    return [*lines, f"{'UTC':<{label}}  {left}{middle}{right}"]
+    return [*lines, f"{zone:<{label}}  {left}{middle}{right}"]
 
 
 def _bar(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,8 @@ from fusion.analysis.drift_model.record import (
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import Campaign
-from fusion.campaign.inputs import pipe_notices, read_record
+from fusion.campaign.inputs import DATED, pipe_notices, read_record
+from fusion.campaign.time_zones import lacks_zone
 from fusion.report.numbers import duration, number
 from fusion.results.progress import Report, counted, left_out_notices, listed
 from fusion.results.results import Notice, Outcome
@@ -44,10 +46,47 @@ def read_source(campaign: Campaign) -> RecordSource:
     health = examine_record(table, declared)
     record = reduce_record(health.table)
     declare(declared, record)
-    left_out = [*pipe_notices(campaign), *left_out_notices(table, "record_rows_left_out"), *_unread_notices(table)]
+    left_out = [
+        *pipe_notices(campaign),
+        *_zone_notices(table),
+        *_held_notices(table),
+        *left_out_notices(table, "record_rows_left_out"),
+        *_unread_notices(table),
+    ]
     return RecordSource(
         record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
     )
+
+
+def _zone_notices(table: xr.Dataset) -> Iterator[Notice]:
+    """Notice of times of day that nobody has given a zone."""
+    if lacks_zone(table) and table["time"].values[0] > DATED:
+        message = "The times of the record carry no zone: they are shown as logged; results.json and fusion.nc take them as UTC."
+        yield Notice(
+            "record_no_zone",
+            message,
+            'Write the zone of the logged times under [campaign], such as time_zone = "Europe/Vienna".',
+        )
+
+
+def _held_notices(table: xr.Dataset) -> Iterator[Notice]:
+    """Notices of logs with a line per change: how values were held between lines, and channels that were not connected."""
+    for one in json.loads(table.attrs.get("held", "[]")):
+        if "step_s" in one:
+            yield Notice(
+                "record_values_held",
+                f"{one['file']} has a line for every change: a channel keeps its value until its next line, on rows every "
+                f"{duration(one['step_s'])} (as {one['fastest']} is logged). The longest time between two lines of a channel is "
+                f"{duration(one['wait_s'])} ({one['slowest']}). Where no channel has a line for {duration(one['longest_s'])}, "
+                "the log counts as interrupted.",
+                "Set the dead bands of the channels below their noise: a value that moves within its dead band looks constant, then late.",
+            )
+        if one["lost"]:
+            yield Notice(
+                "record_channels_lost",
+                f"Not connected in {one['file']}: {listed(one['lost'])}; no value from there to the next line of the channel.",
+                "Look at the connection of these channels; one that was never connected gives nothing to the record.",
+            )
 
 
 def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
@@ -153,18 +192,18 @@ def record_notices(record: Record) -> Iterator[Notice]:
     if not record.drivers:
         yield Notice(
             "no_drivers",
-            "No driver was logged, so a heat source that no sensor sees cannot be distinguished from a drift.",
-            "Log spindle speed, load or duty in the same table, and name the column under record.drivers.",
+            "The record has no driver that changes, so a heat source that no sensor sees cannot be distinguished from a drift.",
+            "Log spindle speed, load or duty in the same table, and give its column the role driver under [record.columns].",
         )
 
 
 def _sample_notices(record: Record) -> Iterator[Notice]:
     """Notices of samples that are missing or impossible, and of pauses."""
     if record.gaps:
-        named = [f"{name} ({number} blocks)" for name, number in record.gaps.items()]
+        named = [f"{name} ({counted(number, 'block')})" for name, number in record.gaps.items()]
         yield Notice(
             "record_gaps",
-            f"Blocks of {record.block_s:g} s without a value were interpolated: {listed(named)}.",
+            f"Blocks of {record.block_s:.4g} s without a value were interpolated: {listed(named)}.",
             "Look at the logger; effects that act within the gaps cannot be seen.",
         )
     if record.impossible:

@@ -102,13 +102,15 @@ def duration(seconds: float | None) -> str:
 
 
 def moment(time: np.datetime64 | str, zone: str | None = None, *, seconds: bool = False) -> str:
-    """Return a UTC time to the minute or second with its zone, local to a zone of the IANA data base where one is named; NaT is a dash."""
+    """Return a UTC time to the minute or second with its zone, local to a zone of the IANA data base where one is named, without one where
+    it is "", not stated; NaT is a dash.
+    """
     stamp = np.datetime64(time.removesuffix("Z")) if isinstance(time, str) else time
     if np.isnat(stamp):
         return "–"
     at = datetime.fromisoformat(np.datetime_as_string(stamp, unit="s")).replace(tzinfo=UTC)
-    local = at if zone is None else at.astimezone(ZoneInfo(zone))
-    return f"{local:{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}} {local.tzname()}"
+    local = at if not zone else at.astimezone(ZoneInfo(zone))
+    return f"{local:{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}} {'(no zone)' if zone == '' else local.tzname()}"
 
 
 def place(x: float | None, y: float | None, unit: str = "mm") -> str:

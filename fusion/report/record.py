@@ -60,11 +60,12 @@ def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
     # The times of a record whose campaign file does not state the beginning count from zero.
     start = first if first >= np.datetime64("1971-01-01") else None
     channels, drivers = (join([str(name) for name in record[dim].values]) for dim in ("channel", "driver_name"))
-    begun = "start not stated" if start is None else moment(start)
+    zone = "" if any(notice.code == "record_no_zone" for notice in results.warnings) else None
+    begun = "start not stated" if start is None else moment(start, zone)
     return {
         "axis": "",
         "first": start,
-        "zone": None,
+        "zone": zone,
         "figures": (),
         "verdict": loop.verdict,
         "headline": headline(results),

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
-from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.config import CampaignError, DriversTable, load_campaign
 from fusion.campaign.inputs import pipe_notices, read_record
 from fusion.campaign.logs import ContactSensors, TableError, read_drivers, read_sensors, split_heading
 from fusion.common import FusionError
@@ -71,6 +72,25 @@ def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
     path.write_text("time,t [degC],t [K]\n2026-03-09T06:31:00+00:00,1,2\n")
     with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
         read_drivers(path)
+
+
+def test_drivers_of_another_layout_are_those_of_headings_that_say_everything(tmp_path: Path) -> None:
+    """A logger's table: a line about the station, a row of units, a mark for no reading, local times with day and month swapped."""
+    (tmp_path / "plain.csv").write_text(
+        "time,Speed [rpm],Load [%]\n2026-03-09T06:30:00,900,10\n2026-03-09T06:31:00,1000,20\n"
+    )
+    (tmp_path / "logger.csv").write_text(
+        "Station 7\nStamp;RECORD;Speed;Load\n;RN;rpm;%\n09/03/2026 06:30;1;900;10\n09/03/2026 06:31;2;1000;20\n09/03/2026 06:32;3;-999;20\n"
+    )
+    layout = DriversTable.model_validate(
+        {"file": "logger.csv", "header_rows": {"names": 2, "units": 3, "values": 4}, "time": "Stamp", "missing": [-999],
+         "time_format": "%d/%m/%Y %H:%M", "columns": {"Speed": "rpm", "Lo*": {"role": "driver"}}}
+    ).layout  # fmt: skip
+    plain, logged = read_drivers(tmp_path / "plain.csv"), read_drivers(tmp_path / "logger.csv", layout)
+    xr.testing.assert_equal(plain, logged)
+    assert plain["time"].attrs == logged["time"].attrs and logged["Speed"].attrs["units"] == "rpm"
+    assert [one["line"] for one in json.loads(logged.attrs["left_out"])] == [6]
+    assert DriversTable(file="drivers.csv", time_zone="Europe/Vienna").layout is None
 
 
 def test_a_record_is_converted_to_the_units_of_the_calculation(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import xarray as xr
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_record
 from fusion.campaign.logs import TableError
+from fusion.pipeline.check import check_campaign
 from fusion.pipeline.columns import ColumnsError, propose_table
 from fusion.pipeline.draft import Asker, DraftError, write_campaign
 
@@ -61,7 +63,19 @@ MONITOR = "".join(
 )  # fmt: skip
 MONITOR += f"MILL:TEMP-1                    {rows('{time:%Y-%m-%d %H:%M:%S.%f}').splitlines()[-1]} 0 UDF INVALID\n"
 MONITOR += "MILL:AIR                       *** Not connected (PV not found)\n"
+#: The same test as a table of changes with the unit, or the quality, of every line.
+LONG = [("Part 1", "t1", "degC"), ("Part 2", "t2", "degC"), ("Nose", "z", "mm")]
+EPOCH_S = STAMPS.astype("M8[s]").astype(int)
 LAYOUTS: dict[str, str] = {
+    "changes with units": "stamp,sensor,value,unit\n" + "".join(
+        f"{line},{unit}\n" for name, key, unit in LONG for line in rows(f"{{time:%Y-%m-%d %H:%M:%S}},{name},{{{key}}}").splitlines()
+    ),
+    "changes by epoch": "ts;tag;value;quality\n" + "".join(
+        f"{1000 * at};{name};{value};192\n"
+        for name, values in (("Temp_1", SPINDLE), ("Temp_2", BEARING), ("Disp_Z", NOSE))
+        for at, value in zip(EPOCH_S, values, strict=True)
+    ),
+    "a clock of 12 hours": "Time,Date,T1,T2,Z\n" + rows("{time:%I:%M:%S %p},{time:%m/%d/%Y},{t1},{t2},{z}"),
     "toa5": TOA5,
     "lvm": LVM.format(columns="One") + "".join(
         f"{60 * m:.6f}".replace(".", ",") + "\t" + line.partition("\t")[2]
@@ -80,7 +94,10 @@ LAYOUTS: dict[str, str] = {
     "date and time": "Date,Time,T1,T2,Z\n" + rows("{time:%Y-%m-%d},{time:%H:%M:%S},{t1},{t2},{z}"),
     "spaces, no headings": rows("{m}  {t1}  {t2}  {z}"),
 }  # fmt: skip
-DATED = {"toa5", "lvm", "lvm without times", "camonitor", "klipper", "date and time"}
+DATED = {
+    "changes with units", "changes by epoch", "a clock of 12 hours", "toa5", "lvm", "lvm without times", "camonitor", "klipper",
+    "date and time",
+}  # fmt: skip
 
 
 def drafted(folder: Path, content: str | bytes, name: str, answers: dict[str, str] | None = None) -> xr.Dataset:
@@ -116,7 +133,7 @@ def test_a_layout_gives_the_record_of_headings_written_by_hand(
 ) -> None:
     answers = {"Unit of the times": "min", "Time from one row": "30 s"}
     if layout == "spaces, no headings":
-        answers["Columns as shown"] = "4 = displacement mm"
+        answers["Column of the displacement"] = "4 = displacement mm"
     data = drafted(tmp_path / "folder", LAYOUTS[layout], "log.txt", answers)
     np.testing.assert_allclose(data["temperature"].values, by_hand["temperature"].values, atol=1e-9)
     np.testing.assert_allclose(data["displacement"].values, by_hand["displacement"].values, atol=1e-9)
@@ -135,13 +152,68 @@ def test_a_sheet_with_lines_above_its_table_is_read_too(tmp_path: Path, by_hand:
     np.testing.assert_array_equal(data["time"].values, by_hand["time"].values)
 
 
+def test_values_are_held_between_their_changes(tmp_path: Path, by_hand: xr.Dataset) -> None:
+    """Lines of one channel each, a second apart, of what moved by 0.05 K or 0.5 um: the rows of the regular table within the dead bands."""
+    lines, last = list[tuple[np.datetime64, str]](), dict[str, float]()
+    delays = np.random.default_rng(1).uniform(0, 1e6, (MINUTES.size, 3)).astype("m8[us]")
+    for k, stamp in enumerate(STAMPS):
+        now = {"TEMP-1": (SPINDLE, 0.05), "TEMP-2": (BEARING, 0.05), "DISP-Z": (NOSE, 0.0005)}
+        for (name, (values, dead)), delay in zip(now.items(), delays[k], strict=True):
+            if abs(values[k] - last.get(name, np.inf)) >= dead:
+                last[name] = values[k]
+                at = str((stamp + delay).astype("M8[us]")).replace("T", " ")
+                lines.append((stamp + delay, f"MILL:{name:<24} {at} {values[k]}\n"))
+    text = [line for _, line in sorted(lines)]
+    text.insert(60, "MILL:TEMP-2                  *** Disconnected\n")
+    data = drafted(tmp_path / "folder", "".join(text), "mill.log")
+    (held,) = json.loads(data.attrs["held"])
+    assert held["lost"] == ["MILL:TEMP-2 (line 61)"] and json.loads(data.attrs["left_out"]) == []
+    rows_of = np.rint((data["time"].values - STAMPS[0]) / np.timedelta64(30, "s")).astype(int)
+    step = float(np.diff(rows_of).mean()) * 30.0
+    assert 30.0 <= step <= 120.0 and rows_of[-1] >= MINUTES.size - 40
+    # Between two rows and within its dead band a value may have moved on.
+    drift = step / 60.0 * np.array([8 / 40, 3 / 60])
+    errors = np.abs(data["temperature"].values - by_hand["temperature"].values[rows_of])
+    assert np.all((errors <= 0.06 + drift) | np.isnan(errors)) and 0 < np.isnan(errors[:, 1]).sum() < 20
+    assert np.all(np.abs(data["displacement"].values - by_hand["displacement"].values[rows_of]) <= 0.6 + 4 * drift[0])
+
+
+def test_a_displacement_that_looks_like_a_temperature_is_asked_for(tmp_path: Path) -> None:
+    text = rows("{n}.25  {t1}  {t2}").replace("3000.25", "30.25").replace("1500.25", "28.5")
+    data = drafted(tmp_path / "folder", text, "log.txt", {"Column of the displacement": "1 = displacement um"})
+    assert data.sizes["sensor"] == 2 and data["displacement"].values[0, 0] == pytest.approx(30.25)
+    with pytest.raises(DraftError, match="without a displacement"):
+        (tmp_path / "folder" / "campaign.toml").unlink()
+        write_campaign(tmp_path / "folder", Asker(None))
+
+
+@pytest.mark.parametrize(("zone", "label"), [("", "no zone  2026-03-09 22:30"), ("UTC", "UTC     2026-03-09 22:30")])
+def test_times_without_a_zone_are_said_to_have_none(tmp_path: Path, zone: str, label: str) -> None:
+    drafted(tmp_path / "folder", LAYOUTS["date and time"], "log.csv")
+    path = tmp_path / "folder" / "campaign.toml"
+    path.write_text(
+        path.read_text().replace("[campaign]", f'[campaign]\ntime_zone = "{zone}"' if zone else "[campaign]")
+    )
+    text = "\n".join(check_campaign(path).lines())
+    assert label in text and ("carry no zone" in text) == (not zone)
+
+
+def test_set_points_are_drivers_and_counters_none(tmp_path: Path) -> None:
+    lines = [f"{k},{k + 10},{20 + k / 7:.2f},{k / 9:.3f},{60 * (k // 20)},100,{k},5" for k in range(50)]
+    names = "time [s],RECORD [RN],T1 [degC],Z [um],bed_target,tool_target,X target [mm],RH [%]"
+    (tmp_path / "log.csv").write_text("\n".join([names, *lines]) + "\n")
+    roles = {column.heading: column.role for column in propose_table(tmp_path / "log.csv").columns}
+    assert roles.pop("bed_target") == "driver"
+    assert {roles[name] for name in ("RECORD [RN]", "tool_target", "X target [mm]", "RH [%]")} == {"out"}
+
+
 def test_counts_are_converted_and_marks_are_no_readings(tmp_path: Path) -> None:
     lines = [
         "time [s],steps,T1",
         *(f"{60 * k},{8 * k - 127},{20 + k / 100 if k != 30 else -180:.2f}" for k in range(60)),
     ]
     lines += ["3600,n.c.,21"]
-    answers = {"Columns as shown": "2 = displacement", "Unit of": "0.0125 mm"}
+    answers = {"Column of the displacement": "2 = displacement", "Unit of": "0.0125 mm"}
     data = drafted(tmp_path / "folder", "\n".join(lines), "log.csv", answers)
     np.testing.assert_allclose(data["displacement"].values[:-1, 0], 12.5 * (8 * np.arange(60) - 127))
     assert np.isnan(data["displacement"].values[-1, 0])

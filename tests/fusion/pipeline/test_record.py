@@ -47,14 +47,14 @@ def test_gaps_missing_displacements_sensors_and_drivers_are_noted():
     displacement = np.zeros((50, 2))
     displacement[3:6, 1] = np.nan
     told = notices_of(plain(gaps={"t1": 4, "speed": 1}, displacement=displacement))
-    assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 blocks)."
+    assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 block)."
     assert told["record_displacements_missing"].startswith("3 block means of 100 of the displacements missing")
     assert set(told) == {"record_gaps", "record_displacements_missing"}
     told = notices_of(plain(unusable={"ch3": "never moves"}))
     assert told["record_channels_left_out"] == "Displacements that cannot be modelled are left out: ch3 never moves."
     told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
     assert told["record_sensors_dependent"] == "Left out because they duplicate other sensors: t2; t3."
-    assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
+    assert told["no_drivers"].startswith("The record has no driver that changes, so a heat source that no sensor sees")
 
 
 @pytest.mark.parametrize(("longer_s", "pauses"), [(150.0, 0), (151.0, 1)])
