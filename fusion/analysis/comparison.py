@@ -481,6 +481,9 @@ def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str
         missing = [campaign.name for campaign, part in zip((before, after), parts, strict=True) if part is None]
         lacks.append(f"ISO 230-2: no readings in {' and in '.join(missing)}.")
         return
+    if one.unit != other.unit:
+        lacks.append("ISO 230-2: one axis is linear, the other a rotary one.")
+        return
     travels = [
         np.sort(np.array(campaign.results.drift.position_mm, float))
         for campaign in (before, after)
@@ -496,7 +499,7 @@ def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str
         if first.value is None or second.value is None:
             lacks.append(f"ISO 230-2, {symbol}: not measured in both campaigns.")
             continue
-        yield _difference(symbol, "ISO 230-2", "um", first, second, machine=False)
+        yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False)
 
 
 def _difference(quantity: str, kind: str, unit: str, before: Quantity, after: Quantity, *, machine: bool) -> Change:

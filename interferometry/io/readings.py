@@ -912,8 +912,8 @@ def read_deviations(
     deviations = _read_table_of_deviations(path, sheet)
     if deviations["deviation"].attrs["units"] != "um" and not rotary:
         raise LaserFormatError(
-            f"{path}: the positions are angles; of a rotary axis only the evaluation by ISO 230-2 is done (thermofuse iso230): heat and "
-            "expansion are explained along a linear axis"
+            f"{path}: the positions are angles; a rotary axis is evaluated by ISO 230-2 alone, without a camera and not while it is "
+            "measured: heat and expansion are explained along a linear axis; give the readings alone to thermofuse run or iso230"
         )
     return deviations
 

@@ -241,13 +241,13 @@ _DIRECTION_TABLE: tuple[tuple[str, bool, str], ...] = (
     (
         "positive",
         False,
-        "forward, forwards, fwd, fw, up, upward, upwards, outward, vorwärts, vor, hin, hinfahrt, aller, avant, avance, adelante, ida, "
+        "forward, forwards, fwd, fw, up, outward, vorwärts, vor, hin, hinfahrt, aller, avant, avance, adelante, ida, "
         "正向, 前进, 去程",
     ),
     (
         "negative",
         False,
-        "reverse, rev, backward, backwards, bwd, bw, down, downward, downwards, return, rückwärts, rück, zurück, rückfahrt, retour, arrière, "
+        "reverse, rev, backward, backwards, bwd, bw, down, return, rückwärts, rück, zurück, rückfahrt, retour, arrière, "
         "atrás, vuelta, "
         "retroceso, 反向, 负向, 后退, 回程",
     ),
