@@ -250,9 +250,9 @@ def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:
     k = int(np.nanargmax(np.abs(reversal)))
     ends, s = settled["mean_unidirectional"].values[:, k], settled["standard_deviation"].values[:, k]
     drawn.segment([x[k]], [ends.min()], [x[k]], [ends.max()], line_color=INK, line_width=3)
-    add_label(
-        drawn, float(x[k]), float((ends + 2 * np.nan_to_num(s)).max()), f"B {abs(reversal[k]):.2f}", offset=(-16, 6)
-    )
+    top = float((ends + 2 * s).max())
+    at, offset = (top, (-16, 6)) if np.isfinite(top) else (float(ends.mean()), (6, -8))
+    add_label(drawn, float(x[k]), at, f"B {abs(reversal[k]):.2f}", offset=offset)
 
 
 def _seen(settled: xr.Dataset, x: np.ndarray, unit: str, along: str) -> str:
