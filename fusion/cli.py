@@ -526,18 +526,18 @@ def iso230(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230 import read_test
-    from fusion.report.page import NO_SCATTER, iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
+    from fusion.report.page import iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
 
     with _answering():
         found = read_test(test, cycles)
         if as_json:
             print_json(iso230_json(found.part, found.dataset))
         elif as_csv:
-            sys.stdout.write(iso230_csv(found.part, found.dataset))
+            sys.stdout.write(iso230_csv(found.dataset))
         else:
             for table in iso230_tables(found.part, found.dataset, title=found.title):
                 _wide().print(table)
-            _print_lines((*(() if found.part else (NO_SCATTER,)), *found.remarks))
+            _print_lines(found.remarks)
         if out is not None:
             page = render_iso230(found.title, found.part, found.dataset, remarks=found.remarks, versions=versions())
             write_iso230(out, page)

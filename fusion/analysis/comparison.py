@@ -410,7 +410,7 @@ def _profile(
     """Compare the profiles, or say why not."""
     without = [one.name for one in (before, after) if one.drift is None]
     if before.drift is None or after.drift is None:
-        lacks.append(f"Profile and scatter: no readings with times in {' and in '.join(without)}.")
+        lacks.append(f"Profile and scatter: no estimate of the drift in {' and in '.join(without)}.")
         return None
     try:
         found = compare_profiles(before.drift, after.drift, level=LEVEL / pairs, tests=tests)
@@ -481,6 +481,9 @@ def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str
         missing = [campaign.name for campaign, part in zip((before, after), parts, strict=True) if part is None]
         lacks.append(f"ISO 230-2: no readings in {' and in '.join(missing)}.")
         return
+    if one.unit != other.unit:
+        lacks.append("ISO 230-2: one axis is linear, the other a rotary one.")
+        return
     travels = [
         np.sort(np.array(campaign.results.drift.position_mm, float))
         for campaign in (before, after)
@@ -493,10 +496,10 @@ def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str
         return
     for symbol in _ISO230:
         first, second = (getattr(part.settled or part, f"{symbol}_um") for part in (one, other))
-        if first.value is None or second.value is None:
-            lacks.append(f"ISO 230-2, {symbol}: not measured in both campaigns.")
+        if None in (first.value, second.value, first.u, second.u):
+            lacks.append(f"ISO 230-2, {symbol}: not measured with its uncertainty in both campaigns.")
             continue
-        yield _difference(symbol, "ISO 230-2", "um", first, second, machine=False)
+        yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False)
 
 
 def _difference(quantity: str, kind: str, unit: str, before: Quantity, after: Quantity, *, machine: bool) -> Change:

@@ -53,6 +53,7 @@ from interferometry.common import DEVIATIONS
 from interferometry.io.faults import BadReading
 from interferometry.io.readings import read_deviations, read_environment
 from interferometry.io.tables import DateOrder, parse_time, read_table
+from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import ThermographyError
 from thermography.io.frame import FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
@@ -259,6 +260,31 @@ class Source(CameraInputs, LaserInputs):
 _OTHER_CAMERA = "among frames of"
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
+#: Fewest cycles with a course: of two there is one difference at every target, which is drift as well as scatter.
+_LEAST_COURSE = 3
+
+
+def is_rotary(deviations: xr.Dataset) -> bool:
+    """Return whether readings are those of a rotary axis, in arcsec."""
+    return bool(deviations["deviation"].attrs["units"] == "arcsec")
+
+
+def lacks_course(deviations: xr.Dataset) -> str:
+    """Return why a test is evaluated by ISO 230-2 alone, without drift and neighbour differences; empty where it is not."""
+    if is_rotary(deviations):
+        return (
+            "The axis is a rotary one: its angles are evaluated by ISO 230-2, with the scatter of the readings as the only uncertainty. "
+            "Drift, positions that stand out and causes are evaluated along a linear axis only; expansion, dead path and the compensation "
+            "of lengths do not apply."
+        )
+    cycles = deviations.sizes["cycle"]
+    if cycles >= _LEAST_COURSE:
+        return ""
+    lacking = "R, A and the uncertainties need the standard deviation of several cycles; " if cycles == 1 else ""
+    return (
+        f"{counted(cycles, 'cycle')}, where ISO 230-2 asks for {STANDARD_CYCLES}: {lacking}drift and positions that stand out need at "
+        f"least {_LEAST_COURSE} cycles."
+    )
 
 
 def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
@@ -327,10 +353,17 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     how = {name: getattr(interferometry, name) for name in ("feed_mm_per_min", "dwell_s", "sheet")}
     zone = campaign.zone_of("interferometry")
     late_s = interferometry.clock_offset_s
-    deviations = bring_to_utc(read_deviations(laser, **how), zone, file=interferometry.deviations, late_s=late_s)
-    check(deviations, DEVIATIONS, name=laser.name)
+    alone = campaign.thermography is None
+    deviations = read_deviations(laser, rotary=alone, **how)
+    deviations = bring_to_utc(deviations, zone, file=interferometry.deviations, late_s=late_s)
+    if not is_rotary(deviations):
+        check(deviations, DEVIATIONS, name=laser.name)
     deviations, notices = _timed_cycles(deviations, file=interferometry.deviations)
-    _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations)
+    _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations, alone=alone)
+    if is_rotary(deviations) and campaign.acceptance.limits():
+        raise SourceError(
+            f"{campaign.path}: [acceptance] holds limits of a length, but {interferometry.deviations} is of a rotary axis; remove it"
+        )
     if _is_timed(deviations):
         cycles_of_readings(deviations)
     environment = None
@@ -342,7 +375,7 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
         compensated = compensate_readings(deviations, environment, interferometry)
     if interferometry.material_temperature == "logged":
         deviations, notices = compensated.deviations, [*notices, *compensated.notices]
-    elif campaign.thermography is None:
+    elif alone:
         raise RecompensationError(
             f'{campaign.path}: interferometry.material_temperature = "camera", but this campaign has no [thermography]; '
             'write "logged", or add the frames'
@@ -535,7 +568,10 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
         message = f"{source.interferometry.deviations} was interpreted as follows: {said}."
         notices.append(Notice("readings_as_read", message, "Compare with the protocol of the test."))
     notices += _log_notices(source)
-    if not _is_timed(source.deviations):
+    if reason := lacks_course(source.deviations):
+        five = source.deviations.sizes["cycle"] >= STANDARD_CYCLES
+        notices.append(Notice("standard_alone", reason, "" if five else f"Measure {STANDARD_CYCLES} cycles."))
+    elif not _is_timed(source.deviations):
         message = (
             f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
             "that stand out and causes need the time of every reading, and no log can be set beside them."
@@ -548,10 +584,10 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
     return notices
 
 
-def _raise_if_too_few_readings(deviations: xr.Dataset, left_out: Sequence[Notice], *, file: str) -> None:
-    """Raise if the test has neither scatter nor drift."""
+def _raise_if_too_few_readings(deviations: xr.Dataset, left_out: Sequence[Notice], *, file: str, alone: bool) -> None:
+    """Raise if the test has no deviation along the axis, or beside a camera neither scatter nor drift."""
     sizes, said = deviations.sizes, "".join(f" {notice.message}" for notice in left_out)
-    if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
+    if (sizes["cycle"] < _LEAST_CYCLES and not alone) or sizes["target"] < _LEAST_TARGETS:
         raise SourceError(
             f"{file}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
             f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets; measure more, or evaluate the readings "

@@ -14,6 +14,7 @@ from fusion.campaign.config import CampaignError, InterferometryTable
 from fusion.results.results import Notice
 from interferometry.compensation import SensorUncertainty, air_index, compensate, dead_path_error_um, followed_factor_um
 from interferometry.iso230 import Iso230Budget
+from interferometry.iso230.uncertainty import SCATTER_ALONE
 
 # The uncertainty budget of a campaign's ISO 230-2 values: what is stated, what was measured, what is assumed.
 
@@ -26,6 +27,11 @@ class StatedBudget:
 
     budget: Iso230Budget
     origins: Mapping[str, Origin]
+
+
+#: Inputs of a budget of lengths.
+_LENGTHS = ("device", "alignment", "material_temperature", "expansion_coefficient")
+ROTARY_BUDGET = StatedBudget(SCATTER_ALONE, dict.fromkeys(_LENGTHS, "not of a rotary axis"))
 
 
 def state_budget(table: InterferometryTable, *, camera_u_K: float | None = None) -> StatedBudget:
@@ -105,7 +111,9 @@ def compensate_readings(
     *,
     material: SeenMaterial | None = None,
 ) -> Compensated:
-    """Leave the readings as the instrument compensated them, apart from a stated dead path; or compensate them again."""
+    """Leave the readings as the instrument compensated them, apart from a stated dead path; or compensate them again. Angles stay."""
+    if deviations["deviation"].attrs["units"] == "arcsec":
+        return Compensated(deviations, ROTARY_BUDGET)
     if table.compensation == "as recorded":
         corrected, notices = _correct_dead_path(deviations, environment, table.dead_path_mm)
         return Compensated(corrected, state_budget(table), notices)

@@ -16,7 +16,7 @@ from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.consistency.checks import Check, ContradictionError, Severity, open_doubts, refuse_contradictions
 from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, read_source
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
 from fusion.campaign.logs import NO_START, read_drivers
 from fusion.common import FusionError
 from fusion.pipeline import record as record_stage
@@ -150,9 +150,10 @@ def _content(source: Inputs) -> Iterator[str]:
     """Say what was read."""
     if isinstance(source, LaserInputs):
         readings, position = source.deviations["deviation"], source.deviations["position"].values
+        unit = "deg" if is_rotary(source.deviations) else "mm"
         yield (
             f"readings: {counted(readings.sizes['cycle'], 'cycle')}, {counted(readings.sizes['target'], 'target')} from "
-            f"{position.min():g} to {position.max():g} mm, {int(readings.notnull().sum())} of {readings.size}"
+            f"{position.min():g} to {position.max():g} {unit}, {int(readings.notnull().sum())} of {readings.size}"
         )
     if isinstance(source, CameraInputs):
         grid, names = source.grid, camera_names(source.pictures)
@@ -190,7 +191,7 @@ def _recordings(source: Inputs) -> Iterator[Recording]:
 def _faults_of_files(campaign: Campaign) -> Iterator[str]:
     """Read every file of a campaign by itself, and yield why it cannot be used."""
     readers: tuple[tuple[Callable[[Path], object], object, str], ...] = (
-        (read_deviations, campaign.interferometry, "deviations"),
+        (partial(read_deviations, rotary=campaign.thermography is None), campaign.interferometry, "deviations"),
         (read_environment, campaign.interferometry, "environment"),
         (partial(read_drivers, layout=campaign.drivers and campaign.drivers.layout), campaign.drivers, "file"),
         (read_fiducials, campaign.plan, "fiducials"),

@@ -35,7 +35,7 @@ from fusion.analysis.consistency.logs import (
 from fusion.analysis.consistency.model import check_coefficients
 from fusion.analysis.consistency.readings import check_readings, check_signs
 from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source, is_rotary
 from fusion.pipeline.thermal import overridden_parameters
 from thermography.io.other_cameras import TemperatureFrame
 
@@ -122,7 +122,7 @@ def _check_readings_and_logs(source: LaserInputs) -> list[Check]:
     if plan is not None and plan.axis is not None and plan.size_mm is not None:
         extent_mm = sum(abs(part) * length for part, length in zip(plan.axis.direction, plan.size_mm, strict=True))
     checks = [
-        *check_readings(source.deviations, plan_extent_mm=extent_mm),
+        *([] if is_rotary(source.deviations) else check_readings(source.deviations, plan_extent_mm=extent_mm)),
         *check_signs(source.deviations),
         *check_log(source.environment, times, name="environment", file=environment_file),
         *check_log(source.drivers, times, name="drivers", file=drivers_file),

@@ -102,7 +102,7 @@ _HINTS = {
 #: Values above this are kelvins and no temperatures of a machine table in degC.
 _WARMEST_DEGC = 150.0
 #: The name of an axis as a word of its own, and the line of a header that holds it: its heading, or the channel of an ecmc log's targets.
-_AXIS = re.compile(r"(?<![^\W_])([XYZ]\d?|[UVW])(?:[-_ ]?ax[ei]s?|[-_ ]?achse)?(?![^\W_])", re.IGNORECASE)
+_AXIS = re.compile(r"(?<![^\W_])([XYZABC]\d?|[UVW])(?:[-_ ]?ax[ei]s?|[-_ ]?achse)?(?![^\W_])", re.IGNORECASE)
 _AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE | re.MULTILINE)
 #: Bytes of a file in which a header is looked for.
 _HEADER = 4096
@@ -119,8 +119,8 @@ def write_campaigns(folder: Path, asker: Asker) -> list[tuple[Path, list[str]]]:
     """
     _refuse_place(folder)
     content = scan_folder(folder.resolve())
-    tests = content.of(Kind.DEVIATIONS)
-    if content.frames or len(tests) < 2:
+    tests = separate_tests(content)
+    if not tests:
         return [write_campaign(folder, asker, content)]
     stems = Counter(test.path.with_suffix("") for test in tests)
     written: list[tuple[Path, list[str]]] = []
@@ -134,6 +134,12 @@ def write_campaigns(folder: Path, asker: Asker) -> list[tuple[Path, list[str]]]:
         files = {**content.files, Kind.DEVIATIONS: (test,)}
         written.append(write_campaign(own, once, replace(content, folder=own, files=files)))
     return written
+
+
+def separate_tests(content: FolderContent) -> Sequence[Recognised]:
+    """Return the tests of a folder that are campaigns of their own: several without frames."""
+    tests = content.of(Kind.DEVIATIONS)
+    return () if content.frames or len(tests) < 2 else tests
 
 
 def _asking_once(ask: Ask, answers: dict[str, str]) -> Ask:
@@ -366,12 +372,16 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield from _optional(
         "environment", content, Kind.ENVIRONMENT, lacking='# environment = "environment.csv"   # none was found'
     )
+    known = _attributes(content.folder / chosen)
+    if known.get("units") == "arcsec":
+        yield "# a rotary axis: neither expansion nor dead path enter its angles"
+        return
     coefficient = asker.quantity(
         "Expansion coefficient of the part that carries the scale or the workpiece", "ppm/K", "11.7 ppm/K"
     )
     yield f"expansion_coefficient = {coefficient}"
     yield f"dead_path = {asker.quantity('Dead path of the laser', 'mm', '0 mm')}"
-    if _attributes(content.folder / chosen).get("origin") == "reconstructed":
+    if known.get("origin") == "reconstructed":
         yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
         yield '# dwell = "2 s"'
 
@@ -379,8 +389,9 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
 def _attributes(path: Path) -> dict[str, str]:
     """Return what is known of a file of deviations and of its times; nothing where it cannot be read, which the check says."""
     try:
-        deviations = read_deviations(path)
-        return {str(name): str(value) for name, value in {**deviations.attrs, **deviations["time"].attrs}.items()}
+        deviations = read_deviations(path, rotary=True)
+        known = {**deviations.attrs, **deviations["time"].attrs, "units": deviations["deviation"].attrs["units"]}
+        return {str(name): str(value) for name, value in known.items()}
     except InterferometryError:
         return {}
 

@@ -189,7 +189,12 @@ def with_findings(row: Row, folder: Path) -> Row:
     known = [(value, u) for value, u in ranges if value is not None]
     most, most_u = max(known, key=lambda one: one[0]) if known else (None, None)
     test = results.iso230
-    values = {} if test is None else {name: getattr(test.settled or test, f"{name}_um") for name in _SYMBOLS}
+    # The columns are lengths.
+    values = (
+        {}
+        if test is None or test.unit != "um"
+        else {name: getattr(test.settled or test, f"{name}_um") for name in _SYMBOLS}
+    )
     return replace(
         row,
         title=results.campaign,

@@ -20,12 +20,12 @@ from fusion.campaign.config import (
     ReportTable,
     load_campaign,
 )
-from fusion.campaign.inputs import read_laser
-from fusion.campaign.recompensation import Origin, StatedBudget, material_by_cycle
+from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
+from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
 from fusion.results.progress import left_out_notices
-from fusion.results.results import read_results
+from fusion.results.results import Notice, read_results
 from fusion.results.store import group, has, joined, plain, read_product
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import NoScatterError, estimate_drift
@@ -44,7 +44,6 @@ from interferometry.iso230 import (
     settled_window,
 )
 from interferometry.iso230.conditions import check_conditions, decide
-from interferometry.iso230.uncertainty import SCATTER_ALONE
 from interferometry.plots import time_span
 
 _RULE = f"of the windows of {STANDARD_CYCLES} cycles in the second half of the test, the one with the least drift by the joint estimate"
@@ -58,6 +57,23 @@ _INPUTS = {
     "material_temperature": ("material_temperature_K", "K"),
     "expansion_coefficient": ("expansion_coefficient_ppm_per_K", "ppm/K"),
 }
+
+
+def estimate_joint(deviations: xr.Dataset) -> tuple[xr.Dataset | None, tuple[Notice, ...]]:
+    """Return the joint estimate; None without a course or times, and with a notice where the digits are too coarse for scatter."""
+    if lacks_course(deviations) or np.isnat(deviations["time"].values).all():
+        return None, ()
+    try:
+        return estimate_drift(deviations), ()
+    except NoScatterError:
+        file = str(deviations.attrs.get("source", "the file of the readings"))
+        message = (
+            f"All or nearly all readings of {file} repeat exactly from cycle to cycle: their digits hide scatter and drift. "
+            "ISO 230-2 values are evaluated as they are; drift, positions that stand out and causes are not."
+        )
+        return None, (
+            Notice("no_scatter", message, "Write more digits, or read with an instrument of finer resolution."),
+        )
 
 
 def evaluate_standard(
@@ -90,6 +106,7 @@ def evaluate_standard(
     # What was measured beside the readings tells where two inputs of the budget come from.
     part_of = partial(_window_part, budget=budget, drift=drift is not None, material=material_degC is not None)
     part = {
+        "unit": first["A"].attrs["units"],
         "window": first.attrs["window"],
         **{f"{name}_um": _quantity(first, name) for name in _AXIS},
         "B_of_scatter_um": float(first["B_of_scatter"]),
@@ -123,13 +140,18 @@ def _window_part(
         name: float((found.sel(contributor=other) ** 2).sum() ** 0.5) for name, found in _one_way_shares(result).items()
     }
     return {
+        "unit": result["A"].attrs["units"],
         "window": result.attrs["window"],
         "cycles": cycles,
         **{f"{name}_um": _quantity(result, name) for name in _AXIS},
         "B_of_scatter_um": float(result["B_of_scatter"]),
         **by_direction,
         "u_without_sampling_um": {name: float(without.sel(quantity=name)) for name in _AXIS} | one_way,
-        "contributions": [_contribution(result, name, budget, drift, material) for name in CONTRIBUTIONS],
+        "contributions": [
+            _contribution(result, name, budget, drift, material)
+            for name in CONTRIBUTIONS
+            if budget.origins.get(name) != "not of a rotary axis"
+        ],
     }
 
 
@@ -168,6 +190,8 @@ def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, drift: bo
 # standards.
 
 _ARROWS = {"positive": "↑", "negative": "↓"}
+#: Conditions that a rotary axis does not have.
+_OF_LENGTHS = ("Travel of the axis", "Lead of the screw", "Feed", "Expansion coefficient", "Dead path", "Readings")
 
 
 def complete_sheet(
@@ -186,7 +210,9 @@ def complete_sheet(
         "conditions": [
             {"name": name, "text": text} for name, text in _conditions(dataset, report, campaign, environment).items()
         ],
-        "other_standards": [asdict(value) for value in evaluate_other_standards(dataset, cycles=cycles)],
+        "other_standards": []
+        if is_rotary(dataset)
+        else [asdict(value) for value in evaluate_other_standards(dataset, cycles=cycles)],
     }
 
 
@@ -200,7 +226,7 @@ def _judge(settled: Mapping[str, Any], symbol: str, limit: float) -> list[dict[s
     rows = []
     for name, quantity in found.items():
         value, expanded = quantity["value"], 2 * quantity["u"]
-        decision = decide(value, expanded, limit) if np.isfinite([value, expanded]).all() else "not measured"
+        decision = decide(value, expanded, limit) if np.isfinite(value) else "not measured"
         judged = {"limit_um": limit, "value_um": value, "expanded_u_um": expanded, "decision": decision}
         rows.append({"quantity": name, **judged})
     return rows
@@ -211,7 +237,8 @@ def _conditions(
 ) -> dict[str, str]:
     """Return the conditions of the test by name, empty where they are not stated; logged values where there is a log."""
     laser = None if campaign is None else campaign.interferometry
-    position = dataset["position"].values
+    position, rotary = dataset["position"].values, is_rotary(dataset)
+    unit = "°" if rotary else " mm"
     feed = report.feed_mm_per_min or (laser.feed_mm_per_min if laser else None)
     dwell = report.dwell_s or (laser.dwell_s if laser else None)
     compensation = {
@@ -224,7 +251,7 @@ def _conditions(
         )
         for name in ("air_temperature", "material_temperature")
     }
-    return {
+    conditions = {
         "Date of the test": _date(dataset, None if campaign is None else campaign.zone_of("interferometry")),
         "Machine": report.machine,
         "Serial number of the machine": report.machine_serial_number,
@@ -234,7 +261,7 @@ def _conditions(
         "Operator": report.operator,
         "Axis": "" if campaign is None else campaign.campaign.axis,
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
-        "Measured travel": f"{np.ptp(position):g} mm, {position.min():g} to {position.max():g} mm",
+        "Measured travel": f"{np.ptp(position):g}{unit}, {position.min():g} to {position.max():g}{unit}",
         "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
         "Feed": "" if feed is None else f"{feed:g} mm/min",
         "Dwell at a target": "" if dwell is None else f"{dwell:g} s",
@@ -249,6 +276,7 @@ def _conditions(
         "Readings": "" if laser is None else compensation[laser.compensation],
         "Remarks": report.remarks,
     }
+    return {name: text for name, text in conditions.items() if not (rotary and name in _OF_LENGTHS)}
 
 
 def _date(dataset: xr.Dataset, zone: str | None) -> str:
@@ -309,8 +337,8 @@ class StandardTest:
 
     Attributes
     ----------
-    part : Iso230Part or None
-        Values; None of a test of one cycle, which has no standard deviation.
+    part : Iso230Part
+        Values; those that need a standard deviation are null of a test of one cycle.
     dataset : Dataset
         Readings, with the group ``settled``.
     remarks : tuple of str
@@ -318,7 +346,7 @@ class StandardTest:
     """
 
     title: str
-    part: Iso230Part | None
+    part: Iso230Part
     dataset: xr.Dataset
     remarks: tuple[str, ...]
 
@@ -337,9 +365,7 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
         read = (laser["deviations"], laser["iso_budget"], cycles, campaign, laser["environment"])
         return _evaluate(campaign.campaign.title, *read)
     deviations = read_deviations(path, rotary=True)
-    rotary = deviations["deviation"].attrs["units"] == "arcsec"
-    origin: Origin = "not of a rotary axis" if rotary else "assumed"
-    budget = StatedBudget(SCATTER_ALONE if rotary else Iso230Budget(), dict.fromkeys(_INPUTS, origin))
+    budget = ROTARY_BUDGET if is_rotary(deviations) else StatedBudget(Iso230Budget(), dict.fromkeys(_INPUTS, "assumed"))
     try:
         return _evaluate(path.name, deviations, budget, cycles)
     except InterferometryError as error:
@@ -373,19 +399,11 @@ def _evaluate(
     campaign: Campaign | None = None,
     environment: xr.Dataset | None = None,
 ) -> StandardTest:
-    """Evaluate readings; a test of one cycle keeps its readings alone."""
+    """Evaluate readings."""
     window = None if cycles is None else read_window(cycles, deviations)
-    remarks = _remarks(deviations)
-    if deviations.sizes["cycle"] == 1:
-        return StandardTest(title, None, deviations, remarks)
-    timed = not np.isnat(deviations["time"].values).all()
-    try:
-        drift = estimate_drift(deviations) if timed else None
-    except NoScatterError:
-        drift, remarks = (
-            None,
-            (*remarks, "all or nearly all readings repeat exactly: no drift is estimated; export more digits"),
-        )
+    drift, digits = estimate_joint(deviations)
+    without = lacks_course(deviations)
+    remarks = (*_remarks(deviations), *(notice.message for notice in digits), *([without] if without else []))
     windows, settled, found = evaluate_standard(
         deviations,
         budget,
@@ -394,9 +412,7 @@ def _evaluate(
         cycles=window,
     )
     dataset = joined(deviations, iso=windows, settled=settled, **({} if drift is None else {"drift": drift}))
-
-    if deviations["deviation"].attrs["units"] == "um":
-        found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
+    found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
     return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks)
 
 

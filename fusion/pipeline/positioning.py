@@ -13,10 +13,10 @@ from fusion.analysis.alignment.align import AxisGeometry, add_sensor_line, align
 from fusion.analysis.consistency.camera import find_gaps, gap_words, in_gaps
 from fusion.analysis.consistency.readings import find_gross_readings
 from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose, undetermined_check
-from fusion.campaign.inputs import LaserInputs, Source
+from fusion.campaign.inputs import LaserInputs, Source, lacks_course
 from fusion.campaign.recompensation import material_by_cycle
 from fusion.campaign.time_zones import utc
-from fusion.pipeline.iso230 import evaluate_standard
+from fusion.pipeline.iso230 import estimate_joint, evaluate_standard
 from fusion.report.numbers import moment
 from fusion.results.progress import Report, counted, listed, silent
 from fusion.results.results import Notice, Outcome
@@ -24,7 +24,7 @@ from fusion.results.store import group, joined
 from interferometry import neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.deviations import OUTLIER
-from interferometry.drift.estimate import NoScatterError, estimate_drift, flag_outliers
+from interferometry.drift.estimate import estimate_drift, flag_outliers
 from thermography.fields.cycle_fields import cycles_with_field
 
 #: Share of the readings that may lie outside the frames' time before the next test should be filmed otherwise.
@@ -36,31 +36,31 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
     report("deviations", 0, 1)
     deviations = source.deviations
     times = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
-    drift, digits = (None, ()) if np.isnat(times).all() else _joint_estimate(deviations)
+    drift, digits = estimate_joint(deviations)
     deviations = deviations if drift is None else flag_outliers(deviations, drift)
-    comparison = neighbours.compare(deviations, drift)
     windows, settled, standard = evaluate_standard(
         deviations,
         source.iso_budget,
         drift=None if drift is None else drift["drift"],
         material_degC=material_by_cycle(deviations, source.environment),
     )
-    groups = {
-        "conventional": neighbours.evaluate_conventional(deviations),
-        "neighbours": neighbours.evaluate_neighbours(deviations),
-        "comparison": comparison,
-        "chart": neighbours.build_chart(deviations),
-    }
-    groups |= {"iso": windows, "settled": settled, **({} if drift is None else {"drift": drift})}
+    groups, parts = {"iso": windows, "settled": settled}, dict[str, Any](iso230=standard)
+    if not lacks_course(deviations):
+        comparison = neighbours.compare(deviations, drift)
+        groups |= {
+            "conventional": neighbours.evaluate_conventional(deviations),
+            "neighbours": neighbours.evaluate_neighbours(deviations),
+            "comparison": comparison,
+            "chart": neighbours.build_chart(deviations),
+        }
+        compared = {"conventional_s_um": "conventional", "pair_s_um": "differenced", "ratio": "ratio"}
+        parts["neighbours"] = {key: by_direction(comparison[name]) for key, name in compared.items()}
+    groups |= {} if drift is None else {"drift": drift}
     dataset = joined(deviations, **groups)
     zone = source.campaign.zone_of("interferometry")
-    compared = {"conventional_s_um": "conventional", "pair_s_um": "differenced", "ratio": "ratio"}
-    parts: dict[str, Any] = {
-        "iso230": standard,
-        "neighbours": {key: by_direction(comparison[name]) for key, name in compared.items()},
-    }
-    if drift is not None:
+    if not np.isnat(times).all():
         parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
+    if drift is not None:
         course = drift["drift"].mean("direction")
         range_u = drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0)
         parts["drift"] = {
@@ -72,20 +72,6 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
         }
     report("deviations", 1, 1)
     return Outcome(dataset, parts, (*digits, *_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
-
-
-def _joint_estimate(deviations: xr.Dataset) -> tuple[xr.Dataset | None, tuple[Notice, ...]]:
-    """Return the joint estimate; None, and a notice, where the digits are too coarse for any scatter."""
-    try:
-        return estimate_drift(deviations), ()
-    except NoScatterError:
-        message = (
-            f"All or nearly all readings of {_file(deviations)} repeat exactly from cycle to cycle: their digits hide scatter and drift. "
-            "ISO 230-2 values are evaluated as they are; drift, positions that stand out and causes are not."
-        )
-        return None, (
-            Notice("no_scatter", message, "Write more digits, or read with an instrument of finer resolution."),
-        )
 
 
 def _approach_notices(deviations: xr.Dataset) -> Iterator[Notice]:

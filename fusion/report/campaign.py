@@ -31,6 +31,7 @@ from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     CONTRIBUTORS,
     ISO230_TERMS,
+    ONE_WAY_TERMS,
     Row,
     Table,
     Words,
@@ -182,20 +183,14 @@ def _camera_prediction(sensors: xr.Dataset) -> dict[str, Any] | None:
 
 #: Columns of the budget, of a test from both sides.
 _BUDGETED = ("A", "R", "E", "M", "B", "mean_reversal")
-#: Values of each direction, in the terms of the standard.
-_ONE_WAY = {
-    "A": "Unidirectional positioning accuracy A",
-    "R": "Unidirectional positioning repeatability R",
-    "E": "Unidirectional systematic positioning error E",
-}
 _ARROWS = {"positive": "↑", "negative": "↓"}
 #: Missing readings that are listed one by one.
 _NAMED = 8
 
 
-def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None, *, unit: str = "µm") -> dict[str, Any]:
+def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict[str, Any]:
     """Return the tables of the section on ISO 230-2, as page and terminal show them."""
-    shown = part.settled
+    shown, unit = part.settled, print_unit(part.unit)
     tables: dict[str, Any] = dict.fromkeys(("positions", "budget", "tolerances"))
     if shown is None:
         rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
@@ -207,7 +202,8 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None, *, unit
         **tables,
         "quoted": shown,
         "axis": _values_table(part, shown, unit),
-        "budget": _budget_table(shown, unit),
+        # Of one cycle nothing is known of the uncertainty.
+        "budget": _budget_table(shown, unit) if len(shown.cycles) > 1 else None,
         "tolerances": _tolerances_table(part, unit) if part.tolerances else None,
         "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
     }
@@ -216,7 +212,8 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None, *, unit
 def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
     """Return the values of every target in the order of the axis; decimals by the uncertainty of a mean deviation."""
     spread = settled["standard_deviation"].values / np.sqrt(np.where(settled["count"] > 0, settled["count"], np.nan))
-    places = decimals_of(float(np.nanmedian(spread)))
+    known = spread[np.isfinite(spread)]
+    places = decimals_of(float(np.median(known)) if known.size else np.nan)
     along = _along(position)
     of_both = ("mean_bidirectional", "reversal", "repeatability_bidirectional")
     of_each = ("mean_unidirectional", "standard_deviation", "repeatability")
@@ -263,17 +260,6 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
     return f"{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
 
 
-def single_run_table(dataset: xr.Dataset) -> Table:
-    """Return the deviations of a test of one cycle."""
-    unit, place = (print_unit(str(dataset[name].attrs["units"])) for name in ("deviation", "position"))
-    along = _along(dataset["position"])
-    values = by_approach(dataset["deviation"].isel(cycle=0), target=along)
-    rows = []
-    for target, at, readings in zip(along, dataset["position"].sel(target=along).values, values, strict=True):
-        rows.append([str(target), f"{at:g}", *(fixed(value, 2) for value in readings)])
-    return table(["Target", place, *(f"deviation{arrow} / {unit}" for arrow in _ARROWS.values())], rows)
-
-
 def _tolerances_table(part: Iso230Part, unit: str) -> Table:
     """Return every quantity that was judged."""
     rows = []
@@ -295,11 +281,11 @@ def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
         values = [quantity(getattr(shown, f"{symbol}_um"))]
         rows.append(Row([term, *values, *([first, spread] if several else [])], marked=True))
         for direction, arrow in _ARROWS.items():
-            if symbol not in _ONE_WAY:
+            if symbol not in ONE_WAY_TERMS:
                 continue
             of_shown = quantity(getattr(getattr(shown, direction), f"{symbol}_um"))
             of_first = quantity(getattr(getattr(part.first, direction), f"{symbol}_um")) if part.first else "–"
-            rows.append(Row([f"{_ONE_WAY[symbol]}{arrow}", of_shown, *([of_first, "–"] if several else [])]))
+            rows.append(Row([f"{ONE_WAY_TERMS[symbol]}{arrow}", of_shown, *([of_first, "–"] if several else [])]))
     mean = [quantity(shown.mean_reversal_um), *([quantity(part.mean_reversal_um), "–"] if several else [])]
     rows.append(Row(["Mean reversal error, with its sign", *mean]))
     columns = [f"{shown.window} / {unit}"]
@@ -314,8 +300,8 @@ def _budget_table(shown: Iso230Window, unit: str) -> Table:
     names: tuple[str, ...] = _BUDGETED
     titles = [name.replace("_", " ") for name in _BUDGETED]
     if side:
-        names = tuple(f"{symbol}_{side}" for symbol in _ONE_WAY)
-        titles = [f"{symbol}{_ARROWS[side]}" for symbol in _ONE_WAY]
+        names = tuple(f"{symbol}_{side}" for symbol in ONE_WAY_TERMS)
+        titles = [f"{symbol}{_ARROWS[side]}" for symbol in ONE_WAY_TERMS]
     rows: list[Row] = []
     for entry in shown.contributions:
         u = "–" if entry.u is None else f"{number(entry.u, 2)} {unit if entry.unit == 'um' else entry.unit}"
@@ -323,7 +309,7 @@ def _budget_table(shown: Iso230Window, unit: str) -> Table:
         cause = CONTRIBUTORS.get(entry.contributor, entry.contributor)
         rows.append(Row([cause, u, entry.origin, *(number(value, 2) for value in found)]))
     without = [shown.u_without_sampling_um.get(name) for name in names]
-    values = [getattr(getattr(shown, side), f"{symbol}_um") for symbol in _ONE_WAY] if side else []
+    values = [getattr(getattr(shown, side), f"{symbol}_um") for symbol in ONE_WAY_TERMS] if side else []
     with_it = [value.u for value in values or (getattr(shown, f"{symbol}_um") for symbol in _BUDGETED)]
     for name, sums in (("U (k = 2) without the sampling of the cycles", without), ("U (k = 2)", with_it)):
         expanded = (number(None if u is None else 2 * u, 2) for u in sums)
@@ -537,7 +523,7 @@ def describe_campaign(
         "seen": "picture" if results.registration is not None and results.registration.is_picture else "table",
         "field_of": "cycle" if "positions" in figures else "window",
         "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
-        "comparison": None if deviations is None else _comparison_table(deviations),
+        "comparison": None if results.neighbours is None or deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
         "anomalies": [
             {
@@ -558,13 +544,14 @@ def describe_campaign(
 def _laser(deviations: xr.Dataset) -> dict[str, Any]:
     """What the laser measured; first and last are None where the readings have no times."""
     read = deviations["deviation"].notnull().any(("cycle", "target"))
-    first, last = time_span(deviations) if has(deviations, "drift") else (None, None)
+    first, last = (None, None) if np.isnat(deviations["time"].values).all() else time_span(deviations)
     return {
         "readings": int(np.isfinite(deviations["deviation"]).sum()),
         "possible": deviations["deviation"].size,
         "origin": deviations["time"].attrs.get("origin", "recorded"),
         "positions": deviations.sizes["target"],
-        "travel_mm": float(np.ptp(deviations["position"].values)),
+        "travel": float(np.ptp(deviations["position"].values)),
+        "unit": print_unit(str(deviations["position"].attrs["units"])),
         "cycles": deviations.sizes["cycle"],
         "approaches": [str(name) for name in read["direction"].values[read.values]],
         "first": first,

@@ -86,5 +86,5 @@ def next_steps(results: Results) -> list[str]:
         steps.append(say("test_place", correlation.source))
     steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))
-    values = "profile" if results.drift is not None or results.iso230 is not None else "temperatures"
+    values = "profile" if results.drift else "values by ISO 230-2" if results.iso230 else "temperatures"
     return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]

@@ -21,12 +21,12 @@ from markupsafe import Markup
 from fusion.analysis.attribution.significance import LEVEL
 from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
 from fusion.common import FusionError
-from fusion.report.campaign import describe_campaign, describe_iso230, single_run_table
+from fusion.report.campaign import describe_campaign, describe_iso230
 from fusion.report.charts.campaign import Drawn, draw_campaign
-from fusion.report.charts.readings import plot_single_runs, plot_test, plot_windows
+from fusion.report.charts.readings import plot_test, plot_windows
 from fusion.report.charts.style import Chart, EmbeddedChart, chart_scripts, embed
 from fusion.report.conclusions import headline
-from fusion.report.numbers import moment, number, place, print_unit
+from fusion.report.numbers import moment, number, place
 from fusion.report.record import describe_record, draw_record
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, print_table, say, sentences, table
 from fusion.results.axis import Iso230Part
@@ -231,32 +231,20 @@ class Iso230PageError(FusionError):
     """A test whose page or values cannot be written; the message says why."""
 
 
-#: A test of one cycle has no scatter.
-NO_SCATTER = (
-    "One cycle: a standard deviation s is not possible, and with it neither R nor A nor any uncertainty of sampling. These are the single "
-    "deviations; ISO 230-2 asks for five cycles."
-)
-
-
-def draw_iso230(part: Iso230Part | None, dataset: xr.Dataset) -> dict[str, Chart]:
+def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
     """Return the charts of the section on ISO 230-2, by name."""
-    if part is None:
-        return {"iso230": plot_single_runs(dataset)}
     charts = {"iso230": plot_test(group(dataset, "settled"), dataset["position"])}
     windows = group(dataset, "iso")
     return charts if windows.sizes["window"] < 3 else {**charts, "windows": plot_windows(windows)}
 
 
 def render_iso230(
-    title: str, part: Iso230Part | None, dataset: xr.Dataset, *, remarks: tuple[str, ...], versions: Mapping[str, str]
+    title: str, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...], versions: Mapping[str, str]
 ) -> str:
     """Return the page of a test as HTML text."""
-    _refuse_angles(dataset, "page")
-    standard = None if part is None else describe_iso230(part, dataset)
-    single = single_run_table(dataset) if part is None else None
-    shown = {"title": title, "iso230": part, "single": single, "no_scatter": NO_SCATTER, "remarks": remarks}
-    summary = {"iso230": standard, "assumptions": {"iso230": ""}}
-    return render_page("iso230.html.j2", embed(draw_iso230(part, dataset)), summary=summary, versions=versions, **shown)
+    shown = {"title": title, "iso230": part, "remarks": remarks}
+    summary = {"iso230": describe_iso230(part, dataset), "assumptions": {"iso230": ""}}
+    return render_page("iso230.html.j2", embed(draw_iso230(dataset)), summary=summary, versions=versions, **shown)
 
 
 def write_iso230(path: Path, page: str) -> None:
@@ -271,11 +259,9 @@ def write_iso230(path: Path, page: str) -> None:
         write_text(path, page)
 
 
-def iso230_tables(part: Iso230Part | None, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
+def iso230_tables(part: Iso230Part, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
     """Return the tables of a test for the terminal."""
-    if part is None:
-        return [print_table(single_run_table(dataset), title)]
-    described = describe_iso230(part, dataset, unit=print_unit(dataset["deviation"].attrs["units"]))
+    described = describe_iso230(part, dataset)
     shown: list[tuple[str, Table | None]] = [
         (f"{title}, {described['quoted'].window}", described["axis"]),
         ("per target position", described["positions"]),
@@ -285,35 +271,22 @@ def iso230_tables(part: Iso230Part | None, dataset: xr.Dataset, *, title: str) -
     return [print_table(found, name) for name, found in shown if found is not None]
 
 
-def iso230_json(part: Iso230Part | None, dataset: xr.Dataset) -> dict[str, Any]:
+def iso230_json(part: Iso230Part, dataset: xr.Dataset) -> dict[str, Any]:
     """Return the values of a test for programs: the part ``iso230`` of results.json, and the values per target."""
-    _refuse_angles(dataset, "JSON")
-    records = _of_targets(part, dataset).astype(object).to_dict("records")
+    records = _of_targets(dataset).astype(object).to_dict("records")
     rows = [{name: None if value != value else value for name, value in record.items()} for record in records]
-    return {"targets": rows} if part is None else {**part.model_dump(mode="json"), "targets": rows}
+    return {**part.model_dump(mode="json"), "targets": rows}
 
 
-def _refuse_angles(dataset: xr.Dataset, kind: str) -> None:
-    """Refuse a rotary axis where the names of the values carry the units of a linear one."""
-    if dataset["deviation"].attrs["units"] == "arcsec":
-        raise Iso230PageError(
-            f"the axis is a rotary one, whose {kind} is not written: its units are those of lengths; use the tables, or --csv"
-        )
-
-
-def iso230_csv(part: Iso230Part | None, dataset: xr.Dataset) -> str:
+def iso230_csv(dataset: xr.Dataset) -> str:
     """Return the values per target as CSV text, one line per target."""
-    return _of_targets(part, dataset).to_csv(index=False, lineterminator="\n")
+    return _of_targets(dataset).to_csv(index=False, lineterminator="\n")
 
 
-def _of_targets(part: Iso230Part | None, dataset: xr.Dataset) -> pd.DataFrame:
+def _of_targets(dataset: xr.Dataset) -> pd.DataFrame:
     """Return the values of each target; headings carry the units of the dataset."""
     unit, place = dataset["deviation"].attrs["units"], dataset["position"].attrs["units"]
     columns = {"target": dataset["target"].values, f"position_{place}": dataset["position"].values}
-    if part is None:
-        for direction in dataset["direction"].values:
-            columns[f"deviation_{direction}_{unit}"] = dataset["deviation"].sel(direction=direction).values[0]
-        return pd.DataFrame(columns)
     settled = group(dataset, "settled").sel(target=dataset["target"].values)
     for direction in dataset["direction"].values:
         here = settled.sel(direction=direction)

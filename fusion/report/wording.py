@@ -237,6 +237,12 @@ ISO230_TERMS = {
     "M": "Mean bidirectional positioning error M",
     "B": "Reversal error B",
 }
+#: Values of each direction, in the terms of the standard.
+ONE_WAY_TERMS = {
+    "A": "Unidirectional positioning accuracy A",
+    "R": "Unidirectional positioning repeatability R",
+    "E": "Unidirectional systematic positioning error E",
+}
 #: Inputs of the uncertainty of a positioning test in words.
 CONTRIBUTORS = {
     "device": "laser with its air compensation",
@@ -279,8 +285,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_values, quoted_window, randomised_causes, spot_places,
-        worse_channels,
+        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, quoted_window, randomised_causes,
+        spot_places, worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
     return made
@@ -308,25 +314,34 @@ def quoted_window(iso: Iso230Part) -> Iso230Part | Iso230Window:
 
 
 def iso230_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
-    """Return the axis values with their expanded uncertainty (k = 2) by symbol, µm."""
-    return {symbol: quantity(getattr(iso, f"{symbol}_um"), "µm") for symbol in ISO230_TERMS}
+    """Return the axis values with their expanded uncertainty (k = 2) by symbol, with their unit."""
+    return {symbol: quantity(getattr(iso, f"{symbol}_um"), print_unit(iso.unit)) for symbol in ISO230_TERMS}
 
 
 def approach_of(iso: Iso230Part | Iso230Window) -> str:
     """Return the only direction of approach that a window holds, "positive" or "negative"; empty where it holds both."""
-    if not isinstance(iso, Iso230Window) or iso.A_um.value is not None:
+    if not isinstance(iso, Iso230Window) or iso.E_um.value is not None:
         return ""
-    return next((side for side in ("positive", "negative") if getattr(iso, side).A_um.value is not None), "")
+    return next((side for side in ("positive", "negative") if getattr(iso, side).E_um.value is not None), "")
 
 
 def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
-    """Return the axis values to quote with their expanded uncertainty (k = 2) by symbol, µm: A, R and B, of one approach A and R."""
-    side = approach_of(iso)
-    if not side:
-        values = iso230_values(iso)
-        return {symbol: values[symbol] for symbol in ("A", "R", "B")}
-    arrow = {"positive": "↑", "negative": "↓"}[side]
-    return {f"{symbol}{arrow}": quantity(getattr(getattr(iso, side), f"{symbol}_um"), "µm") for symbol in "AR"}
+    """Return the axis values to quote with their expanded uncertainty (k = 2) by symbol: A, R and B, of one approach A and R.
+
+    Of one cycle, which has neither A nor R, they are E, M and B, of one approach E.
+    """
+    side, unit = approach_of(iso), print_unit(iso.unit)
+    of_side = getattr(iso, side) if side else iso
+    once = of_side.A_um.value is None and of_side.E_um.value is not None
+    symbols, arrow = (
+        ("E" if once else "AR", {"positive": "↑", "negative": "↓"}[side]) if side else ("EMB" if once else "ARB", "")
+    )
+    return {f"{symbol}{arrow}": quantity(getattr(of_side, f"{symbol}_um"), unit) for symbol in symbols}
+
+
+def quoted_term(symbol: str) -> str:
+    """Return the term of the standard for the symbol of a quoted value, which ends with it."""
+    return ISO230_TERMS.get(symbol) or f"{ONE_WAY_TERMS[symbol[0]]}{symbol[1:]}"
 
 
 def drift_u_note(iso: Iso230Part | None) -> str:

@@ -273,6 +273,8 @@ class Iso230Direction(ResultPart):
 class Iso230Values(ResultPart):
     """Axis values by ISO 230-2:2014, clause 3, of one window of cycles."""
 
+    unit: Literal["um", "arcsec"] = "um"
+    """Unit of all values here: of a rotary axis arcsec, in the fields whose names end in ``_um`` too."""
     window: str
     """Cycles that were evaluated."""
     B_um: Quantity

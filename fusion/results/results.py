@@ -189,9 +189,8 @@ class Results(ResultPart):
             rows.append(("inputs", f"{self.inputs.state}{f' ({doubts})' if doubts else ''}"))
         if self.iso230 is not None:
             values = {name: getattr(self.iso230, f"{name}_um") for name in "ARBEM"}
-            rows.append(
-                ("ISO 230-2 (k = 2)", ", ".join(f"{name} {_expanded(one)}" for name, one in values.items() if one))
-            )
+            told = ", ".join(f"{name} {_expanded(one)}" for name, one in values.items() if one)
+            rows.append(("ISO 230-2 (k = 2)", told.replace("µm", self.iso230.unit.replace("um", "µm"))))
         if self.anomalies is not None:
             named = (f"position {one.target}: {one.cause}, p = {one.p_value:.2g}" for one in self.anomalies)
             rows.append(("anomalies", "; ".join(named) or "none"))

@@ -611,9 +611,11 @@ def find_wide_table(grid: Grid) -> WideTable | None:
     cells = [[*fields, *[""] * (width - len(fields))] for _, fields in grid.rows]
     lines = [line for line, _ in grid.rows]
     for at, row in enumerate(cells):
-        for column, text in enumerate(row):
-            heading = read_heading(text)
-            if heading.role == "position":
+        headings = [read_heading(text) for text in row]
+        # Without a column of positions, that of the targets gives them: "Target" is the usual word for both.
+        name = "position" if any(heading.role == "position" for heading in headings) else "target"
+        for column, heading in enumerate(headings):
+            if heading.role == name:
                 found = _positions_below(grid, cells, lines, at, column, heading)
                 if found is not None:
                     return found
@@ -639,6 +641,8 @@ def _positions_below(
     first = next((i for i in near if _is_number(cells[i][column], grid.numerals)), len(cells))
     data = [i for i in range(first, len(cells)) if _is_number(cells[i][column], grid.numerals)]
     if len(data) < _FEWEST_TARGETS:
+        return None
+    if heading.role == "target" and [cells[i][column] for i in data] == [str(k + 1) for k in range(len(data))]:
         return None
     above = [i for i in range(max(0, at - _ROWS_ABOVE), at) if _names_runs(cells[i][column + 1 :])]
     block = [cells[i] for i in (*above, *range(at, first))]
@@ -762,13 +766,14 @@ def _position_unit(titles: Sequence[str]) -> str | None:
 def read_wide_table(table: WideTable) -> Readings:
     """Read the readings of a table of position by run."""
     path, numerals = table.grid.path, table.grid.numerals
-    kind = _wide_kind(table)
-    given = Readings(path, kind, ignored=table.ignored)
-    factor = UNITS[table.position_unit or ""].factor
+    notes: list[str] = []
+    kind, position_unit, fine_unit = _wide_units(table, notes)
+    given = Readings(path, kind, ignored=table.ignored, notes=notes)
+    factor = UNITS[position_unit].factor
     positions = [numerals.number(text) * factor for _, text in table.positions]
     targets = number_targets(positions)
     for run, cycle in zip(table.runs, _cycles(table), strict=True):
-        fine = UNITS[run.unit or table.deviation_unit or ""].factor * FINE[kind]
+        fine = UNITS[run.unit or fine_unit].factor * FINE[kind]
         for (line, text), target, position in zip(run.values, targets, positions, strict=True):
             if not text:
                 continue
@@ -781,20 +786,18 @@ def read_wide_table(table: WideTable) -> Readings:
     return given
 
 
-def _wide_kind(table: WideTable) -> Kind:
-    place = f"{table.grid.place}, line {table.line}"
-    if table.position_unit is None:
-        raise LaserFormatError(
-            f'{place}: the positions have no unit; write it in their heading, for example "Position [mm]"'
-        )
-    units = {run.unit or table.deviation_unit for run in table.runs}
-    if None in units:
-        raise LaserFormatError(
-            f'{place}: the deviations have no unit; write it in the headings, for example "Run 1 + [um]", or above them as "Unit: um"'
-        )
-    known = [unit or "" for unit in (*units, table.position_unit)]
-    stated = f"positions in {table.position_unit}, deviations in {', '.join(sorted(map(str, units)))}"
-    return _kind_of(known, f"{place}: {stated}")
+def _wide_units(table: WideTable, notes: list[str]) -> tuple[Kind, str, str]:
+    """Return the kind of axis, the unit of the positions, and that of runs without one; what no heading states is noted as taken."""
+    stated = table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
+    known = table.position_unit or stated
+    usual = ("deg", "arcsec") if known and UNITS[known].kind == "angle" else ("mm", "um")
+    position, deviation = table.position_unit or usual[0], stated or usual[1]
+    for name, unit, taken in (("positions", table.position_unit, position), ("deviations", stated, deviation)):
+        if unit is None:
+            notes.append(f"warning: no heading states the unit of the {name}: taken as {taken}")
+    units = sorted({run.unit or deviation for run in table.runs})
+    told = f"positions in {position}, deviations in {', '.join(units)}"
+    return _kind_of([*units, position], f"{table.grid.place}, line {table.line}: {told}"), position, deviation
 
 
 def _cycles(table: WideTable) -> list[int]:
@@ -909,8 +912,8 @@ def read_deviations(
     deviations = _read_table_of_deviations(path, sheet)
     if deviations["deviation"].attrs["units"] != "um" and not rotary:
         raise LaserFormatError(
-            f"{path}: the positions are angles; of a rotary axis only the evaluation by ISO 230-2 is done (thermofuse iso230): heat and "
-            "expansion are explained along a linear axis"
+            f"{path}: the positions are angles; a rotary axis is evaluated by ISO 230-2 alone, without a camera and not while it is "
+            "measured: heat and expansion are explained along a linear axis; give the readings alone to thermofuse run or iso230"
         )
     return deviations
 

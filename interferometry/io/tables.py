@@ -194,7 +194,7 @@ _TABLE = {
         "position, target position, nominal, nominal position, commanded position, programmed position, pos, "
         "sollposition, soll, sollwert, zielposition, nennposition, position cible, position nominale, "
         "position programmée, posición, posición objetivo, posición nominal, posición programada, 位置, 目标位置, 名义位置, "
-        "理论位置, 指令位置"
+        "理论位置, 指令位置, angle, target angle, nominal angle, angular position, winkel, sollwinkel, winkelposition, ángulo, 角度"
     ),
     "measured": (
         "measured, measured position, actual, actual position, laser position, ist, istposition, istwert, "
@@ -203,7 +203,8 @@ _TABLE = {
     ),
     "deviation": (
         "deviation, error, positioning error, position error, positional error, positional deviation, "
-        "positioning deviation, linear error, deviations, errors, positioning errors, abweichung, "
+        "positioning deviation, linear error, angular error, angle error, angular deviation, winkelabweichung, deviations, errors, "
+        "positioning errors, abweichung, "
         "positionsabweichung, positionierabweichung, fehler, positionierfehler, abweichungen, écart, erreur, "
         "écart de position, erreur de position, erreur de positionnement, écarts, erreurs, desviación, "
         "error de posición, error de posicionamiento, desviación de posición, desviaciones, errores, 偏差, 误差, 位置偏差, "
@@ -240,12 +241,14 @@ _DIRECTION_TABLE: tuple[tuple[str, bool, str], ...] = (
     (
         "positive",
         False,
-        "forward, forwards, fwd, fw, outward, vorwärts, vor, hin, hinfahrt, aller, avant, avance, adelante, ida, 正向, 前进, 去程",
+        "forward, forwards, fwd, fw, up, outward, vorwärts, vor, hin, hinfahrt, aller, avant, avance, adelante, ida, "
+        "正向, 前进, 去程",
     ),
     (
         "negative",
         False,
-        "reverse, rev, backward, backwards, bwd, bw, return, rückwärts, rück, zurück, rückfahrt, retour, arrière, atrás, vuelta, "
+        "reverse, rev, backward, backwards, bwd, bw, down, return, rückwärts, rück, zurück, rückfahrt, retour, arrière, "
+        "atrás, vuelta, "
         "retroceso, 反向, 负向, 后退, 回程",
     ),
 )
@@ -260,6 +263,7 @@ _UNIT_TABLE: tuple[tuple[str, str, float, float], ...] = (
     ("length", "mil, thou", 25.4e-3, 0.0),
     ("length", "uin, µin, microinch", 25.4e-6, 0.0),
     ("angle", "arcsec, arcsecond, arcseconds, ″, '', \", 角秒, bogensekunden", 1 / 3600, 0.0),
+    ("angle", "arcmin, arcminute, arcminutes", 1 / 60, 0.0),
     ("angle", "deg, degree, degrees, °, grad, 度", 1.0, 0.0),
     ("temperature", "degc, °c, ℃, c", 1.0, 0.0),
     ("temperature", "k", 1.0, -273.15),

@@ -27,6 +27,8 @@ def decide(value: float, expanded_u: float, limit: float) -> Decision:
 
 #: Least number of target positions, and per metre of travel; travel in mm above which the standard has another test.
 LEAST_TARGETS, TARGETS_PER_METRE, LONGEST_TRAVEL_MM = 5, 5, 2000.0
+#: Travel of a rotary axis in deg up to which so many target positions are enough, and how many beyond.
+_ANGULAR_TARGETS, _MOST_ANGULAR_TARGETS = ((90.0, 3), (180.0, 5)), 8
 #: Spacings that differ by less than this share of their mean are equal.
 _EQUAL_SHARE = 1e-3
 #: A trend over the cycles with a smaller p-value is no scatter.
@@ -49,8 +51,10 @@ def check_conditions(
     lead_mm: float | None = None,
     settling: Sequence[Settling] | None = None,
 ) -> list[ConditionCheck]:
-    """Check what ISO 230-2 asks of a test of a linear axis."""
+    """Check what ISO 230-2 asks of a test of an axis."""
     position = np.sort(deviations["position"].values)
+    if deviations["position"].attrs.get("units") == "deg":
+        return [_angles(position), _cycles(cycles), _completeness(deviations, cycles)]
     checks = [_targets(position), _travel(position), _spacing(position, lead_mm)]
     return [*checks, _cycles(cycles), _completeness(deviations, cycles), _settled(deviations, cycles, settling)]
 
@@ -62,6 +66,13 @@ def _targets(position: np.ndarray) -> ConditionCheck:
     return ConditionCheck(
         name, position.size >= required, f"{position.size} targets over {1e3 * travel_m:g} mm; required: {required}."
     )
+
+
+def _angles(position: np.ndarray) -> ConditionCheck:
+    travel = float(np.ptp(position))
+    required = next((least for angle, least in _ANGULAR_TARGETS if travel <= angle), _MOST_ANGULAR_TARGETS)
+    name = f"at least {required} targets for this travel of a rotary axis"
+    return ConditionCheck(name, position.size >= required, f"{position.size} targets over {travel:g}°.")
 
 
 def _travel(position: np.ndarray) -> ConditionCheck:
@@ -91,7 +102,7 @@ def _spacing(position: np.ndarray, lead_mm: float | None) -> ConditionCheck:
 
 def _cycles(cycles: Sequence[int]) -> ConditionCheck:
     return ConditionCheck(
-        f"{STANDARD_CYCLES} cycles", len(cycles) == STANDARD_CYCLES, f"{len(cycles)} cycles are evaluated."
+        f"{STANDARD_CYCLES} cycles", len(cycles) == STANDARD_CYCLES, f"Cycles evaluated: {len(cycles)}."
     )
 
 

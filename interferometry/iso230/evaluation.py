@@ -85,14 +85,15 @@ def evaluate_iso230(
           largest (NaN where not known), and ``temperature_difference`` (K), that of the material from 20 degC.
 
         The uncertainties of mean deviations are relative to the first position. Quantities that need both directions are NaN where
-        one was not measured. ``attrs["window"]`` names the cycles, says if they are not the five of the standard, and which targets
+        one was not measured; of one cycle, which has no standard deviation, R, A, s_i and all uncertainties are NaN.
+        ``attrs["window"]`` names the cycles, says if they are not the five of the standard, and which targets
         are left out because a direction has fewer than two readings there.
 
     Raises
     ------
     InterferometryError
-        ``deviations`` lack a variable of ``contract.DEVIATIONS``, the window names a cycle that was not measured, no target has two
-        readings in it, or a budget is given for a rotary axis.
+        ``deviations`` lack a variable of ``contract.DEVIATIONS``, the window names a cycle that was not measured, no target of several
+        cycles has two readings in it, or a budget is given for a rotary axis.
 
     Notes
     -----
@@ -130,7 +131,9 @@ def evaluate_iso230(
     used = _budget_of_window(
         budget or (SCATTER_ALONE if unit == "arcsec" else Iso230Budget()), varied, material_degC, numbers
     )
-    uncertain = UncertainTest(result, deviations["position"].values, used)
+    # Without a standard deviation no uncertainty is known either.
+    scattered = result if len(numbers) > 1 else result * np.nan
+    uncertain = UncertainTest(scattered, deviations["position"].values, used)
     stated = np.nan if used.environmental_variation_um is None else used.environmental_variation_um
     result = result.assign(uncertain.uncertainties()).assign(
         environmental_variation=stated, drift_variation=varied, temperature_difference=used.difference_from_20_degC_K
@@ -233,13 +236,14 @@ def _leave_out_single_readings(
     deviations: xr.Dataset, x: np.ndarray, count: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Leave out, by name, positions with fewer than two readings in a measured direction: they have no standard deviation."""
+    if x.shape[0] == 1 and count.any():
+        return x, count, []
     measured = count.any(axis=1, keepdims=True)
     single = (count < 2) & measured
     if not ((count >= 2) & measured).any():
-        window = "one cycle" if x.shape[0] == 1 else f"{x.shape[0]} cycles"
         raise InterferometryError(
-            f"no target has two readings from one side in a window of {window}; ISO 230-2 requires {STANDARD_CYCLES} cycles, and "
-            "scatter needs two: measure more, or widen the window"
+            f"no target has two readings from one side in a window of {x.shape[0]} cycles; ISO 230-2 requires {STANDARD_CYCLES} cycles, "
+            "and scatter needs two: measure more, or widen the window"
         )
     names = [
         f"{deviations['target'].values[target]} {deviations['direction'].values[direction]}"
@@ -259,7 +263,8 @@ def _mean_and_s(x: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _name_window(cycles: np.ndarray, left_out: Sequence[str]) -> str:
     name = f"cycles {cycles[0]} to {cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
     if cycles.size != STANDARD_CYCLES:
-        name += f" ({cycles.size} cycles, not the {STANDARD_CYCLES} of the standard's acceptance test)"
+        counted = "1 cycle" if cycles.size == 1 else f"{cycles.size} cycles"
+        name += f" ({counted}, not the {STANDARD_CYCLES} of the standard's acceptance test)"
     return name + (f"; without targets {', '.join(left_out)} (fewer than two readings)" if left_out else "")
 
 

@@ -14,6 +14,7 @@ from bokeh.plotting import figure
 
 from fusion.app import parts as ui
 from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
+from fusion.campaign.inputs import lacks_course
 from fusion.report.campaign import (
     DECIDED_BEFORE,
     describe_candidates,
@@ -79,7 +80,8 @@ def laser_charts(products: Products, selection: Selection, linker: Linker) -> ui
     """Return the charts of the readings, and say which are missing."""
     assert products.deviations is not None
     if products.drift is None:
-        parts = [ui.note("The readings have no times: profile and drift cannot be told apart and are not shown.")]
+        untimed = "The readings have no times: profile and drift cannot be told apart and are not shown."
+        parts = [ui.note(lacks_course(products.deviations) or untimed)]
     else:
         parts = _drift_charts(products.deviations, products.drift, products, selection, linker)
     return [*parts, *_standard_charts(products.deviations, products, linker)]

@@ -34,6 +34,7 @@ from fusion.app.setup.times import TimesView, recordings_of
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.pipeline.check import BAD_INPUT, CampaignCheck, check_campaign
 from fusion.pipeline.columns import TableProposal, propose_table
+from fusion.pipeline.draft import separate_tests
 from fusion.pipeline.inspect import FolderContent, Kind, Recording, scan_folder
 from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations
@@ -61,6 +62,11 @@ def open_folder(root: Path, folder: Path) -> Opened:
     """Read what the screen shows of a folder."""
     content, campaign = scan_folder(folder), open_campaign(folder)
     remarks: list[str] = []
+    if campaign.saved is None and (tests := separate_tests(content)):
+        remarks.append(
+            f"{len(tests)} tests of an axis are in this folder, each a campaign of its own: thermofuse init {folder} writes one for each, "
+            f"in a folder of its own that can be looked into here, and thermofuse fleet runs them all. Shown is {tests[0].path.name} alone."
+        )
     frame, placed = None, Placed()
     if content.frames:
         try:
@@ -95,7 +101,7 @@ def positions_of(content: FolderContent) -> tuple[float, ...]:
     """Return the axis positions of the targets in a folder, mm; none where its deviations cannot be read."""
     for one in content.of(Kind.DEVIATIONS)[:1]:
         with suppress(InterferometryError):
-            return tuple(np.unique(read_deviations(one.path)["position"].values).tolist())
+            return tuple(np.unique(read_deviations(one.path, rotary=True)["position"].values).tolist())
     return ()
 
 

@@ -122,8 +122,14 @@ def _clock_charts(fused: xr.Dataset, deviations: xr.Dataset | None) -> dict[str,
 
 
 def _reading_charts(deviations: xr.Dataset) -> dict[str, Chart]:
-    """The charts that need neither the times of the readings nor their drift."""
-    position, shifted, sides = deviations["position"], evaluate_common_start(deviations), _sides(deviations)
+    """The charts that need neither the times of the readings nor their drift; without neighbour differences that of the standard alone."""
+    position, sides = deviations["position"], _sides(deviations)
+    standard = (
+        {"iso230": readings.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}
+    )
+    if not has(deviations, "comparison"):
+        return standard
+    shifted = evaluate_common_start(deviations)
     from_start = "deviation from a common start"
     return {
         **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in sides},
@@ -131,9 +137,7 @@ def _reading_charts(deviations: xr.Dataset) -> dict[str, Chart]:
         "scatter": readings.plot_scatter_comparison(group(deviations, "comparison"), position),
         "mean_differences": readings.plot_mean_differences(group(deviations, "neighbours"), position),
         "chart": readings.plot_reference_chart(group(deviations, "chart"), position),
-        **(
-            {"iso230": readings.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}
-        ),
+        **standard,
     }
 
 

@@ -195,8 +195,11 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
     settled, x = settled.isel(target=order), position.values[order].astype(float)
     room = 0.24 * (np.ptp(x) or 1.0)
     left = x[0] - 0.04 * room
-    drawn = new_figure(x="position / mm", y="deviation / µm", height=420, x_range=(left, x[-1] + room), zero=True)
-    columns: dict[str, np.ndarray] = {"target": settled["target"].values, "position / mm": x}
+    unit, along = (print_unit(str(values.attrs.get("units", "um"))) for values in (settled["A"], position))
+    drawn = new_figure(
+        x=f"position / {along}", y=f"deviation / {unit}", height=420, x_range=(left, x[-1] + room), zero=True
+    )
+    columns: dict[str, np.ndarray] = {"target": settled["target"].values, f"position / {along}": x}
     for direction in settled["direction"].values:
         row = settled.sel(direction=direction)
         mean, s = row["mean_unidirectional"].values, row["standard_deviation"].values
@@ -212,24 +215,28 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
         drawn.add_layout(whisker)
         looks = {"marker": MARKERS[direction], "size": 7, "color": COLOURS[direction]}
         points = drawn.scatter("x", "y", source=source, legend_label=f"mean, {name}", **looks)
-        tips = [("position", "@x{0.###} mm"), (f"mean {name}", "@y{0.00} µm"), ("s", "@s{0.00} µm")]
+        tips = [
+            ("position", f"@x{{0.###}} {along}"),
+            (f"mean {name}", f"@y{{0.00}} {unit}"),
+            ("s", f"@s{{0.00}} {unit}"),
+        ]
         add_hover(drawn, tips, [points])
-        columns |= {f"mean, {name} / µm": mean, f"s, {name} / µm": s}
+        columns |= {f"mean, {name} / {unit}": mean, f"s, {name} / {unit}": s}
     if np.isfinite(settled["mean_bidirectional"]).any():
         drawn.line(x, settled["mean_bidirectional"].values, color=INK, line_dash="dotted", legend_label="mean of both")
         _mark_reversal(drawn, settled, x)
     _mark_spans(drawn, settled, x[-1], room)
-    return Chart(drawn, _seen(settled, x), columns)
+    return Chart(drawn, _seen(settled, x, unit, along), columns)
 
 
 def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> None:
     """Draw the spans of A and E to the right of the data, where both approaches were measured, else those of the one approach."""
     mean, s = settled["mean_unidirectional"].values, settled["standard_deviation"].values
-    if not np.isfinite(mean).any():
-        return
     # Labels are at two heights: at one height they would be written over each other.
     spans = (("A", mean - 2 * s, mean + 2 * s, 0.15, 0.3), ("E", mean, mean, 0.62, 0.6))
     for symbol, low, high, share, height in spans:
+        if not np.isfinite(low).any():
+            continue
         at, bottom, top = end + share * room, float(np.nanmin(low)), float(np.nanmax(high))
         drawn.segment([at], [bottom], [at], [top], line_color=INK, line_width=1.4)
         for level in (bottom, top):
@@ -243,40 +250,21 @@ def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:
     k = int(np.nanargmax(np.abs(reversal)))
     ends, s = settled["mean_unidirectional"].values[:, k], settled["standard_deviation"].values[:, k]
     drawn.segment([x[k]], [ends.min()], [x[k]], [ends.max()], line_color=INK, line_width=3)
-    add_label(drawn, float(x[k]), float((ends + 2 * s).max()), f"B {abs(reversal[k]):.2f}", offset=(-16, 6))
+    top = float((ends + 2 * s).max())
+    at, offset = (top, (-16, 6)) if np.isfinite(top) else (float(ends.mean()), (6, -8))
+    add_label(drawn, float(x[k]), at, f"B {abs(reversal[k]):.2f}", offset=offset)
 
 
-def _seen(settled: xr.Dataset, x: np.ndarray) -> str:
+def _seen(settled: xr.Dataset, x: np.ndarray, unit: str, along: str) -> str:
     """Return the text alternative."""
     means = {
         direction: settled["mean_unidirectional"].sel(direction=direction) for direction in settled["direction"].values
     }
-    rows = [f"{ARROWS[side]} {span_words(mean, 'µm')}" for side, mean in means.items() if np.isfinite(mean).any()]
+    rows = [f"{ARROWS[side]} {span_words(mean, unit)}" for side, mean in means.items() if np.isfinite(mean).any()]
     known = [symbol for symbol in "AEB" if np.isfinite(settled[symbol])]
-    values = ", ".join(f"{symbol} {number(float(settled[symbol]))} µm" for symbol in known)
-    told = f"Mean deviation over {span_words(x, 'mm')} of the axis with ±2 s: {'; '.join(rows)}."
+    values = ", ".join(f"{symbol} {number(float(settled[symbol]))} {unit}" for symbol in known)
+    told = f"Mean deviation over {span_words(x, along)} of the axis with ±2 s: {'; '.join(rows)}."
     return f"{told} {values}." if values else told
-
-
-def plot_single_runs(deviations: xr.Dataset) -> Chart:
-    """Draw the deviations of a test of one cycle, which has no standard deviation."""
-    drawn = new_figure(x="position / mm", y="deviation / µm", height=420, zero=True)
-    ordered = deviations.sortby("position")
-    x = ordered["position"].values
-    columns: dict[str, np.ndarray] = {"target": ordered["target"].values, "position / mm": x}
-    seen = []
-    for direction in ordered["direction"].values:
-        for cycle in ordered["cycle"].values:
-            y = ordered["deviation"].sel(direction=direction, cycle=cycle).values
-            if not np.isfinite(y).any():
-                continue
-            name = ARROWS[direction]
-            drawn.line(x, y, color=COLOURS[direction], line_width=1.6, legend_label=name)
-            points = drawn.scatter(x, y, marker=MARKERS[direction], size=7, color=COLOURS[direction], legend_label=name)
-            add_hover(drawn, [("position", "$x{0.###} mm"), (name, "$y{0.00} µm")], [points])
-            columns[f"cycle {cycle}, {name} / µm"] = y
-            seen.append(f"{name} {span_words(y, 'µm')}")
-    return Chart(drawn, f"Single deviations over {span_words(x, 'mm')} of the axis: {'; '.join(seen)}.", columns)
 
 
 # Charts of the differences between neighbouring positions.
@@ -389,8 +377,9 @@ def plot_history(deviations: xr.Dataset, drift: xr.Dataset, target: int) -> Char
 
 def plot_windows(windows: xr.Dataset) -> Chart:
     """Draw accuracy A, repeatability R and reversal B of five-cycle windows along the test; dotted: all cycles as one window."""
+    unit = print_unit(str(windows["A"].attrs.get("units", "um")))
     short, whole = windows.isel(window=slice(None, -1)), windows.isel(window=-1)
-    drawn = new_figure(x="middle cycle of the window", y="A, R, B / µm")
+    drawn = new_figure(x="middle cycle of the window", y=f"A, R, B / {unit}")
     middle = short["middle_cycle"].values
     columns: dict[str, np.ndarray] = {"middle cycle": middle}
     shown = (
@@ -402,13 +391,13 @@ def plot_windows(windows: xr.Dataset) -> Chart:
         value, half = short[name].values, 2 * short[f"{name}_u"].values
         add_series(drawn, middle + 0.25 * (shift - 1), value, name=text, colour=colour, marker=marker, half=half)
         drawn.hspan(float(whole[name]), line_color=colour, line_dash="dotted", line_width=1.5)
-        columns |= {f"{name} / µm": value, f"U({name}), k = 2 / µm": half}
+        columns |= {f"{name} / {unit}": value, f"U({name}), k = 2 / {unit}": half}
     top = max(float(np.nanmax(short[name] + 2 * short[f"{name}_u"])) for name in "ARB")
     fix_range(drawn, 0.0, 1.05 * max(top, float(whole["A"])))
     seen = (
-        f"{middle.size} windows of five cycles: A {span_words(short['A'], 'µm')}, R {span_words(short['R'], 'µm')}, B "
-        f"{span_words(short['B'], 'µm')}; all cycles as one window give A {number(float(whole['A']))} µm and "
-        f"R {number(float(whole['R']))} µm."
+        f"{middle.size} windows of five cycles: A {span_words(short['A'], unit)}, R {span_words(short['R'], unit)}, B "
+        f"{span_words(short['B'], unit)}; all cycles as one window give A {number(float(whole['A']))} {unit} and "
+        f"R {number(float(whole['R']))} {unit}."
     )
     return Chart(drawn, seen, columns)
 

@@ -243,8 +243,8 @@ def export_results(
         return Exported(_write(out, content, overwrite=overwrite))
     if not has(deviations, "drift"):
         raise ExportError(
-            f"{results}: the readings have no times, so there is neither drift nor profile to write; --format csv and xlsx give the values "
-            "by ISO 230-2"
+            f"{results}: the readings have no times, or are too few, so there is neither drift nor profile to write; --format csv and xlsx "
+            "give the values by ISO 230-2"
         )
     run = _Run(results, found, deviations, read_origin(results, found, read_thermal_state(results, deviations)))
     with naming(results):

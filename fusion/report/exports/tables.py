@@ -30,12 +30,19 @@ _FIELD_ROW_BYTES = 38
 def readings_table(deviations: xr.Dataset) -> pd.DataFrame:
     """Return every reading with its drift and the standard uncertainty of that; of readings without times, the readings alone."""
     position, read = deviations["position"], deviations["deviation"]
-    columns = {"position_mm": position, "deviation_um": read}
+    timed = {} if np.isnat(deviations["time"].values).all() else {"time_utc": deviations["time"]}
+    columns = {"position_mm": position, **timed, "deviation_um": read}
     if has(deviations, "drift"):
         drift = group(deviations, "drift")
-        columns = {"position_mm": position, "time_utc": deviations["time"], "deviation_um": read}
         columns |= {"drift_um": drift["drift"], "drift_u_um": drift["drift_u"]}
-    return xr.Dataset(columns).to_dataframe().dropna(subset=["deviation_um"]).reset_index()
+    return _in_its_units(xr.Dataset(columns).to_dataframe().dropna(subset=["deviation_um"]).reset_index(), deviations)
+
+
+def _in_its_units(table: pd.DataFrame, deviations: xr.Dataset) -> pd.DataFrame:
+    """Return a table whose headings carry deg and arcsec where the axis is a rotary one."""
+    if deviations["deviation"].attrs["units"] != "arcsec":
+        return table
+    return table.rename(columns=lambda name: re.sub("_mm$", "_deg", re.sub("_um$", "_arcsec", name)))
 
 
 def profile_table(deviations: xr.Dataset) -> pd.DataFrame:
@@ -57,7 +64,7 @@ def iso230_axis_table(deviations: xr.Dataset) -> pd.DataFrame:
         rows.append(frame.assign(quantity=name.removesuffix("_unidirectional")))
     table = pd.concat(rows, ignore_index=True)
     table["direction"] = table["direction"].fillna("both") if "direction" in table else "both"
-    return table[["window", "quantity", "direction", "value_um", "u_um"]]
+    return _in_its_units(table[["window", "quantity", "direction", "value_um", "u_um"]], deviations)
 
 
 def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFrame:
@@ -76,7 +83,8 @@ def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFr
         "mean_bidirectional_um": evaluated["mean_bidirectional"],
         "repeatability_bidirectional_um": evaluated["repeatability_bidirectional"],
     }
-    return xr.Dataset(columns).to_dataframe().reset_index().assign(window=evaluated.attrs["window"])
+    table = xr.Dataset(columns).to_dataframe().reset_index().assign(window=evaluated.attrs["window"])
+    return _in_its_units(table, deviations)
 
 
 def fields_table(folder: Path) -> pd.DataFrame:

@@ -9,6 +9,7 @@ import pytest
 
 from fusion.analysis.alignment.align import AlignmentError
 from fusion.pipeline.check import check_campaign
+from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import ExportError, export_results
 from fusion.report.terminal import summary_rows
@@ -19,6 +20,7 @@ from tests.fusion.campaign_parts import BOTH, change, keep_cycles, without, writ
 
 pytestmark = pytest.mark.chain
 
+ROTARY = [("position_mm", "angle_deg"), ("deviation_um", "error_arcsec")]
 CAMERA_CHECKS = ("camera", "fiducial", "plan", "frames", "frozen", "scene", "material", "axis_line")
 
 
@@ -264,7 +266,9 @@ def test_readings_without_times_are_exported_without_drift(untimed, tmp_path):
     names = [path.name for path in export_results(untimed, "csv", tmp_path).files]
     assert names == ["readings.csv", "iso230.csv", "iso230_positions.csv"]
     assert export_results(untimed, "xlsx", tmp_path).files
-    with pytest.raises(ExportError, match="the readings have no times, so there is neither drift nor profile"):
+    with pytest.raises(
+        ExportError, match="the readings have no times, or are too few, so there is neither drift nor profile"
+    ):
         export_results(untimed, "linuxcnc", tmp_path, force=True)
 
 
@@ -274,3 +278,22 @@ def test_readings_without_times_beside_a_camera_are_refused(folder):
     with pytest.raises(AlignmentError, match=r"wide.csv: no reading has a time.*leave \[thermography\] out"):
         run_campaign(path, folder / "never")
     assert not (folder / "never").exists()
+
+
+@pytest.mark.parametrize(("cycles", "renamed"), [(1, []), (2, []), (5, ROTARY)])
+def test_a_test_without_a_course_has_the_values_of_the_command_and_no_drift(tmp_path, cycles, renamed):
+    path = write_laser(tmp_path / "test", cycles, 9)
+    for name, other in renamed:
+        change(path.with_name("laser.csv"), name, other)
+    results = run_campaign(path, tmp_path / "results")
+    alone = read_test(path.with_name("laser.csv"), None)
+    left_out = {"conditions", "contributions", "settled", "first"}
+    assert results.iso230.model_dump(exclude=left_out) == alone.part.model_dump(exclude=left_out)
+    assert results.iso230.unit == ("arcsec" if renamed else "um")
+    assert results.drift is results.neighbours is results.loop is results.anomalies is None
+    assert results.warnings[0].code == "standard_alone"
+    assert sections(tmp_path / "results") == {"iso230", "data", "uncertainty", "glossary", "provenance"}
+    text = re.sub("<script.*?</script>", "", (tmp_path / "results/report.html").read_text(encoding="utf-8"), flags=re.S)
+    assert ("µm" in text) is not bool(renamed)
+    told = dict(summary_rows(results))["how much"]
+    assert ("E = " in told and "±" not in told) if cycles == 1 else ("A = " in told and "(k = 2)" in told)

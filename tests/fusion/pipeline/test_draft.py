@@ -228,6 +228,17 @@ def test_laser_tests_of_one_folder_become_a_campaign_each_and_questions_are_aske
         write_campaigns(tmp_path, Asker(answer))
 
 
+def test_a_rotary_axis_is_asked_nothing_about_lengths(tmp_path):
+    rows = [f"{angle};0,5;-0,5;0,7;-0,4" for angle in range(0, 361, 45)]
+    (tmp_path / "C_axis.csv").write_text("\n".join(["Angle [deg];1 + [arcsec];1 -;2 +;2 -", *rows]))
+    asked = []
+    path, missing = write_campaign(tmp_path, Asker(lambda question, default: asked.append(question) or default))
+    assert len(asked) == 2 and not missing and load_campaign(path).campaign.axis == "C"
+    assert check_campaign(path).faults == ()
+    path.write_text(f'{path.read_text()}\n[acceptance]\nA = "5 um"\n')
+    assert "limits of a length" in check_campaign(path).faults[0]
+
+
 def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path):
     heading = "cycle,direction,target,position_mm,time,deviation_um\n"
     for name in ("run_1.csv", "run_2.csv"):

@@ -123,11 +123,6 @@ def test_a_file_of_readings(tmp_path):
     assert {entry.origin for entry in found.part.settled.contributions[:3]} == {"assumed"}
 
 
-def test_a_single_run_keeps_its_deviations(tmp_path):
-    found = read_test(write_laser(tmp_path / "test", 1, 5).with_name("laser.csv"), None)
-    assert found.part is None and found.dataset.sizes["cycle"] == 1
-
-
 def test_a_campaign_of_the_laser_alone_brings_its_budget_and_tolerances(tmp_path):
     stated = '[interferometry.uncertainty]\ndevice = "2 ppm"\n[acceptance]\nA = "1 m"\n'
     found = read_test(without(write_laser(tmp_path / "test", 6, 5), added=stated), None)

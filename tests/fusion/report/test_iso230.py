@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.campaign.recompensation import StatedBudget
+from fusion.campaign.recompensation import ROTARY_BUDGET
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard
 from fusion.report.campaign import describe_iso230
 from fusion.report.page import Iso230PageError, iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
@@ -17,7 +17,6 @@ from fusion.report.wording import say
 from fusion.results.axis import Iso230Part
 from fusion.results.store import joined, plain
 from interferometry.drift.estimate import estimate_drift
-from interferometry.iso230.uncertainty import SCATTER_ALONE
 from tests.fusion.pipeline.test_iso230 import ASSUMED
 from tests.fusion.report.page_tables import tables_of
 from tests.interferometry.iso230.made_tests import by_hand, test_made
@@ -98,7 +97,7 @@ def test_the_sums_of_the_budget_are_those_of_its_rows(test_sheet):
 def test_json_and_csv_hold_full_precision(test_sheet):
     told = iso230_json(*test_sheet)
     assert told["settled"]["A_um"]["value"] == pytest.approx(by_hand(X)["A"], rel=1e-12)
-    rows = list(csv.DictReader(io.StringIO(iso230_csv(*test_sheet))))
+    rows = list(csv.DictReader(io.StringIO(iso230_csv(test_sheet[1]))))
     assert [float(row["mean_positive_um"]) for row in rows] == pytest.approx(X[:, 0].mean(axis=0))
     assert [float(row["B_i_um"]) for row in rows] == pytest.approx(X[:, 0].mean(axis=0) - X[:, 1].mean(axis=0))
     assert told["targets"][0]["readings_negative"] == 5
@@ -111,14 +110,17 @@ def test_missing_readings_are_named_under_the_table():
     assert "1 of 70 readings of the window are missing: cycle 4, target 3\u2193 (missing)." in page
 
 
-def test_a_single_run_shows_deviations_and_says_what_is_not_possible():
-    dataset = test_made(X[:1])
-    page = render_iso230("A", None, dataset, remarks=("1 line left out",), versions=VERSIONS)
-    assert "a standard deviation s is not possible" in page and "<li>1 line left out</li>" in page
+def test_one_cycle_has_e_m_and_b_alone_and_says_why():
+    part, dataset = evaluated(X[:1])
+    page = render_iso230("A", part, dataset, remarks=("1 line left out",), versions=VERSIONS)
+    assert "One cycle has no standard deviation s" in page and "<li>1 line left out</li>" in page
     rows = [cells for cells in cells_of(page) if cells and cells[0].isdigit()]
     assert [as_number(cells[3]) for cells in rows] == pytest.approx(X[0, 1], abs=0.0051)
-    assert list(csv.DictReader(io.StringIO(iso230_csv(None, dataset))))[6]["deviation_positive_um"] == str(X[0, 0, 6])
-    assert len(iso230_tables(None, dataset, title="A")) == 1
+    assert list(csv.DictReader(io.StringIO(iso230_csv(dataset))))[6]["mean_positive_um"] == str(X[0, 0, 6])
+    assert part.A_um.value is part.R_um.value is None and part.E_um.value == pytest.approx(np.ptp(X[0]))
+    assert part.B_um.value == pytest.approx(np.abs(X[0, 0] - X[0, 1]).max()) and part.B_um.u is None
+    # Neither limits nor a budget are judged without an uncertainty.
+    assert [table.title for table in iso230_tables(part, dataset, title="A")][1:] == ["per target position"]
 
 
 def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_path):
@@ -132,22 +134,20 @@ def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_pa
     assert iso230_tables(*test_sheet, title="A")[0].title == "A, cycles 1 to 5"
 
 
-def test_a_rotary_axis_has_tables_and_csv_alone():
+def test_a_rotary_axis_keeps_its_units_everywhere():
     deviations = test_made(X)
     deviations["deviation"].attrs["units"], deviations["position"].attrs["units"] = "arcsec", "deg"
-    budget = StatedBudget(SCATTER_ALONE, dict.fromkeys(ASSUMED.origins, "not of a rotary axis"))
-    windows, settled, part = evaluate_standard(deviations, budget, drift=None, material_degC=None)
+    windows, settled, part = evaluate_standard(deviations, ROTARY_BUDGET, drift=None, material_degC=None)
     dataset = joined(deviations, iso=windows, settled=settled)
+    part = complete_sheet(part, dataset, campaign=None, environment=None)
     found = Iso230Part.model_validate(plain(part))
     tables = iso230_tables(found, dataset, title="A")
     assert tables[0].columns[1].header == "cycles 1 to 5 / arcsec" and tables[1].columns[1].header == "Position / deg"
-    assert iso230_csv(found, dataset).startswith("target,position_deg,mean_positive_arcsec")
-    for write in (
-        lambda: iso230_json(found, dataset),
-        lambda: render_iso230("A", found, dataset, remarks=(), versions=VERSIONS),
-    ):
-        with pytest.raises(Iso230PageError, match="a rotary one"):
-            write()
+    assert iso230_csv(dataset).startswith("target,position_deg,mean_positive_arcsec")
+    assert iso230_json(found, dataset)["unit"] == "arcsec"
+    page = render_iso230("A", found, dataset, remarks=(), versions=VERSIONS)
+    text = " ".join(cell for cells in cells_of(page) for cell in cells)
+    assert "deviation / arcsec" in page and "µm" not in text and "ppm" not in text and " mm" not in text
 
 
 def test_the_budget_of_one_approach_has_its_own_quantities():

@@ -102,7 +102,7 @@ def test_axis_values_bear_the_terms_of_the_standard_of_one_approach_the_unidirec
     known, unknown = Quantity(value=9.9017, u=1.378), Quantity(value=None, u=None)
     side = Iso230Direction(A_um=known, R_um=known, E_um=known)
     other = Iso230Direction(A_um=unknown, R_um=unknown, E_um=unknown)
-    window = Iso230Window.model_construct(A_um=unknown, positive=other, negative=side)
+    window = Iso230Window.model_construct(A_um=unknown, E_um=unknown, positive=other, negative=side)
     assert wording.quoted_values(window) == {"A\u2193": "9.9 \u00b1 2.8 \u00b5m", "R\u2193": "9.9 \u00b1 2.8 \u00b5m"}
     assert list(wording.quoted_values(ISO)) == ["A", "R", "B"]
 

@@ -559,10 +559,32 @@ def test_a_rotary_axis_in_degrees_and_arcseconds(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "taken"),
+    [
+        (f"Target,Run1+,Run1-,Run2+,Run2-\n{DATA}", ["positions: taken as mm", "deviations: taken as um"]),
+        (f"Position,1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", ["positions: taken as mm"]),
+        (f"Target,up 1,down 1,up 2,down 2\n{DATA}", ["positions: taken as mm", "deviations: taken as um"]),
+        (f"Position [mm],1 fwd [um],1 rev [um],2 fwd,2 rev\n{DATA}", []),
+        (f"Angle [deg],1+,1-,2+,2-\n{DATA}", ["deviations: taken as arcsec"]),
+    ],
+)
+def test_units_that_no_heading_states_are_taken_and_noted(tmp_path, text, taken):
+    semicolons = text.replace(",", ";").replace(".", ",")
+    for one in (text, semicolons):
+        test = read_wide(tmp_path, one, rotary=True)
+        assert test["deviation"].values == pytest.approx(WIDE_EXPECTED, abs=1e-6)
+        told = [note.rpartition("of the ")[2] for note in json.loads(test.attrs["notes"]) if "unit" in note]
+        assert told == taken
+
+
+def test_numbers_of_targets_are_no_positions(tmp_path):
+    with pytest.raises(LaserFormatError, match="no table of deviations"):
+        read_wide(tmp_path, "Target,1+,1-,2+,2-\n1,0.1,0.2,0.1,0.3\n2,0.4,0.2,0.1,0.3\n3,0.1,0.2,0.1,0.3\n")
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
-        (f"Position,1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", r"line 1: the positions have no unit; .* \"Position"),
-        (f"Position [mm],1+,1-,2+,2-\n{DATA}", "the deviations have no unit; write it in the headings"),
         (f"Position [deg],1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", "positions in deg, deviations in um; give both as"),
         (f"Position [mm],1+ [um],1- [um],2+ [um],- [um]\n{DATA}", "'- .um.' has no number, but other runs have"),
         (f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}", "no table of deviations; line 1 has columns of"),

@@ -116,15 +116,21 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng):
     test = test_made(rng.normal(0, 1, (5, 2, 4)))
     with pytest.raises(ValueError, match=r"cycles \[6, 7\] of the window were not measured"):
         evaluate_iso230(test, cycles=[5, 6, 7])
-    with pytest.raises(ValueError, match="no target has two readings from one side in a window of one cycle; ISO"):
-        evaluate_iso230(test, cycles=[5])
     once = test["deviation"].values.copy()
     once[3, :, :2], once[4, :, 2:] = np.nan, np.nan
     with pytest.raises(ValueError, match="no target has two readings from one side in a window of 2 cycles"):
         evaluate_iso230(test_made(once), cycles=[4, 5])
-    one_way = test_made(np.where(np.arange(2)[:, None] == 0, test["deviation"].values, np.nan))
-    with pytest.raises(ValueError, match="no target has two readings from one side in a window of one cycle"):
-        evaluate_iso230(one_way, cycles=[5])
+
+
+def test_one_cycle_has_what_needs_no_standard_deviation(rng):
+    x = rng.normal(0, 1, (5, 2, 4))
+    found = evaluate_iso230(test_made(x), cycles=[5])
+    assert float(found["E"]) == np.ptp(x[4]) and float(found["M"]) == np.ptp(x[4].mean(axis=0))
+    assert float(found["B"]) == np.abs(x[4, 0] - x[4, 1]).max()
+    unknown = ("A", "R", "E_u", "B_u", "B_of_scatter", "mean_reversal_u")
+    assert np.isnan([float(found[name]) for name in unknown]).all()
+    one_way = evaluate_iso230(test_made(np.where(np.arange(2)[:, None] == 0, x, np.nan)), cycles=[5])
+    assert float(one_way["E_unidirectional"][0]) == np.ptp(x[4, 0]) and np.isnan(float(one_way["E"]))
 
 
 def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng):

@@ -161,3 +161,10 @@ def test_files_are_dropped_into_the_folder_and_a_wrong_or_large_one_is_refused(a
     field.press("Tab")
     look.press("Enter")
     page.get_by_role("alert").get_by_text("lies outside").wait_for()
+
+
+def test_of_several_laser_tests_the_screen_says_how_each_becomes_a_campaign(tmp_path):
+    rows = "\n".join(f"{place},0.1,0.2,0.3,0.2" for place in (0, 50, 100))
+    for name in ("X", "Y"):
+        (tmp_path / f"{name}_axis.csv").write_text(f"Position [mm],1+ [um],1- [um],2+ [um],2- [um]\n{rows}\n")
+    assert "2 tests of an axis are in this folder" in open_folder(tmp_path, tmp_path).remarks[0]

@@ -15,7 +15,6 @@ from fusion.report.charts.readings import (
     plot_position_scatter,
     plot_profile,
     plot_reversal,
-    plot_single_runs,
     plot_test,
     plot_windows,
 )
@@ -182,10 +181,13 @@ def test_one_approach_has_a_chart_without_b():
     assert not any(label.text.startswith("B") for label in chart.figure.select({"type": Label}))
 
 
-def test_a_single_run_shows_its_readings():
-    x = np.arange(12.0).reshape(1, 2, 6)
-    chart = plot_single_runs(test_made(x))
-    assert chart.columns["cycle 1, negative approach / \u00b5m"] == pytest.approx(np.arange(6.0, 12.0))
+def test_one_cycle_of_a_rotary_axis_has_its_readings_and_units():
+    test = test_made(np.arange(12.0).reshape(1, 2, 6))
+    test["deviation"].attrs["units"], test["position"].attrs["units"] = "arcsec", "deg"
+    chart = plot_test(evaluate_iso230(test), test["position"])
+    assert chart.columns["mean, negative approach / arcsec"] == pytest.approx(np.arange(6.0, 12.0))
+    assert {label.text for label in chart.figure.select({"type": Label})} == {"E 11.00", "B 6.00"}
+    assert "0.00 to 50.00 deg" in chart.seen and "µm" not in chart.seen
 
 
 def test_the_labels_of_both_spans_stand_apart():
