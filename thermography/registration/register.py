@@ -360,7 +360,7 @@ def contradicted_hints(located: Mapping[str, LocatedDisc], fiducials: Sequence[F
             for name, hint in hints.items()
         ]
         if alike and not any(on_another):
-            said = f"all lie by the same ({shift[0]:+.0f}, {shift[1]:+.0f}) px from their discs, as read in another view; they were not used"
+            said = f"all lie by the same ({shift[0]:+.0f}, {shift[1]:+.0f}) px from their discs, as in another view; they were not used"
             return {"column_px, row_px": said}
     for disc in fiducials:
         if disc.hint_px is not None and (distance := _from_hint(disc, located[disc.name])) > WRONG_HINT_PX:
