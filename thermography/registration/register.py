@@ -359,7 +359,7 @@ def contradicted_hints(located: Mapping[str, LocatedDisc], fiducials: Sequence[F
             min(np.hypot(*(hint - place)) for other, place in places.items() if other != name) <= WRONG_HINT_PX
             for name, hint in hints.items()
         ]
-        if alike and not any(on_another):
+        if alike and np.mean(on_another) <= 0.5:
             said = f"all lie by the same ({shift[0]:+.0f}, {shift[1]:+.0f}) px from their discs, as in another view; they were not used"
             return {"column_px, row_px": said}
     for disc in fiducials:
