@@ -23,7 +23,14 @@ from fusion.analysis.consistency.camera import (
 )
 from fusion.analysis.consistency.checks import CODES, Check
 from fusion.analysis.consistency.clocks import Evidence, Recording, check_clocks
-from fusion.analysis.consistency.courses import check_load_scale, compare_drift, compare_load, compare_material
+from fusion.analysis.consistency.courses import (
+    check_load_course,
+    check_load_kind,
+    check_load_scale,
+    compare_drift,
+    compare_load,
+    compare_material,
+)
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.logs import (
     check_contact_sensors,
@@ -126,6 +133,7 @@ def _check_readings_and_logs(source: LaserInputs) -> list[Check]:
         *check_signs(source.deviations),
         *check_log(source.environment, times, name="environment", file=environment_file),
         *check_log(source.drivers, times, name="drivers", file=drivers_file),
+        *check_load_kind(source.drivers, file=drivers_file),
     ]
     if source.sensors is not None and not isinstance(source, CameraInputs):
         # They stand for the camera.
@@ -160,6 +168,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     return [
         *check_clocks(_recordings(source, fields), compared),
         *check_load_scale(field, source.drivers, file=drivers_file),
+        *check_load_course(field, source.drivers, file=drivers_file),
         *check_material(near, source.environment, stated=place_mm is not None, file=environment_file),
         *_compare_sensors(source, fields),
         *check_place(fields),
@@ -173,6 +182,7 @@ def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
     return [
         *check_clocks(_recordings(source, fields), compare_load(field, source.drivers)),
         *check_load_scale(field, source.drivers, file=drivers_file),
+        *check_load_course(field, source.drivers, file=drivers_file),
         *_compare_sensors(source, fields),
         *check_place(fields),
     ]

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from threading import Event, Thread
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -66,6 +67,8 @@ def listed(names: Iterable[str]) -> str:
 Report = Callable[[str, int, int], None]
 
 _SECONDS_BETWEEN_LINES = 10.0
+#: A step is overdue after this multiple of its forecast, and after a minute.
+_OVERDUE, _LEAST_OVERDUE_S = 10.0, 60.0
 
 
 def silent(label: str, done: int, total: int) -> None:
@@ -82,6 +85,8 @@ class Reporter(AbstractContextManager["Reporter"]):
         self._started: dict[str, float] = {}
         self._spoken: dict[str, float] = {}
         self._finished: set[str] = set()
+        self._running: dict[str, tuple[float, float | None]] = {}
+        self._ended = Event()
 
     def __enter__(self) -> Reporter:
         if self._console.is_terminal:
@@ -95,30 +100,51 @@ class Reporter(AbstractContextManager["Reporter"]):
             )
             self._bars = Progress(*columns, console=self._console)
             self._bars.start()
+        # A step that hangs reports nothing.
+        Thread(target=self._watch, daemon=True).start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._ended.set()
         if self._bars is not None:
             self._bars.stop()
 
     def __call__(self, label: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the step `label` are finished."""
+        now = time.monotonic()
+        started, forecast_s = self._running.pop(label, (now, None))
+        if done < total:
+            self._running[label] = started, forecast_s or ((now - started) / done * total if done else None)
         if self._bars is None:
-            self._write(label, done, total)
+            self._write(label, done, total, now)
             return
         if label not in self._tasks:
             self._tasks[label] = self._bars.add_task(label, total=max(total, 1))
         self._bars.update(self._tasks[label], completed=done if total else 1, total=max(total, 1))  # type: ignore[arg-type]
 
-    def _write(self, label: str, done: int, total: int) -> None:
+    def _watch(self) -> None:
+        while not self._ended.wait(_SECONDS_BETWEEN_LINES):
+            self._say_overdue(time.monotonic())
+
+    def _say_overdue(self, now: float) -> None:
+        """Say once of every step that takes ten times what its first parts let expect."""
+        for label, (started, forecast_s) in list(self._running.items()):
+            if forecast_s is not None and now - started > max(_OVERDUE * forecast_s, _LEAST_OVERDUE_S):
+                self._console.print(
+                    f"{label}: {now - started:.0f} s so far, {forecast_s:.0f} s were expected from its first parts; Ctrl-C stops the run, "
+                    "finished stages are kept, and --resume goes on from them",
+                    highlight=False,
+                )
+                self._running[label] = started, float("inf")
+
+    def _write(self, label: str, done: int, total: int, now: float) -> None:
         if label in self._finished:
             if done >= total:
                 return
             self._finished.remove(label)
             del self._started[label]
-        now = time.monotonic()
         if label not in self._started:
             self._started[label] = self._spoken[label] = now
             if done < total:

@@ -33,5 +33,7 @@ def test_no_confident_wrong_answer(tmp_path: Path, capsys: pytest.CaptureFixture
     assert places[Outcome.TRACEBACK] == []
     undisturbed = [row for row in rows if row.group == "none"]
     assert len(undisturbed) == len(RECIPES) and all(row.outcome is Outcome.RIGHT for row in undisturbed)
+    sound = [row for row in rows if row.group == "sound"]
+    assert [f"{row.campaign}: {row.lie}: {row.said}" for row in sound if row.outcome.startswith("doubted")] == []
     silent = [row for row in rows if row.outcome is Outcome.SILENTLY_WRONG and not LIES[row.lie].limit]
     assert [f"{row.campaign}: {row.lie}: {'; '.join(row.wrong)}" for row in silent] == []

@@ -10,6 +10,8 @@ import pytest
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
+from fusion.analysis.consistency.courses import check_load_course, check_load_kind
+from fusion.analysis.consistency.field_series import thin_fields
 from fusion.analysis.consistency.logs import check_log
 from fusion.analysis.consistency.model import check_coefficients, compare_lines
 from fusion.analysis.consistency.readings import check_readings, check_signs
@@ -72,6 +74,8 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
             *check_signs(deviations),
             *check_log(environment, times, name="environment", file="environment.csv"),
             *check_log(drivers, times, name="drivers", file="drivers.csv"),
+            *check_load_kind(drivers, file="drivers.csv"),
+            *check_load_course(thin_fields(fields), drivers, file="drivers.csv"),
             *check_coefficients(loop, travel_mm=result.after.readings.span_mm),
         ]
         failed = [check for check in checks if not check.passed]

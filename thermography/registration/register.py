@@ -344,8 +344,24 @@ def _size_message(factor: float, fiducials: Sequence[Fiducial]) -> str:
 
 
 def contradicted_hints(located: Mapping[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> dict[str, str]:
-    """Hints far from their disc, by a key that says that only the hint is left out: the fiducial itself is used."""
+    """Hints far from their disc, by a key that says that only the hint is left out: the fiducial itself is used.
+
+    Hints that are all off alike, and on no other disc, were read in another view and agree about the names: they have one key together.
+    """
     wrong = {}
+    hints = {disc.name: np.array(disc.hint_px) for disc in fiducials if disc.hint_px is not None}
+    places = {name: np.array([place.column_px, place.row_px]) for name, place in located.items()}
+    off = np.array([hint - places[name] for name, hint in hints.items()]).reshape(-1, 2)
+    if len(off) >= 4:
+        shift = np.median(off, axis=0)
+        alike = np.hypot(*(off - shift).T).max() <= WRONG_HINT_PX < np.hypot(*shift)
+        on_another = [
+            min(np.hypot(*(hint - place)) for other, place in places.items() if other != name) <= WRONG_HINT_PX
+            for name, hint in hints.items()
+        ]
+        if alike and np.mean(on_another) <= 0.5:
+            said = f"all lie by the same ({shift[0]:+.0f}, {shift[1]:+.0f}) px from their discs, as in another view; they were not used"
+            return {"column_px, row_px": said}
     for disc in fiducials:
         if disc.hint_px is not None and (distance := _from_hint(disc, located[disc.name])) > WRONG_HINT_PX:
             wrong[f"{disc.name} (hint)"] = (

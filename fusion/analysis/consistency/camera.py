@@ -18,7 +18,7 @@ from fusion.analysis.consistency.checks import Check, Severity, judge
 from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
 from fusion.common import Array
 from thermography.common import ThermographyError
-from thermography.evaluation import share_outside_range
+from thermography.evaluation import share_outside_range, thermogram
 from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.large_arrays import median_of_pieces, piece_slices
 from thermography.inspection import FileWarning, check_series
@@ -219,6 +219,8 @@ def _away_share(seconds: Array, reading_s: Array, position_mm: Array) -> float:
 
 #: Largest share of the pixels of a frame outside the range in which the camera is calibrated.
 _OUTSIDE_SHARE = 0.01
+#: The parameters of Planck's law that belong to a range of the camera.
+_PLANCK = ("planck_r1", "planck_b", "planck_f", "planck_o", "planck_r2")
 _CHANGING = ("parameters_vary", "several_cameras", "several_lenses")
 
 
@@ -226,11 +228,15 @@ def check_frames(frames: Sequence[FrameReference], *, overridden: Collection[str
     """Check what the frames store of their measurement."""
     if not frames:
         return []
-    warnings = check_series(frames, overridden=overridden)
+    ranges = [(frame.limits.minimum_K, frame.limits.maximum_K) for frame in frames]
+    switched = [place for place in range(1, len(frames)) if ranges[place] != ranges[place - 1]]
+    continued = len(switched) == 1 and _continued(frames, switched[0])
+    warnings = check_series(frames, overridden={*overridden, *(_PLANCK if continued else ())})
     changing = [warning for warning in warnings if warning.code in _CHANGING]
-    ranges = {(frame.limits.minimum_K, frame.limits.maximum_K) for frame in frames}
-    if len(ranges) > 1:
-        changing.append(FileWarning("range", f"the camera's range changes ({len(ranges)} ranges).", "Use one range."))
+    if switched and not continued:
+        changing.append(
+            FileWarning("range", f"the camera's range changes ({len({*ranges})} ranges).", "Use one range.")
+        )
     pixels = _spread(frames)
     implausible = [warning for warning in warnings if warning.code not in _CHANGING]
     return [
@@ -239,6 +245,22 @@ def check_frames(frames: Sequence[FrameReference], *, overridden: Collection[str
         _range(pixels),
         *_frozen(pixels),
     ]
+
+
+def _continued(frames: Sequence[FrameReference], place: int) -> bool:
+    """Whether each of two ranges has parameters of its own, by which the temperatures go on across the switch as before and after it."""
+    of_range = [
+        {tuple(getattr(one.parameters, name) for name in _PLANCK) for one in some}
+        for some in (frames[:place], frames[place:])
+    ]
+    if [len(each) for each in of_range] != [1, 1] or of_range[0] == of_range[1] or not 2 <= place < len(frames) - 1:
+        return False
+    try:
+        seen = [thermogram(frame)["temperature"].values for frame in frames[place - 2 : place + 2]]
+        before, change, after = np.abs(np.diff(seen, axis=0))
+    except (ThermographyError, ValueError):
+        return False
+    return float(np.mean(change > np.maximum(before, after) + _JUMP_K)) <= _JUMP_SHARE
 
 
 def _collected(code: str, warnings: Sequence[FileWarning], sound: str) -> Check:

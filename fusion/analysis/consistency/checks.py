@@ -63,6 +63,9 @@ CONDITIONS = {
     "deviation_unit": Condition("the deviations are in µm", _LASER, _AXIS_VALUES),
     "travel": Condition("the positions are in mm", _LASER, "every value per length: expansion, pitch, index of air"),
     "copied_cycles": Condition("every cycle was measured", _LASER, "scatter, repeatability, p-values"),
+    "copied_targets": Condition("every target was measured", _LASER, _PROFILE),
+    "repeated_value": Condition("the readings are whole", _LASER, _PROFILE),
+    "missed_trigger": Condition("every reading belongs to its target", _LASER, _PROFILE),
     "approach_labels": Condition(
         "the labels of the approaches are right",
         _LASER,
@@ -111,6 +114,8 @@ CONDITIONS = {
         "all clocks agree as stated", _CLOCK, "whatever is brought to one time: " + _FIELDS_AT_READINGS
     ),
     "drivers_scale": Condition("the loads are logged in one unit throughout", _LOG, _LOADS),
+    "drivers_kind": Condition("the drivers' log holds loads", _LOG, _LOADS),
+    "drivers_course": Condition("the drivers' log is that of what heats the table", _LOG, _LOADS),
     "material_course": Condition("frames and environment log are of one test and in order", _CAMERA, _SCALE),
     "material_still": Condition(
         "the material sensor measured the table",

@@ -49,6 +49,15 @@ _SCALE_JUMP = 20.0
 _SCALES = (60.0, 100.0, 1000.0, 3600.0)
 #: Largest load in per cent: drives may be overloaded.
 _PER_CENT = 200.0
+#: A load that explains less than the same log does at half of all other times, of which so many are tried, is not what heats the table.
+#: That is told where the load's standard deviation is a quarter of its largest value, so that it shapes what it heats, and where the
+#: field's rate has a structure (normal deviate of its correlation from frame to frame, p = 1e-3) that warms some part by half a kelvin
+#: apart from a steady trend: a room that swings by 2 K in an hour warms a table of 40 mm by less.
+_OTHER_TIMES, _LEAST_VARIATION, _STRUCTURED, _LEAST_WARMED_K = 60, 0.25, 3.1, 0.5
+#: Rises in a row without a fall that chance makes less than once in a million: a counter.
+_COUNTED = 20
+#: Share of the variance of a load's response that may depend on whether it is held or interpolated between two rows.
+_BETWEEN_ROWS = 0.25
 #: Resampled courses, none of which may gain as much, from blocks of this length, s.
 _DRAWS, _BLOCK_S = 400, 1800.0
 
@@ -145,6 +154,94 @@ def check_load_scale(field: FieldSeries | None, log: xr.Dataset | None, *, file:
                 evidence = f"{name} in {file} is some {value:.0f} times {size} from {since}Z on: {reason}."
     remedy = f"Write all rows of {file} in one unit; a share is 0 to 1 or, throughout, per cent."
     return [judge("drivers_scale", value, _SCALE_JUMP, evidence, remedy, passed=value == 1.0)]
+
+
+def check_load_kind(log: xr.Dataset | None, *, file: str) -> list[Check]:
+    """Check that the loads are loads by their own shape: no counters, and rows that are dense enough."""
+    loads = _loads(log)
+    if log is None or not loads:
+        return []
+    at = np.asarray((log["time"].values - log["time"].values[0]) / np.timedelta64(1, "s"), float)
+    found = []
+    for name, load in loads.items():
+        changes = np.diff(load)[np.diff(load) != 0.0]
+        if changes.size >= _COUNTED and (np.sign(changes) == np.sign(changes[0])).all():
+            found.append(
+                f"{name} only {'grows' if changes[0] > 0.0 else 'falls'}, in {changes.size} of {load.size} rows: a counter"
+            )
+        elif (share := _between_rows(at, load)) > _BETWEEN_ROWS:
+            found.append(
+                f"{name} is known too seldom: {100.0 * share:.0f} % of the variance of what it heats depends on whether it stays or "
+                "changes steadily from row to row, as in a log of events"
+            )
+    remedy = f"Write the load itself into {file}, a row every minute: of a counter its differences, of events the state after each."
+    sound = f"The loads in {file} look like loads."
+    return [judge("drivers_kind", len(found), 0.0, f"{file}: {'; '.join(found)}.", remedy, sound=sound)]
+
+
+def _loads(log: xr.Dataset | None) -> dict[str, Array]:
+    """The loads of a log by name."""
+    columns = {} if log is None else {str(name): column for name, column in log.data_vars.items() if _is_load(column)}
+    return {name: column.values.astype(float) for name, column in columns.items()}
+
+
+def _between_rows(at: Array, load: Array) -> float:
+    """Share of the variance of a quick source's response that differs between a load held from row to row and one interpolated."""
+    known = np.isfinite(load)
+    grid = np.arange(at[0], at[-1] + 1.0, 60.0)
+    held = load[known][np.searchsorted(at[known], grid, side="right").clip(1) - 1]
+    responses = respond(
+        np.column_stack([np.interp(grid, at[known], load[known]), held]), grid, time_constant_s=_SOURCE_S[0]
+    )
+    return float(np.var(responses[:, 1] - responses[:, 0]) / max(float(np.var(responses[:, 1])), 1e-30))
+
+
+def check_load_course(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
+    """Check that the field's rate follows a load: more than the same log at other times, and than one that was read wrong."""
+    loads = _loads(log)
+    if field is None or log is None or not loads:
+        return []
+    at, rate = field.since_start(log["time"].values), _Rate.of(field)
+    grid = np.arange(at[0], at[-1] + 1.0, 60.0)
+    courses = {name: np.interp(grid, at[np.isfinite(load)], load[np.isfinite(load)]) for name, load in loads.items()}
+    lefts = {name: _load_left(rate, grid, course) for name, course in courses.items()}
+    name = min(lefts, key=lambda one: lefts[one])
+    course, left = courses[name], lefts[name]
+    told = course.std() >= _LEAST_VARIATION * np.abs(course).max() and _is_structured(field, rate)
+    other_kinds = {
+        "backwards in time": course[::-1],
+        "as a counter, by its differences": np.diff(course, prepend=course[0]),
+    }
+    other_left, kind = min((_load_left(rate, grid, other), kind) for kind, other in other_kinds.items())
+    explains = told and other_left <= 1.0 - _LEAST_EXPLAINED and left > _LEFT_RATIO * other_left
+    at_other_times = 0.0
+    if told and not explains and left > 1.0 - _LEAST_EXPLAINED:
+        rolls = np.linspace(0, course.size, _OTHER_TIMES, endpoint=False, dtype=int)[1:]
+        at_other_times = float(np.mean([_load_left(rate, grid, np.roll(course, k)) <= left for k in rolls]))
+    evidence = f"{name} in {file} explains {100.0 * (1.0 - left):.0f} % of the rate at which the field changes"
+    if explains:
+        evidence += f", read {kind} {100.0 * (1.0 - other_left):.0f} %"
+    elif at_other_times > 0.0:
+        evidence += f"; {100.0 * at_other_times:.0f} % of the same log put at other times explain as much or more"
+    return [
+        judge(
+            "drivers_course",
+            at_other_times,
+            0.5,
+            f"{evidence}.",
+            f"Check whether {file} is of this test and of the axis that heats the table, in the order of its times, the load itself and "
+            "no mean over a longer time.",
+            passed=not explains and at_other_times <= 0.5,
+        )
+    ]
+
+
+def _is_structured(field: FieldSeries, rate: _Rate) -> bool:
+    """Whether the field changes in a course of its own that a load must follow."""
+    leading, steady = rate.modes[:, 0], np.polynomial.polynomial.polyvander(field.seconds, 1)
+    follows = float(leading[1:] @ leading[:-1]) / max(float(leading @ leading), 1e-30) * np.sqrt(leading.size)
+    bent = field.temperature - steady @ np.linalg.lstsq(steady, field.temperature, rcond=None)[0]
+    return bool(follows > _STRUCTURED and np.ptp(bent, axis=0).max() > _LEAST_WARMED_K)
 
 
 def _scale_jumps(load: Array) -> Iterator[tuple[int, float]]:

@@ -1,9 +1,9 @@
-"""Checks of the readings alone: magnitude and unit, travel, copied cycles, exchanged directions of approach."""
+"""Checks of the readings alone: magnitude and unit, travel, copies, clipping, missed triggers, exchanged directions of approach."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,9 +23,12 @@ _LARGEST_SHARE, _LARGEST_MM = 0.01, 1.0
 _LEAST_NOISE_UM, _NOISE_TRAVEL_MM = 0.002, 200.0
 #: Smallest travel as a share of the plan's extent along the axis.
 _LEAST_TRAVEL_SHARE = 0.03
-#: Share of equal readings from which two cycles are copies, the share that ordinary cycles may have, and how many pairs of copies chance
-#: may make where the readings of a cycle are few.
-_COPIED_SHARE, _ORDINARY_SHARE, _COPIED_BY_CHANCE = 0.8, 0.3, 0.01
+#: Share of equal readings from which two cycles or targets are copies, and the share of one value that ordinary sites may have.
+_COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
+#: Probability that sound readings show it by chance, from which a coincidence over targets or cycles is doubted.
+_COINCIDENCE = 1e-6
+#: The same for a change of the profile that looks like a shift by one target, of the one largest change.
+_SHIFT_BY_CHANCE = 1e-4
 #: Cycles that are compared with all others at once.
 _CYCLES_AT_ONCE = 256
 #: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
@@ -55,6 +58,9 @@ def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> l
         _least_noise(deviations, max(noise_um, _rounding_um(values))),
         *([] if plan_extent_mm is None else [_travel(deviations, plan_extent_mm)]),
         _copied_cycles(deviations),
+        _copied_targets(deviations),
+        _repeated_value(deviations),
+        _missed_trigger(deviations),
         _exchanged_approaches(deviations, noise_um),
         _datum(deviations, noise_um),
         _zeroed_cycles(deviations),
@@ -68,7 +74,7 @@ def random_part_um(values: Array) -> float:
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
     second = second[np.isfinite(second)]
     # The second difference of independent readings has six times their variance.
-    return float(scatter_by_median(second) / np.sqrt(6.0))
+    return float(scatter_by_median(second) / np.sqrt(6.0)) if second.size else float("nan")
 
 
 def _rounding_um(values: Array) -> float:
@@ -133,32 +139,148 @@ def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
 
 def _copied_cycles(deviations: xr.Dataset) -> Check:
     """Two cycles that agree digit for digit are one cycle, entered twice."""
-    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
-    largest, following, copies = 0.0, [], []
-    for start, shares in _equal_shares(values):
-        later = np.triu(shares, start + 1)
-        largest = max(largest, float(later.max(initial=0.0)))
-        following.append(np.diagonal(shares, start + 1).copy())
-        copies.append(np.argwhere(later >= _COPIED_SHARE) + np.array([start, 0]))
-    pairs = []
-    ordinary = np.concatenate(following)
-    # Coarsely rounded readings agree from cycle to cycle, and those of one or two targets in one pair of many; then agreement says nothing.
-    by_chance = (
-        0.5 * len(values) ** 2 * ordinary.mean() ** (_COPIED_SHARE * values.shape[1]) if ordinary.size else np.inf
-    )
-    if by_chance <= _COPIED_BY_CHANCE and np.median(ordinary) <= _ORDINARY_SHARE:
-        number = deviations["cycle"].values
-        pairs = [f"{number[a]} and {number[b]}" for a, b in np.concatenate(copies)]
-    named = ", ".join(pairs[:5]) + (f" and {len(pairs) - 5} more" if len(pairs) > 5 else "")
+    number, values = deviations["cycle"].values, deviations["deviation"].values
+    rows = values.reshape(len(values), -1)
+    pairs = [f"{number[a]} and {number[b]}" for a, b in _copies(rows, rows[:0])]
     return judge(
         "copied_cycles",
-        largest,
-        _COPIED_SHARE,
-        f"Cycles {named} agree digit for digit.",
+        len(pairs),
+        0.0,
+        f"Cycles {_first_few(pairs)} agree digit for digit.",
         "Leave one of the two cycles out of the file.",
-        passed=not pairs,
         sound="No two cycles agree digit for digit.",
     )
+
+
+def _copied_targets(deviations: xr.Dataset) -> Check:
+    """Two targets, or both approaches of one, that agree digit for digit over the cycles are one column, entered twice."""
+    number, values = deviations["target"].values, deviations["deviation"].values
+    between = np.diff(values, axis=1)
+    copies = _copies(values.reshape(len(values), -1).T, between.reshape(len(values), -1).T)
+    pairs = dict.fromkeys(f"{number[a % number.size]} and {number[b % number.size]}" for a, b in copies)
+    return judge(
+        "copied_targets",
+        len(pairs),
+        0.0,
+        f"Targets {_first_few([*pairs])} agree digit for digit over the cycles (one target with itself: in both approaches).",
+        "Enter the readings of every target and approach from its own column, or leave the copy out of the file.",
+        sound="No two targets or approaches agree digit for digit.",
+    )
+
+
+def _first_few(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _copies(rows: Array, between: Array) -> list[tuple[int, int]]:
+    """Rows that agree digit for digit where rows that follow each other, and most of the differences between approaches, do not."""
+    equal = [
+        np.argwhere(np.triu(shares, start + 1) >= _COPIED_SHARE) + np.array([start, 0])
+        for start, shares in _equal_shares(rows)
+    ]
+    following = _largest_shares(np.diff(rows, axis=0))
+    usual = max([one for one, zeros in following if zeros < _COPIED_SHARE], default=1.0)
+    # Both approaches agree where the resolution is coarse, also when a compensation was added to what was read.
+    usual = max(usual, float(np.median([one for one, _ in _largest_shares(between)] or [0.0])))
+    tried = 0.5 * len(rows) ** 2
+    # Every value counts once: readings that stay at one value, as where the laser is zeroed, are equal and no copies.
+    return [
+        (int(a), int(b))
+        for a, b in np.concatenate(equal)
+        if tried * usual ** np.unique(rows[a][rows[a] == rows[b]]).size < _COINCIDENCE
+    ]
+
+
+def _repeated_value(deviations: xr.Dataset) -> Check:
+    """One value that far more readings hold than scatter and resolution let them is a limit of the recorder or a filler."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    sound = judge("repeated_value", 0.0, 0.0, "No value is repeated beyond what the resolution makes.")
+    with np.errstate(invalid="ignore"):
+        steps = np.abs(np.diff(np.round(values, 6), axis=0))
+    least = np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf)
+    if not np.isfinite(least).any():
+        return sound
+    # Single values that were typed with more digits do not make the resolution of the others.
+    step_um = float(np.median(least[np.isfinite(least)]))
+    random_um = np.array([random_part_um(values[:, [site]]) for site in range(values.shape[1])])
+    # Where rounding makes the scatter, readings repeat; so does the reading at which the laser is zeroed.
+    scatters = np.nan_to_num(random_um) > step_um
+    some = np.round(values[:, scatters], 6)
+    found, counts = np.unique(some[np.isfinite(some)], return_counts=True)
+    if not counts.size:
+        return sound
+    value = float(found[np.argmax(counts)])
+    at = (some == value).any(axis=0)
+    # The largest probability of one value, that at the centre of a normal distribution.
+    chance = step_um / (np.sqrt(2.0 * np.pi) * random_um[scatters][at])
+    expected = float((chance * np.isfinite(some[:, at]).sum(axis=0)).sum())
+    # Any of the values might have been the most frequent one, and its first reading is no repetition.
+    p = found.size * float(special.gammainc(counts.max() - 1, expected)) if counts.max() > 1 else 1.0
+    end = {np.nanmax(some): ", the largest of these", np.nanmin(some): ", the smallest of these"}.get(value, "")
+    return judge(
+        "repeated_value",
+        float(counts.max()),
+        expected,
+        f"{counts.max()} readings at targets that scatter hold one value, {value:g} µm{end}; scatter and resolution make {expected:.2g}.",
+        "Check the range of the recorder (clipped readings) and what it writes where it has no reading; leave these out of the file.",
+        passed=p >= _COINCIDENCE,
+        sound=sound.evidence,
+    )
+
+
+def _missed_trigger(deviations: xr.Dataset) -> Check:
+    """From one cycle on the profile is that of before, by one target late or early in the order of travel."""
+    sound = judge("missed_trigger", 0.0, 0.0, "The profile does not shift by a target at any cycle.")
+    complete = np.isfinite(deviations["deviation"].values).all(axis=(1, 2))
+    values, cycles = deviations["deviation"].values[complete], deviations["cycle"].values[complete]
+    if len(values) < 2 * _LEAST_SIDE or values.shape[2] < _LEAST_TARGETS:
+        return sound
+    # In the order of travel, so that a missed trigger shifts both approaches alike.
+    order = np.argsort(deviations["position"].values)
+    reverse = deviations["direction"].values == "negative"
+    passes = values[:, :, order]
+    passes[:, reverse] = passes[:, reverse, ::-1]
+    totals = np.concatenate([np.zeros((1, *passes.shape[1:])), np.cumsum(passes, axis=0)])
+    count = len(passes)
+    noise_um = max(random_part_um(values), _rounding_um(values))
+    found = []
+    for k in range(_LEAST_SIDE, count - _LEAST_SIDE + 1):
+        before, after = totals[k] / k, (totals[-1] - totals[k]) / (count - k)
+        error_um = noise_um * np.sqrt(1.0 / k + 1.0 / (count - k))
+        profiles = (before[:, 1:-1], before[:, :-2], before[:, 2:])
+        as_read, late, early = (max(_without_line(after[:, 1:-1] - one), error_um) for one in profiles)
+        found.append((as_read / error_um, as_read, min(late, early), k, late < early))
+    _, as_read, left, first, is_late = max(found)
+    # Share of the volume of all changes as large that lies as near to a shift by one target; a line of each approach is fitted.
+    p = 2.0 * (left / as_read) ** (passes.shape[1] * (passes.shape[2] - 4))
+    return judge(
+        "missed_trigger",
+        as_read,
+        left,
+        f"From cycle {cycles[first]} on every target reads what the one {'before' if is_late else 'after'} it in the order of travel read "
+        f"before: the profiles differ by {as_read:.2g} µm as read, by {left:.2g} µm shifted by one target.",
+        "A trigger was missed or counted twice: give these readings to the targets at which they were taken, or leave these cycles out.",
+        passed=p >= _SHIFT_BY_CHANCE,
+        sound=sound.evidence,
+    )
+
+
+def _without_line(profiles: Array) -> float:
+    """Standard deviation of profiles (direction, target) about a straight line of each, um."""
+    design = np.vander(np.arange(profiles.shape[1], dtype=float), 2)
+    base, _ = np.linalg.qr(design)
+    left = profiles - (profiles @ base) @ base.T
+    return float(np.sqrt((left**2).sum() / (profiles.shape[0] * (profiles.shape[1] - 2))))
+
+
+def _largest_shares(differences: Array) -> list[tuple[float, float]]:
+    """Share of the most frequent value of each row, and of zero, digit for digit."""
+    rows = [row[np.isfinite(row)] for row in np.round(differences, 6)]
+    return [
+        (float(np.unique(row, return_counts=True)[1].max()) / row.size, float(np.mean(row == 0.0)))
+        for row in rows
+        if row.size
+    ]
 
 
 def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:

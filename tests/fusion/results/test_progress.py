@@ -40,6 +40,22 @@ def test_plain_lines_speak_up_during_a_long_step(monkeypatch: pytest.MonkeyPatch
     assert told.splitlines() == ["frames ...", "frames: 2 of 10, about 44 s left", "frames: done in 30.0 s"]
 
 
+def test_a_step_that_takes_ten_times_its_forecast_says_so_once_and_how_to_stop_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = iter([0.0, 4.0, 5.0, 6.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    written = io.StringIO()
+    with Reporter(Console(file=written, width=300)) as report:
+        for label, done in (("closed loop", 0), ("closed loop", 2), ("correlation", 0), ("closed loop", 3)):
+            report(label, done, 10)
+        # 4 s for two of ten parts: 20 s; of the correlation no part is done.
+        for now in (199.0, 201.0, 300.0):
+            report._say_overdue(now)
+    _, _, said = written.getvalue().splitlines()
+    assert said.startswith("closed loop: 201 s so far, 20 s were expected") and "Ctrl-C stops the run" in said
+
+
 def test_a_terminal_gets_a_bar_per_step() -> None:
     text = shown(("frames", 0, 60), ("frames", 60, 60), ("report", 0, 1), ("report", 1, 1), terminal=True)
     assert all(words in text for words in ("frames", "60/60", "report", "1/1"))

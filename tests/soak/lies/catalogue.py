@@ -15,5 +15,6 @@ GROUPS: dict[str, tuple[Lie, ...]] = {
     "logs": logs.LIES,
     "units": units.LIES,
     "settings": settings.LIES,
+    "sound": (*frames.SOUND, *place.SOUND, *readings.SOUND),
 }
 LIES = {lie.name: lie for lies in GROUPS.values() for lie in lies}

@@ -182,6 +182,20 @@ def sequence(name: str, edit: Callable[[bytearray], bytearray]) -> Lie:
     return Lie(f"sequence: {name}", DAMAGED, in_sequence(edit), camera(file="seq"))
 
 
+def other_range(number: int, frame: Frame) -> Frame:
+    """The second half by the next range, with the parameters of Planck's law that belong to its half as many counts."""
+    if number < HALF:
+        return frame
+    of = frame.parameters
+    counts = np.rint(0.5 * (frame.counts + of.planck_o) - of.planck_o).astype(np.uint16)
+    return replace(
+        frame,
+        counts=counts,
+        parameters=replace(of, planck_r1=0.5 * of.planck_r1),
+        limits=CalibratedRange(minimum_K=273.0, maximum_K=773.0, raw_minimum=9000, raw_maximum=60000),
+    )
+
+
 LIES = (
     Lie("FFC jumps 0.5 K every 15 min", LEVEL, world=camera(ffc_step_K=0.5), describes=frozenset({"camera_offset"})),
     Lie("FFC jumps 0.1 K every 15 min", LEVEL, world=camera(ffc_step_K=0.1), describes=frozenset({"camera_offset"})),
@@ -276,3 +290,5 @@ LIES = (
     Lie("every third file twice", FROZEN + "|twice|same time", copied_files),
     Lie("two cameras mixed", r"camera", frames(second_camera)),
 )
+#: What is unusual and sound.
+SOUND = (Lie("sound: another range with its parameters", "$^", edit_frames(other_range)),)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pandas as pd
 
-from tests.soak.lies.folder import edit_column, edit_table, key
+from tests.soak.lies.folder import Plant, edit_column, edit_table, key
 from tests.soak.lies.lie import Lie
 
 ENVIRONMENT = r"environment"
@@ -45,6 +47,26 @@ def of_another_test(duty: np.ndarray) -> np.ndarray:
     return np.round(rng.random(changes[-1] + 1)[changes], 3)
 
 
+def events(table: pd.DataFrame) -> pd.DataFrame:
+    """A row where the load changes, and none between."""
+    return table[table["duty [1]"].diff().fillna(1.0) != 0.0]
+
+
+def starts(duty: np.ndarray) -> np.ndarray:
+    """A mark in the minute in which the load grows."""
+    return (np.diff(duty, prepend=0.0) > 0.0).astype(float)
+
+
+def in_blocks(duty: np.ndarray) -> np.ndarray:
+    """Means over 40 min."""
+    block = np.arange(duty.size) // 40
+    return np.round(np.bincount(block, duty) / np.bincount(block), 3)[block]
+
+
+def load(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    return edit_column("drivers.csv", "duty [1]", change)
+
+
 LIES = (
     Lie("environment log missing for the second half", ENVIRONMENT, edit_table("environment.csv", first_half)),
     Lie("environment log missing", ENVIRONMENT, key("interferometry", "environment", None)),
@@ -70,5 +92,12 @@ LIES = (
         DRIVERS,
         edit_column("drivers.csv", "duty [1]", in_percent_from_the_middle),
     ),
+    Lie("drivers log of events", DRIVERS, edit_table("drivers.csv", events)),
+    Lie("drivers log of starts", DRIVERS, load(starts)),
+    Lie("drivers log of an energy counter", DRIVERS, load(lambda d: np.cumsum(d).round(3))),
+    Lie("drivers log in blocks of 40 min", DRIVERS, load(in_blocks)),
+    Lie("drivers log clipped at a fifth", DRIVERS, load(lambda d: np.minimum(d, 0.2))),
+    Lie("drivers log of a switch", DRIVERS, load(lambda d: (d > 0.5).astype(float))),
+    Lie("drivers log backwards in time", DRIVERS, load(lambda d: d[::-1])),
     Lie("drivers log once an hour", DRIVERS, edit_table("drivers.csv", lambda table: table.iloc[::60])),
 )

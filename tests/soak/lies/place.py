@@ -155,3 +155,11 @@ LIES = (
         fiducials(lambda t: t.assign(column_px=COLUMNS - 1 - t["column_px"])),
     ),
 )
+#: What is unusual and sound.
+SOUND = (
+    Lie(
+        "sound: hints off by the same 110 px",
+        "$^",
+        fiducials(lambda t: t.assign(column_px=t["column_px"] + 88.0, row_px=t["row_px"] + 66.0)),
+    ),
+)

@@ -22,7 +22,7 @@ TARGETS_NAMED = r"target|position"
 RESOLUTION = r"resolution|rounded|digits|repeat|alike"
 #: Cycles of the block at the end, which the hold-out covers, and of the block in the middle that is lost.
 _LAST, _LOST = range(CYCLES - 6, CYCLES + 1), range(15, 22)
-_COPIED = 15
+_COPIED, _SLIPPED = 15, 19
 
 
 def laser(edit: Callable[[pd.DataFrame], pd.DataFrame]) -> Plant:
@@ -113,6 +113,46 @@ def exchanged_targets(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(position_mm=table["target"].map(place))
 
 
+def of_the_neighbour(table: pd.DataFrame) -> pd.DataFrame:
+    """Target 7 holds what target 6 reads."""
+    here, neighbour = table["target"] == 7, table["target"] == 6
+    keys = ["cycle", "direction"]
+    values = table[neighbour].set_index(keys)["deviation_um"]
+    read = values.reindex(pd.MultiIndex.from_frame(table.loc[here, keys])).to_numpy()
+    table.loc[here, "deviation_um"] = read
+    return table
+
+
+def clipped(table: pd.DataFrame) -> pd.DataFrame:
+    """The largest 30 % of the readings are one value."""
+    return table.assign(deviation_um=table["deviation_um"].clip(upper=round(table["deviation_um"].quantile(0.7), 3)))
+
+
+def one_target_late(table: pd.DataFrame) -> pd.DataFrame:
+    """From cycle 19 on, a trigger was missed: every reading is that of the target before, in the order of the times."""
+    table = table.sort_values("time", kind="stable")
+    late = table["deviation_um"].shift(1, fill_value=0.0)
+    return table.assign(deviation_um=table["deviation_um"].where(table["cycle"] < _SLIPPED, late))
+
+
+def set_to_zero(table: pd.DataFrame) -> pd.DataFrame:
+    """The laser was set to zero at the first reading of the second half."""
+    late = table["cycle"] >= HALF
+    zero = table.loc[late, "deviation_um"].iloc[0]
+    return table.assign(deviation_um=table["deviation_um"] - zero * late)
+
+
+def with_play(table: pd.DataFrame) -> pd.DataFrame:
+    """A common drift with play: it follows the slow course of the readings only after they moved by 1 µm."""
+    level = table.groupby("cycle")["deviation_um"].mean()
+    held, followed = float(level.iloc[0]), []
+    for value in level:
+        held = min(max(held, value - 1.0), value + 1.0)
+        followed.append(held)
+    added_um = table["cycle"].map(dict(zip(level.index, np.array(followed) - followed[0], strict=True)))
+    return table.assign(deviation_um=(table["deviation_um"] + 0.5 * added_um).round(4))
+
+
 LIES = (
     Lie("sign of the deviations inverted", SIGN, inverted(lambda t: t["cycle"] > 0)),
     Lie("sign inverted in the second half", SIGN, inverted(lambda t: t["cycle"] >= HALF)),
@@ -164,5 +204,16 @@ LIES = (
     ),
     Lie("laser set to zero at the start of every cycle", DATUM, laser(zeroed_in_every_cycle)),
     Lie("all deviations 0", RESOLUTION, laser(lambda t: t.assign(deviation_um=0.0))),
+    Lie("target 7 holds the values of target 6", COPIED + "|target 7", laser(of_the_neighbour), targets=frozenset({7})),
+    Lie("readings clipped at the 70th percentile", r"clipped|one value|largest value|range", laser(clipped)),
+    Lie("a trigger missed from cycle 19 on", r"trigger|one target|target_order|neighbour", laser(one_target_late)),
+    Lie("laser set to zero in the middle", DATUM, laser(set_to_zero), describes=frozenset({"step_event"})),
+    Lie(
+        "lines of cycle 20 twice",
+        COPIED,
+        laser(lambda t: pd.concat([t, t[t["cycle"] == 20]], ignore_index=True)),
+    ),
     Lie("deviations rounded to 1 µm", RESOLUTION, laser(lambda t: t.assign(deviation_um=t["deviation_um"].round(0)))),
 )
+#: What is unusual and sound.
+SOUND = (Lie("sound: drift with play", "$^", laser(with_play), describes=frozenset({"thermal_lag"})),)

@@ -165,9 +165,9 @@ def _cell(row: Row) -> str:
 
 
 def counts_table(rows: Sequence[Row]) -> str:
-    """A markdown table: how many lies led to each outcome, the undisturbed campaigns and the declared limits apart."""
+    """A markdown table: how many lies led to each outcome; undisturbed campaigns, sound ones and declared limits apart."""
     campaigns = [name for name in RECIPES if any(row.campaign == name for row in rows)]
-    lies = [row for row in rows if row.group != "none" and not LIES[row.lie].limit]
+    lies = [row for row in rows if row.group not in ("none", "sound") and not LIES[row.lie].limit]
     counts = Counter((row.outcome, row.campaign) for row in lies)
     lines = [f"| outcome | {' | '.join(campaigns)} | all |", "|---|" + "---|" * (len(campaigns) + 1)]
     for outcome in Outcome:

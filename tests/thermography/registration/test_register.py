@@ -441,3 +441,11 @@ def test_places_diameters_and_hints_that_contradict_are_named():
     wrong = contradicted_hints(places, hinted_at(places, [10.0, 70.0]))
     assert list(wrong) == ["F2 (hint)"]
     assert "is 70 px from the disc; it was not used" in wrong["F2 (hint)"]
+    # Hints of another view are all off alike; those that point at other discs exchange the names.
+    places = located()
+    (alike,) = contradicted_hints(places, hinted_at(places, [60.0, 55.0, 62.0, 60.0, 58.0, 60.0])).items()
+    assert alike[0] == "column_px, row_px" and "by the same (+60, +0) px" in alike[1]
+    spacing_px = next(p for n, p in places.items() if n == "F2").column_px - places["F1"].column_px
+    assert list(contradicted_hints(places, hinted_at(places, [spacing_px] * 4))) == [
+        f"F{n} (hint)" for n in (1, 2, 3, 4)
+    ]

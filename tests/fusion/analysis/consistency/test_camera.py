@@ -58,6 +58,25 @@ def with_camera(frame: FrameReference, **changed: str) -> FrameReference:
     return replace(frame, camera=replace(frame.camera, **changed))
 
 
+@pytest.mark.parametrize(("error", "expected"), [(1.0, set()), (1.05, {"camera_settings"})])
+def test_another_range_is_no_fault_where_its_own_parameters_continue_the_temperatures(
+    frames: list[FrameReference], monkeypatch: pytest.MonkeyPatch, error: float, expected: set[str]
+) -> None:
+    """Half as many counts by half R1; with an R1 that is 5 % wrong, the temperatures jump by 3 K."""
+    kind, read = type(frames[0]), type(frames[0]).read_counts
+
+    def by_the_range(frame: FrameReference) -> np.ndarray:
+        counts, offset = read(frame), frame.parameters.planck_o
+        halved = np.rint(0.5 * (counts + offset) - offset).astype(np.uint16)
+        return counts if frame.limits.maximum_K < 2000.0 else halved
+
+    monkeypatch.setattr(kind, "read_counts", by_the_range)
+    r1 = 0.5 * error * frames[0].parameters.planck_r1
+    limits = CalibratedRange(273.15, 2273.15, 0, 65535)
+    switched = [replace(with_parameters(frame, planck_r1=r1), limits=limits) for frame in frames[3:]]
+    assert set(failed([*frames[:3], *switched], STATED)) == expected
+
+
 def hot(frame: FrameReference) -> FrameReference:
     limits = CalibratedRange(573.15, 2273.15, frame.limits.raw_minimum, frame.limits.raw_maximum)
     return replace(frame, limits=limits)

@@ -8,7 +8,14 @@ import xarray as xr
 
 from fusion.analysis.consistency.checks import Severity, judge
 from fusion.analysis.consistency.clocks import QUARTERS, Recording, check_clocks, without_consequences
-from fusion.analysis.consistency.courses import check_load_scale, compare_drift, compare_load, compare_material
+from fusion.analysis.consistency.courses import (
+    check_load_course,
+    check_load_kind,
+    check_load_scale,
+    compare_drift,
+    compare_load,
+    compare_material,
+)
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from tests.fusion.analysis.consistency.twin_fields import (
     FILES,
@@ -138,6 +145,39 @@ def test_a_jump_of_another_unit_is_held_against_the_rate_of_the_field() -> None:
     assert not check.passed and "% of the field's rate unexplained" in check.evidence
     (sound,) = check_load_scale(field, loads(1500.0 * duty, "1/min"), file="drivers.csv")
     assert sound.passed and sound.value == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda duty: np.cumsum(duty), "duty only grows, in"),
+        (lambda duty: duty[np.diff(duty, prepend=-1.0) != 0.0], "in a log of events"),
+        (lambda duty: duty[::-1], "read backwards in time"),
+        (lambda duty: np.roll(duty, duty.size // 3), "of the same log put at other times explain as much or more"),
+    ],
+)
+def test_logs_that_are_no_load_of_the_table_are_doubted_and_named(change, words: str) -> None:
+    test = recorded(duty="switched")
+    field, duty = thin_fields(test.fields), test.drivers["duty"]
+    changed = np.flatnonzero(np.diff(duty.values, prepend=-1.0)) if "events" in words else slice(None)
+    log = xr.Dataset({"duty": duty[changed].copy(data=change(duty.values.astype(float)))})
+    checks = [*check_load_kind(log, file="drivers.csv"), *check_load_course(field, log, file="drivers.csv")]
+    assert words in " ".join(check.evidence for check in checks if not check.passed)
+
+
+def test_a_load_that_drives_the_table_a_staircase_and_a_constant_one_are_loads() -> None:
+    for duty in ("random", "switched"):
+        test = recorded(duty=duty)
+        field = thin_fields(test.fields)
+        size = test.drivers.sizes["time"]
+        staircase = test.drivers.assign(duty=("time", np.linspace(0.0, 5.0, size).round()))
+        checks = [
+            *check_load_course(field, test.drivers, file="drivers.csv"),
+            *(check for log in (test.drivers, staircase) for check in check_load_kind(log, file="drivers.csv")),
+        ]
+        assert len(checks) == 3 and all(check.passed for check in checks)
+    constant = xr.Dataset({"duty": test.drivers["duty"].copy(data=np.ones(size))})
+    assert check_load_kind(constant, file="drivers.csv") == check_load_course(field, None, file="drivers.csv") == []
 
 
 @pytest.mark.parametrize(("before", "after"), [(0.01, 0.9), (1.0, 57.0)])

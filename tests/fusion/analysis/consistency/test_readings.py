@@ -114,6 +114,45 @@ def test_a_cycle_that_was_copied_is_named() -> None:
     assert named["copied_cycles"].evidence == "Cycles 20 and 21 agree digit for digit."
 
 
+def test_a_target_that_holds_the_values_of_its_neighbour_is_named() -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[:, :, 7] = values[:, :, 6]
+    named = failed(with_deviation(test, values))
+    assert set(named) == {"copied_targets"} and "Targets 7 and 8 agree" in named["copied_targets"].evidence
+
+
+def test_readings_cut_off_at_one_value_are_named_with_it() -> None:
+    test = sound()
+    limit_um = float(np.quantile(test["deviation"], 0.7).round(3))
+    named = failed(with_deviation(test, np.minimum(test["deviation"].values, limit_um).round(4)))
+    assert f"{limit_um:g} µm, the largest" in named["repeated_value"].evidence
+
+
+@pytest.mark.parametrize("late", [1, -1])
+def test_a_missed_trigger_is_named_with_its_first_cycle(late: int) -> None:
+    """In the order of travel, so that the approaches shift against each other; the reading that falls out of a pass is the next one's."""
+    test = sound(noise_um=0.2)
+    passes = test["deviation"].values.copy()
+    passes[:, 1] = passes[:, 1, ::-1]
+    passes[18:] = np.roll(passes.ravel(), late).reshape(passes.shape)[18:]
+    passes[:, 1] = passes[:, 1, ::-1]
+    check = failed(with_deviation(test, passes))["missed_trigger"]
+    assert f"From cycle 19 on every target reads what the one {'before' if late > 0 else 'after'} it" in check.evidence
+
+
+def test_coincidences_are_no_chance_in_sound_tests_of_all_lengths_and_resolutions() -> None:
+    """Two cycles and more, fine and coarse, with a profile that changes at one cycle, a target at zero, and compensated afterwards."""
+    for seed, (cycles, step_um) in enumerate([(2, 0.1), (3, 1.0), (5, 0.001), (12, 0.5), (40, 0.3), (40, 10.0)]):
+        test = sound(seed, noise_um=0.3).isel(cycle=slice(0, cycles))
+        bent = np.random.default_rng(seed).normal(0.0, 0.5, TARGETS) * (np.arange(cycles) >= cycles // 2)[:, None, None]
+        values = np.round((test["deviation"].values + bent) / step_um) * step_um
+        values[:, :, 0] = 0.0
+        compensated = values + np.linspace(0.0, 0.37, cycles)[:, None, None] * np.linspace(0.0, 1.0, TARGETS)
+        for one in (values, compensated):
+            assert {"copied_targets", "repeated_value", "missed_trigger"}.isdisjoint(failed(with_deviation(test, one)))
+
+
 def test_coarse_rounding_is_no_copy() -> None:
     test = sound(noise_um=0.1)
     assert "copied_cycles" not in failed(with_deviation(test, np.round(test["deviation"].values)))
