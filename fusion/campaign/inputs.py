@@ -428,7 +428,7 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
 def plan_grid(plan: PlanTable, shape: tuple[int, int]) -> PlanGrid:
     """Return the cells of a plan in mm, or of the picture (rows, columns) that is the plan."""
     if plan.in_pixels:
-        return picture_grid(shape, plan.cell_px)
+        return picture_grid(shape)
     assert plan.size_mm is not None and plan.cell_size_mm is not None
     return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 

@@ -327,7 +327,6 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
         if where == "pixels":
             yield from ("", "[plan]")
             yield 'registration = "pixels"                  # no fiducials were found: the picture is the plan, without millimetres'
-            yield '# cell_px = "4 px"                     # side of a cell, a divisor of both sides of the picture; left out: a usual one'
             yield "# for a plan in mm: size, cell_size and fiducials (at least four places on the table that are known in mm)"
             return
     yield ""

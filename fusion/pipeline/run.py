@@ -54,7 +54,6 @@ from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
-from thermography.fields.cycle_fields import plan_unit
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
@@ -220,11 +219,10 @@ def _evaluate_thermograms(run: Run, alone: CameraInputs) -> xr.Dataset:
 
 
 def _series_of(run: Run, camera: CameraInputs, alone: CameraInputs | None = None) -> CameraInputs | None:
-    """The camera whose frames are reduced to fields; None where its pictures show no course of one scene."""
+    """The camera whose frames are reduced to fields: beside a laser, or alone where a plan in mm says what they show."""
     if alone is None:
         return camera
-    still = run.parts["thermograms"]["scene"] == "still" or not alone.plan.in_pixels
-    if not still or len(alone.cycles.number) < 2:
+    if alone.plan.in_pixels or len(alone.cycles.number) < 2:
         return None
     run.notices.append(window_notice(alone))
     return camera
@@ -343,8 +341,7 @@ def _find_hotspots(
     """Wait for the correlation, which tests the hotspots; describe them where there is none."""
     if correlation is not None:
         return correlation()
-    shift_px = run.parts["thermograms"]["largest_shift_px"] if plan_unit(fields) == "px" else None
-    run.parts["hotspots"] = attribution.describe_hotspots(fields, shift_px or 0.0)
+    run.parts["hotspots"] = attribution.describe_hotspots(fields)
     return None
 
 

@@ -24,7 +24,7 @@ from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
 from fusion.results.store import check, write_atomically
 from thermography.common import FIELDS, ThermographyError
-from thermography.fields.cycle_fields import cycles_with_field, in_pixels, plan_unit, reference_cycle
+from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
 from thermography.fields.large_arrays import in_pieces, piece_slices
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
@@ -64,7 +64,7 @@ from thermography.radiometry.planck import ZERO_CELSIUS_K, Overrides, calibrate,
 from thermography.radiometry.uncertainty import InputUncertainty, common_contributions, rise_scale_contributions
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.plan import Polygon
-from thermography.registration.register import Registration, RegistrationError, register, register_picture
+from thermography.registration.register import Registration, RegistrationError, register
 
 # The camera before the fields are made: damaged frames are left out, steps and drift of its zero are taken out.
 
@@ -163,10 +163,7 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         shifts = travel[:, None] * np.array(source.direction)
     blocks = locate_blocks(survey, registration, source.grid, shifts)
     _refuse_patch_on_plan(source, blocks)
-    # What changes fast in a picture of which nothing is known may be what was to be seen: only a table is known to change slowly.
-    disturbed = (
-        {} if registration.is_picture else disturbed_frames(survey, blocks, still=source.thermography.table == "still")
-    )
+    disturbed = disturbed_frames(survey, blocks, still=source.thermography.table == "still")
     left_out = [
         *survey.damaged,
         *(RejectedFrame(survey.frames[i].path, survey.frames[i].index, reason) for i, reason in disturbed.items()),
@@ -184,8 +181,7 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     part: dict[str, Any] = {"frames_checked": len(source.frames), "frames_damaged": rejected, "steps": ()}
     if levels is None:
         part |= {"drift_K": 0.0, "largest_correction_K": 0.0, "largest_u_K": None}
-        notice = _NO_SURROUNDINGS_IN_A_PICTURE if registration.is_picture else _NO_SURROUNDINGS
-        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, notice])
+        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, _NO_SURROUNDINGS])
     background, table, spread = levels
     if survey.patch is not None:
         background = survey.patch[kept]
@@ -281,14 +277,6 @@ _NO_SURROUNDINGS = Notice(
 )
 
 
-_NO_SURROUNDINGS_IN_A_PICTURE = Notice(
-    "camera_unchecked",
-    "The whole picture is the plan, so that there are no surroundings to show steps and drift of the camera's zero, which look like a "
-    "rise of the whole picture.",
-    'State the drift, for example thermography.camera_drift_u = "0.2 K".',
-)
-
-
 def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameReference], u_K: float) -> Iterator[Notice]:
     """Return one notice each for steps, for a drift, and for what cannot be distinguished."""
     if correction.steps:
@@ -373,7 +361,6 @@ def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[st
     mean = float(rise.isel(cycle=int(np.flatnonzero(seen)[-1])).mean())
     at = _largest_at(rise)
     cell = rise[at]
-    unit = plan_unit(fields)
     since = (fields["cycle_time"].values[at[0]] - fields["cycle_time"].values[seen][0]) / np.timedelta64(1, "s")
     return {
         "fields": int(seen.sum()),
@@ -383,7 +370,7 @@ def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[st
         "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"][at])},
         "largest_cycle": int(cell["cycle"]),
         "largest_after_s": float(since),
-        **{f"largest_{axis}_{unit}": float(cell[axis]) for axis in "xy"},
+        **{f"largest_{axis}_mm": float(cell[axis]) for axis in "xy"},
     }
 
 
@@ -550,8 +537,6 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     fields = fields.assign_coords(cycle=source.cycles.number)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
-    if registration.is_picture:
-        fields = in_pixels(fields)
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
@@ -569,8 +554,6 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
 
 def register_campaign(source: CameraInputs, reference: np.ndarray) -> Registration:
     """Register the plan on the mean of the first frames; a refusal names the file of the fiducials."""
-    if source.plan.in_pixels:
-        return register_picture(reference.shape)
     moving = source.thermography.table == "moving"
     if moving and any(fiducial.is_point for fiducial in source.fiducials):
         raise RegistrationError(
@@ -674,9 +657,6 @@ def pixel_notices(counts: np.ndarray) -> Iterator[Notice]:
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
     """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
     degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
-    picture = (("row", "column"), reference.astype("f4"), degrees)
-    if registration.is_picture:
-        return xr.Dataset({"reference_frame": picture})
     names = list(registration.located)
     places = [registration.located[name] for name in names]
     fiducials = [registration.fiducials[name] for name in names]
@@ -690,21 +670,19 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     }
     variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
     variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
-    variables["reference_frame"] = picture
+    variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
     variables["fiducial_name"] = ("fiducial", names)
     return xr.Dataset(variables)
 
 
 def _registration_part(registration: Registration, source: CameraInputs) -> dict[str, Any]:
     """Return the part ``registration`` of results.json."""
-    part = {"model": registration.model, "frames_rejected": source.frames_rejected}
-    if registration.is_picture:
-        return {**part, "rms_mm": None, "leave_one_out_mm": {}}
     # The share of the plan that the fiducials in use span.
     places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
     hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
     return {
-        **part,
+        "model": registration.model,
+        "frames_rejected": source.frames_rejected,
         "rms_mm": registration.rms_mm,
         "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
         "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
@@ -755,8 +733,6 @@ _FRAME_ATTRIBUTES = {
 def _frame_notices(fields: xr.Dataset) -> Iterator[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
     for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
-        if name == "frames_unchecked" and plan_unit(fields) == "px":
-            continue
         frames = json.loads(fields.attrs.get(name, "[]"))
         if frames:
             named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])

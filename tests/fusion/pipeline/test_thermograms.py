@@ -181,5 +181,4 @@ def test_a_part_that_leaves_the_range_of_the_camera_is_said_so(tmp_path, real_fi
     assert results.thermograms.indicated_degC == pytest.approx(391.3, abs=0.1)
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Highest temperature above 312 °C" in page and "data:image/jpeg;base64," in page
-    # No hotspot where a shift by a pixel makes as much at an edge.
-    assert re.search(r'id="pictures"', page) and len(results.hotspots) < 11
+    assert re.search(r'id="pictures"', page) and results.field is None
