@@ -81,14 +81,6 @@ def contradictions(campaign: Campaign) -> Iterator[tuple[tuple[str, ...], str]]:
         if camera is not None and laser is not None and camera.window_s is not None:
             fault = "thermography.window divides the frames where no laser gives cycles; here [interferometry] does"
             yield ("thermography", "window"), f"{fault}: remove the key"
-        if camera is not None and laser is not None:
-            for region in camera.region:
-                if not region.is_surface:
-                    fault = (
-                        f"region {region.name} is evaluated only where a camera stands alone; beside [interferometry] a region is a part "
-                        "of the table, a rectangle or polygon in mm with its emissivity or its two states"
-                    )
-                    yield ("thermography", "region"), f"{fault}: remove it, or give the frames a campaign of their own"
         if plan is None:
             if camera is not None or sensors is not None:
                 name = "sensors" if camera is None else "thermography"

@@ -297,7 +297,7 @@ def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
     if not contents.unit:
         guess = "K" if np.nanmedian(values) > _WARMEST_DEGC else "degC"
         yield f"unit = {_quoted(asker.choice('Unit of the temperatures', tuple(sorted(('degC', 'K'), key=guess.__ne__))))}"
-    if contents.times is None:
+    if contents.times is None and (contents.frames > 1 or len(content.frame_files) > 1):
         pattern = _time_in_name(first.name)
         if pattern:
             yield f"time_in_name = {_quoted(pattern)}   # local time: write its time_zone below"

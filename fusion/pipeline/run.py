@@ -48,7 +48,7 @@ from fusion.pipeline.stages import (
     stamp_run,
 )
 from fusion.pipeline.thermal import camera_corrected, describe_field
-from fusion.pipeline.thermograms import evaluate_thermograms
+from fusion.pipeline.thermograms import evaluate_thermograms, has_regions
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
@@ -208,13 +208,16 @@ def run_stages(run: Run, stages: Mapping[str, Callable[..., Any]], made: dict[st
             made[makes] = stage(run, **{one.name: made.get(one.name) for one in parameters})
 
 
-def _evaluate_thermograms(run: Run, alone: CameraInputs) -> xr.Dataset:
-    """Every picture in degC, where a camera measures alone."""
-    thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, alone))
+def _evaluate_thermograms(run: Run, camera: CameraInputs, alone: CameraInputs | None = None) -> Maybe:
+    """Every picture in degC where a camera measures alone; beside a laser where there are regions of the picture."""
+    if alone is None and not has_regions(camera):
+        return None
+    thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, camera))
     table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
     claim(run.folder, _TABLE)
     run.products.append(write_text(run.folder / _TABLE, table.to_dataframe().reset_index().to_csv(index=False)))
-    run.draw(partial(_draw, "pictures", thermograms, run.parts["thermograms"]["series"]))
+    series = run.parts["thermograms"]["series"] if alone else run.parts["regions"][0]["camera"]
+    run.draw(partial(_draw, "pictures", thermograms, series))
     return thermograms
 
 

@@ -176,7 +176,10 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         for item in left_out
     ]
     usable = replace(source, frames=frames, frames_rejected=[*source.frames_rejected, *rejected])
-    notices = [*frames_notices(rejected, "frames_damaged"), *_repeat_notices(survey)]
+    notices = [
+        *frames_notices(rejected, "frames_damaged"),
+        *repeat_notices(survey.repeated, [frame.time for frame in survey.frames]),
+    ]
     levels = _levels(survey, blocks, kept)
     part: dict[str, Any] = {"frames_checked": len(source.frames), "frames_damaged": rejected, "steps": ()}
     if levels is None:
@@ -259,9 +262,9 @@ def _series(source: CameraInputs, background: Array, table: Array) -> LevelSerie
     return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), room)
 
 
-def _repeat_notices(survey: Survey) -> Iterator[Notice]:
+def repeat_notices(repeated: NDArray[np.bool_], times: Sequence[np.datetime64] | Array) -> Iterator[Notice]:
     """Return one notice for frames that the camera wrote twice."""
-    flags = find_repeats(survey.repeated, np.array([frame.time for frame in survey.frames], "datetime64[ms]"))
+    flags = find_repeats(repeated, np.array(times, "datetime64[ms]"))
     if flags:
         yield Notice(
             "frames_repeated",
@@ -509,7 +512,7 @@ _REGISTRATION_FRAMES = 5
 #: Number of frames above which finished cycles are stored during the reduction; below, this costs more than it saves.
 _CHECKPOINT_FRAMES = 2000
 #: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
-_PIXEL_FRAMES = 24
+PIXEL_FRAMES = 24
 
 
 def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
@@ -525,7 +528,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     camera = examine_camera(source, survey, registration)
     source, notices = camera.source, camera.notices
     if source.thermography.table == "still":
-        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
+        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
     fields, clock, clock_notices = _reduce_on_clock(
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
@@ -649,8 +652,8 @@ def pixel_notices(counts: np.ndarray) -> Iterator[Notice]:
         pixels = counted(int(np.count_nonzero(flags)), "pixel")
         yield Notice(
             "bad_pixels",
-            f"{pixels} do not follow their neighbours ({named}); they are included in the cell averages.",
-            "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
+            f"{pixels} do not follow their neighbours ({named}); they are included in the averages.",
+            "Have the camera replace them (a one-point correction, or its maker's service); means of few pixels may be off.",
         )
 
 

@@ -466,7 +466,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
 
 #: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
 _SECTIONS = (
-    ("pictures", "thermograms", "Pictures"),
+    ("pictures", "regions", "Pictures"),
     ("iso230", "iso230", "ISO 230-2"),
     ("drift", "drift", "Drift"),
     ("anomalies", "anomalies", "Positions"),

@@ -133,7 +133,7 @@ class Results(ResultPart):
     thermograms: ThermogramsPart | None = None
     """Pictures of a camera that measures alone."""
     regions: tuple[TemperatureRegionPart, ...] | None = None
-    """Temperatures of the whole picture and of regions in it, by camera, where a camera measures alone."""
+    """Temperatures of the whole picture and of regions in it, by camera; beside a laser only where regions are stated or stored."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
     camera: CameraPart | None = None

@@ -313,11 +313,6 @@ def test_any_subset_of_the_instruments_is_a_campaign(bare_folder: Path, lines: t
         ((LASER, CAMERA, PLAN), 4, "[plan] lacks axis; add it"),
         ((CAMERA, MOVING, PLAN), 4, "[plan] lacks axis; add it"),
         ((LASER, CAMERA, 'thermography.window = "5 min"', PLAN, AXIS), 4, "thermography.window divides the frames"),
-        (
-            (LASER, CAMERA, 'thermography.region = [{ name = "pump", spot = ["3 px", "4 px"] }]', PLAN, AXIS),
-            4,
-            "region pump is evaluated only where a camera stands alone",
-        ),
         ((CAMERA, PLAN.replace("plan.size", "# ")), 4, "[plan] lacks size; add it"),
         ((LASER, CAMERA, PIXELS), 2, 'plan.registration = "pixels", but [interferometry] needs the measured line'),
         ((CAMERA, PIXELS, SENSORS), 4, 'plan.registration = "pixels", but [sensors] needs the places of the sensors'),
