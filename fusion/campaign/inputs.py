@@ -264,6 +264,8 @@ class Source(CameraInputs, LaserInputs):
 
 #: Words of the reason why a frame of another camera or size is left out.
 _OTHER_CAMERA = "among frames of"
+#: Words of the reason why a second frame of one time is left out.
+_SAME_TIME = "has the same time"
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
@@ -650,6 +652,8 @@ def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_re
     remedy = "Copy damaged files again from the camera."
     if all(_OTHER_CAMERA in _reason(item) for item in rejected):
         remedy = "Name the frames of one camera and one size only in thermography.frames."
+    elif all(_SAME_TIME in _reason(item) for item in rejected):
+        remedy = "Give every frame a time of its own, for example by times in [thermography.stack]."
     return [Notice(code, f"{counted(len(rejected), 'frame')} left out: {listed(named)}.", remedy)]
 
 

@@ -32,7 +32,7 @@ def describe_thermograms(results: Results, thermograms: xr.Dataset) -> dict[str,
         "hottest": thermograms.attrs["hottest"],
     }
     if part is None:
-        return {**shown, "of_series": table_of_regions(regions)}
+        return {**shown, "of_series": table_of_regions(regions), "every": None, "visible": ""}
     beyond = [one for one in regions if one.name == _WHOLE and (one.overrange_pictures or one.underrange_pictures)]
     own = [one for one in regions if one.camera == part.series]
     return {
