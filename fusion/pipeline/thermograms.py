@@ -85,6 +85,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         tables.append(every.assign_coords(camera=("time", of_camera), source=("time", np.array(files, object))))
         count(len(frames))
     rejected = [one for each in tables for one in json.loads(each.attrs["rejected"])]
+    notices = _rejected_notices(source, rejected)
     damaged = {(str(one["path"]), one["index"]) for one in rejected}
     source = replace(source, frames=[one for one in source.frames if (str(one.path), one.index) not in damaged])
     kinds = {str(region): str(kind) for each in tables for region, kind in each["kind"].to_series().items()}
@@ -101,10 +102,10 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         hottest_frame=hottest.index,
         outlines=json.dumps([{"name": one.name, "kind": one.kind, "points": one.points} for one in outlines.values()]),
     )
-    notices = [*_cut_notices(outlines.values(), hottest.shape)]
+    cut = _cut_notices(outlines.values(), hottest.shape)
     region_parts = {"regions": [part for each in tables for part in _region_parts(each)]}
     if isinstance(source, LaserInputs):
-        return Outcome(dataset, region_parts, tuple(notices))
+        return Outcome(dataset, region_parts, tuple(cut))
     scene, shifts = _scene(source, override)
     part: dict[str, Any] = {
         "pictures": table.sizes["time"],
@@ -118,11 +119,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     if (change := _difference(source, override, scene, shifts)) is not None:
         dataset["difference"] = change
         part["difference"] = _difference_part(source, override, change, shifts[-1] if scene == "still" else None)
-    notices += [
-        *_rejected_notices(source, rejected),
-        *_series_notices(source, table, of_series, scene),
-        *_scene_notices(source, part),
-    ]
+    notices += [*cut, *_series_notices(source, table, of_series, scene), *_scene_notices(source, part)]
     try:
         visible = read_visible_picture(hottest) if isinstance(hottest, FlirFrameReference) else None
     except FlirFormatError as error:
@@ -313,16 +310,14 @@ def _cut_notices(regions: Iterable[Region], shape: tuple[int, int]) -> Iterator[
 
 def _rejected_notices(source: CameraInputs, rejected: Sequence[dict[str, Any]]) -> list[Notice]:
     """Return a notice for pictures that could not be evaluated; those of a series on a plan in mm are named where its fields are made."""
-    folder, named = source.campaign.folder, []
-    for one in rejected:
-        path = Path(one["path"])
-        if (
-            source.plan.in_pixels
-            or len(source.cycles.number) < 2
-            or path not in {frame.path for frame in source.frames}
-        ):
-            reason = str(one["reason"]).replace(f"{folder}/", "")
-            named.append({"file": relative_name(path, folder), "index": one["index"], "reason": reason})
+    folder = source.campaign.folder
+    has_fields = not source.plan.in_pixels and len(source.cycles.number) > 1
+    named_there = {str(frame.path) for frame in source.frames} if has_fields else set()
+    named = [
+        {**one, "file": relative_name(Path(one["path"]), folder), "reason": one["reason"].replace(f"{folder}/", "")}
+        for one in rejected
+        if one["path"] not in named_there
+    ]
     return frames_notices(named, "pictures_left_out")
 
 

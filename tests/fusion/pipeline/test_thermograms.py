@@ -158,6 +158,10 @@ def test_a_damaged_picture_is_left_out_and_named(tmp_path, scene):
     assert part["pictures"] == 2 and part["difference"]["mean_K"]["value"] == pytest.approx(1.5, abs=0.01)
     (left_out,) = [one for one in notices if one.code == "pictures_left_out"]
     assert "A645sc_1.jpg" in left_out.message
+    # On a plan in mm the fields name what they leave out.
+    source = read_source(load_campaign(path))
+    listed = replace(source, plan=source.plan.model_copy(update={"registration": "fiducials"}))
+    assert "pictures_left_out" not in {one.code for one in evaluate_thermograms(listed, report=silent).notices}
 
 
 def test_pictures_of_several_cameras_are_a_table_by_camera(tmp_path, scene):
