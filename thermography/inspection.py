@@ -33,11 +33,11 @@ _OLDEST_YEAR = 2001
 #: Code of a warning -> what to do about it.
 _REMEDIES = {
     "frame_left_out": "Copy the file from the camera again if the frame matters.",
-    "no_time": "They cannot be matched with laser readings.",
+    "no_time": "They take no part in the course over time.",
     "clock_not_set": "Set it, or give thermography.clock_offset in the campaign.",
     "several_cameras": "Store the frames of each camera in a separate file.",
-    "several_lenses": "Use one lens: another one shows the table elsewhere and at another scale.",
-    "parameters_vary": "Override them if the scene did not change.",
+    "several_lenses": "Use one lens: another one shows the scene elsewhere and at another scale.",
+    "parameters_vary": "Where the scene did not change, state one value for all pictures under [thermography].",
     "emissivity": "Give emissivity.",
     "distance_zero": "Give object_distance.",
     "humidity": "Give relative_humidity as a fraction.",
@@ -286,10 +286,14 @@ def describe_stack(path: Path) -> list[str]:
     ]
     if finite.size < values.size:
         lines.append(f"  {values.size - finite.size} of {values.size} pixels of the first frame are not numbers")
+    if contents.emissivity is not None:
+        lines.append(f"  calculated with the emissivity {contents.emissivity:g}")
     if contents.times is not None:
         lines.append(f"  {contents.times[0]} to {contents.times[-1]} {'UTC' if contents.zoned else 'without zone'}")
     missing = [] if contents.unit else ["unit"]
-    missing += [] if contents.times is not None else ["time_in_name, times, or start and interval"]
+    if contents.times is None:
+        series = "" if contents.frames > 1 else "of a series "
+        missing.append(f"{series}time_in_name, times, or start and interval")
     return lines + ([f"  state under [thermography.stack]: {'; '.join(missing)}"] if missing else [])
 
 

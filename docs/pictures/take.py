@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +15,9 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
+
+from fusion.pipeline.remote import fetch_sample, read_registry
+from fusion.pipeline.run import run_campaign
 
 #: A README loads its pictures for every reader.
 _MOST_BYTES = 150_000
@@ -56,9 +59,9 @@ def open_page(browser: Browser, address: str, height: int) -> Iterator[Page]:
     page.close()
 
 
-def take_report(browser: Browser, report: Path, folder: Path) -> None:
+def take_report(browser: Browser, report: Path, folder: Path, parts: Mapping[str, tuple[str, int]] = _PARTS) -> None:
     """Write a picture of every part of a report."""
-    for name, (place, height) in _PARTS.items():
+    for name, (place, height) in parts.items():
         with open_page(browser, report.resolve().as_uri(), height) as page:
             page.wait_for_load_state("networkidle")
             page.locator(place).first.evaluate("element => element.scrollIntoView({block: 'start'})")
@@ -81,6 +84,17 @@ def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> N
             (folder / "app.png").write_bytes(compact(page.screenshot()))
     finally:
         shutil.rmtree(copy.parent)
+
+
+def take_thermograms(browser: Browser, folder: Path) -> None:
+    """Write a picture of the report of public FLIR files: a heated part, from github.com/frkatona/ThermalImageFitter."""
+    with tempfile.TemporaryDirectory() as name:
+        test = Path(name)
+        for sample in (one for one in read_registry() if "ThermalImageFitter" in one):
+            shutil.copy(fetch_sample(sample), test)
+        (test / "campaign.toml").write_text('campaign.title = "Heated part"\nthermography.frames = ["*.jpg"]\n')
+        run_campaign(test / "campaign.toml", test / "results")
+        take_report(browser, test / "results" / "report.html", folder, {"only-flir-files": ("body", 800)})
 
 
 def take_table(browser: Browser, folder: Path) -> None:
@@ -111,4 +125,5 @@ if __name__ == "__main__":
         take_report(browser, results / "report.html", pictures)
         take_app(browser, campaign, results, pictures)
         take_table(browser, pictures)
+        take_thermograms(browser, pictures)
         browser.close()

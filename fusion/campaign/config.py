@@ -40,7 +40,6 @@ from fusion.campaign.values import (
     PartsPerMillion,
     PartsPerMillionU,
     PixelPatch,
-    Pixels,
     Point,
     PositiveMicrometres,
     PositiveMillimetres,
@@ -82,14 +81,6 @@ def contradictions(campaign: Campaign) -> Iterator[tuple[tuple[str, ...], str]]:
         if camera is not None and laser is not None and camera.window_s is not None:
             fault = "thermography.window divides the frames where no laser gives cycles; here [interferometry] does"
             yield ("thermography", "window"), f"{fault}: remove the key"
-        if camera is not None and laser is not None:
-            for region in camera.region:
-                if not region.is_surface:
-                    fault = (
-                        f"region {region.name} is evaluated only where a camera stands alone; beside [interferometry] a region is a part "
-                        "of the table, a rectangle or polygon in mm with its emissivity or its two states"
-                    )
-                    yield ("thermography", "region"), f"{fault}: remove it, or give the frames a campaign of their own"
         if plan is None:
             if camera is not None or sensors is not None:
                 name = "sensors" if camera is None else "thermography"
@@ -532,7 +523,6 @@ class PlanTable(Table):
     registration: Literal["fiducials", "pixels"] = "fiducials"
     size_mm: tuple[PositiveMillimetres, PositiveMillimetres] | None = None
     cell_size_mm: PositiveMillimetres | None = None
-    cell_px: Pixels | None = None
     fiducials: ExistingFile | None = None
     regions: ExistingFile | None = None
     axis: AxisTable | None = None
@@ -544,15 +534,12 @@ class PlanTable(Table):
 
     @model_validator(mode="after")
     def _has_one_unit(self) -> PlanTable:
-        if self.in_pixels:
-            given = [_key(self, name) for name in _IN_MILLIMETRES if getattr(self, name) is not None]
-            if given:
-                raise ValueError(
-                    f'{", ".join(given)} in millimetres cannot be combined with registration = "pixels", where the picture is the plan and '
-                    'cell_px = "4 px" its cell; remove one of them'
-                )
-        elif self.cell_px is not None:
-            raise ValueError('cell_px belongs to a plan of pixels; write registration = "pixels", or cell_size in mm')
+        given = [_key(self, name) for name in _IN_MILLIMETRES if getattr(self, name) is not None]
+        if self.in_pixels and given:
+            raise ValueError(
+                f'{", ".join(given)} in millimetres cannot be combined with registration = "pixels", where the picture is the plan; remove '
+                "one of them"
+            )
         return self
 
     @model_validator(mode="after")

@@ -29,6 +29,7 @@ from fusion.campaign.config import (
     CampaignError,
     InterferometryTable,
     PlanTable,
+    RegionTable,
     StackTable,
     ThermographyTable,
     relative_name,
@@ -57,6 +58,8 @@ from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import ThermographyError
 from thermography.io.frame import FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
+from thermography.io.region import Region as PictureRegion
+from thermography.io.region import RegionKind
 from thermography.io.sequence import FrameList, camera_names, frame_times
 from thermography.registration.plan import Fiducial, PlanGrid, Polygon, PolygonError, read_fiducials
 from thermography.registration.projection import Lens, read_lens
@@ -71,8 +74,9 @@ _ZERO_CELSIUS_K = 273.15
 def stack_options(campaign: Campaign) -> StackOptions:
     """Return what a campaign file says of files of temperatures."""
     table = None if campaign.thermography is None else campaign.thermography.stack
+    needs_time = campaign.interferometry is not None or len(campaign.frame_paths()) > 1
     if table is None:
-        return StackOptions()
+        return StackOptions(needs_time=needs_time)
     reflected = table.reflected_temperature_degC
     same = ("scale", "offset", "variable", "time_in_name", "interval_s", "time_zone")
     return StackOptions(
@@ -80,8 +84,9 @@ def stack_options(campaign: Campaign) -> StackOptions:
         unit=table.unit or "",
         times=None if table.times is None else _read_times(campaign.resolve(table.times), table),
         start=None if table.start is None else _instant(campaign.path, table.start, table.time_zone),
-        emissivity=1.0 if table.emissivity is None else table.emissivity,
-        reflected_temperature_K=(20.0 if reflected is None else reflected) + _ZERO_CELSIUS_K,
+        emissivity=table.emissivity,
+        needs_time=needs_time,
+        reflected_temperature_K=None if reflected is None else reflected + _ZERO_CELSIUS_K,
     )
 
 
@@ -111,7 +116,8 @@ def _read_times(path: Path, table: StackTable) -> dict[tuple[str, int], np.datet
 
 def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameReference]) -> Iterator[Notice]:
     """Return notices of what was assumed of a camera whose files hold temperatures."""
-    if not any(isinstance(frame, TemperatureFrame) for frame in frames):
+    read = [frame for frame in frames if isinstance(frame, TemperatureFrame)]
+    if not read:
         return
     if table.camera_offset_u_K is None:
         yield Notice(
@@ -119,7 +125,7 @@ def camera_accuracy_notices(table: ThermographyTable, frames: Sequence[FrameRefe
             "The files hold temperatures and not what camera took them: the accuracy of an uncooled camera was assumed.",
             'Write the accuracy of its data sheet under [thermography], for example camera_offset_u = "1 K" and camera_scale_u = 0.01.',
         )
-    if table.stack is None or table.stack.emissivity is None:
+    if any(frame.options.emissivity is None for frame in read):
         yield Notice(
             "stack_emissivity_unknown",
             "The emissivity with which the camera's program calculated the temperatures is not stated; they are taken as they are.",
@@ -258,6 +264,8 @@ class Source(CameraInputs, LaserInputs):
 
 #: Words of the reason why a frame of another camera or size is left out.
 _OTHER_CAMERA = "among frames of"
+#: Words of the reason why a second frame of one time is left out.
+_SAME_TIME = "has the same time"
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 #: Fewest cycles with a course: of two there is one difference at every target, which is drift as well as scatter.
@@ -452,7 +460,7 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
     }
     if cycles is None:
         times = camera_on_laser_clock(frame_times(frames), thermography.clock_offset_s or 0.0)
-        windows = cycles_of_frames(times, thermography.window_s or usual_window_s(times)) if frames else None
+        windows = cycles_of_frames(times, thermography.window_s or usual_window_s(times)) if len(frames) > 1 else None
         camera["cycles"] = windows or Cycles(np.zeros(0, np.int64), np.zeros((0, 2), "datetime64[ns]"))
     return camera
 
@@ -460,7 +468,7 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
 def plan_grid(plan: PlanTable, shape: tuple[int, int]) -> PlanGrid:
     """Return the cells of a plan in mm, or of the picture (rows, columns) that is the plan."""
     if plan.in_pixels:
-        return picture_grid(shape, plan.cell_px)
+        return picture_grid(shape)
     assert plan.size_mm is not None and plan.cell_size_mm is not None
     return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 
@@ -482,6 +490,8 @@ def _read_frames(campaign: Campaign, *, several_cameras: bool) -> tuple[FrameLis
 
 def _series(pictures: FrameList) -> FrameList:
     """Return the frames of the camera that took most of them, which have a time; none where it took no more than the others."""
+    if len(pictures) == 1:
+        return pictures
     names, timed = camera_names(pictures), ~np.isnat(pictures.times)
     listed, first, counted = np.unique(names.astype(str), return_index=True, return_counts=True)
     most = min(range(listed.size), key=lambda k: (-counted[k], first[k])) if listed.size else 0
@@ -631,13 +641,11 @@ def _raise_if_regions_unusable(source: CameraInputs) -> None:
             raise SourceError(
                 f"{where}: {names[region.name]} regions are called {region.name}; give each a name of its own"
             )
-        height, width = source.pictures[0].shape
-        (left, top), (right, bottom) = np.min(region.points, axis=0), np.max(region.points, axis=0)
-        if region.unit == "px" and (right < 0 or bottom < 0 or left > width - 1 or top > height - 1):
-            raise SourceError(
-                f"{where}: region {region.name} lies outside the picture of {width} x {height} px; give column and row from 0, 0 to "
-                f"{width - 1}, {height - 1}"
-            )
+        if region.unit == "px":
+            try:
+                picture_region(region).pixels((source.frames or source.pictures)[0].shape)
+            except ThermographyError as error:
+                raise SourceError(f"{where}: {error}") from None
     for region in source.thermography.surfaces:
         try:
             shares = Polygon(f"region {region.name}", np.array(region.corners)).cell_shares(grid.x_mm, grid.y_mm)
@@ -656,6 +664,17 @@ def _raise_if_regions_unusable(source: CameraInputs) -> None:
                 )
 
 
+#: Shape of a region in the campaign file -> kind of region.
+_KINDS: dict[str, RegionKind] = {
+    "spot": "spot", "line": "line", "rectangle": "box", "ellipse": "ellipse", "polygon": "polygon",
+}  # fmt: skip
+
+
+def picture_region(table: RegionTable) -> PictureRegion:
+    """Return a region of the campaign file whose points are pixels."""
+    return PictureRegion(table.name, _KINDS[table.shape], table.points, table.emissivity)
+
+
 class SourceError(FusionError):
     """The inputs of a campaign cannot be used together; the message says which and what to do."""
 
@@ -665,9 +684,11 @@ def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_re
     if not rejected:
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
-    remedy = "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours."
+    remedy = "Copy damaged files again from the camera."
     if all(_OTHER_CAMERA in _reason(item) for item in rejected):
         remedy = "Name the frames of one camera and one size only in thermography.frames."
+    elif all(_SAME_TIME in _reason(item) for item in rejected):
+        remedy = "Give every frame a time of its own, for example by times in [thermography.stack]."
     return [Notice(code, f"{counted(len(rejected), 'frame')} left out: {listed(named)}.", remedy)]
 
 

@@ -224,7 +224,6 @@ Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temper
 #: A camera whose clock was never set may be decades off; nanoseconds in 64 bits hold 292 years.
 Seconds = Annotated[float, _quantity("s"), _within(-3e9, 3e9, "this time in s"), _written("37 s")]
 PositiveSeconds = Annotated[float, _quantity("s"), _within(0.0, 1e6, "this time in s"), _written("2 s")]
-Pixels = Annotated[int, _quantity("px"), _within(0.0, 1e5, "this number of pixels"), _written("4 px")]
 PositiveMicrometres = Annotated[float, _quantity("um"), _within(0.0, 1e6, "this displacement in um"), _written("10 um")]
 PartsPerMillion = Annotated[
     float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K"), _written("11.7 ppm/K")

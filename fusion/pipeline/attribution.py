@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import maximum_filter
 
 from fusion.analysis.attribution.correlate import (
     area_of,
@@ -28,7 +27,6 @@ from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart
 from fusion.results.progress import Report
 from fusion.results.results import Outcome
-from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.hotspots import Hotspot, detect_hotspots
 
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
@@ -69,38 +67,22 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     return Outcome(maps, parts, tuple(averaged))
 
 
-def describe_hotspots(fields: xr.Dataset, shift_px: float = 0.0) -> list[dict[str, Any]]:
-    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested.
-
-    A picture that shifts makes an edge look as if it warmed beside and cooled behind: a hotspot stands out by more than that.
-    """
+def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested."""
     spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
-    if shift_px:
-        last = fields["temperature"].isel(cycle=-1)
-        down, across = np.gradient(last.values, *(float(np.median(np.diff(last[axis]))) for axis in "yx"))
-        steepest = xr.DataArray(maximum_filter(np.hypot(down, across), 5), last.coords, last.dims)
-        spots = [
-            spot
-            for spot in spots
-            if spot.prominence_K > shift_px * float(steepest.sel(x=spot.x_mm, y=spot.y_mm, method="nearest"))
-        ]
     return [{**_peak_part(f"hotspot {k}", spot, fields), **_UNTESTED} for k, spot in enumerate(spots, start=1)]
 
 
 def _peak_part(name: str, spot: Hotspot, fields: xr.Dataset) -> dict[str, Any]:
     """Place, area and rise of a hotspot."""
     u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
-    rise = {"name": name, "peak_rise_K": spot.peak_rise_K, "peak_rise_u_K": float(u)}
-    unit = plan_unit(fields)
-    area = dict(zip(("x_low", "x_high", "y_low", "y_high"), spot.extent_mm, strict=True))
-    part = {
-        f"x_{unit}": spot.x_mm,
-        f"y_{unit}": spot.y_mm,
-        f"centroid_x_{unit}": spot.centroid_x_mm,
-        f"centroid_y_{unit}": spot.centroid_y_mm,
-        "area" if unit == "mm" else "area_px": {f"{end}_{unit}": at for end, at in area.items()},
+    return {
+        "name": name,
+        "peak_rise_K": spot.peak_rise_K,
+        "peak_rise_u_K": float(u),
+        **{key: getattr(spot, key) for key in ("x_mm", "y_mm", "centroid_x_mm", "centroid_y_mm")},
+        "area": dict(zip(("x_low_mm", "x_high_mm", "y_low_mm", "y_high_mm"), spot.extent_mm, strict=True)),
     }
-    return {"x_mm": None, "y_mm": None, **rise, **part}
 
 
 def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Region]:

@@ -162,9 +162,7 @@ def _content(source: Inputs) -> Iterator[str]:
         if not source.frames:
             yield "no camera took most of them, or they have no time: a table of single pictures, not a series"
         elif source.plan.in_pixels:
-            yield (
-                f"plan: the picture of {grid.width_mm:g} x {grid.height_mm:g} px in cells of {grid.cell_size_mm:g} px, no scale in mm"
-            )
+            yield "plan: the picture itself, no scale in mm"
         else:
             yield f"plan: {grid.width_mm:g} x {grid.height_mm:g} mm, {counted(len(source.fiducials), 'fiducial')}"
     if source.sensors is not None:

@@ -190,7 +190,7 @@ def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
 
 def check_plan(source: CameraInputs, registration: Mapping[str, Any]) -> list[Check]:
     """Check what the registration found."""
-    return [] if source.plan.in_pixels else check_registration(registration, file=source.fiducials_file)
+    return check_registration(registration, file=source.fiducials_file)
 
 
 def check_loop(loop: Mapping[str, Any], source: LaserInputs) -> list[Check]:

@@ -303,7 +303,7 @@ def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
     if not contents.unit:
         guess = "K" if np.nanmedian(values) > _WARMEST_DEGC else "degC"
         yield f"unit = {_quoted(asker.choice('Unit of the temperatures', tuple(sorted(('degC', 'K'), key=guess.__ne__))))}"
-    if contents.times is None:
+    if contents.times is None and (contents.frames > 1 or len(content.frame_files) > 1):
         pattern = _time_in_name(first.name)
         if pattern:
             yield f"time_in_name = {_quoted(pattern)}   # local time: write its time_zone below"
@@ -333,7 +333,6 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
         if where == "pixels":
             yield from ("", "[plan]")
             yield 'registration = "pixels"                  # no fiducials were found: the picture is the plan, without millimetres'
-            yield '# cell_px = "4 px"                     # side of a cell, a divisor of both sides of the picture; left out: a usual one'
             yield "# for a plan in mm: size, cell_size and fiducials (at least four places on the table that are known in mm)"
             return
     yield ""

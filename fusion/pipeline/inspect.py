@@ -713,7 +713,7 @@ def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
     times = np.array([frame.time for frame in frames], dtype="datetime64[ns]")
     timed = np.sort(times[~np.isnat(times)])
     if timed.size == 0:
-        yield "no times: the frames cannot be matched with readings"
+        yield "no times: the frames give no course over time"
         return
     length_s = float((timed[-1] - timed[0]) / np.timedelta64(1, "s"))
     zones = sorted({frame.utc_offset_minutes or 0 for frame in frames})

@@ -48,13 +48,12 @@ from fusion.pipeline.stages import (
     stamp_run,
 )
 from fusion.pipeline.thermal import camera_corrected, describe_field
-from fusion.pipeline.thermograms import evaluate_thermograms
+from fusion.pipeline.thermograms import evaluate_thermograms, has_regions
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
-from thermography.fields.cycle_fields import plan_unit
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
@@ -209,22 +208,24 @@ def run_stages(run: Run, stages: Mapping[str, Callable[..., Any]], made: dict[st
             made[makes] = stage(run, **{one.name: made.get(one.name) for one in parameters})
 
 
-def _evaluate_thermograms(run: Run, alone: CameraInputs) -> xr.Dataset:
-    """Every picture in degC, where a camera measures alone."""
-    thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, alone))
+def _evaluate_thermograms(run: Run, camera: CameraInputs, alone: CameraInputs | None = None) -> Maybe:
+    """Every picture in degC where a camera measures alone; beside a laser where there are regions of the picture."""
+    if alone is None and not has_regions(camera):
+        return None
+    thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, camera))
     table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
     claim(run.folder, _TABLE)
     run.products.append(write_text(run.folder / _TABLE, table.to_dataframe().reset_index().to_csv(index=False)))
-    run.draw(partial(_draw, "pictures", thermograms, run.parts["thermograms"]["series"]))
+    series = run.parts["thermograms"]["series"] if alone else run.parts["regions"][0]["camera"]
+    run.draw(partial(_draw, "pictures", thermograms, series))
     return thermograms
 
 
 def _series_of(run: Run, camera: CameraInputs, alone: CameraInputs | None = None) -> CameraInputs | None:
-    """The camera whose frames are reduced to fields; None where its pictures show no course of one scene."""
+    """The camera whose frames are reduced to fields: beside a laser, or alone where a plan in mm says what they show."""
     if alone is None:
         return camera
-    still = run.parts["thermograms"]["scene"] == "still" or not alone.plan.in_pixels
-    if not still or len(alone.cycles.number) < 2:
+    if alone.plan.in_pixels or len(alone.cycles.number) < 2:
         return None
     run.notices.append(window_notice(alone))
     return camera
@@ -343,8 +344,7 @@ def _find_hotspots(
     """Wait for the correlation, which tests the hotspots; describe them where there is none."""
     if correlation is not None:
         return correlation()
-    shift_px = run.parts["thermograms"]["largest_shift_px"] if plan_unit(fields) == "px" else None
-    run.parts["hotspots"] = attribution.describe_hotspots(fields, shift_px or 0.0)
+    run.parts["hotspots"] = attribution.describe_hotspots(fields)
     return None
 
 

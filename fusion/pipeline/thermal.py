@@ -24,7 +24,7 @@ from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
 from fusion.results.store import check, write_atomically
 from thermography.common import FIELDS, ThermographyError
-from thermography.fields.cycle_fields import cycles_with_field, in_pixels, plan_unit, reference_cycle
+from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
 from thermography.fields.large_arrays import in_pieces, piece_slices
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
@@ -64,7 +64,7 @@ from thermography.radiometry.planck import ZERO_CELSIUS_K, Overrides, calibrate,
 from thermography.radiometry.uncertainty import InputUncertainty, common_contributions, rise_scale_contributions
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.plan import Polygon
-from thermography.registration.register import Registration, RegistrationError, register, register_picture
+from thermography.registration.register import Registration, RegistrationError, register
 
 # The camera before the fields are made: damaged frames are left out, steps and drift of its zero are taken out.
 
@@ -163,10 +163,7 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         shifts = travel[:, None] * np.array(source.direction)
     blocks = locate_blocks(survey, registration, source.grid, shifts)
     _refuse_patch_on_plan(source, blocks)
-    # What changes fast in a picture of which nothing is known may be what was to be seen: only a table is known to change slowly.
-    disturbed = (
-        {} if registration.is_picture else disturbed_frames(survey, blocks, still=source.thermography.table == "still")
-    )
+    disturbed = disturbed_frames(survey, blocks, still=source.thermography.table == "still")
     left_out = [
         *survey.damaged,
         *(RejectedFrame(survey.frames[i].path, survey.frames[i].index, reason) for i, reason in disturbed.items()),
@@ -179,13 +176,15 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         for item in left_out
     ]
     usable = replace(source, frames=frames, frames_rejected=[*source.frames_rejected, *rejected])
-    notices = [*frames_notices(rejected, "frames_damaged"), *_repeat_notices(survey)]
+    notices = [
+        *frames_notices(rejected, "frames_damaged"),
+        *repeat_notices(survey.repeated, [frame.time for frame in survey.frames]),
+    ]
     levels = _levels(survey, blocks, kept)
     part: dict[str, Any] = {"frames_checked": len(source.frames), "frames_damaged": rejected, "steps": ()}
     if levels is None:
         part |= {"drift_K": 0.0, "largest_correction_K": 0.0, "largest_u_K": None}
-        notice = _NO_SURROUNDINGS_IN_A_PICTURE if registration.is_picture else _NO_SURROUNDINGS
-        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, notice])
+        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, _NO_SURROUNDINGS])
     background, table, spread = levels
     if survey.patch is not None:
         background = survey.patch[kept]
@@ -263,9 +262,9 @@ def _series(source: CameraInputs, background: Array, table: Array) -> LevelSerie
     return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), room)
 
 
-def _repeat_notices(survey: Survey) -> Iterator[Notice]:
+def repeat_notices(repeated: NDArray[np.bool_], times: Sequence[np.datetime64] | Array) -> Iterator[Notice]:
     """Return one notice for frames that the camera wrote twice."""
-    flags = find_repeats(survey.repeated, np.array([frame.time for frame in survey.frames], "datetime64[ms]"))
+    flags = find_repeats(repeated, np.array(times, "datetime64[ms]"))
     if flags:
         yield Notice(
             "frames_repeated",
@@ -278,14 +277,6 @@ _NO_SURROUNDINGS = Notice(
     "camera_unchecked",
     "Only the table is in view, so that steps and drift of the camera's zero cannot be distinguished from its warming.",
     "Leave a margin around the table in view.",
-)
-
-
-_NO_SURROUNDINGS_IN_A_PICTURE = Notice(
-    "camera_unchecked",
-    "The whole picture is the plan, so that there are no surroundings to show steps and drift of the camera's zero, which look like a "
-    "rise of the whole picture.",
-    'State the drift, for example thermography.camera_drift_u = "0.2 K".',
 )
 
 
@@ -373,7 +364,6 @@ def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[st
     mean = float(rise.isel(cycle=int(np.flatnonzero(seen)[-1])).mean())
     at = _largest_at(rise)
     cell = rise[at]
-    unit = plan_unit(fields)
     since = (fields["cycle_time"].values[at[0]] - fields["cycle_time"].values[seen][0]) / np.timedelta64(1, "s")
     return {
         "fields": int(seen.sum()),
@@ -383,7 +373,7 @@ def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[st
         "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"][at])},
         "largest_cycle": int(cell["cycle"]),
         "largest_after_s": float(since),
-        **{f"largest_{axis}_{unit}": float(cell[axis]) for axis in "xy"},
+        **{f"largest_{axis}_mm": float(cell[axis]) for axis in "xy"},
     }
 
 
@@ -522,7 +512,7 @@ _REGISTRATION_FRAMES = 5
 #: Number of frames above which finished cycles are stored during the reduction; below, this costs more than it saves.
 _CHECKPOINT_FRAMES = 2000
 #: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
-_PIXEL_FRAMES = 24
+PIXEL_FRAMES = 24
 
 
 def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
@@ -538,7 +528,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     camera = examine_camera(source, survey, registration)
     source, notices = camera.source, camera.notices
     if source.thermography.table == "still":
-        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
+        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
     fields, clock, clock_notices = _reduce_on_clock(
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
@@ -550,8 +540,6 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     fields = fields.assign_coords(cycle=source.cycles.number)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
-    if registration.is_picture:
-        fields = in_pixels(fields)
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
@@ -569,8 +557,6 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
 
 def register_campaign(source: CameraInputs, reference: np.ndarray) -> Registration:
     """Register the plan on the mean of the first frames; a refusal names the file of the fiducials."""
-    if source.plan.in_pixels:
-        return register_picture(reference.shape)
     moving = source.thermography.table == "moving"
     if moving and any(fiducial.is_point for fiducial in source.fiducials):
         raise RegistrationError(
@@ -666,17 +652,14 @@ def pixel_notices(counts: np.ndarray) -> Iterator[Notice]:
         pixels = counted(int(np.count_nonzero(flags)), "pixel")
         yield Notice(
             "bad_pixels",
-            f"{pixels} do not follow their neighbours ({named}); they are included in the cell averages.",
-            "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
+            f"{pixels} do not follow their neighbours ({named}); they are included in the averages.",
+            "Have the camera replace them (a one-point correction, or its maker's service); means of few pixels may be off.",
         )
 
 
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
     """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
     degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
-    picture = (("row", "column"), reference.astype("f4"), degrees)
-    if registration.is_picture:
-        return xr.Dataset({"reference_frame": picture})
     names = list(registration.located)
     places = [registration.located[name] for name in names]
     fiducials = [registration.fiducials[name] for name in names]
@@ -690,21 +673,19 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     }
     variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
     variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
-    variables["reference_frame"] = picture
+    variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
     variables["fiducial_name"] = ("fiducial", names)
     return xr.Dataset(variables)
 
 
 def _registration_part(registration: Registration, source: CameraInputs) -> dict[str, Any]:
     """Return the part ``registration`` of results.json."""
-    part = {"model": registration.model, "frames_rejected": source.frames_rejected}
-    if registration.is_picture:
-        return {**part, "rms_mm": None, "leave_one_out_mm": {}}
     # The share of the plan that the fiducials in use span.
     places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
     hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
     return {
-        **part,
+        "model": registration.model,
+        "frames_rejected": source.frames_rejected,
         "rms_mm": registration.rms_mm,
         "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
         "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
@@ -755,8 +736,6 @@ _FRAME_ATTRIBUTES = {
 def _frame_notices(fields: xr.Dataset) -> Iterator[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
     for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
-        if name == "frames_unchecked" and plan_unit(fields) == "px":
-            continue
         frames = json.loads(fields.attrs.get(name, "[]"))
         if frames:
             named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])

@@ -1,9 +1,10 @@
-"""Thermograms stage: every picture of a camera that measures alone, in degC, and what changed between them."""
+"""Thermograms stage: every picture of a camera that measures alone, in degC, and what changed between them; beside a laser, regions."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,12 +14,20 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import RegionTable, relative_name
-from fusion.campaign.inputs import CameraInputs
+from fusion.campaign.inputs import CameraInputs, LaserInputs, frames_notices, picture_region
 from fusion.campaign.time_zones import utc
-from fusion.pipeline.thermal import counter, overridden_parameters, register_campaign, stated_uncertainty
+from fusion.pipeline.thermal import (
+    PIXEL_FRAMES,
+    counter,
+    overridden_parameters,
+    pixel_notices,
+    register_campaign,
+    repeat_notices,
+    stated_uncertainty,
+)
 from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
-from thermography.common import Array
+from thermography.common import Array, ThermographyError
 from thermography.evaluation import (
     WHOLE_PICTURE,
     evaluate_regions,
@@ -29,16 +38,12 @@ from thermography.evaluation import (
 )
 from thermography.io.flir import FlirFrameReference, read_visible_picture
 from thermography.io.frame import FlirFormatError, FrameReference
-from thermography.io.region import Region, RegionKind
+from thermography.io.region import Region
 from thermography.io.sequence import camera_names
 from thermography.radiometry.planck import Overrides
 from thermography.radiometry.uncertainty import rise_scale_contributions, temperature_uncertainty
 from thermography.registration.displacement import picture_displacements
 
-#: Shape of a region in the campaign file -> kind of region.
-_KINDS: dict[str, RegionKind] = {
-    "spot": "spot", "line": "line", "rectangle": "box", "ellipse": "ellipse", "polygon": "polygon",
-}  # fmt: skip
 #: Largest shift of pictures that count as taken from one place, px: a part that warms shifts the best match of two pictures by up to one.
 _LARGEST_SHIFT_PX = 2.0
 #: Most pictures of a series that are compared with one another, spread over it.
@@ -49,8 +54,20 @@ _WIDEST = 640
 Scene = Literal["one picture", "still", "moved", "unlike", "no series"]
 
 
+def has_regions(source: CameraInputs) -> bool:
+    """Whether the campaign or the first frame names places in the picture, besides parts of the table with an emissivity of their own."""
+    if any(not table.is_surface for table in source.thermography.region):
+        return True
+    with suppress(ThermographyError):  # a damaged frame is named where the frames are reduced
+        return bool(stored_regions(source.frames[0]))
+    return False
+
+
 def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.Dataset]:
-    """Evaluate the regions that the files store and those of the campaign in every picture, and what changed from first to last."""
+    """Evaluate the regions that the files store and those of the campaign in every picture, and what changed from first to last.
+
+    Beside a laser the fields show what changed, and name the frames that are left out: the regions alone are evaluated.
+    """
     override, inputs = Overrides(overridden_parameters(source.thermography)), stated_uncertainty(source.thermography)
     names, folder = camera_names(source.pictures), source.campaign.folder
     stated = _stated_regions(source, override)
@@ -68,6 +85,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         tables.append(every.assign_coords(camera=("time", of_camera), source=("time", np.array(files, object))))
         count(len(frames))
     rejected = [one for each in tables for one in json.loads(each.attrs["rejected"])]
+    notices = _rejected_notices(source, rejected)
     damaged = {(str(one["path"]), one["index"]) for one in rejected}
     source = replace(source, frames=[one for one in source.frames if (str(one.path), one.index) not in damaged])
     kinds = {str(region): str(kind) for each in tables for region, kind in each["kind"].to_series().items()}
@@ -84,6 +102,10 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         hottest_frame=hottest.index,
         outlines=json.dumps([{"name": one.name, "kind": one.kind, "points": one.points} for one in outlines.values()]),
     )
+    cut = _cut_notices(outlines.values(), hottest.shape)
+    region_parts = {"regions": [part for each in tables for part in _region_parts(each)]}
+    if isinstance(source, LaserInputs):
+        return Outcome(dataset, region_parts, tuple(cut))
     scene, shifts = _scene(source, override)
     part: dict[str, Any] = {
         "pictures": table.sizes["time"],
@@ -97,7 +119,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     if (change := _difference(source, override, scene, shifts)) is not None:
         dataset["difference"] = change
         part["difference"] = _difference_part(source, override, change, shifts[-1] if scene == "still" else None)
-    notices = [*_rejected_notices(rejected, folder), *_scene_notices(source, part)]
+    notices += [*cut, *_series_notices(source, table, of_series, scene), *_scene_notices(source, part)]
     try:
         visible = read_visible_picture(hottest) if isinstance(hottest, FlirFrameReference) else None
     except FlirFormatError as error:
@@ -106,11 +128,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     if visible is not None:
         dataset["visible"] = (("visible_row", "visible_column", "channel"), _reduced(visible.pixels))
     dataset.attrs["rejected"] = json.dumps(rejected).replace(f"{folder}/", "")
-    return Outcome(
-        dataset,
-        {"thermograms": part, "regions": [part for each in tables for part in _region_parts(each)]},
-        tuple(notices),
-    )
+    return Outcome(dataset, {"thermograms": part, **region_parts}, tuple(notices))
 
 
 def _stated_regions(source: CameraInputs, override: Overrides) -> list[Region]:
@@ -120,14 +138,15 @@ def _stated_regions(source: CameraInputs, override: Overrides) -> list[Region]:
         first = source.frames[0]
         registration = register_campaign(source, thermogram(first, override(first))["temperature"].values)
         return [_in_picture(table, registration.to_sensor) for table in tables]
-    return [Region(table.name, _KINDS[table.shape], table.points, table.emissivity) for table in tables]
+    return [picture_region(table) for table in tables]
 
 
 def _in_picture(table: RegionTable, to_sensor: Any) -> Region:
     """A region of the plan as the camera sees it: an area becomes a polygon."""
+    region = picture_region(table)
     if table.unit == "px":
-        return Region(table.name, _KINDS[table.shape], table.points, table.emissivity)
-    kind = _KINDS[table.shape]
+        return region
+    kind = region.kind
     points = table.points if kind in ("spot", "line") else table.corners
     if kind == "ellipse":
         (x0, y0), (x1, y1) = table.points
@@ -278,15 +297,42 @@ def _extreme(one: xr.Dataset, name: str, at: Any) -> dict[str, Any]:
     }
 
 
-def _rejected_notices(rejected: Sequence[dict[str, Any]], folder: Path) -> Iterator[Notice]:
-    """Return a notice for pictures that could not be evaluated."""
-    if rejected:
-        reasons = listed(one["reason"].replace(f"{folder}/", "") for one in rejected)
+def _cut_notices(regions: Iterable[Region], shape: tuple[int, int]) -> Iterator[Notice]:
+    """Return a notice for regions of which a part is evaluated."""
+    if cut := [region.name for region in regions if region.is_cut(shape)]:
+        rows, columns = shape
         yield Notice(
-            "pictures_left_out",
-            f"{counted(len(rejected), 'picture')} left out: {reasons}.",
-            "Copy damaged pictures again from the camera.",
+            "regions_cut",
+            f"Partly outside the picture of {columns} x {rows} px, and evaluated within it: {listed(cut)}.",
+            f"Place {listed(cut)} within columns 0 to {columns - 1} and rows 0 to {rows - 1}.",
         )
+
+
+def _rejected_notices(source: CameraInputs, rejected: Sequence[dict[str, Any]]) -> list[Notice]:
+    """Return a notice for pictures that could not be evaluated; those of a series on a plan in mm are named where its fields are made."""
+    folder = source.campaign.folder
+    has_fields = not source.plan.in_pixels and len(source.cycles.number) > 1
+    named_there = {str(frame.path) for frame in source.frames} if has_fields else set()
+    named = [
+        {**one, "file": relative_name(Path(one["path"]), folder), "reason": one["reason"].replace(f"{folder}/", "")}
+        for one in rejected
+        if one["path"] not in named_there
+    ]
+    return frames_notices(named, "pictures_left_out")
+
+
+def _series_notices(source: CameraInputs, table: xr.Dataset, camera: str, scene: Scene) -> Iterator[Notice]:
+    """Return what the pictures of a series without a plan show of the camera: pixels that stand out, and pictures that are copies."""
+    if not source.plan.in_pixels or not source.frames:
+        return
+    whole = table.sel(region=WHOLE_PICTURE).isel(time=np.flatnonzero(table["camera"].values == camera))
+    same = (
+        np.diff(np.array([whole[name].values for name in ("mean", "standard_deviation", "maximum", "minimum")]), axis=1)
+        == 0
+    )
+    yield from repeat_notices(np.concatenate([[False], same.all(axis=0)]), whole["time"].values)
+    if scene == "still":
+        yield from pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
 
 
 def _scene_notices(source: CameraInputs, part: dict[str, Any]) -> Iterator[Notice]:
@@ -310,13 +356,15 @@ def _scene_notices(source: CameraInputs, part: dict[str, Any]) -> Iterator[Notic
         yield Notice(
             "picture_moved",
             f"The picture shifts by up to {part['largest_shift_px']:.1f} px: the difference is taken after bringing the last picture onto "
-            "the first, regions stay where they are in the picture, and neither rises of cells nor hotspots are named.",
+            "the first; regions stay where they are in the picture, and may show another part of the scene.",
             "Fasten the camera.",
         )
     elif part["scene"] == "unlike":
+        taken = (
+            "the difference of the two is taken pixel by pixel" if "difference" in part else "no difference is taken"
+        )
         yield Notice(
             "pictures_unlike",
-            "Some pictures have too little in common to show whether the camera stayed where it was: neither rises of cells nor hotspots "
-            "are named.",
+            f"Some pictures have too little in common to show whether the camera stayed where it was: {taken}.",
             "Fasten the camera, and put pictures of one scene into a folder of their own.",
         )

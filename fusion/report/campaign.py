@@ -59,7 +59,6 @@ from fusion.results.results import Results
 from fusion.results.store import by_approach, group, has
 from interferometry.deviations import REGISTRY
 from interferometry.plots import time_span
-from thermography.fields.cycle_fields import plan_unit
 
 # Drift and field in the report: the facts that its templates state.
 
@@ -453,7 +452,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
 
 #: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
 _SECTIONS = (
-    ("pictures", "thermograms", "Pictures"),
+    ("pictures", "regions", "Pictures"),
     ("iso230", "iso230", "ISO 230-2"),
     ("drift", "drift", "Drift"),
     ("anomalies", "anomalies", "Positions"),
@@ -520,7 +519,6 @@ def describe_campaign(
         "camera": None if fields is None else _camera(fields),
         "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
         "drift_stated": (provenance["parameters"].get("thermography") or {}).get("camera_drift_u_K") is not None,
-        "seen": "picture" if results.registration is not None and results.registration.is_picture else "table",
         "field_of": "cycle" if "positions" in figures else "window",
         "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
         "comparison": None if results.neighbours is None or deviations is None else _comparison_table(deviations),
@@ -564,7 +562,7 @@ def _camera(fields: xr.Dataset) -> dict[str, Any]:
     """What the camera measured; rises are those of the last cycle, K."""
     first, last = fields["time"].values[[0, -1]]
     rise = fields["temperature_rise"].isel(cycle=-1)
-    names = ("name", "residual", "leave_one_out") if "fiducial" in fields.sizes else ()
+    names = ("name", "residual", "leave_one_out")
     return {
         "frames": int(fields["frame_count"].sum()) if "frame_count" in fields else fields.sizes["time"],
         "fields": fields.sizes["cycle"],
@@ -573,7 +571,6 @@ def _camera(fields: xr.Dataset) -> dict[str, Any]:
         "duration_s": float((last - first) / np.timedelta64(1, "s")),
         "cells": (fields.sizes["x"], fields.sizes["y"]),
         "cell_size": float(np.median(np.diff(fields["x"]))),
-        "unit": plan_unit(fields),
         "visible": float(np.isfinite(rise).mean()),
         "mean_rise_K": float(rise.mean()),
         "largest_rise_K": float(rise.max()),

@@ -113,10 +113,10 @@ def moment(time: np.datetime64 | str, zone: str | None = None, *, seconds: bool 
     return f"{local:{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}} {'(no zone)' if zone == '' else local.tzname()}"
 
 
-def place(x: float | None, y: float | None, unit: str = "mm") -> str:
-    """Return a place on the plan to the millimetre, or to the pixel."""
+def place(x: float | None, y: float | None) -> str:
+    """Return a place on the plan to the millimetre."""
     across, down = ("–" if value is None else f"{value:z.0f}" for value in (x, y))
-    return f"x {across} {unit}, y {down} {unit}"
+    return f"x {across} mm, y {down} mm"
 
 
 def join(items: Sequence[str]) -> str:

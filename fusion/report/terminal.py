@@ -35,8 +35,8 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
         lines = [line for line in (*doubts, untouched(results.inputs, figures_of(results))) if line]
         rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
-    if results.thermograms is not None and results.regions is not None:
-        several = len(results.thermograms.cameras) > 1
+    if results.regions is not None:
+        several = results.thermograms is not None and len(results.thermograms.cameras) > 1
         shown = [one for one in results.regions if not several or one.name == "whole picture"]
         rows += [(one.camera if several else one.name, say("region_line", one)) for one in shown]
     if results.registration is not None and results.thermograms is None:

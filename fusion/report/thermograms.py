@@ -23,18 +23,24 @@ _WHOLE = "whole picture"
 def describe_thermograms(results: Results, thermograms: xr.Dataset) -> dict[str, Any]:
     """Return the facts on the pictures that the templates state."""
     part, regions = results.thermograms, results.regions or ()
-    assert part is not None
     zone = results.time.zone if results.time else None
+    shown = {
+        "part": part,
+        "lines": sum(one.kind == "line" for one in regions),
+        "pictures": _table_of_pictures(thermograms, zone),
+        "count": thermograms.sizes["time"],
+        "hottest": thermograms.attrs["hottest"],
+    }
+    if part is None:
+        return {**shown, "of_series": table_of_regions(regions), "every": None, "visible": ""}
     beyond = [one for one in regions if one.name == _WHOLE and (one.overrange_pictures or one.underrange_pictures)]
     own = [one for one in regions if one.camera == part.series]
     return {
-        "part": part,
+        **shown,
         "of_series": table_of_regions(own) if part.series else table_of_cameras(results),
         "every": None if part.series and len(part.cameras) == 1 else table_of_regions(regions, with_camera=True),
         "beyond": [say("beyond_range", one, part) for one in beyond],
-        "pictures": _table_of_pictures(thermograms, zone),
         "visible": _jpeg(thermograms["visible"].values) if "visible" in thermograms else "",
-        "hottest": thermograms.attrs["hottest"],
         "seconds": _seconds(thermograms, part.series),
     }
 
@@ -97,13 +103,17 @@ def _table_of_pictures(thermograms: xr.Dataset, zone: str | None) -> Table:
     whole, regions = shown.sel(region=_WHOLE), [str(name) for name in shown["region"].values[1 : 1 + _MOST_REGIONS]]
     columns = [whole[name].values for name in ("maximum", "minimum", "mean")]
     columns += [shown["maximum"].sel(region=name).values for name in regions]
-    beyond = whole["overrange"].values > 0
+    over = {0: whole["overrange"].values > 0}
+    over |= {at: shown["overrange"].sel(region=name).values > 0 for at, name in enumerate(regions, start=3)}
+    under = whole["underrange"].values > 0
     files, frames = shown["source"].values, shown["frame"].values
     several = len(set(files)) < len(files)
     rows = []
     for at, time in enumerate(shown["time"].values):
         values = [fixed(float(values[at]), 1) for values in columns]
-        values[0] = f"> {values[0]}" if beyond[at] else values[0]
+        for place, beyond in over.items():
+            values[place] = f"> {values[place]}" if beyond[at] else values[place]
+        values[1] = f"< {values[1]}" if under[at] else values[1]
         picture = f"{files[at]} #{frames[at]}" if several else str(files[at])
         rows.append([picture, moment(time, zone, seconds=True), *values])
     titles = [Words("Picture"), Words("Time"), *(f"{name} / °C" for name in ("Highest", "Lowest", "Mean", *regions))]

@@ -37,7 +37,7 @@ from fusion.report.numbers import (
 )
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, HotspotPart, Iso230Part, Iso230Window
 from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop, StepPart
-from fusion.results.parts import AreaPart, Figures, InputsPart, PixelAreaPart, Quantity
+from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.results import Results
 
 # Tables as the report and the terminal show them: columns, rows, and which rows are marked.
@@ -402,17 +402,15 @@ def scatter_of(anomaly: AnomalyPart) -> float | None:
     return float((sum(value**2 for value in known) / len(known)) ** 0.5) if known else None
 
 
-def edges(area: AreaPart | PixelAreaPart | None) -> str:
-    """Return the edges of an area on the plan, mm, or in the picture, px; a dash where there is none."""
+def edges(area: AreaPart | None) -> str:
+    """Return the edges of an area on the plan, mm; a dash where there is none."""
     if area is None:
         return "–"
-    unit = "mm" if isinstance(area, AreaPart) else "px"
-    low_x, high_x, low_y, high_y = (getattr(area, f"{end}_{unit}") for end in ("x_low", "x_high", "y_low", "y_high"))
-    return f"x {low_x:.0f} to {high_x:.0f} {unit}, y {low_y:.0f} to {high_y:.0f} {unit}"
+    return f"x {area.x_low_mm:.0f} to {area.x_high_mm:.0f} mm, y {area.y_low_mm:.0f} to {area.y_high_mm:.0f} mm"
 
 
 class SpotPlaces(NamedTuple):
-    """Edges, peak and middle of the area of a hotspot in words: on the plan in mm, or in the picture in px."""
+    """Edges, peak and middle of the area of a hotspot in words, on the plan in mm."""
 
     area: str
     peak: str
@@ -421,10 +419,7 @@ class SpotPlaces(NamedTuple):
 
 def spot_places(spot: HotspotPart) -> SpotPlaces:
     """Return the places of a hotspot in words."""
-    if spot.x_px is None:
-        return SpotPlaces(edges(spot.area), place(spot.x_mm, spot.y_mm), place(spot.centroid_x_mm, spot.centroid_y_mm))
-    middle = place(spot.centroid_x_px, spot.centroid_y_px, "px")
-    return SpotPlaces(edges(spot.area_px), place(spot.x_px, spot.y_px, "px"), middle)
+    return SpotPlaces(edges(spot.area), place(spot.x_mm, spot.y_mm), place(spot.centroid_x_mm, spot.centroid_y_mm))
 
 
 def figures_of(results: Results) -> list[Figures]:

@@ -15,7 +15,6 @@ from fusion.results.parts import (
     Iso230Tolerance,
     Number,
     OtherEvaluation,
-    PixelAreaPart,
     Quantity,
     ResultPart,
     Sensitivity,
@@ -170,8 +169,7 @@ class RegistrationPart(ResultPart):
     """Registration of the thermograms to the plan."""
 
     rms_mm: Number
-    """Root mean square of the registration residuals of the fiducials, mm; null where four fiducials determine the plan exactly, or where
-    the picture is the plan."""
+    """Root mean square of the registration residuals of the fiducials, mm; null where four fiducials determine the plan exactly."""
     position_u_mm: Number = None
     """Standard uncertainty of a place on the plan, root mean square over its cells, mm."""
     fiducials_listed: int = 0
@@ -192,11 +190,6 @@ class RegistrationPart(ResultPart):
     """Distance by which each fiducial is missed when it takes no part in the registration, mm, by name."""
     frames_rejected: tuple[RejectedFrame, ...]
     """Thermograms that were not used."""
-
-    @property
-    def is_picture(self) -> bool:
-        """Whether the picture itself is the plan, whose lengths are in px."""
-        return self.model == "picture"
 
 
 class CameraStepPart(ResultPart):
@@ -466,19 +459,9 @@ class HotspotPart(ResultPart):
     area: AreaPart | None = None
     """Its area: the connected cells around the peak whose rise exceeds that at half of the peak's prominence."""
     x_mm: Number
-    """Place of the peak on the plan, x, mm; null where the plan is the picture itself, which has no scale in mm."""
+    """Place of the peak on the plan, x, mm."""
     y_mm: Number
-    """Place of the peak on the plan, y, mm; null where the plan is the picture itself."""
-    x_px: Number = None
-    """Place of the peak in the picture, from its left edge, px; only where the picture is the plan."""
-    y_px: Number = None
-    """Place of the peak in the picture, from its upper edge, px; only where the picture is the plan."""
-    centroid_x_px: Number = None
-    """Middle of its area, x, px; only where the picture is the plan."""
-    centroid_y_px: Number = None
-    """Middle of its area, y, px; only where the picture is the plan."""
-    area_px: PixelAreaPart | None = None
-    """Its area where the picture is the plan."""
+    """Place of the peak on the plan, y, mm."""
     peak_rise_K: Number
     """Rise of the peak since the first cycle, K."""
     peak_rise_u_K: Number = None

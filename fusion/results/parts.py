@@ -72,19 +72,6 @@ class AreaPart(ResultPart):
     """Largest y, mm."""
 
 
-class PixelAreaPart(ResultPart):
-    """A place on a plan that is the picture itself, as the rectangle around its cells, from the upper left corner of the picture."""
-
-    x_low_px: float
-    """Smallest x, px."""
-    x_high_px: float
-    """Largest x, px."""
-    y_low_px: float
-    """Smallest y, px."""
-    y_high_px: float
-    """Largest y, px."""
-
-
 def _of_time(text: str) -> str:
     try:
         datetime.fromisoformat(text)
@@ -315,13 +302,9 @@ class FieldPart(ResultPart):
     largest_after_s: Number
     """From the first field to that one, s."""
     largest_x_mm: Number = None
-    """Place of that cell, x, mm; null where the plan is the picture itself."""
+    """Place of that cell, x, mm."""
     largest_y_mm: Number = None
-    """Place of that cell, y, mm; null where the plan is the picture itself."""
-    largest_x_px: Number = None
-    """Place of that cell from the left edge of the picture, px; only where the picture is the plan."""
-    largest_y_px: Number = None
-    """Place of that cell from the upper edge of the picture, px; only where the picture is the plan."""
+    """Place of that cell, y, mm."""
 
 
 class PicturePlace(ResultPart):

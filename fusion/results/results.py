@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SCHEMA_VERSION = 3
+#: Parts that earlier versions wrote in pixels where a camera measured alone; every picture is evaluated instead.
+_OF_A_PICTURE = ("registration", "camera", "radiometry", "field", "hotspots")
 #: Keys of schema 2 and earlier that have another name now.
 RENAMED_KEYS = {
     "as_well_ppm_per_K": "alternative_ppm_per_K",
@@ -131,7 +133,7 @@ class Results(ResultPart):
     thermograms: ThermogramsPart | None = None
     """Pictures of a camera that measures alone."""
     regions: tuple[TemperatureRegionPart, ...] | None = None
-    """Temperatures of the whole picture and of regions in it, by camera, where a camera measures alone."""
+    """Temperatures of the whole picture and of regions in it, by camera; beside a laser only where regions are stated or stored."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
     camera: CameraPart | None = None
@@ -270,6 +272,8 @@ def read_results(folder: str | Path) -> Results:
 
 def in_this_schema(content: Any) -> Any:
     """Return the content of a results.json with the keys of this schema."""
+    if isinstance(content, dict) and (content.get("registration") or {}).get("model") == "picture":
+        content = {name: part for name, part in content.items() if name not in _OF_A_PICTURE}
     if not isinstance(content, dict) or content.get("schema") not in range(1, SCHEMA_VERSION):
         return content
     return {**_renamed(content), "schema": SCHEMA_VERSION}

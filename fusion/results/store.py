@@ -401,6 +401,7 @@ def require_kind(product: xr.Dataset, name: str, path: Path) -> xr.Dataset:
     expected = PRODUCTS[name].items()
     found = {variable: array.dims for variable, array in product.variables.items()}
     lacks = [f"{variable} {_tuple(dims)}" for variable, dims in expected if found.get(variable) != dims]
+    lacks += ["places in mm"] if product.attrs.get("plan_unit") == "px" else []
     if lacks:
         product.close()
         raise DamagedProductError(

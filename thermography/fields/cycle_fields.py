@@ -315,26 +315,6 @@ def _rate_of(mean: Array, time: Array, some: slice) -> Array:
     return rate(mean[start:end], time[start:end], since=time[timed[0]])[some.start - start : some.stop - start]
 
 
-def in_pixels(fields: xr.Dataset) -> xr.Dataset:
-    """Return fields on a plan that is the picture itself, with coordinates that say so."""
-    named = fields.drop_vars("position_u", errors="ignore").assign_attrs(
-        title="Temperature fields on the picture", plan_unit="px"
-    )
-    for axis, start in (("x", "left"), ("y", "upper")):
-        named[axis].attrs = {
-            "long_name": f"distance from the {start} edge of the picture",
-            "units": "1",
-            "comment": "px; the centre of the first pixel lies at 0.5",
-            "axis": axis.upper(),
-        }
-    return named
-
-
-def plan_unit(fields: xr.Dataset) -> str:
-    """Return the unit of the places on a plan: mm, or px where the picture itself is the plan."""
-    return str(fields.attrs.get("plan_unit", "mm"))
-
-
 def annotate(dataset: xr.Dataset) -> xr.Dataset:
     """Set the CF attributes of every listed variable, and no fill value for coordinates."""
     for name, variable in dataset.variables.items():

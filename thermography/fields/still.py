@@ -350,8 +350,6 @@ class Displacements:
 
     def find_knock(self, block: Block, monitored_px: Array) -> Knock | None:
         """Measure the frames of a block up to the first one of a lasting displacement."""
-        if self.registrations.spans[block.span].registration.is_picture:
-            return None
         sizes = np.linalg.norm(monitored_px - self.baseline_px, axis=1)
         if (sizes <= SUSPECT_PX).all():
             self.size_px[block.first : block.stop] = sizes
@@ -392,8 +390,6 @@ class Displacements:
         """First frame and end of stretches of unmeasured frames at whose end no frame nor the mean of several shows the registration."""
         stretches = []
         for index, span in enumerate(self.registrations.spans):
-            if span.registration.is_picture:
-                continue
             stop = self.registrations.stop_frame(index) or len(self.frames)
             chosen = [i for i in range(span.first_frame + 1, stop) if not left_out[i]]
             measured = [i for i in chosen if np.isfinite(self.size_px[i])]
@@ -474,8 +470,7 @@ class Obstructions:
 
     def examine(self, block: Block, result: BlockResult) -> None:
         """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ."""
-        in_picture = self.registrations.spans[block.span].registration.is_picture
-        if in_picture or result.samples.shape[1] < _LEAST_PIXELS:
+        if result.samples.shape[1] < _LEAST_PIXELS:
             return
         if block.span != self._span:
             # Median of the first frames of a registration span, of which less than half may be obstructed.

@@ -15,11 +15,12 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec
+from itertools import takewhile
 from math import prod
 from pathlib import Path
 from textwrap import shorten
@@ -78,10 +79,12 @@ class StackOptions:
         From one frame of a file to the next, s.
     time_zone : str
         IANA name of the zone of times in names and in files that give none.
-    emissivity : float
-        With which the camera's program calculated the temperatures; 1 where it is not known.
-    reflected_temperature_K : float
-        Likewise, K.
+    emissivity : float or None
+        With which the camera's program calculated the temperatures; None: as the file says, 1 where it does not.
+    reflected_temperature_K : float or None
+        Likewise, K; 293.15 K where the file does not say it.
+    needs_time : bool
+        Whether a file of one frame without a time is refused; a picture that stands alone needs none.
 
     Notes
     -----
@@ -89,7 +92,7 @@ class StackOptions:
 
     Examples
     --------
-    >>> StackOptions(unit="K", scale=0.04, time_in_name="%Y%m%d_%H%M%S").emissivity
+    >>> StackOptions(unit="K", scale=0.04, time_in_name="%Y%m%d_%H%M%S").parameters.emissivity
     1.0
     """
 
@@ -102,15 +105,17 @@ class StackOptions:
     start: np.datetime64 | None = None
     interval_s: float | None = None
     time_zone: str = "UTC"
-    emissivity: float = 1.0
-    reflected_temperature_K: float = 293.15
+    emissivity: float | None = None
+    reflected_temperature_K: float | None = None
+    needs_time: bool = True
 
     @property
     def parameters(self) -> CameraParameters:
         """Camera parameters of the scale of counts."""
         # A stored transmission of 1: the camera's program has corrected the path already.
+        reflected_K = 293.15 if self.reflected_temperature_K is None else self.reflected_temperature_K
         return CameraParameters(
-            emissivity=self.emissivity, object_distance_m=1.0, reflected_temperature_K=self.reflected_temperature_K,
+            emissivity=self.emissivity or 1.0, object_distance_m=1.0, reflected_temperature_K=reflected_K,
             atmospheric_temperature_K=293.15, window_temperature_K=293.15, window_transmission=1.0, stored_transmission=1.0,
             relative_humidity=0.5, planck_r1=float(_PLANCK_R1), planck_b=_PLANCK_B, planck_f=1.0, planck_o=0.0, planck_r2=1.0,
             atmosphere_alpha1=0.006569, atmosphere_alpha2=0.01262, atmosphere_beta1=-0.002276, atmosphere_beta2=-0.00667,
@@ -128,6 +133,8 @@ class StackContents:
         "degC" or "K" where the file says it, else "".
     times : sequence of datetime64, or None
         UTC or, without `zoned`, in the zone that `StackOptions` names; None where the file holds none.
+    emissivity, reflected_temperature_K : float or None
+        With which the temperatures were calculated, where the file says it.
     """
 
     frames: int
@@ -135,6 +142,8 @@ class StackContents:
     unit: str = ""
     times: tuple[np.datetime64, ...] | None = None
     zoned: bool = False
+    emissivity: float | None = None
+    reflected_temperature_K: float | None = None
 
 
 class TemperatureReader(ABC):
@@ -166,6 +175,10 @@ class TemperatureReader(ABC):
     def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | RejectedFrame]:
         """Yield the frames of a file in its order."""
         contents = self.frame_contents(path, options)
+        stated = ("emissivity", "reflected_temperature_K")
+        options = replace(
+            options, **{name: getattr(contents, name) for name in stated if getattr(options, name) is None}
+        )
         unit = options.unit or contents.unit
         if unit not in ("degC", "K"):
             raise StackError(f'{path}: nothing says whether values are degC or K; write unit = "degC" or unit = "K"')
@@ -250,6 +263,8 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
             time if np.isnat(time) else to_utc(path, time.astype("datetime64[us]").item(), zone)
             for time in contents.times
         ]
+    if count == 1 and not options.needs_time:
+        return [np.datetime64("NaT", "ns")]
     raise StackError(
         f'{path}: the file holds no times; write time_in_name = "..." (as "%Y%m%d_%H%M%S" in the name of the file), times = "times.csv" '
         '(file,frame,time), or start = "2026-03-09T06:30:00Z" and interval = "10 s"'
@@ -523,6 +538,15 @@ _MOST_BYTES = 1 << 28
 _MOST_COLUMNS, _MOST_LINES = 16_384, 131_072
 
 
+#: Bytes that are searched for what stands above the numbers.
+_MOST_HEADING = 8192
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+#: What headings of exports say: of FLIR's programs emissivity and reflected temperature, of this one unit and time.
+_EMISSIVITY = re.compile(r"\bemissivity\W{1,4}([01][.,]?\d*)\b", re.IGNORECASE)
+_REFLECTED = re.compile(r"\brefl\w*\W+(?:\w+\W+)?temp\w*[^\w-]{1,4}(-?\d+(?:[.,]\d+)?)\W*([CFK])\b", re.IGNORECASE)
+_OWN_EXPORT = re.compile(r"surface temperature / degC; ([\dT:.-]+) UTC")
+
+
 class TextReader(TemperatureReader):
     """Reader of one frame per file as CSV or TSV: the longest block of lines with equally many numbers; lines around it are passed over."""
 
@@ -530,7 +554,7 @@ class TextReader(TemperatureReader):
 
     def recognises(self, path: Path, start: bytes) -> bool:
         """Return whether a file is text."""
-        marked = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        marked = start.startswith(_UTF16)
         return bool(start) and (marked or not set(start) & (set(range(32)) - {9, 10, 12, 13, 27}))
 
     def begins_a_frame(self, text: str) -> bool:
@@ -554,15 +578,27 @@ class TextReader(TemperatureReader):
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds; the pixels of numbers alone are counted and not read."""
-        rows, columns = _plain_shape(path.read_bytes()) or self.read_values(path, 0, options).shape
-        return StackContents(1, (rows, columns))
+        if shape := _plain_shape(path.read_bytes()):
+            return StackContents(1, shape)
+        rows, columns = self.read_values(path, 0, options).shape
+        head = _heading(path)
+        own, emissivity, reflected = (pattern.search(head) for pattern in (_OWN_EXPORT, _EMISSIVITY, _REFLECTED))
+        return StackContents(
+            1,
+            (rows, columns),
+            unit="degC" if own else "",
+            times=(np.datetime64(own[1], "ns"),) if own else None,
+            zoned=True,
+            emissivity=float(emissivity[1].replace(",", ".")) if emissivity else None,
+            reflected_temperature_K=_kelvin(*reflected.groups()) if reflected else None,
+        )
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the numbers of a file, (row, column); NaN where a field is no number."""
         if path.stat().st_size > _MOST_BYTES:
             raise ThermographyError(f"{path}: {path.stat().st_size} bytes exceed a frame of text; export one per file")
         content = path.read_bytes()
-        utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        utf16 = content.startswith(_UTF16)
         lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
         for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
             block = _longest_block(lines, delimiter)
@@ -571,6 +607,21 @@ class TextReader(TemperatureReader):
         raise ThermographyError(
             f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; export it as CSV, a line per row"
         )
+
+
+def _heading(path: Path) -> str:
+    """Return the lines above the numbers of a text."""
+    with path.open("rb") as file:
+        start = file.read(_MOST_HEADING)
+    text = start.decode("utf-16" if start[:2] in _UTF16 else "utf-8-sig", errors="replace")
+    above = takewhile(lambda line: all(_numbers(line, mark) is None for mark in _DELIMITERS), text.splitlines())
+    return "\n".join(above)
+
+
+def _kelvin(value: str, unit: str) -> float:
+    """Return a temperature of a heading, in C, F or K, in K."""
+    number = float(value.replace(",", "."))
+    return {"K": number, "C": number + _ZERO_CELSIUS_K, "F": (number - 32.0) / 1.8 + _ZERO_CELSIUS_K}[unit.upper()]
 
 
 def _plain_shape(content: bytes) -> tuple[int, int] | None:

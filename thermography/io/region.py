@@ -114,6 +114,11 @@ class Region:
             )
         return slice(int(low[1]), int(high[1]) + 1), slice(int(low[0]), int(high[0]) + 1), mask
 
+    def is_cut(self, shape: tuple[int, int]) -> bool:
+        """Return whether a part of the region lies outside a picture of (rows, columns)."""
+        places = np.rint(np.asarray(self.points))
+        return bool((places < 0).any() or (places >= shape[::-1]).any())
+
     def path(self) -> Array:
         """Pixels from the first point over the others to the last, (n, 2) column and row."""
         points = np.rint(np.asarray(self.points)).astype(np.int64)

@@ -1023,24 +1023,16 @@ def _reasons(missed: dict[str, str]) -> str:
 
 #: Name of this registration, in the place of a lens model.
 PICTURE = "picture"
-#: Largest number of cells along the longer side where no size of a cell is given: cells finer than a screen shows are only slow.
+#: Largest number of cells along the longer side: cells finer than a screen shows are only slow.
 _MOST_CELLS = 160
 
 
-def usual_cell_px(shape: tuple[int, int]) -> int:
-    """Return the size of a cell where none is given, px: the smallest that divides both sides, at most 160 cells along the longer one."""
-    sizes = _dividing(shape)
-    return next((size for size in sizes if max(shape) <= _MOST_CELLS * size), sizes[-1])
-
-
-def picture_grid(shape: tuple[int, int], cell_px: int | None = None) -> PlanGrid:
-    """Return the grid of a plan that is the picture itself."""
+def picture_grid(shape: tuple[int, int]) -> PlanGrid:
+    """Return the grid of a plan that is the picture itself: the smallest cells that divide both sides, at most 160 along the longer one."""
     rows, columns = shape
-    size = usual_cell_px(shape) if cell_px is None else cell_px
-    if size not in _dividing(shape):
-        choice = ", ".join(str(one) for one in _dividing(shape) if 2 * one <= min(shape))
-        raise ThermographyError(f'cell_px = "{size} px" does not divide {columns} x {rows} pixels; choose {choice} px')
-    return PlanGrid(columns, rows, size)
+    common = math.gcd(rows, columns)
+    sizes = [size for size in range(1, common + 1) if common % size == 0]
+    return PlanGrid(columns, rows, next((size for size in sizes if max(shape) <= _MOST_CELLS * size), common))
 
 
 def register_picture(shape: tuple[int, int]) -> Registration:
@@ -1056,9 +1048,3 @@ def register_picture(shape: tuple[int, int]) -> Registration:
         shape=shape,
         covariance=np.zeros((8, 8)),
     )
-
-
-def _dividing(shape: tuple[int, int]) -> list[int]:
-    """Sizes of a cell that divide both sides."""
-    common = math.gcd(*shape)
-    return [size for size in range(1, common + 1) if common % size == 0]

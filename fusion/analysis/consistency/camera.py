@@ -19,7 +19,6 @@ from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evide
 from fusion.common import Array
 from thermography.common import ThermographyError
 from thermography.evaluation import share_outside_range, thermogram
-from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.large_arrays import median_of_pieces, piece_slices
 from thermography.inspection import FileWarning, check_series
 from thermography.io.frame import Frame, FrameReference
@@ -353,9 +352,6 @@ def check_place(fields: xr.Dataset) -> list[Check]:
     common = [_left_out(left_out, total), _repeated(fields, total)]
     if "table_across" in fields:
         return [_across(fields), *common]
-    if plan_unit(fields) == "px":
-        # `fusion.analysis.consistency.camera.check_picture` says whether the picture stayed; what is in it is not known to change slowly.
-        return common
     return [_unchecked(fields, total), *common, _jump(fields)]
 
 

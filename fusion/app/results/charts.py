@@ -53,7 +53,6 @@ from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
 from fusion.results.store import DamagedProductError, group, has
 from interferometry.plots import ACCENT, INK, hours_since_start
-from thermography.fields.cycle_fields import plan_unit
 
 
 def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
@@ -269,7 +268,6 @@ class ThermalView:
     def __init__(self, products: Products, selection: Selection, linker: Linker) -> None:
         self._products, self._selection, self._linker = products, selection, linker
         self._fields = products.camera
-        self._unit = plan_unit(self._fields)
         self._layers = {layer.words: layer for layer in products.layers}
         limits = {"start": int(products.cycles[0]), "end": int(products.cycles[-1]), "value": selection.cycle}
         self._quantity = pn.widgets.Select(label="Quantity", options=list(self._layers), width=240)
@@ -284,12 +282,10 @@ class ThermalView:
         self._map = self._draw()
         self._history = ui.column()
         self._unlink: Callable[[], None] = lambda: None
-        label = f"square of / {self._unit} (0: a cell)"
-        self._size = pn.widgets.FloatInput(label=label, value=0.0, start=0.0, width=200)
+        self._size = pn.widgets.FloatInput(label="square of / mm (0: a cell)", value=0.0, start=0.0, width=200)
         middles = {axis: round(float(self._fields[axis].values.mean()), 1) for axis in "xy"}
         self._x, self._y = (
-            pn.widgets.FloatInput(label=f"{axis} / {self._unit}", value=middle, width=110)
-            for axis, middle in middles.items()
+            pn.widgets.FloatInput(label=f"{axis} / mm", value=middle, width=110) for axis, middle in middles.items()
         )
         self._add = pn.widgets.Button(label="Add place", align="end")
         self._places = pn.widgets.MultiChoice(label="Places over time", options=[], sizing_mode="stretch_width")
@@ -333,11 +329,11 @@ class ThermalView:
         fields, results = self._fields, self._products.results
         values = self._products.map_of(self._layer, self._selection.cycle)
         scale, _ = self._products.scale(self._layer)
-        drawn = draw_map(values, extent_of(fields), self._layer, scale, unit=self._unit)
+        drawn = draw_map(values, extent_of(fields), self._layer, scale)
         read = self._products.deviations
         position = None if read is None else read["position"]
         draw_places(drawn, fields, position, results.hotspots or (), results.sensors or ())
-        to_scale(drawn, drawn.select_one("cells"), downwards=self._unit == "px")
+        to_scale(drawn, drawn.select_one("cells"))
         draw_ring(drawn, self._chosen)
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
         drawn.scatter("x", "y", source=self._marks, **square)
@@ -368,7 +364,7 @@ class ThermalView:
         _, whole = self._products.scale(layer)
         beyond = " The colour scale is that of evenly spaced cycles; a value beyond it is light blue."
         low, high = number(float(np.nanmin(values))), number(float(np.nanmax(values)))
-        at = place(float(fields["x"][at_column]), float(fields["y"][at_row]), self._unit)
+        at = place(float(fields["x"][at_column]), float(fields["y"][at_row]))
         return f"{head}{f'{low} to {high} {layer.printed_unit}'.rstrip()}, largest at {at}.{'' if whole else beyond}"
 
     def _show_layer(self) -> None:
@@ -394,7 +390,7 @@ class ThermalView:
         left, right, bottom, top = extent_of(self._fields)
         if left <= x_mm <= right and bottom <= y_mm <= top:
             size = float(self._size.value or 0.0)
-            self._selection.add(Place(round(float(x_mm), 1), round(float(y_mm), 1), size, self._unit))
+            self._selection.add(Place(round(float(x_mm), 1), round(float(y_mm), 1), size))
 
     def _keep(self, words: list[str]) -> None:
         """Remove the places that were removed from the list."""
@@ -428,10 +424,10 @@ class ThermalView:
         self._history[:] = [pn.pane.Bokeh(drawn, sizing_mode="stretch_width"), seen]
 
 
-def to_scale(drawn: figure, cells: GlyphRenderer, *, downwards: bool = False) -> None:
+def to_scale(drawn: figure, cells: GlyphRenderer) -> None:
     """Show a millimetre of the plan as long in both directions, whatever the width of the screen."""
     drawn.x_range = DataRange1d(renderers=[cells], range_padding=0.03)
-    drawn.y_range = DataRange1d(renderers=[cells], range_padding=0.03, flipped=downwards)
+    drawn.y_range = DataRange1d(renderers=[cells], range_padding=0.03)
 
 
 def draw_cells(

@@ -158,18 +158,17 @@ POSITION, CYCLE, HOURS = "position", "cycle", "hours"
 
 
 class Place(NamedTuple):
-    """Middle and side of a square of the plan whose mean temperature is shown over time, in `unit`; side 0 is one cell."""
+    """Middle and side of a square of the plan whose mean temperature is shown over time, mm; side 0 is one cell."""
 
     x_mm: float
     y_mm: float
     size_mm: float
-    unit: str = "mm"
 
     @property
     def words(self) -> str:
         """The place as a legend names it."""
-        size = f", {self.size_mm:g} {self.unit} square" if self.size_mm else ""
-        return f"x {self.x_mm:.0f} {self.unit}, y {self.y_mm:.0f} {self.unit}{size}"
+        size = f", {self.size_mm:g} mm square" if self.size_mm else ""
+        return f"x {self.x_mm:.0f} mm, y {self.y_mm:.0f} mm{size}"
 
 
 class Selection(param.Parameterized):

@@ -44,8 +44,9 @@ def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
     """Draw all charts of a campaign's report."""
     fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
     drawn = draw_measured(fields, deviations, None if fused is None else fused.to_dataset())
-    if results.thermograms is not None and "thermograms" in datasets:
-        drawn = drawn.with_more(draw_pictures(datasets["thermograms"], results.thermograms.series))
+    if results.regions and "thermograms" in datasets:
+        series = results.thermograms.series if results.thermograms else results.regions[0].camera
+        drawn = drawn.with_more(draw_pictures(datasets["thermograms"], series))
     correlation = results.correlation
     if fused is not None and correlation is not None and "correlation" in fused.children:
         drawn = drawn.with_more(draw_attributed(fused, correlation.source.part, correlation.p_resolution))
@@ -72,7 +73,7 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fuse
 
 
 def draw_pictures(thermograms: xr.Dataset, series: str) -> Drawn:
-    """Draw the pictures of a camera that measures alone."""
+    """Draw the pictures in degC."""
     return Drawn(embed(draw_thermograms(thermograms, series)))
 
 

@@ -29,7 +29,6 @@ from fusion.report.numbers import join, number, place
 from fusion.results.axis import HotspotPart
 from fusion.results.parts import ContactSensorPart
 from interferometry.plots import ACCENT, INK
-from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.large_arrays import in_pieces
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
@@ -49,12 +48,11 @@ def extent_of(cells: xr.Dataset) -> Extent:
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
-def new_plan(extent: Extent, *, title: str = "", height: int = 260, unit: str = "mm") -> figure:
-    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both; of a picture, y downwards."""
+def new_plan(extent: Extent, *, title: str = "", height: int = 260) -> figure:
+    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both."""
     left, right, bottom, top = extent
-    y_range = (top, bottom) if unit == "px" else (bottom, top)
-    ranges: dict[str, Any] = {"x_range": (left, right), "y_range": y_range}
-    drawn = new_figure(x=f"x / {unit}", y=f"y / {unit}", title=title, height=height, **ranges)
+    ranges: dict[str, Any] = {"x_range": (left, right), "y_range": (bottom, top)}
+    drawn = new_figure(x="x / mm", y="y / mm", title=title, height=height, **ranges)
     drawn.match_aspect = True
     drawn.grid.grid_line_color = None
     return drawn
@@ -154,11 +152,10 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     hours = scale * hours
     drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K", zero=True)
     add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
-    seen_part = "picture" if plan_unit(fields) == "px" else "table"
-    add_series(drawn, hours, mean, name=f"mean of the {seen_part}", colour=ACCENT)
+    add_series(drawn, hours, mean, name="mean of the table", colour=ACCENT)
     add_series(drawn, hours, most, name="warmest cell", colour=INK, dash="dashed")
     seen = (
-        f"Rise of the {seen_part} over {number(float(hours[-1]), 2)} {unit}: the mean of its cells is {span_words(mean, 'K')}, the warmest "
+        f"Rise of the table over {number(float(hours[-1]), 2)} {unit}: the mean of its cells is {span_words(mean, 'K')}, the warmest "
         f"cell reaches {number(float(np.nanmax(most)))} K."
     )
     columns = {
@@ -254,8 +251,6 @@ _MAP_BUDGET = 3_000_000
 _MISSING = -32768
 #: A colour outside the scale, for values beyond its ends.
 _BEYOND = "#7fe3ff"
-#: Usual width of the map on a page, and largest height of a picture, CSS px.
-_WIDTH, _MOST_HEIGHT = 900, 720
 #: Room about the plan, as a share of its length, so that a ring at its rim is whole.
 _ROOM = 0.025
 
@@ -330,11 +325,10 @@ def plot_thermal_map(
     """Draw the plan of the table with measured line, targets and hotspots."""
     shown = [layer for layer in LAYERS if layer.variable in fields]
     kept, note = _thin(fields[[layer.variable for layer in shown]])
-    unit = plan_unit(fields)
     steps = {layer.words: _in_steps(kept[layer.variable].values, layer) for layer in shown}
     scales = [scale_of(kept[layer.variable].values, layer) for layer in shown]
     last = kept[shown[0].variable].values[-1]
-    drawn = draw_map(last, extent_of(kept), shown[0], scales[0], unit=unit)
+    drawn = draw_map(last, extent_of(kept), shown[0], scales[0])
     draw_places(drawn, fields, position, hotspots, sensors)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
@@ -344,13 +338,11 @@ def plot_thermal_map(
     return chart, MapControls([layer.words for layer in shown], kept["cycle"].values.tolist(), note)
 
 
-def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[str, Any], *, unit: str = "mm") -> figure:
+def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[str, Any]) -> figure:
     """Draw one quantity in one cycle on the plan of the table."""
     left, right, bottom, top = extent
     room = _ROOM * (right - left)
-    # A table is longer than wide; a picture is drawn about as high as it is on a screen.
-    height = 330 if unit == "mm" else int(min(_MOST_HEIGHT, 60 + _WIDTH * values.shape[0] / values.shape[1]))
-    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=height, unit=unit)
+    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=330)
     mapper = LinearColorMapper(
         palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
         name="scale",
@@ -358,7 +350,7 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
     cells = drawn.image(
         [values.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
     )  # fmt: skip
-    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), layer.tip], [cells])
+    add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), layer.tip], [cells])
     drawn.select_one(HoverTool).name = "reading"
     add_colour_bar(drawn, mapper, f"{layer.words} / {layer.unit}")
     drawn.below[-1].name = "bar"
@@ -413,7 +405,7 @@ def draw_places(
     """Draw the measured line where it is known, the hotspots and the contact sensors over a map."""
     if "target_x" in fields:
         _draw_line(drawn, fields, position)
-    _draw_hotspots(drawn, hotspots, plan_unit(fields))
+    _draw_hotspots(drawn, hotspots)
     _draw_sensors(drawn, sensors)
 
 
@@ -437,11 +429,11 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
     add_names(drawn, x[named], y[named], [f"{targets[order[k]]}" for k in named], y_offset=-7, text_align="center")
 
 
-def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
+def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart]) -> None:
     """Ring the peak of every hotspot and write its name."""
     if not hotspots:
         return
-    x, y = ([getattr(spot, f"{axis}_{unit}") for spot in hotspots] for axis in "xy")
+    x, y = ([getattr(spot, f"{axis}_mm") for spot in hotspots] for axis in "xy")
     add_marks(drawn, x, y, "circle", 19)
     names = [spot.name or f"hotspot {place}" for place, spot in enumerate(hotspots, start=1)]
     middle = np.mean([drawn.x_range.start, drawn.x_range.end])
@@ -475,7 +467,7 @@ def _seen(kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], c
     marked = f"; {count} {'hotspot is' if count == 1 else 'hotspots are'} ringed" if count else ""
     return (
         f"Plan of the table: in cycle {cycle} the rise is {number(float(np.nanmin(last)))} to {number(float(np.nanmax(last)))} K, largest "
-        f"at {place(float(kept['x'][column]), float(kept['y'][row]), plan_unit(kept))}{marked}."
+        f"at {place(float(kept['x'][column]), float(kept['y'][row]))}{marked}."
     )
 
 
@@ -486,5 +478,4 @@ def _columns(kept: xr.Dataset, shown: Sequence[Layer], cycle: int) -> dict[str, 
     values = {
         f"{layer.words}, cycle {cycle}{units[layer.words]}": kept[layer.variable].values[-1].ravel() for layer in shown
     }
-    unit = plan_unit(kept)
-    return {f"x / {unit}": x.ravel(), f"y / {unit}": y.ravel(), **values}
+    return {"x / mm": x.ravel(), "y / mm": y.ravel(), **values}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from bokeh.plotting import figure
 from fusion.report.charts.plan import add_marks, add_names, draw_picture
 from fusion.report.charts.style import DIVERGING, Chart, add_series, new_figure, of_rank, span_words
 from fusion.report.numbers import fixed
-from interferometry.plots import INK
+from interferometry.plots import ACCENT, INK
+from thermography.evaluation import count_temperatures, read_profile
+from thermography.io.region import Region
 
 #: Regions that are drawn over time: more lines cannot be told apart.
 MOST_LINES = 8
@@ -20,13 +23,21 @@ MOST_LINES = 8
 _BEYOND = 0.1
 #: Most pixels of a picture that is drawn, and of one whose values the reader can download; larger ones are averaged in blocks.
 _DRAWN, _DOWNLOADED = 400_000, 40_000
+#: Classes of a histogram.
+_CLASSES = 60
 #: Units of a time axis: from how many seconds, unit, seconds.
 _TIMES = ((7200.0, "h", 3600.0), (120.0, "min", 60.0), (0.0, "s", 1.0))
 
 
 def draw_thermograms(thermograms: xr.Dataset, series: str) -> dict[str, Chart]:
     """Draw what the pictures show."""
-    charts = {"thermogram": plot_thermogram(thermograms)}
+    picture = thermograms[["thermogram", "flag"]].rename(thermogram="temperature")
+    regions = [Region(one["name"], one["kind"], one["points"]) for one in json.loads(thermograms.attrs["outlines"])]
+    rows, columns = picture["temperature"].shape
+    lines = [one for one in regions if one.kind == "line" and not one.is_cut((rows, columns))]
+    charts = {"thermogram": plot_thermogram(thermograms), "histogram": plot_histogram(picture)}
+    if lines:
+        charts["profile"] = plot_profiles(picture, lines[:MOST_LINES])
     of_series = thermograms.isel(time=np.flatnonzero(thermograms["camera"].values == series))
     if np.unique(of_series["time"].values).size > 1:
         charts["region_history"] = plot_regions(of_series)
@@ -121,6 +132,39 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
         columns[f"{name} / °C"] = values.values
         told.append(f"{name} {span_words(values, '°C')}")
     return Chart(drawn, f"Temperatures in {seconds.size} pictures: {'; '.join(told)}.", columns)
+
+
+def plot_profiles(picture: xr.Dataset, lines: Sequence[Region]) -> Chart:
+    """Draw the temperatures along lines."""
+    drawn = new_figure(x="distance along the line / px", y="temperature / °C", legend_columns=3)
+    columns: dict[str, Any] = {}
+    told = []
+    for rank, line in enumerate(lines):
+        along = read_profile(picture, line)
+        add_series(drawn, along["distance"].values, along.values, name=line.name, **of_rank(rank))
+        columns |= {f"{line.name}, distance / px": along["distance"].values, f"{line.name} / °C": along.values}
+        told.append(f"{line.name} {span_words(along.values, '°C')}")
+    longest = max(len(values) for values in columns.values())
+    padded = {
+        name: np.pad(values, (0, longest - len(values)), constant_values=np.nan) for name, values in columns.items()
+    }
+    return Chart(drawn, f"Temperatures along lines: {'; '.join(told)}.", padded)
+
+
+def plot_histogram(picture: xr.Dataset) -> Chart:
+    """Draw how many pixels have which temperature; the columns to download say how many are warmer (isotherm)."""
+    counts = count_temperatures(picture, bins=_CLASSES)
+    values, width = counts["temperature"].values, float(counts["temperature"].diff("temperature").mean())
+    most = float(values[counts.values.argmax()])
+    drawn = new_figure(x="temperature / °C", y="pixels", y_type="log", height=300)
+    some = counts.values > 0
+    sides = {"left": (values - width / 2)[some], "right": (values + width / 2)[some], "top": counts.values[some]}
+    drawn.quad(**sides, bottom=0.5, color=ACCENT, line_color="#ffffff")
+    seen = f"Histogram of {int(counts.sum())} pixels within the calibrated range, most at {fixed(most, 1)} °C."
+    warmer = counts.values[::-1].cumsum()[::-1]
+    return Chart(
+        drawn, seen, {"temperature / °C": values, "pixels": counts.values, "pixels from this class up": warmer}
+    )
 
 
 def plot_difference(values: np.ndarray) -> Chart:

@@ -21,7 +21,6 @@ from fusion.report.wording import quoted_window
 from fusion.results.results import Results
 from fusion.results.store import group, has, read_product, refuse_damaged, require_kind
 from interferometry import iso230
-from thermography.fields.cycle_fields import plan_unit
 
 #: Bytes of a row of fields.csv, measured on the demo.
 _FIELD_ROW_BYTES = 38
@@ -92,8 +91,7 @@ def fields_table(folder: Path) -> pd.DataFrame:
     fields = read_product(folder, "fields")
     frame = fields[["temperature", "temperature_rise", "temperature_rise_u"]].to_dataframe().dropna().reset_index()
     names = {"temperature": "temperature_degC", "temperature_rise": "rise_K", "temperature_rise_u": "rise_u_K"}
-    unit = plan_unit(fields)
-    return frame.rename(columns={"x": f"x_{unit}", "y": f"y_{unit}", **names})
+    return frame.rename(columns={"x": "x_mm", "y": "y_mm", **names})
 
 
 def fields_megabytes(folder: Path) -> float | None:

@@ -57,7 +57,7 @@ def test_a_folder_of_frames_alone_is_ready_with_the_picture_as_its_plan(copied):
     campaign = load_campaign(path)
     assert missing == [] and campaign.plan.in_pixels and campaign.campaign.axis == ""
     checked = check_campaign(path)
-    assert checked.faults == () and any("plan: the picture of " in line for line in checked.content)
+    assert checked.faults == () and any("plan: the picture itself" in line for line in checked.content)
     path.unlink()
     in_mm = Asker(lambda question, default: "fiducials" if question.startswith("No table of fiducials") else default)
     _, missing = write_campaign(copied / "thermal", in_mm)

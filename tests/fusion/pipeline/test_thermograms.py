@@ -16,6 +16,7 @@ from fusion.pipeline.run import run_campaign
 from fusion.pipeline.thermograms import evaluate_thermograms
 from fusion.report.page import report_of
 from fusion.results.progress import silent
+from fusion.results.results import read_results
 from tests.thermography.plan_scene import SC660
 from thermography.io.flir_writer import write_jpeg
 from thermography.io.frame import CameraIdentity
@@ -117,7 +118,10 @@ def test_one_picture_is_a_thermogram(tmp_path, scene):
 @pytest.mark.parametrize(
     ("regions", "fault"),
     [
-        ('[{ name = "a", spot = ["500 px", "5 px"] }]', "region a lies outside the picture of 128 x 96 px"),
+        (
+            '[{ name = "a", spot = ["500 px", "5 px"] }]',
+            "region 'a': spot at 500,5 lies outside the picture of 128 x 96 pixels",
+        ),
         (
             '[{ name = "a", spot = ["5 px", "5 px"] }, { name = "a", spot = ["6 px", "5 px"] }]',
             "2 regions are called a",
@@ -127,6 +131,20 @@ def test_one_picture_is_a_thermogram(tmp_path, scene):
 def test_a_region_that_cannot_be_evaluated_is_refused_before_the_work(tmp_path, scene, regions, fault):
     with pytest.raises(SourceError, match=fault):
         read_source(load_campaign(write(tmp_path, [scene], lines=f"region = {regions}")))
+
+
+def test_a_region_that_leaves_the_picture_is_evaluated_within_it_and_named(tmp_path, scene):
+    lines = REGIONS.replace('["36 px", "26 px"]', '["-4 px", "26 px"]')
+    dataset, _, _, notices = evaluated(write(tmp_path, [scene, scene + 1.0], lines=lines))
+    assert dataset["pixels"].sel(region="part").values.tolist() == [45 * 9] * 2
+    (cut,) = [one for one in notices if one.code == "regions_cut"]
+    assert cut.message == "Partly outside the picture of 128 x 96 px, and evaluated within it: part."
+
+
+def test_pictures_that_the_camera_wrote_twice_are_named(tmp_path, scene):
+    *_, notices = evaluated(write(tmp_path, [scene, scene, scene + 1.0]))
+    (repeated,) = [one for one in notices if one.code == "frames_repeated"]
+    assert "1 frame repeats the counts of frame 0" in repeated.message
 
 
 def test_a_damaged_picture_is_left_out_and_named(tmp_path, scene):
@@ -140,6 +158,10 @@ def test_a_damaged_picture_is_left_out_and_named(tmp_path, scene):
     assert part["pictures"] == 2 and part["difference"]["mean_K"]["value"] == pytest.approx(1.5, abs=0.01)
     (left_out,) = [one for one in notices if one.code == "pictures_left_out"]
     assert "A645sc_1.jpg" in left_out.message
+    # On a plan in mm the fields name what they leave out.
+    source = read_source(load_campaign(path))
+    listed = replace(source, plan=source.plan.model_copy(update={"registration": "fiducials"}))
+    assert "pictures_left_out" not in {one.code for one in evaluate_thermograms(listed, report=silent).notices}
 
 
 def test_pictures_of_several_cameras_are_a_table_by_camera(tmp_path, scene):
@@ -155,7 +177,7 @@ def test_pictures_of_several_cameras_are_a_table_by_camera(tmp_path, scene):
 
 
 def test_a_picture_of_another_camera_is_no_part_of_the_series(tmp_path, scene):
-    path = write(tmp_path, [scene] * 4)
+    path = write(tmp_path, [scene + step for step in (0.0, 0.1, 0.2, 0.3)])
     write(tmp_path, [scene], camera=CameraIdentity(model="FLIR E40", serial="2"), start=LATE)
     source = read_source(load_campaign(path))
     assert len(source.frames) == 4 and len(source.pictures) == 5
@@ -181,5 +203,37 @@ def test_a_part_that_leaves_the_range_of_the_camera_is_said_so(tmp_path, real_fi
     assert results.thermograms.indicated_degC == pytest.approx(391.3, abs=0.1)
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Highest temperature above 312 °C" in page and "data:image/jpeg;base64," in page
-    # No hotspot where a shift by a pixel makes as much at an edge.
-    assert re.search(r'id="pictures"', page) and len(results.hotspots) < 11
+    assert re.search(r'id="pictures"', page) and results.field is None
+
+
+LINE = """
+[[thermography.region]]
+name = "edge"
+line = [["100 px", "200 px"], ["500 px", "200 px"]]
+"""
+
+
+@pytest.mark.chain
+def test_regions_of_the_picture_are_evaluated_beside_a_laser(campaign_folder, results_folder, tmp_path):
+    folder, out = shutil.copytree(campaign_folder, tmp_path / "in"), tmp_path / "out"
+    path = folder / "campaign.toml"
+    path.write_text(path.read_text(encoding="utf-8") + LINE, encoding="utf-8")
+    results, without = run_campaign(path, out), read_results(results_folder)
+    assert [one.name for one in results.regions] == ["whole picture", "edge"] and results.thermograms is None
+    assert results.regions[1].pictures == len(list((folder / "thermal").iterdir()))
+    assert results.drift == without.drift and without.regions is None
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Regions of the picture" in page and 'id="drawing-profile"' in page and 'id="drawing-region_history"' in page
+
+
+@pytest.mark.parametrize("heading", ["", "# surface temperature / degC; 2026-03-09T06:30:00.000 UTC; FLIR A645sc 1\n"])
+def test_one_exported_picture_needs_no_time(tmp_path, scene, heading):
+    rows = "\n".join(",".join(f"{value:.3f}" for value in row) for row in scene)
+    (tmp_path / "a.csv").write_text(heading + rows + "\n", encoding="utf-8")
+    path = tmp_path / "campaign.toml"
+    text = '[campaign]\ntitle = "T"\n[thermography]\nframes = ["*.csv"]\n'
+    path.write_text(text + ("" if heading else '[thermography.stack]\nunit = "degC"\n'), encoding="utf-8")
+    results = run_campaign(path, tmp_path / "out")
+    assert results.thermograms.scene == "one picture" and results.thermograms.cameras[0].first == (
+        "2026-03-09T06:30:00Z" if heading else None
+    )

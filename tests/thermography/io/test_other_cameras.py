@@ -471,3 +471,29 @@ def test_files_of_cameras_that_are_not_read_are_named_for_what_they_are(tmp_path
     (tmp_path / name).write_bytes(content)
     (rejected,) = index_recordings([tmp_path / name])[1]
     assert told in rejected.reason and "not text" not in rejected.reason
+
+
+@pytest.mark.parametrize(
+    ("heading", "stated"),
+    [
+        (
+            "File Path:,C:\\x.seq\n\nParameters:,Emissivity:,0.93\n,Refl. Temp.:,22.5 °C\n,Distance:,1.0 m\n\n",
+            (0.93, 295.65),
+        ),
+        ("Emissivity;0,9\nReflected apparent temperature;293,15 K\n\n", (0.9, 293.15)),
+        ("a note\n", (None, None)),
+    ],
+)
+def test_emissivity_and_surroundings_of_an_exported_picture_stand_in_its_heading(tmp_path, heading, stated):
+    path = tmp_path / "a.csv"
+    mark = ";" if ";" in heading else ","
+    rows = "\n".join(mark.join(f"{20 + row + column / 100:.2f}" for column in range(40)) for row in range(30))
+    path.write_text(heading + rows, encoding="utf-8")
+    ((frame,), _) = index_recordings([path], StackOptions(unit="degC", start=np.datetime64("2026-03-09T06:30", "ns")))
+    assert (frame.options.emissivity, frame.options.reflected_temperature_K) == pytest.approx(stated)
+    assert frame.read_temperature()[0, 1] == pytest.approx(20.01)
+    # What the campaign file states takes precedence.
+    ((frame,), _) = index_recordings(
+        [path], StackOptions(unit="degC", start=np.datetime64("2026-03-09T06:30", "ns"), emissivity=0.5)
+    )
+    assert frame.parameters.emissivity == 0.5
