@@ -22,7 +22,7 @@ from fusion.campaign.time_zones import utc
 from fusion.common import Array
 from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
-from fusion.results.store import check, write_atomically
+from fusion.results.store import check
 from thermography.common import FIELDS, ThermographyError
 from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
 from thermography.fields.large_arrays import in_pieces, piece_slices
