@@ -12,7 +12,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.consistency.model import compare_lines
+from fusion.analysis.consistency.model import compare_lines, with_line
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
     FieldFault,
@@ -167,6 +167,8 @@ def model_drift(
         anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
         axis_u = axis_scale_u(fields, source.axis, deviations["position"].values)
         loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields))
+        declared = [with_line(entry, loop.get("axis_line")) for entry in loop["declared_coefficients"]]
+        loop = {**loop, "declared_coefficients": declared}
     elif "axis_scale_u" in fused:
         scale_u = float(fused["axis_scale_u"])
         loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)

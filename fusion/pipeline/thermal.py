@@ -16,6 +16,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
+from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.analysis.consistency.logs import rise_share_u
 from fusion.campaign.config import RegionTable, ThermographyTable, relative_name
 from fusion.campaign.inputs import CameraInputs, Source, SourceError, frames_notices
 from fusion.campaign.time_zones import utc
@@ -345,12 +347,29 @@ def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:
     return InputUncertainty(**{name: u for name, u in given.items() if u is not None})
 
 
-def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overrides) -> Outcome[xr.Dataset]:
+def _by_material_sensor(source: CameraInputs, fields: xr.Dataset, emissivity: float) -> float | None:
+    """Standard uncertainty of an emissivity that the material sensor leaves; None where it is stated, or the sensor tells nothing."""
+    if not isinstance(source, Source) or source.thermography.emissivity_u is not None:
+        return None
+    place_mm = source.interferometry.material_sensor_mm
+    near = thin_fields(fields) if place_mm is None else field_at(fields, place_mm)
+    share = rise_share_u(near, source.environment, stated=place_mm is not None)
+    # Beyond a third of it an emissivity has no upper end.
+    return None if share is None else emissivity * min(share, 1.0 / 3.0)
+
+
+def complete_fields(
+    source: CameraInputs, fields: xr.Dataset, parameters: Overrides, *, offset_s: float = 0.0
+) -> Outcome[xr.Dataset]:
     """Calibrate the surfaces that have an emissivity of their own, and add the total uncertainties."""
     table, inputs = source.thermography, stated_uncertainty(source.thermography)
     along = {"cycle": "cycle_time", "time": "time"}
     cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
     camera = cameras["cycle"][reference_cycle(fields["temperature"])]
+    on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
+    measured_u = _by_material_sensor(source, on_laser, camera.emissivity)
+    if measured_u is not None:
+        inputs = replace(inputs, emissivity=measured_u)
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
     if regions:
@@ -359,7 +378,7 @@ def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overri
     part = {
         **_two_parts(fields),
         "rise_scale_u": float(fields["rise_scale_u"].mean()),
-        "budget": _budget(table, fields, camera, inputs),
+        "budget": _budget(table, fields, camera, inputs, measured=measured_u is not None),
         "surfaces": [_surface_part(table, one, fields, camera, inputs) for one in surfaces],
         "edge_cells": int(edge.sum()),
     }
@@ -436,7 +455,7 @@ def _last_field(fields: xr.Dataset) -> xr.Dataset:
 
 
 def _budget(
-    table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+    table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty, *, measured: bool
 ) -> list[dict[str, Any]]:
     """Every input that all frames share, with its contributions on the main surface at the mean of the last field."""
     last = _last_field(fields)
@@ -451,7 +470,8 @@ def _budget(
             continue
         if camera.window_transmission == 1 and name.startswith("window_") and getattr(inputs, name) == 0:
             continue
-        source = "assumed" if getattr(table, key) is None else "stated"
+        unstated = "measured" if measured and name == "emissivity" else "assumed"
+        source = unstated if getattr(table, key) is None else "stated"
         of_temperature = abs(float(to_temperature.get(name, 0.0)))
         of_rise = {"temperature_u_K": of_temperature, "rise_u_percent": 100.0 * abs(float(to_rise.get(name, 0.0)))}
         value = {"value": getattr(camera, name, None), "u": getattr(inputs, name)}
@@ -548,7 +568,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
     fields = fields.assign_attrs(frames_damaged=json.dumps(damaged), frames_repeated=json.dumps(repeated))
     fields = fields.assign_coords(cycle=source.cycles.number)
-    completed = complete_fields(source, fields, override)
+    completed = complete_fields(source, fields, override, offset_s=offset_s)
     fields = check(completed.dataset, FIELDS, name="the fields")
     if registration.is_picture:
         fields = in_pixels(fields)

@@ -47,6 +47,8 @@ class DeclaredCoefficient(Coefficient):
     """Name of the effect."""
     jackknife_u: Number = None
     """Standard deviation by which it moves when a target or a part of the test is left out; null where it rests on one of them alone."""
+    u_line: Number = None
+    """The part of the line on the plan; absent where lines that fit as well as the declared one ask for about the same."""
 
 
 class ErrorInterval(ResultPart):

@@ -190,7 +190,8 @@ class Check:
     code : for programs and for ``[accept] doubts``
     value, limit : in the unit that the evidence names
     evidence : one sentence with the numbers
-    remedy : empty where the check is passed
+    remedy : empty where the check is passed and verified
+    verified : whether a passed check confirms the input; else its figures hold only under the assumption
     """
 
     code: str
@@ -201,12 +202,15 @@ class Check:
     remedy: str
     endangers: str
     severity: Severity = Severity.DOUBT
+    verified: bool = True
 
     def as_json(self, *, recompensated: bool = False) -> dict[str, object]:
         """One entry of ``inputs.checks`` in results.json; `recompensated` as for `fusion.analysis.consistency.checks.condition_of`."""
         condition = condition_of(self.code, recompensated=recompensated)
         entries = {name: value for name, value in vars(self).items() if name != "severity"}
-        return {**entries, "assumption": condition.assumption, "conditional": condition.figures}
+        # What nothing contradicts and nothing confirms: sizes depend on it, no name does.
+        figures = condition.figures if self.verified else tuple(name for name in condition.figures if name == _FIELD)
+        return {**entries, "assumption": condition.assumption, "conditional": figures}
 
 
 def judge(
@@ -220,8 +224,9 @@ def judge(
     sound: str = "",
     severity: Severity = Severity.DOUBT,
     endangers: str = "",
+    unverified: str = "",
 ) -> Check:
-    """Compare a value with its limit; `sound` is the evidence of a passed check, where it is another one."""
+    """Compare a value with its limit; `sound` is the evidence of a passed check, `unverified` the remedy where it confirms nothing."""
     passed = bool(value <= limit if passed is None else passed)
     return Check(
         code,
@@ -229,9 +234,10 @@ def judge(
         float(limit),
         passed,
         sound if passed and sound else evidence,
-        "" if passed else remedy,
+        unverified if passed else remedy,
         endangers or condition_of(code).endangers,
         severity,
+        verified=not (passed and unverified),
     )
 
 
