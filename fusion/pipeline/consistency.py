@@ -18,6 +18,7 @@ from fusion.analysis.consistency.camera import (
     check_gaps,
     check_order,
     check_phase,
+    check_picture,
     check_place,
     check_registration,
     compare_phase,
@@ -169,6 +170,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *material,
         *sensors,
         *check_place(fields),
+        *check_picture(fields),
         *check_gaps(fields["time"].values, source.deviations["time"]),
     ]
 
@@ -181,6 +183,7 @@ def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
         *check_load_scale(field, source.drivers, file=drivers_file),
         *_compare_sensors(source, fields),
         *check_place(fields),
+        *check_picture(fields),
     ]
 
 

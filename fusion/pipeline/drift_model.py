@@ -45,12 +45,21 @@ from thermography.fields.cycle_fields import cycles_with_field
 def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
     """Return the relative standard uncertainty of the rise along the measured line."""
     along = MeasuredLine(fields, axis, position_mm).sample(np.stack(_last_rise(fields)))
-    return _weighted(along[0], along[1])
+    return float(np.hypot(_weighted(along[0], along[1]), _zero_share(fields)))
 
 
 def plan_scale_u(fields: xr.Dataset) -> float:
     """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
-    return _weighted(*_last_rise(fields))
+    return float(np.hypot(_weighted(*_last_rise(fields)), _zero_share(fields)))
+
+
+def _zero_share(fields: xr.Dataset) -> float:
+    """Uncertainty of the camera's zero, which changes as slowly as the table warms, as a share of the mean rise; over all cycles."""
+    if "camera_correction_u" not in fields:
+        return 0.0
+    rise, zero_u = fields["temperature_rise"].mean(("y", "x")).values, fields["camera_correction_u"].values
+    known = np.isfinite(rise) & np.isfinite(zero_u)
+    return float(np.sqrt((zero_u[known] ** 2).sum() / max((rise[known] ** 2).sum(), np.finfo(float).tiny)))
 
 
 def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import optimize
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.consistency.field_series import field_at, thin_fields
@@ -34,6 +35,7 @@ from thermography.fields.survey import (
     LEAST_SURROUNDING_BLOCKS,
     Blocks,
     Survey,
+    compare_discs,
     disturbed_frames,
     locate_blocks,
     survey_frames,
@@ -212,6 +214,30 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     return CameraState(usable, correction_K if correction.corrects else None, u_K, part, notices)
 
 
+def _held_against_discs(camera: CameraState, registration: Registration) -> tuple[CameraState, dict[str, Any]]:
+    """The camera with what the discs show of its zero in its uncertainty, and what they show of a pattern in the picture."""
+    source = camera.source
+    shown = compare_discs(source.frames, registration)
+    if shown is None:
+        return camera, {}
+    change = np.ptp(shown.pattern_K, axis=0)
+    strongest = int(np.argmax(change))
+    found = {"pattern_K": float(change[strongest]), "disc": shown.names[strongest], "zero_K": 0.0}
+    if source.thermography.reference_patch_px is not None:
+        return camera, found
+    correction_K = np.zeros(len(source.frames)) if camera.correction_K is None else camera.correction_K
+    left = shown.common_K + correction_K[shown.index] - correction_K[0]
+    room = _room(source)[shown.index]
+    if room.shape[1]:
+        # Discs reflect the room, whose surfaces change by no more than its air.
+        room = room - room[0]
+        left = left - room @ optimize.lsq_linear(room, left, (0.0, 1.0)).x
+        left -= left[0]
+    # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
+    zero_u_K = np.interp(np.arange(len(source.frames)), shown.index, np.abs(left)) / np.sqrt(3.0)
+    return replace(camera, u_K=np.maximum(camera.u_K, zero_u_K)), {**found, "zero_K": float(np.ptp(left))}
+
+
 def camera_corrected(part: Mapping[str, Any]) -> bool:
     """Whether thermograms were left out or corrected."""
     return bool(part["frames_damaged"] or part["steps"] or part["drift_K"])
@@ -254,15 +280,18 @@ def _series(source: CameraInputs, background: Array, table: Array) -> LevelSerie
     seconds = (times - times[0]) / np.timedelta64(1, "s")
     sensors = [name for name in frames[0].housekeeping if all(name in frame.housekeeping for frame in frames)]
     housing = np.array([[frame.housekeeping[name] for name in sensors] for frame in frames], float)
-    room = np.zeros((len(frames), 0))
-    if source.environment is not None and "air_temperature" in source.environment:
-        log = source.environment
-        # The log is on the laser's clock; the room changes too slowly for a clock that is still to be found to matter.
-        on_laser = camera_on_laser_clock(times, source.thermography.clock_offset_s or 0.0)
-        logged = (log["time"].values - on_laser[0]) / np.timedelta64(1, "s")
-        air = log["air_temperature"].values
-        room = room_temperatures((on_laser - on_laser[0]) / np.timedelta64(1, "s"), logged, air)
-    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), room)
+    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), _room(source))
+
+
+def _room(source: CameraInputs) -> Array:
+    """Temperatures of the room at the frames, (frames, m); m is 0 where none was logged."""
+    log = source.environment
+    if log is None or "air_temperature" not in log:
+        return np.zeros((len(source.frames), 0))
+    # The log is on the laser's clock; the room changes too slowly for a clock that is still to be found to matter.
+    on_laser = camera_on_laser_clock(source.frame_times, source.thermography.clock_offset_s or 0.0)
+    logged = (log["time"].values - on_laser[0]) / np.timedelta64(1, "s")
+    return room_temperatures((on_laser - on_laser[0]) / np.timedelta64(1, "s"), logged, log["air_temperature"].values)
 
 
 def _repeat_notices(survey: Survey) -> Iterator[Notice]:
@@ -563,6 +592,9 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     offset_s = clock["value"]
+    if source.thermography.table == "still" and not json.loads(fields.attrs.get("knocks", "[]")):
+        camera, shown = _held_against_discs(camera, registration)
+        fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     damaged = [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
     repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]

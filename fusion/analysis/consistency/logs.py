@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import xarray as xr
@@ -237,8 +238,8 @@ def compare_course(cells: Array, logged: Array) -> tuple[Array, float]:
     return np.sqrt(left / logged.size), float(target.std())
 
 
-def _material(near: FieldSeries | None, log: xr.Dataset | None) -> tuple[NDArray[np.bool_], Array] | None:
-    """Frames that the log covers, and the logged material temperature at them."""
+def _material(near: FieldSeries | None, log: xr.Dataset | None) -> tuple[Array, Array] | None:
+    """Whether the log covers each frame, and the logged material temperature at those that it covers."""
     if near is None or log is None or "material_temperature" not in log:
         return None
     at = near.since_start(log["time"].values)
@@ -272,6 +273,7 @@ def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: 
         _same_course(near, inside, logged, file=file),
         _still(near, inside, logged, file=file),
         _rise(near, inside, logged, stated=stated),
+        *([_gain(near, inside, logged)] if stated else []),
         _level(near.temperature[inside], logged),
     ]
     if "air_temperature" not in log:
@@ -362,6 +364,44 @@ def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> C
         "small), the drift of the camera, and whether the sensor sits on the table (material_sensor under [interferometry]).",
         passed=abs(off) <= limit,
         unverified="" if stated else _STATE_PLACE,
+    )
+
+
+def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
+    """Change through the test of the camera's rise per K of the logged one, apart from a steady drift of its zero."""
+    limit, seconds = _rise_limit(logged, stated=True), near.seconds[inside]
+    passed = np.asarray((seconds - seconds.mean()) / np.ptp(seconds))
+    lagged = [near.lagged(lag_s)[inside, 0] for lag_s in SENSOR_LAGS_S]
+    left, change, u = np.inf, 0.0, np.inf
+    # A sensor shows the place through a time constant between two of those that are tried.
+    for faster, slower in pairwise(lagged):
+        centred = faster - faster.mean()
+        design = np.column_stack([np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred])
+        values, _, rank, _ = np.linalg.lstsq(design, logged, rcond=None)
+        rest = logged - design @ values
+        per_K = float(values[1] + values[2])
+        if rank < design.shape[1] or per_K <= 0.0 or not float(rest @ rest) < left:
+            continue
+        left = float(rest @ rest)
+        # Errors that last for several frames count as fewer (first-order autoregression).
+        memory = max(float(rest[1:] @ rest[:-1]) / max(left, 1e-12), 0.0)
+        variance = left / max(len(rest) - rank, 1) * (1.0 + memory) / max(1.0 - memory, 1e-3)
+        change = -float(values[4]) / per_K
+        u = float(np.sqrt(variance * np.linalg.inv(design.T @ design)[4, 4])) / per_K
+    testable = float(np.ptp(logged)) >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES and u <= limit
+    evidence = (
+        f"The camera's rise at the sensor's place per K of the logged material temperature changes by {change:+.2g} ± {2.0 * u:.2g} from "
+        "the first to the last frame."
+    )
+    untestable = (
+        "Whether the camera's gain stayed the same through the test, the logged material temperature does not show."
+    )
+    return judge(
+        "material_gain",
+        max(abs(change) - 2.0 * u, 0.0) if testable else 0.0,
+        limit,
+        evidence if testable else untestable,
+        "Check the window before the camera (dirt, condensation) and its transmission, what the table reflects, and the sensor's contact.",
     )
 
 
