@@ -52,17 +52,7 @@ from fusion.report.wording import (
     untouched,
 )
 from fusion.results.axis import CorrelationPart, Evidence, Iso230Part, Iso230Window, PlacePart
-from fusion.results.loop import (
-    AxisLoop,
-    AxisStep,
-    Coefficient,
-    DeclaredCoefficient,
-    HoldOutQuestion,
-    Loop,
-    Nothing,
-    RunnerUp,
-    StepPart,
-)
+from fusion.results.loop import AxisLoop, AxisStep, Coefficient, HoldOutQuestion, Loop, Nothing, RunnerUp, StepPart
 from fusion.results.parts import Figures
 from fusion.results.results import Results
 from fusion.results.store import by_approach, group, has
@@ -448,7 +438,7 @@ def _coefficient(coefficient: Coefficient) -> str:
     if coefficient.u_scale is not None:
         fit, scale = number(2 * (coefficient.u_fit or 0.0), 2), number(2 * coefficient.u_scale, 2)
         text += f", of which the fit ± {fit} and the scale of the rise ± {scale}"
-    if isinstance(coefficient, DeclaredCoefficient) and coefficient.u_line is not None:
+    if coefficient.u_line is not None:
         text += f", the choice of the line on the plan ± {number(2 * coefficient.u_line, 2)}"
     if coefficient.prior is not None:
         text += f" (prior {measured(coefficient.prior, coefficient.prior_u, unit)})"

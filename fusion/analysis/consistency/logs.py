@@ -223,6 +223,9 @@ _PROBE_K = 0.03
 _LARGEST_LEVEL_K = 4.0
 
 
+#: Parts of a test that are left out in turn, and coverage factor of 95 % for the standard deviation that they give (Student's t, 5
+#: degrees of freedom; JCGM 100:2008, G.3).
+_PARTS, _PARTS_95 = 6, 2.57
 #: What confirms the scale of the camera's rise.
 _STATE_PLACE = (
     "State where the material sensor sits on the table: material_sensor under [interferometry], its place on the plan."
@@ -372,33 +375,31 @@ def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
     limit, seconds = _rise_limit(logged, stated=True), near.seconds[inside]
     passed = np.asarray((seconds - seconds.mean()) / np.ptp(seconds))
     lagged = [near.lagged(lag_s)[inside, 0] for lag_s in SENSOR_LAGS_S]
-    left, change, u = np.inf, 0.0, np.inf
+    left, changes = np.inf, np.full(_PARTS + 1, np.nan)
+    # What a sensor makes of the course between two frames is not noise: its weight is judged by leaving out parts of the test.
+    part = np.minimum((_PARTS * np.arange(len(logged))) // len(logged), _PARTS - 1)
     # A sensor shows the place through a time constant between two of those that are tried.
     for faster, slower in pairwise(lagged):
         centred = faster - faster.mean()
         design = np.column_stack([np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred])
-        values, _, rank, _ = np.linalg.lstsq(design, logged, rcond=None)
-        rest = logged - design @ values
-        per_K = float(values[1] + values[2])
-        if rank < design.shape[1] or per_K <= 0.0 or not float(rest @ rest) < left:
-            continue
-        left = float(rest @ rest)
-        # Errors that last for several frames count as fewer (first-order autoregression).
-        memory = max(float(rest[1:] @ rest[:-1]) / max(left, 1e-12), 0.0)
-        variance = left / max(len(rest) - rank, 1) * (1.0 + memory) / max(1.0 - memory, 1e-3)
-        change = -float(values[4]) / per_K
-        u = float(np.sqrt(variance * np.linalg.inv(design.T @ design)[4, 4])) / per_K
+        fits = [np.linalg.lstsq(design[part != k], logged[part != k], rcond=None)[0] for k in range(-1, _PARTS)]
+        rest = logged - design @ fits[0]
+        if float(rest @ rest) < left and all(values[1] + values[2] > 0.0 for values in fits):
+            left = float(rest @ rest)
+            changes = np.array([-values[4] / (values[1] + values[2]) for values in fits])
+    change = float(changes[0])
+    u = float(np.sqrt((_PARTS - 1) * np.var(changes[1:])))
     testable = float(np.ptp(logged)) >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES and u <= limit
     evidence = (
-        f"The camera's rise at the sensor's place per K of the logged material temperature changes by {change:+.2g} ± {2.0 * u:.2g} from "
-        "the first to the last frame."
+        "The camera's rise at the sensor's place per K of the logged material temperature changes by "
+        f"{change:+.2g} ± {_PARTS_95 * u:.2g} from the first to the last frame."
     )
     untestable = (
         "Whether the camera's gain stayed the same through the test, the logged material temperature does not show."
     )
     return judge(
         "material_gain",
-        max(abs(change) - 2.0 * u, 0.0) if testable else 0.0,
+        max(abs(change) - _PARTS_95 * u, 0.0) if testable else 0.0,
         limit,
         evidence if testable else untestable,
         "Check the window before the camera (dirt, condensation) and its transmission, what the table reflects, and the sensor's contact.",
