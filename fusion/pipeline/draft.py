@@ -394,6 +394,7 @@ def _material_sensor(asker: Asker) -> str:
             continue
         if len(parts) == 2:
             return f"material_sensor = [{_quoted(parts[0])}, {_quoted(parts[1])}]"
+        asker.say(f'"{answer}" is not x and y')
     return example
 
 
