@@ -235,7 +235,9 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
         left -= left[0]
     # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
     zero_u_K = np.interp(np.arange(len(source.frames)), shown.index, np.abs(left)) / np.sqrt(3.0)
-    return replace(camera, u_K=np.maximum(camera.u_K, zero_u_K)), {**found, "zero_K": float(np.ptp(left))}
+    u_K = np.maximum(camera.u_K, zero_u_K)
+    part = {**camera.part, "largest_u_K": float(u_K.max())}
+    return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
 
 
 def camera_corrected(part: Mapping[str, Any]) -> bool:
@@ -396,8 +398,7 @@ def complete_fields(
     cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
     camera = cameras["cycle"][reference_cycle(fields["temperature"])]
     on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
-    measured_u = _by_material_sensor(source, on_laser, camera.emissivity)
-    if measured_u is not None:
+    if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity)) is not None:
         inputs = replace(inputs, emissivity=measured_u)
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)

@@ -7,7 +7,7 @@ damaged, or covered for one frame, lies far off both. The levels show what the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -388,7 +388,8 @@ def compare_discs(frames: Sequence[FrameReference], registration: Registration) 
     index = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _COMPARED)).round().astype(np.intp))
     if len(masks) < _LEAST_DISCS or index.size < _LEAST_FRAMES:
         return None
-    counts = np.array([_means(frames[i].read_counts(), masks.values()) for i in index])
+    pictures = (frames[i].read_counts() for i in index)
+    counts = np.array([[[picture[mask].mean() for mask in pair] for pair in masks.values()] for picture in pictures])
     parameters = frames[0].parameters
     gain, _ = count_line(parameters)
     level = temperature_from_counts(counts[..., 1].mean(), parameters) + ZERO_CELSIUS_K
@@ -428,10 +429,3 @@ def _disc_masks(registration: Registration) -> dict[str, tuple[NDArray[np.bool_]
         name: (inside(disc, _CORE), inside(disc, _RING[1]) & ~inside(disc, _RING[0])) for name, disc in discs.items()
     }
     return {name: pair for name, pair in pairs.items() if all(mask.any() for mask in pair)}
-
-
-def _means(
-    counts: NDArray[np.uint16], masks: Iterable[tuple[NDArray[np.bool_], NDArray[np.bool_]]]
-) -> list[list[float]]:
-    """Mean count of every pair of masks."""
-    return [[float(counts[mask].mean()) for mask in pair] for pair in masks]

@@ -394,9 +394,7 @@ def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
         "The camera's rise at the sensor's place per K of the logged material temperature changes by "
         f"{change:+.2g} ± {_PARTS_95 * u:.2g} from the first to the last frame."
     )
-    untestable = (
-        "Whether the camera's gain stayed the same through the test, the logged material temperature does not show."
-    )
+    untestable = "The logged material temperature does not show whether the camera's gain stayed the same."
     return judge(
         "material_gain",
         max(abs(change) - _PARTS_95 * u, 0.0) if testable else 0.0,
