@@ -222,7 +222,12 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
         return camera, {}
     change = np.ptp(shown.pattern_K, axis=0)
     strongest = int(np.argmax(change))
-    found = {"pattern_K": float(change[strongest]), "disc": shown.names[strongest], "zero_K": 0.0}
+    found = {
+        "pattern_K": float(change[strongest]),
+        "disc": shown.names[strongest],
+        "zero_K": 0.0,
+        "warming_K": shown.warming_K,
+    }
     if source.thermography.reference_patch_px is not None:
         return camera, found
     correction_K = np.zeros(len(source.frames)) if camera.correction_K is None else camera.correction_K

@@ -372,6 +372,8 @@ class DiscCourses:
         Change since the first that all discs share: of the camera's zero, or of what the discs reflect.
     pattern_K : (n, k) ndarray, K
         What differs from disc to disc, apart from noise: a pattern that grows in the picture, or a reflection on single discs.
+    warming_K : float, K
+        Largest change of the table around a disc: the lens mixes some per cent of it into the disc, not the same for all.
     names : tuple of str
         Of the discs.
     """
@@ -379,6 +381,7 @@ class DiscCourses:
     index: NDArray[np.intp]
     common_K: Array
     pattern_K: Array
+    warming_K: float
     names: tuple[str, ...]
 
 
@@ -403,7 +406,11 @@ def compare_discs(frames: Sequence[FrameReference], registration: Registration) 
     smooth = ndimage.uniform_filter1d(_beside(added), _SMOOTHED, axis=0, mode="nearest")
     scores, sizes, places = np.linalg.svd(smooth, full_matrices=False)
     return DiscCourses(
-        index, added.mean(axis=1) - added[0].mean(), sizes[0] * np.outer(scores[:, 0], places[0]), tuple(masks)
+        index,
+        added.mean(axis=1) - added[0].mean(),
+        sizes[0] * np.outer(scores[:, 0], places[0]),
+        float(np.ptp(table, axis=0).max()),
+        tuple(masks),
     )
 
 

@@ -512,6 +512,8 @@ def _excess(frames: xr.DataArray, seconds: Array, some: slice, least_K: float) -
 #: Change of the picture that only some discs show, and of its level that all show, beyond which it is named, K: as large as the steps of
 #: many cameras. Discs of 20 pixels show them to 0.01 K.
 _PICTURE_K = 0.1
+#: Share of the table's warming by which discs may differ on top: the blur of the lens mixes some of the table into small discs.
+_RIM_SHARE = 0.03
 
 
 def check_picture(fields: xr.Dataset) -> list[Check]:
@@ -524,7 +526,7 @@ def check_picture(fields: xr.Dataset) -> list[Check]:
         judge(
             "camera_picture",
             pattern_K,
-            _PICTURE_K,
+            _PICTURE_K + _RIM_SHARE * shown["warming_K"],
             f"Discs and the table around them change alike by up to {pattern_K:.2g} K against other places (most at {shown['disc']}); no "
             "temperature of the table does that: a pattern grows in the picture (narcissus, a warm lens, a dirty window), or a reflection.",
             "Let the camera warm up, clean or remove the window, tilt the camera by some degrees, and shield the table from sun and lamps.",
