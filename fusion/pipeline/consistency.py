@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from fusion.analysis.consistency.camera import (
     check_gaps,
     check_order,
     check_phase,
+    check_picture,
     check_place,
     check_registration,
     compare_phase,
@@ -165,13 +167,19 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *compare_material(near, source.environment),
         *compare_load(field, source.drivers),
     ]
+    material = check_material(near, source.environment, stated=place_mm is not None, file=environment_file)
+    sensors = _compare_sensors(source, fields)
+    if sensors:
+        # Contact sensors on the plan have shown the scale, or contradict it.
+        material = [check if check.verified else replace(check, verified=True, remedy="") for check in material]
     return [
         *check_clocks(_recordings(source, fields), compared),
         *check_load_scale(field, source.drivers, file=drivers_file),
         *check_load_course(field, source.drivers, file=drivers_file),
-        *check_material(near, source.environment, stated=place_mm is not None, file=environment_file),
-        *_compare_sensors(source, fields),
+        *material,
+        *sensors,
         *check_place(fields),
+        *check_picture(fields),
         *check_gaps(fields["time"].values, source.deviations["time"]),
     ]
 
@@ -185,6 +193,7 @@ def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
         *check_load_course(field, source.drivers, file=drivers_file),
         *_compare_sensors(source, fields),
         *check_place(fields),
+        *check_picture(fields),
     ]
 
 

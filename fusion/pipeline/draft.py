@@ -375,6 +375,8 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     if known.get("units") == "arcsec":
         yield "# a rotary axis: neither expansion nor dead path enter its angles"
         return
+    if content.frame_files and content.of(Kind.ENVIRONMENT):
+        yield _material_sensor(asker)
     coefficient = asker.quantity(
         "Expansion coefficient of the part that carries the scale or the workpiece", "ppm/K", "11.7 ppm/K"
     )
@@ -383,6 +385,26 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     if known.get("origin") == "reconstructed":
         yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
         yield '# dwell = "2 s"'
+
+
+def _material_sensor(asker: Asker) -> str:
+    """Return the line with the place of the material sensor, which confirms the scale of the temperatures."""
+    example = (
+        '# material_sensor = ["350 mm", "90 mm"]   # its place on the plan: confirms the scale of the temperatures'
+    )
+    question = "Plan point of the material temperature sensor, such as 350 mm, 90 mm; empty: not known"
+    while answer := asker.text(question, "").strip():
+        parts = [part.strip() for part in answer.split(",")]
+        try:
+            for part in parts:
+                read_quantity(part, "mm")
+        except QuantityError as error:
+            asker.say(str(error))
+            continue
+        if len(parts) == 2:
+            return f"material_sensor = [{_quoted(parts[0])}, {_quoted(parts[1])}]"
+        asker.say(f'"{answer}" is not x and y')
+    return example
 
 
 def _attributes(path: Path) -> dict[str, str]:

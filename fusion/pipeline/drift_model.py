@@ -12,7 +12,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.consistency.model import compare_lines
+from fusion.analysis.consistency.model import compare_lines, with_line
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
     FieldFault,
@@ -45,12 +45,21 @@ from thermography.fields.cycle_fields import cycles_with_field
 def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
     """Return the relative standard uncertainty of the rise along the measured line."""
     along = MeasuredLine(fields, axis, position_mm).sample(np.stack(_last_rise(fields)))
-    return _weighted(along[0], along[1])
+    return float(np.hypot(_weighted(along[0], along[1]), _zero_share(fields)))
 
 
 def plan_scale_u(fields: xr.Dataset) -> float:
     """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
-    return _weighted(*_last_rise(fields))
+    return float(np.hypot(_weighted(*_last_rise(fields)), _zero_share(fields)))
+
+
+def _zero_share(fields: xr.Dataset) -> float:
+    """Uncertainty of the camera's zero, which changes as slowly as the table warms, as a share of the mean rise; over all cycles."""
+    if "camera_correction_u" not in fields:
+        return 0.0
+    rise, zero_u = fields["temperature_rise"].mean(("y", "x")).values, fields["camera_correction_u"].values
+    known = np.isfinite(rise) & np.isfinite(zero_u)
+    return float(np.sqrt((zero_u[known] ** 2).sum() / max((rise[known] ** 2).sum(), np.finfo(float).tiny)))
 
 
 def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:
@@ -167,6 +176,8 @@ def model_drift(
         anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
         axis_u = axis_scale_u(fields, source.axis, deviations["position"].values)
         loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields))
+        declared = [with_line(entry, loop.get("axis_line")) for entry in loop["declared_coefficients"]]
+        loop = {**loop, "declared_coefficients": declared}
     elif "axis_scale_u" in fused:
         scale_u = float(fused["axis_scale_u"])
         loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)

@@ -14,8 +14,11 @@ import cv2
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import optimize
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
+from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.analysis.consistency.logs import rise_share_u
 from fusion.campaign.config import RegionTable, ThermographyTable, relative_name
 from fusion.campaign.inputs import CameraInputs, Source, SourceError, frames_notices
 from fusion.campaign.time_zones import utc
@@ -32,6 +35,7 @@ from thermography.fields.survey import (
     LEAST_SURROUNDING_BLOCKS,
     Blocks,
     Survey,
+    compare_discs,
     disturbed_frames,
     locate_blocks,
     survey_frames,
@@ -209,6 +213,37 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     return CameraState(usable, correction_K if correction.corrects else None, u_K, part, notices)
 
 
+def _held_against_discs(camera: CameraState, registration: Registration) -> tuple[CameraState, dict[str, Any]]:
+    """The camera with what the discs show of its zero in its uncertainty, and what they show of a pattern in the picture."""
+    source = camera.source
+    shown = compare_discs(source.frames, registration)
+    if shown is None:
+        return camera, {}
+    change = np.ptp(shown.pattern_K, axis=0)
+    strongest = int(np.argmax(change))
+    found = {
+        "pattern_K": float(change[strongest]),
+        "disc": shown.names[strongest],
+        "zero_K": 0.0,
+        "warming_K": shown.warming_K,
+    }
+    if source.thermography.reference_patch_px is not None:
+        return camera, found
+    correction_K = np.zeros(len(source.frames)) if camera.correction_K is None else camera.correction_K
+    left = shown.common_K + correction_K[shown.index] - correction_K[0]
+    room = _room(source)[shown.index]
+    if room.shape[1]:
+        # Discs reflect the room, whose surfaces change by no more than its air.
+        room = room - room[0]
+        left = left - room @ optimize.lsq_linear(room, left, (0.0, 1.0)).x
+        left -= left[0]
+    # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
+    zero_u_K = np.interp(np.arange(len(source.frames)), shown.index, np.abs(left)) / np.sqrt(3.0)
+    u_K = np.maximum(camera.u_K, zero_u_K)
+    part = {**camera.part, "largest_u_K": float(u_K.max())}
+    return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
+
+
 def camera_corrected(part: Mapping[str, Any]) -> bool:
     """Whether thermograms were left out or corrected."""
     return bool(part["frames_damaged"] or part["steps"] or part["drift_K"])
@@ -251,15 +286,18 @@ def _series(source: CameraInputs, background: Array, table: Array) -> LevelSerie
     seconds = (times - times[0]) / np.timedelta64(1, "s")
     sensors = [name for name in frames[0].housekeeping if all(name in frame.housekeeping for frame in frames)]
     housing = np.array([[frame.housekeeping[name] for name in sensors] for frame in frames], float)
-    room = np.zeros((len(frames), 0))
-    if source.environment is not None and "air_temperature" in source.environment:
-        log = source.environment
-        # The log is on the laser's clock; the room changes too slowly for a clock that is still to be found to matter.
-        on_laser = camera_on_laser_clock(times, source.thermography.clock_offset_s or 0.0)
-        logged = (log["time"].values - on_laser[0]) / np.timedelta64(1, "s")
-        air = log["air_temperature"].values
-        room = room_temperatures((on_laser - on_laser[0]) / np.timedelta64(1, "s"), logged, air)
-    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), room)
+    return LevelSeries(seconds, background, table, housing.reshape(len(frames), -1), _room(source))
+
+
+def _room(source: CameraInputs) -> Array:
+    """Temperatures of the room at the frames, (frames, m); m is 0 where none was logged."""
+    log = source.environment
+    if log is None or "air_temperature" not in log:
+        return np.zeros((len(source.frames), 0))
+    # The log is on the laser's clock; the room changes too slowly for a clock that is still to be found to matter.
+    on_laser = camera_on_laser_clock(source.frame_times, source.thermography.clock_offset_s or 0.0)
+    logged = (log["time"].values - on_laser[0]) / np.timedelta64(1, "s")
+    return room_temperatures((on_laser - on_laser[0]) / np.timedelta64(1, "s"), logged, log["air_temperature"].values)
 
 
 def repeat_notices(repeated: NDArray[np.bool_], times: Sequence[np.datetime64] | Array) -> Iterator[Notice]:
@@ -336,12 +374,28 @@ def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:
     return InputUncertainty(**{name: u for name, u in given.items() if u is not None})
 
 
-def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overrides) -> Outcome[xr.Dataset]:
+def _by_material_sensor(source: CameraInputs, fields: xr.Dataset, emissivity: float) -> float | None:
+    """Standard uncertainty of an emissivity that the material sensor leaves; None where it is stated, or the sensor tells nothing."""
+    if not isinstance(source, Source) or source.thermography.emissivity_u is not None:
+        return None
+    place_mm = source.interferometry.material_sensor_mm
+    near = thin_fields(fields) if place_mm is None else field_at(fields, place_mm)
+    share = rise_share_u(near, source.environment, stated=place_mm is not None)
+    # Beyond a third of it an emissivity has no upper end.
+    return None if share is None else emissivity * min(share, 1.0 / 3.0)
+
+
+def complete_fields(
+    source: CameraInputs, fields: xr.Dataset, parameters: Overrides, *, offset_s: float = 0.0
+) -> Outcome[xr.Dataset]:
     """Calibrate the surfaces that have an emissivity of their own, and add the total uncertainties."""
     table, inputs = source.thermography, stated_uncertainty(source.thermography)
     along = {"cycle": "cycle_time", "time": "time"}
     cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
     camera = cameras["cycle"][reference_cycle(fields["temperature"])]
+    on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
+    if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity)) is not None:
+        inputs = replace(inputs, emissivity=measured_u)
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
     if regions:
@@ -350,7 +404,7 @@ def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overri
     part = {
         **_two_parts(fields),
         "rise_scale_u": float(fields["rise_scale_u"].mean()),
-        "budget": _budget(table, fields, camera, inputs),
+        "budget": _budget(table, fields, camera, inputs, measured=measured_u is not None),
         "surfaces": [_surface_part(table, one, fields, camera, inputs) for one in surfaces],
         "edge_cells": int(edge.sum()),
     }
@@ -426,7 +480,7 @@ def _last_field(fields: xr.Dataset) -> xr.Dataset:
 
 
 def _budget(
-    table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
+    table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty, *, measured: bool
 ) -> list[dict[str, Any]]:
     """Every input that all frames share, with its contributions on the main surface at the mean of the last field."""
     last = _last_field(fields)
@@ -441,7 +495,8 @@ def _budget(
             continue
         if camera.window_transmission == 1 and name.startswith("window_") and getattr(inputs, name) == 0:
             continue
-        source = "assumed" if getattr(table, key) is None else "stated"
+        unstated = "measured" if measured and name == "emissivity" else "assumed"
+        source = unstated if getattr(table, key) is None else "stated"
         of_temperature = abs(float(to_temperature.get(name, 0.0)))
         of_rise = {"temperature_u_K": of_temperature, "rise_u_percent": 100.0 * abs(float(to_rise.get(name, 0.0)))}
         value = {"value": getattr(camera, name, None), "u": getattr(inputs, name)}
@@ -533,12 +588,15 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     offset_s = clock["value"]
+    if source.thermography.table == "still" and not json.loads(fields.attrs.get("knocks", "[]")):
+        camera, shown = _held_against_discs(camera, registration)
+        fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     damaged = [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
     repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
     fields = fields.assign_attrs(frames_damaged=json.dumps(damaged), frames_repeated=json.dumps(repeated))
     fields = fields.assign_coords(cycle=source.cycles.number)
-    completed = complete_fields(source, fields, override)
+    completed = complete_fields(source, fields, override, offset_s=offset_s)
     fields = check(completed.dataset, FIELDS, name="the fields")
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):

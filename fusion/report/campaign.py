@@ -423,6 +423,8 @@ def _coefficient(coefficient: Coefficient) -> str:
     if coefficient.u_scale is not None:
         fit, scale = number(2 * (coefficient.u_fit or 0.0), 2), number(2 * coefficient.u_scale, 2)
         text += f", of which the fit ± {fit} and the scale of the rise ± {scale}"
+    if coefficient.u_line is not None:
+        text += f", the choice of the line on the plan ± {number(2 * coefficient.u_line, 2)}"
     if coefficient.prior is not None:
         text += f" (prior {measured(coefficient.prior, coefficient.prior_u, unit)})"
     return text
@@ -510,6 +512,7 @@ def describe_campaign(
         "headline": headline(results),
         # What a camera that measures alone shows beyond its range is counted with its temperatures.
         "doubts": [one for one in doubts if results.thermograms is None or one.code != "camera_range"],
+        "unverified": results.inputs.unverified if results.inputs else (),
         "untouched": untouched(results.inputs, figures),
         "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
         "answers": conclude(results),

@@ -72,7 +72,8 @@ def _clock_doubted(results: Results) -> bool:
 
 def next_steps(results: Results) -> list[str]:
     """Return what to do next: doubted inputs, what the loop found, positions that stand out, the place, remedies of the warnings."""
-    steps = [check.remedy for check in results.inputs.doubts] if results.inputs else []
+    inputs = results.inputs
+    steps = [check.remedy for check in (*inputs.doubts, *inputs.unverified)] if inputs else []
     loop, correlation = results.loop, results.correlation
     if loop is not None:
         steps += [action(step, results.time, record=results.registration is None) for step in loop.steps]

@@ -34,7 +34,9 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
     if results.inputs is not None and not (results.thermograms and not results.thermograms.series):
         doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
         lines = [line for line in (*doubts, untouched(results.inputs, figures_of(results))) if line]
-        rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
+        open_checks = [f"not verified: {check.evidence} {check.remedy}" for check in results.inputs.unverified]
+        sound = [] if lines else [f"sound in {len(results.inputs.checks)} checks"]
+        rows.append(("inputs", "\n".join([*lines, *sound, *open_checks])))
     if results.regions is not None:
         several = results.thermograms is not None and len(results.thermograms.cameras) > 1
         shown = [one for one in results.regions if not several or one.name == "whole picture"]

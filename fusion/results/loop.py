@@ -38,6 +38,8 @@ class Coefficient(Sensitivity):
     """What was expected beforehand; absent where nothing was."""
     prior_u: Number = None
     """Standard uncertainty of what was expected."""
+    u_line: Number = None
+    """The part of the line on the plan; absent where lines that fit as well as the declared one ask for about the same."""
 
 
 class DeclaredCoefficient(Coefficient):

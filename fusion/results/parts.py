@@ -137,13 +137,15 @@ class CheckPart(ResultPart):
     evidence: str
     """One sentence with the numbers."""
     remedy: str
-    """What to correct; empty where the check is passed."""
+    """What to correct, or what would confirm the input; empty where the check is passed and verified."""
     endangers: str
     """Results that are wrong if the doubt is justified."""
     assumption: str
     """Assumption behind the results that depend on it, as it follows "only if"."""
     conditional: tuple[Figures, ...]
     """Results that hold only under that assumption."""
+    verified: bool = True
+    """False where the check is passed because nothing contradicts the input, and nothing confirms it either."""
 
 
 class InputsPart(ResultPart):
@@ -161,9 +163,15 @@ class InputsPart(ResultPart):
         """Checks that are not passed and not accepted."""
         return tuple(check for check in self.checks if not check.passed and check.code not in self.accepted)
 
+    @property
+    def unverified(self) -> tuple[CheckPart, ...]:
+        """Checks that are passed without confirming the input, and not accepted."""
+        return tuple(check for check in self.checks if not check.verified and check.code not in self.accepted)
+
     def assumptions(self, *figures: Figures) -> tuple[str, ...]:
-        """Return what has to be right for some figures to hold; nothing where no doubt touches them."""
-        return tuple(dict.fromkeys(check.assumption for check in self.doubts if set(check.conditional) & set(figures)))
+        """Return what has to be right for some figures to hold; nothing where no doubt and nothing unverified touches them."""
+        open_checks = (*self.doubts, *self.unverified)
+        return tuple(dict.fromkeys(one.assumption for one in open_checks if set(one.conditional) & set(figures)))
 
 
 # Parts of the ISO 230-2 evaluation in results.json that a test sheet shows in addition to the values: tolerances, conditions,

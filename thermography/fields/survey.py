@@ -14,12 +14,13 @@ import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
-from thermography.radiometry.planck import temperature_from_counts
-from thermography.registration.plan import PlanGrid
+from thermography.radiometry.planck import ZERO_CELSIUS_K, count_line, signal_slope, temperature_from_counts
+from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.register import Registration
 
 #: Blocks along a row: large enough that noise averages out, small enough that many lie outside the table.
@@ -341,3 +342,97 @@ def _strays(survey: Survey, blocks: Blocks, kept: NDArray[np.int64]) -> dict[int
         table = table - np.median(around - np.median(around, axis=0), axis=1, keepdims=True)
     reason = "the table differs by {:.2g} K from the frames before and after it: from another series, or with another setting"
     return {int(kept[i]): reason.format(beyond) for i, beyond in stray_frames(table, ends=examined).items()}
+
+
+# What the camera adds to a picture, by two surfaces at one place: a disc of low emissivity and the painted table around it share it whole,
+# and share the temperature in proportion to their emissivities.
+
+#: Frames that are compared, evenly spaced.
+_COMPARED = 60
+#: Discs that are painted, or so dull that they show little but their own temperature, tell nothing of the camera: largest share of the
+#: table's change that they show.
+_DULL = 0.6
+#: Fewest discs that show a pattern beside a change that all share and the warming of the table.
+_LEAST_DISCS = 5
+#: Radii of the middle of a disc, and of the ring of table around it, over that of the disc: the lens blurs the rim.
+_CORE, _RING = 0.6, (1.6, 2.6)
+#: Frames over whose mean a course is judged: what the camera adds changes slowly.
+_SMOOTHED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class DiscCourses:
+    """What n frames of a series show on k discs beyond the warming of the table.
+
+    Attributes
+    ----------
+    index : (n,) ndarray of int
+        Places of the frames in the series.
+    common_K : (n,) ndarray, K
+        Change since the first that all discs share: of the camera's zero, or of what the discs reflect.
+    pattern_K : (n, k) ndarray, K
+        What differs from disc to disc, apart from noise: a pattern that grows in the picture, or a reflection on single discs.
+    warming_K : float, K
+        Largest change of the table around a disc: the lens mixes some per cent of it into the disc, not the same for all.
+    names : tuple of str
+        Of the discs.
+    """
+
+    index: NDArray[np.intp]
+    common_K: Array
+    pattern_K: Array
+    warming_K: float
+    names: tuple[str, ...]
+
+
+def compare_discs(frames: Sequence[FrameReference], registration: Registration) -> DiscCourses | None:
+    """Compare the discs with the table around them; None where too few are of low emissivity."""
+    masks = _disc_masks(registration)
+    index = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _COMPARED)).round().astype(np.intp))
+    if len(masks) < _LEAST_DISCS or index.size < _LEAST_FRAMES:
+        return None
+    pictures = (frames[i].read_counts() for i in index)
+    counts = np.array([[[picture[mask].mean() for mask in pair] for pair in masks.values()] for picture in pictures])
+    parameters = frames[0].parameters
+    gain, _ = count_line(parameters)
+    level = temperature_from_counts(counts[..., 1].mean(), parameters) + ZERO_CELSIUS_K
+    disc, table = np.moveaxis((counts - counts[0]) / (gain * signal_slope(level, parameters)), -1, 0)
+    # The share of the table's change that a disc shows: from what differs between discs and frames, which no change of the zero does.
+    own, around = (_beside(values) for values in (disc, table))
+    share = float((own * around).sum() / max((around**2).sum(), np.finfo(float).tiny))
+    if share > _DULL:
+        return None
+    added = (disc - max(share, 0.0) * table) / (1.0 - max(share, 0.0))
+    smooth = ndimage.uniform_filter1d(_beside(added), _SMOOTHED, axis=0, mode="nearest")
+    scores, sizes, places = np.linalg.svd(smooth, full_matrices=False)
+    return DiscCourses(
+        index,
+        added.mean(axis=1) - added[0].mean(),
+        sizes[0] * np.outer(scores[:, 0], places[0]),
+        float(np.ptp(table, axis=0).max()),
+        tuple(masks),
+    )
+
+
+def _beside(values: Array) -> Array:
+    """What is neither common to all discs of a frame nor constant on a disc."""
+    values = values - values.mean(axis=0)
+    return np.asarray(values - values.mean(axis=1, keepdims=True))
+
+
+def _disc_masks(registration: Registration) -> dict[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Pixels of the middle of every disc in use, and of the table around it."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
+    circle = np.column_stack([np.cos(turn), np.sin(turn)])
+
+    def inside(disc: Fiducial, radii: float) -> NDArray[np.bool_]:
+        image = np.zeros(registration.shape, np.uint8)
+        outline = registration.to_sensor(np.array([disc.x_mm, disc.y_mm]) + radii * disc.diameter_mm / 2.0 * circle)
+        cv2.fillPoly(image, [np.rint(outline).astype(np.int32)], 1)
+        return image.astype(bool)
+
+    discs = {name: disc for name, disc in registration.fiducials.items() if not disc.is_point and disc.marker is None}
+    pairs = {
+        name: (inside(disc, _CORE), inside(disc, _RING[1]) & ~inside(disc, _RING[0])) for name, disc in discs.items()
+    }
+    return {name: pair for name, pair in pairs.items() if all(mask.any() for mask in pair)}

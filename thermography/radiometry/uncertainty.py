@@ -52,7 +52,8 @@ _NORMAL_95 = 1.959964
 class InputUncertainty:
     """Standard uncertainties (coverage factor 1) of the inputs of the measurement formula.
 
-    The defaults apply to a painted surface in a workshop and to the data sheet of a bolometer camera: accuracy of +-2 K or +-2 % of the
+    The defaults apply to a painted surface in a workshop (non-metallic paints and lacquers from 8 to 14 um: 0.87 to 0.98, FLIR Systems,
+    user's manual T559880, emissivity tables; rectangular) and to the data sheet of a bolometer camera: accuracy of +-2 K or +-2 % of the
     reading, both as rectangular distributions (JCGM 100:2008, 4.3.7), NETD of 50 mK at 30 degC.
 
     Attributes
@@ -81,7 +82,7 @@ class InputUncertainty:
         Where an uncertainty is negative or not finite.
     """
 
-    emissivity: float = 0.01
+    emissivity: float = 0.03
     reflected_temperature_K: float = 1.0
     atmospheric_temperature_K: float = 1.0
     relative_humidity: float = 0.05

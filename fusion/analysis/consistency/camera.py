@@ -527,6 +527,46 @@ def _excess(frames: xr.DataArray, seconds: Array, some: slice, least_K: float) -
     return np.asarray(excess - least_K)
 
 
+#: Change of the picture that only some discs show, and of its level that all show, beyond which it is named, K: as large as the steps of
+#: many cameras. Discs of 20 pixels show them to 0.01 K.
+_PICTURE_K = 0.1
+#: Share of the table's warming by which discs may differ on top: the blur of the lens mixes some of the table into small discs.
+_RIM_SHARE = 0.03
+
+
+def check_picture(fields: xr.Dataset) -> list[Check]:
+    """Check that discs of low emissivity and the table around them warm as surfaces of one temperature."""
+    shown = json.loads(fields.attrs.get("discs", "{}"))
+    if not shown:
+        return []
+    pattern_K, zero_K = shown["pattern_K"], shown["zero_K"]
+    return [
+        judge(
+            "camera_picture",
+            pattern_K,
+            _PICTURE_K + _RIM_SHARE * shown["warming_K"],
+            f"Discs and the table around them change alike by up to {pattern_K:.2g} K against other places (most at {shown['disc']}); no "
+            "temperature of the table does that: a pattern grows in the picture (narcissus, a warm lens, a dirty window), or a reflection.",
+            "Let the camera warm up, clean or remove the window, tilt the camera by some degrees, and shield the table from sun and lamps.",
+            sound=f"Discs and the table around them show no pattern that grows in the picture (largest {pattern_K:.2g} K).",
+        ),
+        judge(
+            "camera_zero",
+            zero_K,
+            _PICTURE_K,
+            f"Zero not verified: discs of low emissivity change by {zero_K:.2g} K with the table around them and not with the logged room: "
+            "the camera's zero, a window, or what the discs reflect. The uncertainty of the rise contains it.",
+            passed=True,
+            unverified="Keep a surface of constant temperature in view (reference_patch under [thermography])."
+            if zero_K > _PICTURE_K
+            else "",
+            sound=""
+            if zero_K > _PICTURE_K
+            else f"The discs show no change of the camera's zero (largest {zero_K:.2g} K).",
+        ),
+    ]
+
+
 # Checks of the registration: fiducials that are missing or unchecked, hints that contradict, a plan of another size
 # or mirrored.
 

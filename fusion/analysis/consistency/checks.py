@@ -124,6 +124,7 @@ CONDITIONS = {
     ),
     "environment_columns": Condition("the columns of the environment log are named right", _LOG, _COMPENSATION),
     "material_rise": Condition("the emissivity is right", _CAMERA, _SCALE),
+    "material_gain": Condition("the gain of the camera stayed the same", _CAMERA, _SCALE),
     "material_level": Condition("the level of the camera's temperature is right", _CAMERA, _SCALE),
     "fiducials_found": Condition("the plan is registered right", _CAMERA, _PLACES),
     "fiducials_unchecked": Condition("the plan is registered right", _CAMERA, _PLACES),
@@ -135,6 +136,8 @@ CONDITIONS = {
         _CAMERA,
         "place and direction of the measured line on the plan, and every cause that follows the field",
     ),
+    "camera_picture": Condition("no pattern of the camera or of a reflection grew in the picture", _CAMERA, _FIELDS),
+    "camera_zero": Condition("the zero of the camera stayed the same", _CAMERA, _RISES),
     "frozen_camera": Condition("every frame was taken at its time", _CAMERA, _RISES),
     "camera_place": Condition("the camera stayed in its place", _CAMERA, _FIELDS),
     "frames_left_out": Condition("the frames that are left show the whole test", _CAMERA, _FIELDS),
@@ -195,7 +198,8 @@ class Check:
     code : for programs and for ``[accept] doubts``
     value, limit : in the unit that the evidence names
     evidence : one sentence with the numbers
-    remedy : empty where the check is passed
+    remedy : empty where the check is passed and verified
+    verified : whether a passed check confirms the input; else its figures hold only under the assumption
     """
 
     code: str
@@ -206,12 +210,15 @@ class Check:
     remedy: str
     endangers: str
     severity: Severity = Severity.DOUBT
+    verified: bool = True
 
     def as_json(self, *, recompensated: bool = False) -> dict[str, object]:
         """One entry of ``inputs.checks`` in results.json; `recompensated` as for `fusion.analysis.consistency.checks.condition_of`."""
         condition = condition_of(self.code, recompensated=recompensated)
         entries = {name: value for name, value in vars(self).items() if name != "severity"}
-        return {**entries, "assumption": condition.assumption, "conditional": condition.figures}
+        # What nothing contradicts and nothing confirms: sizes depend on it, no name does.
+        figures = condition.figures if self.verified else tuple(name for name in condition.figures if name == _FIELD)
+        return {**entries, "assumption": condition.assumption, "conditional": figures}
 
 
 def judge(
@@ -225,8 +232,9 @@ def judge(
     sound: str = "",
     severity: Severity = Severity.DOUBT,
     endangers: str = "",
+    unverified: str = "",
 ) -> Check:
-    """Compare a value with its limit; `sound` is the evidence of a passed check, where it is another one."""
+    """Compare a value with its limit; `sound` is the evidence of a passed check, `unverified` the remedy where it confirms nothing."""
     passed = bool(value <= limit if passed is None else passed)
     return Check(
         code,
@@ -234,9 +242,10 @@ def judge(
         float(limit),
         passed,
         sound if passed and sound else evidence,
-        "" if passed else remedy,
+        unverified if passed else remedy,
         endangers or condition_of(code).endangers,
         severity,
+        verified=not (passed and unverified),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import xarray as xr
@@ -222,6 +223,15 @@ _PROBE_K = 0.03
 _LARGEST_LEVEL_K = 4.0
 
 
+#: Parts of a test that are left out in turn, and coverage factor of 95 % for the standard deviation that they give (Student's t, 5
+#: degrees of freedom; JCGM 100:2008, G.3).
+_PARTS, _PARTS_95 = 6, 2.57
+#: What confirms the scale of the camera's rise.
+_STATE_PLACE = (
+    "State where the material sensor sits on the table: material_sensor under [interferometry], its place on the plan."
+)
+
+
 def compare_course(cells: Array, logged: Array) -> tuple[Array, float]:
     """Return what a constant and a positive multiple of every cell leave of a logged temperature, and its standard deviation, K."""
     centred, target = cells - cells.mean(axis=0), logged - logged.mean()
@@ -231,24 +241,47 @@ def compare_course(cells: Array, logged: Array) -> tuple[Array, float]:
     return np.sqrt(left / logged.size), float(target.std())
 
 
-def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool, file: str) -> list[Check]:
-    """Check course, rise and level of the camera's temperature and the logged material temperature against each other."""
+def _material(near: FieldSeries | None, log: xr.Dataset | None) -> tuple[Array, Array] | None:
+    """Whether the log covers each frame, and the logged material temperature at those that it covers."""
     if near is None or log is None or "material_temperature" not in log:
-        return []
+        return None
     at = near.since_start(log["time"].values)
     inside = (near.seconds >= at[0]) & (near.seconds <= at[-1])
     if inside.sum() < 2:
-        return []
-    logged = np.interp(near.seconds[inside], at, log["material_temperature"].values)
+        return None
+    return inside, np.interp(near.seconds[inside], at, log["material_temperature"].values)
+
+
+def rise_share_u(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool) -> float | None:
+    """Standard uncertainty of the camera's rise, as a share of it, that a material sensor leaves; None where it tells nothing."""
+    compared = _material(near, log)
+    if near is None or compared is None:
+        return None
+    slopes = _slopes(near, *compared, stated=stated)
+    # Every scale at which some place of the sensor fits is as likely (rectangular, JCGM 100:2008, 4.3.7).
+    return (
+        None if slopes is None else float(np.hypot(_CONTACT, max(abs(slope - 1.0) for slope in slopes) / np.sqrt(3.0)))
+    )
+
+
+def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool, file: str) -> list[Check]:
+    """Check course, rise and level of the camera's temperature and the logged material temperature against each other."""
+    compared = _material(near, log)
+    if near is None or log is None or compared is None:
+        words = "Scale not verified: no material temperature is logged with the frames, which would confirm the camera's rise."
+        remedy = "Log a contact sensor on the table (material_temperature in the environment log), and state its place (material_sensor)."
+        return [judge("material_rise", 0.0, _UNKNOWN_PLACE, words, unverified=remedy)]
+    inside, logged = compared
     checks = [
         _same_course(near, inside, logged, file=file),
         _still(near, inside, logged, file=file),
         _rise(near, inside, logged, stated=stated),
+        *([_gain(near, inside, logged)] if stated else []),
         _level(near.temperature[inside], logged),
     ]
     if "air_temperature" not in log:
         return checks
-    air = np.interp(near.seconds[inside], at, log["air_temperature"].values)
+    air = np.interp(near.seconds[inside], near.since_start(log["time"].values), log["air_temperature"].values)
     columns = judge(
         "environment_columns",
         not _agrees(near, inside, logged, stated=stated) and _agrees(near, inside, air, stated=stated),
@@ -314,19 +347,60 @@ def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> C
     change, limit = float(np.ptp(logged)), _rise_limit(logged, stated=stated)
     slopes = _slopes(near, inside, logged, stated=stated)
     if slopes is None:
-        untestable = f"The logged material temperature changes by {change:.2g} K and does not show the camera's scale: cannot be tested."
-        return judge("material_rise", 0.0, limit, untestable)
+        untestable = (
+            f"Scale not verified: the logged material temperature changes by {change:.2g} K and does not show it."
+        )
+        remedy = "State the emissivity with its uncertainty." if stated else _STATE_PLACE
+        return judge("material_rise", 0.0, limit, untestable, unverified=remedy)
     off = _off(slopes)
     where = "at the sensor's place" if stated else "where it resembles the sensor most"
+    unknown = (
+        "" if stated or abs(off) > limit else "Scale not verified, the place of the material sensor is not known. "
+    )
     return judge(
         "material_rise",
         off,
         limit,
-        f"The camera's rise {where} is {slopes[0]:.3g} to {slopes[1]:.3g} times that of the logged material temperature, which changes by "
-        f"{change:.2g} K.",
+        f"{unknown}The camera's rise {where} is {slopes[0]:.3g} to {slopes[1]:.3g} times that of the logged material temperature, which "
+        f"changes by {change:.2g} K.",
         "Check emissivity, object_distance and reflected_temperature (a rise that is too large comes from an emissivity that is too "
         "small), the drift of the camera, and whether the sensor sits on the table (material_sensor under [interferometry]).",
         passed=abs(off) <= limit,
+        unverified="" if stated else _STATE_PLACE,
+    )
+
+
+def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
+    """Change through the test of the camera's rise per K of the logged one, apart from a steady drift of its zero."""
+    limit, seconds = _rise_limit(logged, stated=True), near.seconds[inside]
+    passed = np.asarray((seconds - seconds.mean()) / np.ptp(seconds))
+    lagged = [near.lagged(lag_s)[inside, 0] for lag_s in SENSOR_LAGS_S]
+    left, changes = np.inf, np.full(_PARTS + 1, np.nan)
+    # What a sensor makes of the course between two frames is not noise: its weight is judged by leaving out parts of the test.
+    part = np.minimum((_PARTS * np.arange(len(logged))) // len(logged), _PARTS - 1)
+    # A sensor shows the place through a time constant between two of those that are tried.
+    for faster, slower in pairwise(lagged):
+        centred = faster - faster.mean()
+        design = np.column_stack([np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred])
+        fits = [np.linalg.lstsq(design[part != k], logged[part != k], rcond=None)[0] for k in range(-1, _PARTS)]
+        rest = logged - design @ fits[0]
+        if float(rest @ rest) < left and all(values[1] + values[2] > 0.0 for values in fits):
+            left = float(rest @ rest)
+            changes = np.array([-values[4] / (values[1] + values[2]) for values in fits])
+    change = float(changes[0])
+    u = float(np.sqrt((_PARTS - 1) * np.var(changes[1:])))
+    testable = float(np.ptp(logged)) >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES and u <= limit
+    evidence = (
+        "The camera's rise at the sensor's place per K of the logged material temperature changes by "
+        f"{change:+.2g} ± {_PARTS_95 * u:.2g} from the first to the last frame."
+    )
+    untestable = "The logged material temperature does not show whether the camera's gain stayed the same."
+    return judge(
+        "material_gain",
+        max(abs(change) - _PARTS_95 * u, 0.0) if testable else 0.0,
+        limit,
+        evidence if testable else untestable,
+        "Check the window before the camera (dirt, condensation) and its transmission, what the table reflects, and the sensor's contact.",
     )
 
 

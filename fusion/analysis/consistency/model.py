@@ -218,6 +218,9 @@ _FRAME_TRAVELS, _LEAST_FRAME_MM = 5.0, 3000.0
 #: Log-likelihood by which another line must explain the readings better where it does away with a named cause: odds of 400 to 1. That
 #: cause was chosen among as many candidates as there are lines, so that the number of alternatives counts on both sides.
 _LINE_GAIN_OVER_CAUSE = 6.0
+#: Share of the expansion that lines which fit as well may span for it to be a figure of the declared line alone: half of what the
+#: coefficients of steels differ by (10 to 13 ppm/K), which no longer tells one from another.
+_LINES_SPAN = 0.1
 #: Standard deviations by which a coefficient must lie beyond what is possible.
 _BEYOND_SIGMAS = 3.0
 
@@ -315,6 +318,7 @@ def _axis_line(line: Mapping[str, Any], unconfirmed: Mapping[str, float]) -> Che
     named = [name.replace("_", " ") for name in line["superfluous"]]
     without = f", and without {', '.join(named)}" if named else ""
     low, high = line["alternative_ppm_per_K"]
+    spread = lines_differ(line)
     if line["gain"] <= 0.0:
         none = "No other line on the plan, order of the targets or sign of the deviations explains the readings better"
     else:
@@ -330,5 +334,27 @@ def _axis_line(line: Mapping[str, Any], unconfirmed: Mapping[str, float]) -> Che
         f"{limit:g}), with an expansion of {line['expansion_ppm_per_K']:.3g} ± {line['expansion_u_ppm_per_K']:.2g} ppm/K{without}.",
         "Check origin and direction under [plan.axis], the plan coordinates of the fiducials, the order of the targets and the sign "
         "of the deviations.",
-        sound=f"{none}; lines that fit as well as the declared one indicate {low:.3g} to {high:.3g} ppm/K.",
+        sound=f"{'Line not verified. ' if spread else ''}{none}; lines that fit as well as the declared one indicate {low:.3g} to "
+        f"{high:.3g} ppm/K.",
+        unverified="Measure the plan point under the spindle at axis position 0 again (origin under [plan.axis]); a test in which one part "
+        "of the table warms more than the rest would show the line."
+        if spread
+        else "",
     )
+
+
+def lines_differ(line: Mapping[str, Any]) -> bool:
+    """Whether lines that explain the readings as well as the declared one ask for expansions that differ."""
+    low, high = line["alternative_ppm_per_K"]
+    return bool(high - low > _LINES_SPAN * max(abs(low), abs(high)))
+
+
+def with_line(entry: Mapping[str, Any], line: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the declared expansion with what the choice of the line adds to its uncertainty (rectangular, JCGM 100:2008, 4.3.7)."""
+    if line is None or entry["effect"] != "axis_expansion" or not lines_differ(line):
+        return dict(entry)
+    # The expansion that was expected takes part along every line.
+    share = 0.0 if entry.get("prior") is None else entry["u_fit"] ** 2 / entry["prior_u"] ** 2
+    along = [(1.0 - share) * value + share * (entry.get("prior") or 0.0) for value in line["alternative_ppm_per_K"]]
+    u_line = max(abs(value - entry["value"]) for value in along) / math.sqrt(3.0)
+    return {**entry, "u": math.hypot(entry["u"], u_line), "u_line": u_line}

@@ -24,6 +24,7 @@ ANSWERS = {
     "Plan point under the spindle at axis position 0, x": "500 mm",
     "Plan point under the spindle at axis position 0, y": "90 mm",
     "How that point moves over the plan as the axis position grows (right, left, down, up)": "left",
+    "Plan point of the material temperature sensor, such as 350 mm, 90 mm; empty: not known": "640 mm, 30 mm",
     "Size of a cell of the field; it divides both sides": "20 mm",
 }
 
@@ -40,6 +41,7 @@ def test_answers_make_a_campaign_that_is_ready(copied):
     written = load_campaign(path)
     assert written.campaign.title == 'The "small" one'
     assert written.plan == original.plan
+    assert written.interferometry.material_sensor_mm == (640.0, 30.0)
     assert written.input_files() == original.input_files()
 
 

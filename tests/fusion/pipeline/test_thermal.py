@@ -283,9 +283,11 @@ def test_results_give_both_parts_and_say_what_was_assumed(results_folder):
     # Absolute temperatures carry the camera's accuracy, rises the scale; the noise of a cell is some millikelvin.
     assert temperature["noise_K"] < 0.02 and 1.0 < temperature["common_K"] < 1.5
     assert rise["total_K"] == pytest.approx(np.hypot(rise["noise_K"], rise["common_K"]), rel=1e-6)
-    assert part["rise_scale_u"] == pytest.approx(0.0152, abs=0.001)
+    # Contact of the material sensor, whose place is stated, 2 %; scale of the camera 1.2 %.
+    assert part["rise_scale_u"] == pytest.approx(0.0242, abs=0.002)
     sources = {entry["input"]: entry["source"] for entry in part["budget"]}
-    assert sources.pop("camera_drift_K") == "measured" and set(sources.values()) == {"assumed"}
+    assert sources.pop("camera_drift_K") == sources.pop("emissivity") == "measured"
+    assert set(sources.values()) == {"assumed"}
     total = np.sqrt(sum(entry["temperature_u_K"] ** 2 for entry in part["budget"]))
     assert total == pytest.approx(temperature["common_K"], rel=0.02)
     html = (results_folder / "report.html").read_text()
@@ -330,7 +332,7 @@ def test_a_region_is_calibrated_with_its_own_emissivity(campaign, results_folder
         expected = temperature_from_counts(counts, camera, emissivity=0.5)
         np.testing.assert_allclose(after[name].sel(inside).values, expected, atol=1e-3)
     steel, rest = (after["rise_scale_u"].sel(x=x, y=90, method="nearest") for x in (160, 400))
-    assert steel > 2 * rest
+    assert steel > 1.5 * rest
     (notice,) = outcome.notices
     assert notice.message.endswith("cells at the edges of region steel see two surfaces and were left empty.")
     part = outcome.parts["radiometry"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fusion.analysis.consistency.checks import Check, inputs_part
+from fusion.analysis.consistency.checks import Check, inputs_part, judge
 from fusion.report.terminal import summary_rows
 from fusion.results.results import Notice, assemble
 from tests.fusion.results_sample import PARTS
@@ -29,6 +29,23 @@ def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
     touched = {name for name, text in rows.items() if condition[1:-1] in text.lower()}
     of_laser = "verdict, how much, where, how sure, scatter per position, added, held-out error, plain predictions, noise floor"
     assert touched == set(of_laser.split(", "))
+
+
+def test_what_is_not_verified_is_said_with_what_would_confirm_it():
+    checks = [
+        judge("material_rise", 0.0, 0.07, "Scale not verified.", unverified="State where the material sensor sits.")
+    ]
+    results = assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])
+    rows = dict(summary_rows(results))
+    assert (
+        rows["inputs"] == "sound in 1 checks\nnot verified: Scale not verified. State where the material sensor sits."
+    )
+    assert rows["next"].startswith("1. State where the material sensor sits.")
+    assert results.inputs.state == "sound" and results.inputs.assumptions("field") == ("the emissivity is right",)
+    # A scale that all share makes no cause right or wrong.
+    assert results.inputs.assumptions("positions", "attribution", "causes") == ()
+    accepted = assemble("A", {**PARTS, "inputs": inputs_part(checks, ("material_rise",))}, [])
+    assert accepted.inputs.unverified == ()
 
 
 def test_an_exact_fit_is_not_printed_as_accuracy():

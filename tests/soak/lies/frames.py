@@ -25,6 +25,8 @@ OTHER_TEST = r"clock|another test|material|level|same test|frames.*readings"
 STRAY = OTHER_TEST + "|" + DAMAGED + "|frames?.*(unlike|differ)|jump"
 SETTING = r"emissivity|parameters.*(change|vary)|settings"
 ORDER = r"clock|order|times? of the frames|level|frames?.*(left out|differ)"
+WINDOW = r"transmission|window|" + LEVEL
+PATTERN = r"narcissus|pattern|optical axis"
 VIEW = r"knock|view|registration|disc|moved|blur|sharp|mirror"
 _COUNTS_PER_K = float(counts_of(25.5) - counts_of(24.5))
 _ROWS, _COLUMNS = np.mgrid[0:ROWS, 0:COLUMNS]
@@ -66,6 +68,22 @@ def tray(counts: np.ndarray) -> np.ndarray:
     covered = counts.copy()
     covered[95:150, 90:150] = counts_of(31.0)
     return covered
+
+
+def over_time(change: Callable[[np.ndarray, float], np.ndarray]) -> Plant:
+    """Change the pixels of every frame by the share of the test that has passed."""
+
+    def edit(number: int, frame: Frame) -> Frame:
+        counts = np.rint(change(frame.counts.astype(float), (number - 1) / (CYCLES - 1)))
+        return replace(frame, counts=np.clip(counts, 0, 65535).astype(np.uint16))
+
+    return edit_frames(edit)
+
+
+def spot(column: float, row: float, spread: float) -> np.ndarray:
+    """A round spot of height 1; place and spread in shares of the picture's width."""
+    away = np.hypot(_COLUMNS - (COLUMNS - 1) * column, _ROWS - (ROWS - 1) * row)
+    return np.exp(-0.5 * (away / (COLUMNS * spread)) ** 2)
 
 
 def missing(numbers: set[int]) -> Plant:
@@ -196,7 +214,49 @@ def other_range(number: int, frame: Frame) -> Frame:
     )
 
 
+#: Faults of the picture that grow through the test, and scales that are constant and wrong.
+_PICTURE = (
+    Lie(
+        "window that gets dirty, transmission 1 to 0.85",
+        WINDOW,
+        over_time(lambda counts, t: (1.0 - 0.15 * t) * counts + 0.15 * t * counts_of(24.0)),
+    ),
+    Lie(
+        "narcissus of 0.6 K grows in the middle of the picture",
+        PATTERN,
+        over_time(lambda counts, t: counts + 0.6 * t * _COUNTS_PER_K * spot(0.5, 0.5, 0.15)),
+    ),
+    Lie(
+        "camera's zero creeps by 1 K",
+        LEVEL + "|zero",
+        over_time(lambda counts, t: counts + t * _COUNTS_PER_K),
+        describes=frozenset({"camera_offset"}),
+    ),
+    Lie(
+        "sun of 1 K travels over the table",
+        BODY + "|travel",
+        over_time(lambda counts, t: counts + _COUNTS_PER_K * spot(0.15 + 0.7 * t, 0.5, 0.08)),
+        describes=frozenset({"reflected_source"}),
+    ),
+    Lie(
+        "table greyer than stated (0.80 for 0.97)",
+        SETTING,
+        key("thermography", "emissivity", "0.97"),
+        camera(emissivity=0.80),
+    ),
+    Lie("emissivity 0.79 for 0.97", SETTING, key("thermography", "emissivity", "0.79")),
+)
+
+
+def without_place(lie: Lie) -> Lie:
+    """The same where the place of the material sensor is not stated."""
+    plant = in_turn(lie.plant, key("interferometry", "material_sensor", None))
+    return replace(lie, name=f"{lie.name}, sensor's place not stated", plant=plant)
+
+
 LIES = (
+    *_PICTURE,
+    *(without_place(lie) for lie in (*_PICTURE, Lie("emissivity right", SETTING))),
     Lie("FFC jumps 0.5 K every 15 min", LEVEL, world=camera(ffc_step_K=0.5), describes=frozenset({"camera_offset"})),
     Lie("FFC jumps 0.1 K every 15 min", LEVEL, world=camera(ffc_step_K=0.1), describes=frozenset({"camera_offset"})),
     Lie("camera drifts 0.3 K per K of its housing", LEVEL, world=camera(drift_K_per_K=0.3)),
@@ -257,7 +317,7 @@ LIES = (
     ),
     Lie(
         "window put before the camera in the middle",
-        r"transmission|window|" + LEVEL,
+        WINDOW,
         pixels(range(HALF, CYCLES + 1), lambda counts: 0.85 * counts + 0.15 * counts_of(24.0)),
     ),
     Lie(

@@ -21,6 +21,12 @@ from tests.soak.lies.lie import Lie
 _SIGMAS, _RELATIVE = 3.0, 0.1
 #: Checks that list many possible faults as their remedy: only what their evidence says names a fault.
 _CATCH_ALL = {"expansion_coefficient"}
+#: Figures that each check which confirms nothing is printed with.
+_NOT_VERIFIED = {
+    "material_rise": ("expansion", "temperature"),
+    "camera_zero": ("expansion", "temperature"),
+    "axis_line": ("expansion",),
+}
 
 
 class Outcome(StrEnum):
@@ -32,6 +38,7 @@ class Outcome(StrEnum):
     DOUBTED = "doubted, not naming it"
     REFUSED_NAMED = "refused, naming the fault"
     REFUSED = "refused, not naming it"
+    CONDITIONAL = "wrong in a figure that is printed as not verified"
     SILENTLY_WRONG = "silently wrong"
     TRACEBACK = "traceback"
 
@@ -48,7 +55,10 @@ def judge(lie: Lie, truth: Truth, results: Results, folder: Path) -> tuple[Outco
         named = any(_names(lie, words) for words in _doubts(results))
         return (Outcome.DOUBTED_NAMED if named else Outcome.DOUBTED), wrong
     if wrong:
-        return Outcome.SILENTLY_WRONG, wrong
+        open_codes = {check.code for check in results.inputs.unverified} if results.inputs is not None else set()
+        covered = tuple({word for code in open_codes for word in _NOT_VERIFIED[code]})
+        told = bool(covered) and all(fault.startswith(covered) for fault in wrong)
+        return (Outcome.CONDITIONAL if told else Outcome.SILENTLY_WRONG), wrong
     notices = [f"{notice.code}: {notice.message}" for notice in results.warnings]
     return (Outcome.CORRECTED if any(_names(lie, notice) for notice in notices) else Outcome.RIGHT), wrong
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.thermography.flir_mutations import without_checksums
 from tests.thermography.plan_scene import GRID, SC660, START, Scene, registered, smooth_field
-from thermography.fields.survey import disturbed_frames, locate_blocks, stray_frames, survey_frames
+from thermography.fields.survey import compare_discs, disturbed_frames, locate_blocks, stray_frames, survey_frames
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CalibratedRange, Frame
@@ -177,3 +177,25 @@ def test_a_step_of_the_camera_a_restless_table_and_a_short_series_tell_nothing()
     restless = _course() + np.random.default_rng(5).normal(0.0, 0.6, 30)[:, None]
     assert stray_frames(restless, ends=True) == {}
     assert stray_frames(_course()[:6] + np.array([0, 0, 0, 2, 0, 0])[:, None], ends=True) == {}
+
+
+def test_discs_show_what_the_camera_adds_to_a_table_that_warms(tmp_path, rng):
+    """Discs of emissivity 0.15 show 0.15 of the table's warming, and all of what a camera adds."""
+    mask = (Scene(disc_K=1.0).render() - Scene(disc_K=0.0).render()).clip(0.0, 1.0)
+    rows, columns = np.mgrid[0 : mask.shape[0], 0 : mask.shape[1]]
+    spot = np.exp(-0.5 * (np.hypot(rows - rows.mean(), columns - columns.mean()) / (0.15 * columns.max())) ** 2)
+    warming = 1.0 + columns / columns.max()
+
+    def shown(added):
+        def change(index, image):
+            passed = index / (FRAMES - 1)
+            return image + passed * (warming * (1.0 - 0.85 * mask) + added)
+
+        name = f"{np.ptp(added):.1f}_{np.max(added):.1f}.seq"
+        return compare_discs(_film(tmp_path / name, Scene(disc_K=-4.0).render(), rng, change), registered())
+
+    sound, creeps, narcissus = shown(0.0 * spot), shown(0.0 * spot + 1.0), shown(0.6 * spot)
+    # A dozen pixels of 50 mK per disc.
+    assert np.abs(sound.common_K).max() < 0.05 and np.ptp(sound.pattern_K, axis=0).max() < 0.1
+    assert creeps.common_K[-1] == pytest.approx(1.0, abs=0.06) and np.ptp(creeps.pattern_K, axis=0).max() < 0.1
+    assert np.ptp(narcissus.pattern_K, axis=0).max() > 0.2

@@ -21,6 +21,8 @@ from thermography.radiometry.planck import RadiometryError, counts_from_temperat
 from thermography.radiometry.uncertainty import InputUncertainty, temperature_uncertainty
 
 CAMERA = override(PARAMETERS, emissivity=0.97, object_distance_m=1.2, reflected_temperature_K=295.15)
+#: An emissivity that is far enough from 1 for first order.
+WELL_KNOWN = InputUncertainty(emissivity=0.01)
 NONE = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -33,12 +35,12 @@ def fields(noise_K: float = 0.01, top: float = 27.0) -> xr.Dataset:
 def test_noise_and_common_part_add_up_to_the_propagated_budget():
     reduced = fields()
     before = reduced.copy(deep=True)
-    done = evaluate_uncertainty(reduced, [CAMERA] * 3)
+    done = evaluate_uncertainty(reduced, [CAMERA] * 3, WELL_KNOWN)
     xr.testing.assert_identical(reduced, before)
     cell = done.isel(y=1, x=1)
-    common = temperature_uncertainty([22.0, 24.0, 27.0], CAMERA).common_u
+    common = temperature_uncertainty([22.0, 24.0, 27.0], CAMERA, WELL_KNOWN).common_u
     np.testing.assert_allclose(cell["temperature_u"], np.hypot(common, 0.01), rtol=2e-3)
-    rise = temperature_rise_uncertainty([22.0, 24.0, 27.0], 22.0, CAMERA).common_u
+    rise = temperature_rise_uncertainty([22.0, 24.0, 27.0], 22.0, CAMERA, WELL_KNOWN).common_u
     # The share of the rise is the derivative at its middle: exact to the third order of the rise.
     np.testing.assert_allclose(cell["temperature_rise_u"], np.hypot(rise, [0, 0.01414, 0.01414]), rtol=5e-3)
     assert done["temperature_u"].attrs["units_metadata"] == "temperature: difference"
@@ -109,7 +111,7 @@ def test_metal_is_corrected_to_the_propagated_distribution_or_refused():
 
 def test_drawn_inputs_are_covered(rng):
     """One wrong emissivity, one reflected temperature, one offset and scale of the camera per draw, in all cycles."""
-    done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3).isel(y=1, x=1)
+    done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3, WELL_KNOWN).isel(y=1, x=1)
     true = np.array([22.0, 24.0, 27.0])
     black = override(CAMERA, emissivity=1.0, object_distance_m=0.0)
     errors = []
@@ -143,11 +145,11 @@ def shown(temperature: np.ndarray, rise: np.ndarray) -> ShownRange:
 
 def test_first_order_is_compared_with_drawn_values_of_all_cells():
     still = np.full(4, 22.0)
-    compared = compare_with_monte_carlo(shown(still, still - 22.0), CAMERA, InputUncertainty())
+    compared = compare_with_monte_carlo(shown(still, still - 22.0), CAMERA, WELL_KNOWN)
     assert compared.rise_ratio == pytest.approx(1.0, abs=0.05)
     temperature = np.array([22.0, 30.0, 40.0])
     hidden, whole = (
-        compare_with_monte_carlo(shown(temperature, np.array([first, 8.0, 18.0])), CAMERA, InputUncertainty())
+        compare_with_monte_carlo(shown(temperature, np.array([first, 8.0, 18.0])), CAMERA, WELL_KNOWN)
         for first in (np.nan, 0.0)
     )
     assert hidden.rise_ratio == whole.rise_ratio

@@ -16,6 +16,7 @@ from fusion.analysis.consistency.camera import (
     check_gaps,
     check_order,
     check_phase,
+    check_picture,
     check_place,
     check_registration,
     find_gaps,
@@ -422,3 +423,14 @@ def test_each_doubt_is_named(changed, code, evidence):
     ((named, text),) = doubts(**changed)
     assert named == code
     assert evidence in text
+
+
+@pytest.mark.parametrize(("pattern_K", "zero_K"), [(0.03, 0.02), (0.4, 0.02), (0.03, 0.5)])
+def test_a_pattern_in_the_picture_is_doubted_and_a_zero_that_may_be_a_reflection_is_not_verified(
+    pattern_K: float, zero_K: float
+) -> None:
+    shown = {"pattern_K": pattern_K, "disc": "F3", "zero_K": zero_K, "warming_K": 2.0}
+    picture, zero = check_picture(xr.Dataset(attrs={"discs": json.dumps(shown)}))
+    assert picture.passed is (pattern_K < 0.1) and ("F3" in picture.evidence) is (pattern_K > 0.1)
+    assert zero.passed and zero.verified is (zero_K < 0.1) and bool(zero.remedy) is (zero_K > 0.1)
+    assert check_picture(xr.Dataset()) == []

@@ -14,6 +14,7 @@ from fusion.analysis.consistency.logs import (
     check_material,
     check_sensors,
     compare_sensors,
+    rise_share_u,
 )
 from tests.fusion.analysis.consistency.twin_fields import SENSOR_MM, recorded, scaled
 
@@ -207,6 +208,31 @@ def test_a_sound_camera_passes(stated: bool) -> None:
     assert found["material_rise"].value == pytest.approx(0.0, abs=0.02)
 
 
+def test_the_scale_is_as_well_known_as_the_place_of_the_sensor() -> None:
+    test = recorded()
+    at_place = rise_share_u(field_at(test.fields, SENSOR_MM), test.environment, stated=True)
+    anywhere = rise_share_u(thin_fields(test.fields), test.environment, stated=False)
+    assert at_place is not None and anywhere is not None
+    # The contact of a surface probe is known to 2 %.
+    assert 0.02 <= at_place < 0.025 < anywhere
+    assert checks(stated=True)["material_rise"].verified
+    unknown = checks(stated=False)["material_rise"]
+    assert not unknown.verified and "material_sensor under [interferometry]" in unknown.remedy
+
+
+def test_a_gain_that_falls_through_the_test_is_doubted_and_a_steady_drift_of_the_zero_is_not() -> None:
+    test = recorded()
+    passed = xr.DataArray(np.linspace(0.0, 1.0, test.fields.sizes["time"]), dims="time")
+    shown = test.fields["frame_temperature"]
+    dirty = test.fields.assign(frame_temperature=24.0 + (1.0 - 0.15 * passed) * (shown - 24.0))
+    creeps = test.fields.assign(frame_temperature=shown + 0.5 * passed)
+    found = of_log(test.environment, dirty, stated=True)["material_gain"]
+    # The value is what lies beyond the uncertainty.
+    assert not found.passed and 0.08 < found.value < 0.15 and "window" in found.remedy
+    for fields in (test.fields, creeps):
+        assert of_log(test.environment, fields, stated=True)["material_gain"].passed
+
+
 # The rise grows nearly as the reciprocal of the emissivity: 0.97 over 0.90, over 0.50, and over 1.0.
 @pytest.mark.parametrize("factor", [1.078, 1.94, 0.85])
 def test_a_wrong_emissivity_is_doubted(factor: float) -> None:
@@ -275,12 +301,17 @@ def test_a_small_change_tells_nothing() -> None:
     test = recorded()
     short = test.fields.isel(time=slice(0, 12))
     found = of_log(test.environment, scaled(short, 1.9), stated=False)
-    assert found["material_rise"].passed and "cannot be tested" in found["material_rise"].evidence
+    assert found["material_rise"].passed and not found["material_rise"].verified
+    assert rise_share_u(thin_fields(short), test.environment, stated=False) is None
 
 
-def test_without_a_log_or_a_field_there_is_no_check() -> None:
+def test_without_a_log_or_a_field_nothing_confirms_the_scale() -> None:
     test = recorded()
-    assert check_material(None, test.environment, stated=False, file="") == []
-    assert check_material(thin_fields(test.fields), None, stated=False, file="") == []
-    assert of_log(test.environment.drop_vars("material_temperature"), test.fields, stated=False) == {}
+    without = test.environment.drop_vars("material_temperature")
+    for near, log in ((None, test.environment), (thin_fields(test.fields), None), (thin_fields(test.fields), without)):
+        (check,) = check_material(near, log, stated=False, file="")
+        assert (
+            check.code == "material_rise" and check.passed and not check.verified and "material_sensor" in check.remedy
+        )
+        assert check.as_json()["conditional"] == ("field",)
     assert "environment_columns" not in of_log(test.environment.drop_vars("air_temperature"), test.fields, stated=False)

@@ -12,7 +12,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines
+from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines, with_line
 from fusion.analysis.drift_model.axis import declare
 from fusion.analysis.drift_model.fit import Term, fit_model
 from fusion.analysis.effects.library import library
@@ -261,3 +261,19 @@ def test_a_line_that_does_away_with_a_named_cause_needs_less(
     assert ("indicate 11.2 to 12.6 ppm/K" in check.evidence) is passed
     assert (f"(log-likelihood {gain:+.1f}" in check.evidence) is (gain > 0.0)
     assert ("without angular growth" in check.evidence) is (bool(superfluous) and not passed)
+    # 11.2 to 12.6 ppm/K differ by more than a tenth.
+    assert check.verified is not passed and ("Line not verified" in check.evidence) is passed
+
+
+def test_lines_that_fit_as_well_are_part_of_the_uncertainty_of_the_expansion() -> None:
+    entry = {"effect": "axis_expansion", "value": 16.0, "u": 0.5, "u_fit": 0.4, "prior": 11.7, "prior_u": 2.0}
+    far, near = {"alternative_ppm_per_K": (11.0, 16.2)}, {"alternative_ppm_per_K": (15.0, 16.2)}
+    # The readings alone ask for 11 ppm/K along the other line, and with the one that was expected for a little more.
+    u_line = (16.0 - (0.96 * 11.0 + 0.04 * 11.7)) / math.sqrt(3.0)
+    assert with_line(entry, far) == {
+        **entry,
+        "u": pytest.approx(math.hypot(0.5, u_line)),
+        "u_line": pytest.approx(u_line),
+    }
+    assert with_line(entry, near) == with_line(entry, None) == entry
+    assert with_line({**entry, "effect": "table_offset"}, far)["u"] == 0.5
