@@ -964,7 +964,7 @@ class LoopResult:
             (
                 "added",
                 f"{step.effect} ({', '.join(map(_words_of, step.parameters.items()))}), p = {step.p_value:.2g}, "
-                f"{'confirmed' if step.confirmed else 'not confirmed'}",
+                f"{step.doubt or 'borne out'}",
             )
             for step in self.steps
         ]
@@ -1005,14 +1005,18 @@ class LoopResult:
     @property
     def separable(self) -> bool:
         """Whether a cause can be named: ridge regression with lagged copies does not predict better by a quarter."""
-        return is_separable(*(rmse(self.hold_out_errors[name]) for name in ("final", "ridge_with_lags")))
+        return is_separable(self._error("final"), self._error("ridge_with_lags"))
+
+    def _error(self, name: str) -> float:
+        """Error of a prediction of the hold-out set, um."""
+        return float(self.hold_out[name].rmse_um or 0.0)
 
     @property
     def _falls_short(self) -> bool:
         """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
-        errors = {name: rmse(one) for name, one in self.hold_out_errors.items() if name != "declared"}
-        exceeds = exceeds_noise(errors["final"], self.noise_floor_um, remainder.DRIFT_SHARE)
-        return any(step.keeps_name for step in self.steps) and exceeds and errors["final"] > min(errors.values())
+        final, plain = self._error("final"), min(map(self._error, self.hold_out.keys() - {"declared", "final"}))
+        exceeds = exceeds_noise(final, self.noise_floor_um, remainder.DRIFT_SHARE)
+        return any(step.keeps_name for step in self.steps) and exceeds and final > plain
 
     def described(
         self,
@@ -1066,7 +1070,7 @@ class LoopResult:
             }
         left = self.remainder
         shape = left.shape or (BEYOND_PLAIN if self._falls_short else "")
-        sizes = (left.rms_um, self.wandering_um, excess_um(rmse(self.hold_out_errors["final"]), self.noise_floor_um))
+        sizes = (left.rms_um, self.wandering_um, excess_um(self._error("final"), self.noise_floor_um))
         return schema.AxisUnexplained(shape=shape, rms_um=max(sizes) if shape else 0.0, p_value=left.p_value, **nearest)
 
 

@@ -876,6 +876,10 @@ ANSWER_LEVEL = 0.05
 _HALF, _TWICE = 0.5, 2.0
 #: Readings per column below which an interval says nothing.
 _READINGS_PER_COLUMN = 2
+#: Share of its length that a column keeps by rounding where the others contain it.
+_ROUNDING = 1e-6
+#: A size is not told where a right effect would hardly be borne out more often than one that is not there.
+_LEAST_POWER = 2.0 * ANSWER_LEVEL
 
 
 @dataclass(frozen=True)
@@ -918,8 +922,10 @@ class Unseen:
         asked = np.column_stack([self.response, self.shares, self.uncertain])
         laid = fit.system.whiten(np.column_stack([asked, level, self.beside, rates]))[0] / fit.sigma
         asked, beside = laid[:, : asked.shape[1]], laid[:, asked.shape[1] :]
-        asked = asked - beside @ np.linalg.lstsq(beside, asked, rcond=None)[0]
-        return asked[:, 0], asked[:, 1 : 1 + number], asked[:, 1 + number :], freedom
+        left = asked - beside @ np.linalg.lstsq(beside, asked, rcond=None)[0]
+        # What is of no size beside the others is rounding.
+        left[:, np.linalg.norm(left, axis=0) < _ROUNDING * np.linalg.norm(asked, axis=0)] = 0.0
+        return left[:, 0], left[:, 1 : 1 + number], left[:, 1 + number :], freedom
 
 
 @dataclass(frozen=True)
@@ -964,12 +970,12 @@ class Answer:
 
     def described(self, where: str) -> dict[str, Any]:
         """What results.json holds of it; `where` says which readings were asked."""
-        known = np.isfinite(self.u)
+        known = self.power >= _LEAST_POWER
         size = f"{where} its size is {self.slope:.2f} ± {2.0 * self.u:.2f} (k = 2) of that predicted"
         doubts = {
             "yes": "",
             "no": self.against or f"contradicted: {size}",
-            "cannot tell": f"not yet borne out: {size}" if known else f"not yet borne out: it does not change {where}",
+            "cannot tell": f"not yet borne out: {size}" if known else f"not yet borne out: it hardly changes {where}",
         }
         return {
             "confirmed": self.word == "yes",
