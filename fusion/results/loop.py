@@ -178,7 +178,7 @@ class Unexplained(ResultPart):
     shape: str
     """Description; empty where nothing is left."""
     rms_um: Number
-    """Its root mean square, um: the largest of the pattern, what the held-out error exceeds the noise by, and the random drift."""
+    """Its root mean square, um: the larger of what the shape describes and the random drift that the model allows."""
     p_value: Number
     """p-value of any structure in the residual, family-wise over the shapes."""
     closest_effect: str
@@ -519,6 +519,19 @@ class RunPart(HoldOutErrors):
     """Verdict by the errors in this run; empty where it is not held out."""
 
 
+class Tracking(ResultPart):
+    """Errors on the hold-out where the displacements are read again from time to time; means over the channels."""
+
+    every_min: Number
+    """Time from one reading to the next, min."""
+    model: ErrorInterval
+    """Of the final model, its random drift carried on from the readings by the Kalman filter."""
+    last_reading: ErrorInterval
+    """Of repeating the last reading."""
+    ridge: ErrorInterval
+    """Of ridge regression started at the last reading."""
+
+
 class RecordLoop(Loop):
     """What the closed loop found on a record; errors are means over the channels."""
 
@@ -528,6 +541,8 @@ class RecordLoop(Loop):
     """What is left."""
     channels: Mapping[str, ChannelErrors]
     """Errors by channel."""
+    tracking: Tracking | None = None
+    """Errors with a reading from time to time; null for several runs, and in results of earlier versions."""
     chained: tuple[ChainedPart, ...]
     """Forward-chained parts."""
     search: tuple[tuple[RecordScorePart, ...], ...]

@@ -1070,8 +1070,9 @@ class LoopResult:
             }
         left = self.remainder
         shape = left.shape or (BEYOND_PLAIN if self._falls_short else "")
-        sizes = (left.rms_um, self.wandering_um, excess_um(self._error("final"), self.noise_floor_um))
-        return schema.AxisUnexplained(shape=shape, rms_um=max(sizes) if shape else 0.0, p_value=left.p_value, **nearest)
+        # The held-out error of a drift that is carried on at its rate says nothing of the size of what drifts.
+        size = max(left.rms_um or excess_um(self._error("final"), self.noise_floor_um), self.wandering_um)
+        return schema.AxisUnexplained(shape=shape, rms_um=size if shape else 0.0, p_value=left.p_value, **nearest)
 
 
 def _words_of(parameter: tuple[str, Any]) -> str:

@@ -71,7 +71,7 @@ from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.common import Array
 from fusion.results import loop as schema
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
-from interferometry.drift.kalman import DriftModelError
+from interferometry.drift.kalman import DriftModelError, drift_system
 
 # Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training
 # part.
@@ -202,6 +202,35 @@ def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Arr
         "ridge": predict(record, now, train).predicted,
         "ridge_with_lags": predict(record, np.column_stack([now, *late]), train).predicted,
     }
+
+
+#: Readings of the hold-out set that a prediction which tracks is given: often enough for an interval, seldom enough to need a model.
+_READINGS = 10
+
+
+def track(record: Record, train: NDArray[np.bool_], forecast: Array, ridge: Array) -> schema.Tracking:
+    """Predict the hold-out set with a reading of all channels from time to time, weighed by the drift of what the forecast misses."""
+    held = np.flatnonzero(~train)
+    every = max(1, held.size // _READINGS)
+    read = train.copy()
+    read[held[every - 1 :: every]] = True
+    # The last block that was read before each one.
+    before = np.maximum.accumulate(np.where(read, np.arange(read.size), 0))[held - 1]
+    carried = np.full(record.displacement.shape, np.nan)
+    for k in range(len(record.channels)):
+        rows = np.flatnonzero(np.isfinite(record.displacement[:, k]))
+        seconds, one = record.seconds[rows], np.ones((rows.size, 1))
+        off = (record.displacement - forecast)[rows, k]
+        # A random walk is carried on at its level: a rate would be carried on as well, and hours ahead it leads astray.
+        before_it = train[rows]
+        fit = estimate(seconds[before_it], one[before_it], off[before_it], one[before_it], order=1, robust=True)
+        told = drift_system(seconds, one, order=1, ratios=fit.system.ratios, observed=read[rows])
+        missed, _ = told.innovations(np.column_stack([off, one]))
+        carried[rows, k] = missed[:, 0] - missed[:, 1] * fit.coefficients[0]
+    last = record.displacement[held] - record.displacement[before]
+    errors = {"model": carried[held], "last_reading": last, "ridge": last - (ridge[held] - ridge[before])}
+    intervals = {name: error_interval(one, held, np.random.default_rng(1)) for name, one in errors.items()}
+    return schema.Tracking(every_min=every * record.block_s / 60.0, **intervals)
 
 
 def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:
@@ -1050,6 +1079,7 @@ class RecordResult:
     answers : what blocks that the coefficients were not fitted to say of every added effect
     away : places of the effects that left the forecast
     forecast : prediction with the others, from the training part
+    tracking : errors with a reading from time to time, None for several runs
     """
 
     state: RecordState
@@ -1066,6 +1096,7 @@ class RecordResult:
     answers: list[Answer]
     away: set[int]
     forecast: Prediction
+    tracking: schema.Tracking | None
 
     @property
     def noise_um(self) -> float:
@@ -1163,11 +1194,7 @@ class RecordResult:
         """Return the part ``loop`` of results.json; errors are means over the channels."""
         mean, final_um = known_mean(self.errors, axis=1), self.final_um
         shape = self.remainder.shape or (BEYOND_PLAIN if self.falls_short else "")
-        sizes = (
-            self.remainder.rms_um,
-            self.wandering_um,
-            excess_um(float(known_mean(final_um)), self.noise_um),
-        )
+        size = max(self.remainder.rms_um or excess_um(float(known_mean(final_um)), self.noise_um), self.wandering_um)
         persistence_um = channel_rmse(self.record, self.plain["last_value"], self.hold_out)
         last = self.state.rounds[-1].scores
         runs: dict[str, Any] = (
@@ -1189,7 +1216,7 @@ class RecordResult:
             unconfirmed_effects=self.state.unnamed(ENTRY_LEVEL),
             unexplained=schema.RecordUnexplained(
                 shape=shape,
-                rms_um=max(sizes) if shape else 0.0,
+                rms_um=size if shape else 0.0,
                 p_value=self.remainder.p_value,
                 p_values=self.remainder.p_values,
                 variance_share=known_mean(self.remainder.variance_share),
@@ -1206,6 +1233,7 @@ class RecordResult:
                 for k, name in enumerate(self.record.channels)
             },
             chained=self.chained,
+            tracking=self.tracking,
             **runs,
             search=[_round_scores(scored) for scored in self.state.rounds],
             not_tried=self.state.not_tried(),
@@ -1298,6 +1326,9 @@ def close_record(
     away = left_out_of_forecast(problem, state, {place for place, one in enumerate(told) if one.word == "no"})
     forecast = problem.predict(state.kept(away))
     final_um = channel_rmse(record, forecast.predicted, ~train)
+    plain, tracking = plain_predictions(record, train), None
+    if not record.runs:
+        tracking = track(record, train, forecast.predicted, plain["ridge"])
     return RecordResult(
         state=state,
         record=record,
@@ -1305,7 +1336,7 @@ def close_record(
         held_out=description,
         predictions=predictions,
         errors=errors,
-        plain=plain_predictions(record, train),
+        plain=plain,
         left_out=left_out,
         whole=whole,
         remainder=examine(whole, final_um, np.random.default_rng(seed)),
@@ -1313,6 +1344,7 @@ def close_record(
         answers=told,
         away=away,
         forecast=forecast,
+        tracking=tracking,
     )
 
 
