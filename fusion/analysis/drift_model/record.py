@@ -1080,6 +1080,7 @@ class RecordResult:
     away : places of the effects that left the forecast
     forecast : prediction with the others, from the training part
     tracking : errors with a reading from time to time, None for several runs
+    wandering_um : root mean square of the random drift beside the final model, mean over the channels, um
     """
 
     state: RecordState
@@ -1097,6 +1098,7 @@ class RecordResult:
     away: set[int]
     forecast: Prediction
     tracking: schema.Tracking | None
+    wandering_um: float
 
     @property
     def noise_um(self) -> float:
@@ -1260,12 +1262,6 @@ class RecordResult:
             event_s=term.candidate.event_s,
         )
 
-    @property
-    def wandering_um(self) -> float:
-        """Root mean square of the random drift beside the final model, mean over the channels, um."""
-        drifts = [unexplained_drift(fit)[0][:, 0] for fit in self.whole.channels]
-        return float(np.mean([np.sqrt(np.mean(drift**2)) for drift in drifts]))
-
     def contribution(self, term: Term) -> Array:
         """Contribution of a term to the prediction by the final model, about its mean."""
         place = place_of(self.state.model.terms, term)
@@ -1345,6 +1341,7 @@ def close_record(
         away=away,
         forecast=forecast,
         tracking=tracking,
+        wandering_um=float(np.mean([np.sqrt(np.mean(unexplained_drift(fit)[0] ** 2)) for fit in whole.channels])),
     )
 
 
