@@ -426,31 +426,20 @@ class AxisProblem(Problem[ModelFit]):
         model = self.fitted(before.model.terms)
         lasting = [place for place, term in enumerate(before.added) if term.candidate.event_s is None]
         here = ~self.used & np.isin(self.readings.site, self.readings.site[self.used])
+        readings, nothing = self.readings.subset(here), np.zeros(int(here.sum()))
         share = {id(term): model.series(term)[0][here] for term in model.terms}
-        events = [share[id(term)] for place, term in enumerate(before.added) if place not in lasting]
-        profile, static = model.profile[here], slice(0, model.profile.shape[1])
+        added = [share[id(term)] for term in before.added]
+        static = slice(0, model.profile.shape[1])
+        known = model.profile[here] @ model.fit.coefficients[static]
+        known = known + sum((one for place, one in enumerate(added) if place not in lasting), nothing)
         variances, directions = np.linalg.eigh(model.fit.covariance[static, static])
-        nothing = np.zeros(int(here.sum()))
+        uncertain = model.profile[here] @ directions * np.sqrt(np.maximum(variances, 0.0))
+        declared = sum((share[id(term)] for term in before.declared), nothing)
         later = [term.candidate.columns[here] for term in state.added[len(before.added) :]]
-        asked = answers(
-            [
-                Unseen(
-                    np.arange(nothing.size),
-                    self.readings.seconds[here],
-                    self.readings.loadings[here],
-                    self.readings.response[here] - profile @ model.fit.coefficients[static] - sum(events, nothing),
-                    np.column_stack(
-                        [
-                            self.readings.loadings[here, 1:],
-                            sum((share[id(term)] for term in before.declared), nothing),
-                            *later,
-                        ]
-                    ),
-                    np.column_stack([np.empty((nothing.size, 0)), *(share[id(before.added[k])] for k in lasting)]),
-                    profile @ directions * np.sqrt(np.maximum(variances, 0.0)),
-                )
-            ]
-        )
+        beside = np.column_stack([readings.loadings[:, 1:], declared, *later])
+        shares = np.array([added[place] for place in lasting]).reshape(len(lasting), -1).T
+        rows, left = np.arange(nothing.size), readings.response - known
+        asked = answers([Unseen(rows, readings.seconds, readings.loadings, left, beside, shares, uncertain)])
         told = dict(zip(lasting, asked, strict=True))
         return [told.get(place) for place in range(len(state.steps))]
 
@@ -1136,22 +1125,8 @@ def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
     """What the blocks that are left out say of an effect, from their errors without it and with it."""
     here = np.isfinite(before_um) & np.isfinite(after_um)
     readings = model.readings.subset(model.used).subset(here)
-    share, none = (before_um - after_um)[here], np.empty((int(here.sum()), 0))
-    loadings = readings.loadings
-    (asked,) = answers(
-        [
-            Unseen(
-                np.arange(share.size),
-                readings.seconds,
-                loadings,
-                before_um[here],
-                loadings[:, 1:],
-                share[:, None],
-                none,
-            )
-        ]
-    )
-    return asked
+    rows, loadings, share = np.arange(int(here.sum())), readings.loadings, (before_um - after_um)[here, None]
+    return answers([Unseen(rows, readings.seconds, loadings, before_um[here], loadings[:, 1:], share)])[0]
 
 
 def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:

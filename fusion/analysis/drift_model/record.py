@@ -1135,11 +1135,8 @@ class RecordResult:
         """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
         final = float(known_mean(self.final_um))
         exceeds = exceeds_noise(final, self.noise_um, RESIDUAL_SHARE)
-        return (
-            any(self._kept)
-            and exceeds
-            and final > min(rmse(self.record, one, self.hold_out) for one in self.plain.values())
-        )
+        plain = min(rmse(self.record, one, self.hold_out) for one in self.plain.values())
+        return any(self._kept) and exceeds and final > plain
 
     @property
     def _kept(self) -> list[bool]:
@@ -1153,20 +1150,16 @@ class RecordResult:
 
     def separable(self, here: NDArray[np.bool_]) -> bool:
         """Whether a cause can be named: ridge regression with lagged copies does not predict these blocks better by a quarter."""
-        final, plain = (
-            rmse(self.record, one, here) for one in (self.forecast.predicted, self.plain["ridge_with_lags"])
-        )
-        return is_separable(final, plain)
+        compared = (self.forecast.predicted, self.plain["ridge_with_lags"])
+        return is_separable(*(rmse(self.record, one, here) for one in compared))
 
     def _verdict(self, here: NDArray[np.bool_], *, remains: bool) -> schema.Verdict:
-        last, mean = self._plain_errors(here)
+        final, plain = rmse(self.record, self.forecast.predicted, here), self._plain_errors(here)
         return verdict(
             named=any(self._kept),
             left=remains or not all(self._kept),
             tested=bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested,
-            skill=has_skill(
-                rmse(self.record, self.forecast.predicted, here), last, mean, self.noise_um, RESIDUAL_SHARE
-            ),
+            skill=has_skill(final, *plain, self.noise_um, RESIDUAL_SHARE),
             separable=self.separable(here),
         )
 
@@ -1360,9 +1353,8 @@ def ask_unseen(
     events = [place for place, term in enumerate(state.added) if term.candidate.event_s is not None]
     lasting = [place for place in range(len(added)) if place not in events]
     response = record.displacement - np.sum([np.zeros(declared.shape), *(added[place] for place in events)], axis=0)
-    told = dict(
-        zip(lasting, answers(_unseen(record, held_out, response, [declared], [added[k] for k in lasting])), strict=True)
-    )
+    asked = answers(_unseen(record, held_out, response, [declared], [added[place] for place in lasting]))
+    told = dict(zip(lasting, asked, strict=True))
     everywhere = np.ones_like(held_out)
     for place in events:
         without = left_out[1 + place]
@@ -1379,14 +1371,9 @@ def _unseen(
     for k in range(len(record.channels)):
         rows = np.flatnonzero(here & np.isfinite(response[:, k]))
         later = (record.run[rows, None] == np.unique(record.run[rows])[1:]).astype(float)
-        columns = (
-            np.column_stack([np.empty((rows.size, 0)), *(one[rows, k] for one in some)]) for some in (beside, shares)
-        )
-        free, predicted = columns
-        one, none = np.ones((rows.size, 1)), np.empty((rows.size, 0))
-        parts.append(
-            Unseen(rows, record.seconds[rows], one, response[rows, k], np.column_stack([later, free]), predicted, none)
-        )
+        free = np.column_stack([later, *(one[rows, k] for one in beside)])
+        predicted = np.array([one[rows, k] for one in shares]).reshape(len(shares), -1).T
+        parts.append(Unseen(rows, record.seconds[rows], np.ones((rows.size, 1)), response[rows, k], free, predicted))
     return parts
 
 

@@ -893,7 +893,7 @@ class Unseen:
     response : (n,) the readings
     beside : (n, q) what may be of any size there beside a level, such as the share of the declared effects
     shares : (n, effects) the predicted share of every effect
-    uncertain : (n, r) errors of what was taken from the response beforehand, one column for each of unit variance
+    uncertain : (n, r) errors of what was taken from the response beforehand, one column for each of unit variance; None for none
     """
 
     rows: NDArray[np.intp]
@@ -902,7 +902,7 @@ class Unseen:
     response: Array
     beside: Array
     shares: Array
-    uncertain: Array
+    uncertain: Array | None = None
 
     def whitened(self) -> tuple[Array, Array, Array, int] | None:
         """Response, shares and uncertain columns freed of `beside` and whitened by the drift and noise of these very readings, and the
@@ -918,8 +918,12 @@ class Unseen:
             fit = estimate(self.seconds, self.loadings, self.response, design, memory=True)
         except DriftModelError:
             return None
+        if fit.sigma <= 0.0:
+            return None
         rates = fit.design[:, design.shape[1] :]
-        asked = np.column_stack([self.response, self.shares, self.uncertain])
+        asked = np.column_stack(
+            [self.response, self.shares, level[:, :0] if self.uncertain is None else self.uncertain]
+        )
         laid = fit.system.whiten(np.column_stack([asked, level, self.beside, rates]))[0] / fit.sigma
         asked, beside = laid[:, : asked.shape[1]], laid[:, asked.shape[1] :]
         left = asked - beside @ np.linalg.lstsq(beside, asked, rcond=None)[0]

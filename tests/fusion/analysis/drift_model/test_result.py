@@ -524,7 +524,6 @@ def unseen(rng: np.random.Generator, size: float, *, channels: int = 3, alike: f
     return [
         Unseen(
             np.arange(100), seconds, np.ones((100, 1)), size * load + walk, rng.standard_normal((100, 1)), load[:, None],
-            np.empty((100, 0)),
         )
         for walk in walks.T
     ]  # fmt: skip
