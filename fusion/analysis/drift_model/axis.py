@@ -437,7 +437,7 @@ class AxisProblem(Problem[ModelFit]):
         declared = sum((share[id(term)] for term in before.declared), nothing)
         later = [term.candidate.columns[here] for term in state.added[len(before.added) :]]
         beside = np.column_stack([readings.loadings[:, 1:], declared, *later])
-        shares = np.array([added[place] for place in lasting]).reshape(len(lasting), -1).T
+        shares = np.array([added[place] for place in lasting]).reshape(len(lasting), nothing.size).T
         rows, left = np.arange(nothing.size), readings.response - known
         asked = answers([Unseen(rows, readings.seconds, readings.loadings, left, beside, shares, uncertain)])
         told = dict(zip(lasting, asked, strict=True))

@@ -1372,7 +1372,7 @@ def _unseen(
         rows = np.flatnonzero(here & np.isfinite(response[:, k]))
         later = (record.run[rows, None] == np.unique(record.run[rows])[1:]).astype(float)
         free = np.column_stack([later, *(one[rows, k] for one in beside)])
-        predicted = np.array([one[rows, k] for one in shares]).reshape(len(shares), -1).T
+        predicted = np.array([one[rows, k] for one in shares]).reshape(len(shares), rows.size).T
         parts.append(Unseen(rows, record.seconds[rows], np.ones((rows.size, 1)), response[rows, k], free, predicted))
     return parts
 
