@@ -245,7 +245,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
     dims = ("time", "channel")
     # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the hold-out set.
     chained = np.array([one.channel_rmse_final_um for one in result.chained]).reshape(-1, len(record.channels))
-    spread = np.fmax(result.errors[-1], np.sqrt(known_mean(chained**2, axis=0)) if len(chained) else 0.0)
+    spread = np.fmax(result.final_um, np.sqrt(known_mean(chained**2, axis=0)) if len(chained) else 0.0)
     dataset = xr.Dataset(
         {
             "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
@@ -281,7 +281,7 @@ def _predictions(record: Record, result: RecordResult) -> dict[str, Any]:
     dims = ("time", "channel")
     named = {
         "declared": result.predictions[0].predicted,
-        "final": result.predictions[-1].predicted,
+        "final": result.forecast.predicted,
         "last_value": result.plain["last_value"],
     }
     variables: dict[str, Any] = {f"predicted_{name}": (dims, values, {"units": "um"}) for name, values in named.items()}

@@ -100,7 +100,7 @@ def compare_records(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]
     """Compare the effects that the loops of two finished records named."""
     results = [read_results(folder) for folder in folders]
     loops = [one.loop for one in results if isinstance(one.loop, RecordLoop)]
-    confirmed = [[step.effect for step in loop.steps if step.confirmed] for loop in loops]
+    confirmed = [[step.effect for step in loop.named] for loop in loops]
     names = list(dict.fromkeys(name for shown in confirmed for name in shown))
     shown_by = {name: [k for k, shown in enumerate(confirmed) if name in shown] for name in names}
     titles = [one.campaign for one in results]

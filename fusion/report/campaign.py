@@ -322,8 +322,8 @@ def _budget_table(shown: Iso230Window, unit: str) -> Table:
 
 #: What the hold-out is for, and what it is not.
 DECIDED_BEFORE = (
-    "What enters is decided on the training part alone. The hold-out is opened once, to report: an effect that it does not confirm "
-    "stays in the table as not confirmed, and the error after may exceed the error before."
+    "What enters is decided on the training part alone. The hold-out is opened once: it bears an effect out, contradicts it, or cannot "
+    "tell, either statement being false with a probability of 0.05. What it contradicts leaves headline and forecast."
 )
 
 
@@ -351,7 +351,7 @@ def steps_table(loop: Loop) -> Table:
     for turn, step in enumerate(loop.steps, start=1):
         held_out = " -> ".join(numbers[2 * turn - 1 : 2 * turn + 1])
         rows.append(Row([str(turn), *_step_cells(step, held_out)], marked=True))
-    titles = ("p", "Held out / µm", "Blocks / µm", Words("Confirmed"), Words("Next best effect"))
+    titles = ("p", "Held out / µm", "Blocks / µm", Words("Borne out"), Words("Next best effect"))
     return table(["Step", Words("Effect"), *titles], rows)
 
 
@@ -362,7 +362,7 @@ def _step_cells(step: StepPart, held_out: str) -> list[str]:
         p_cell(step.p_value),
         held_out,
         " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
-        f"not confirmed: {step.doubt}" if step.doubt else "yes",
+        say("doubt", step) if step.doubt else "yes",
         _runner_up(step.runner_up),
     ]
 

@@ -133,7 +133,7 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
             figures[effect_words(declared.effect).name] = measured(
                 declared.value, declared.u, print_unit(declared.unit)
             )
-        added = join([effect_words(step.effect).name for step in results.loop.steps if step.confirmed])
+        added = join([effect_words(step.effect).name for step in results.loop.named])
         figures["effects that were missing"] = added or "none shown"
     if results.iso230 is not None:
         window = quoted_window(results.iso230)

@@ -77,7 +77,7 @@ def next_steps(results: Results) -> list[str]:
     loop, correlation = results.loop, results.correlation
     if loop is not None:
         steps += [action(step, results.time, record=results.registration is None) for step in loop.steps]
-        if loop.verdict in {"partial", "unexplained", "no_skill"} and not _clock_doubted(results):
+        if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
     steps += [
         f"{position_words(anomaly.target, anomaly.position_mm)}: {anomaly.evidence.check}"

@@ -81,7 +81,7 @@ def _loop_rows(loop: Loop) -> list[tuple[str, str, Figures]]:
     """Return name and text of what the model is and predicts, with the figures that each rests on."""
     rows: list[tuple[str, str, Figures]] = []
     for step in loop.steps:
-        doubt = "" if step.confirmed else ", not confirmed"
+        doubt = f", {say('doubt', step)}" if step.doubt else ""
         rows.append(("added", f"{step.effect} ({p_words(step.p_value)}), {step_errors(step)}{doubt}", "causes"))
     stages = (loop.errors.declared, loop.errors.final) if loop.steps else (loop.errors.declared,)
     numbers = iter(alike([value for one in stages for value in (one.rmse_um, one.low_um, one.high_um)], distinct=False))

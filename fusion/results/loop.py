@@ -8,6 +8,8 @@ from typing import Literal
 from fusion.results.parts import Number, ResultPart, Sensitivity
 
 Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
+#: What readings that an effect was not fitted to say of it; "no": they contradict it.
+BorneOut = Literal["yes", "no", "cannot tell"]
 #: Value of a parameter of an effect: a number in the unit that its name ends with, or a word.
 Parameter = float | int | str
 #: Range of a parameter that fits equally well: its ends (None where the data set none), or the other words.
@@ -68,7 +70,7 @@ class ModelErrors(ResultPart):
     declared: ErrorInterval
     """Of the declared model."""
     final: ErrorInterval
-    """With the effects that the training part alone decided on."""
+    """With the effects that the training part alone decided on, without those that left the forecast."""
 
 
 class Baselines(ResultPart):
@@ -123,11 +125,27 @@ class StepPart(ResultPart):
     runner_up: RunnerUp | Nothing
     """The next best effect."""
     confirmed: bool
-    """Whether readings that were not used to find it support it; false: the effect is not confirmed."""
+    """Whether readings that it was not fitted to bear it out; false: they contradict it, or cannot tell."""
     doubt: str
-    """Why it is not confirmed, with both errors; empty where it is."""
+    """Why it is not borne out; empty where it is."""
+    borne_out: BorneOut | None = None
+    """Whether those readings, the hold-out or for an event blocks that are left out, bear it out; no: they contradict it, it leaves the
+    forecast and its name the headline. Either statement is false with a probability of 0.05. Null in results of earlier versions."""
+    borne_out_p: Number = None
+    """Probability of a size as large there where the effect is not there."""
+    borne_out_size: Number = None
+    """Size with which it acts there over that predicted, 1: 1 where it is right, 0 where it is not there; null where it does not change."""
+    borne_out_size_u: Number = None
+    """Standard uncertainty of that."""
+    borne_out_power: Number = None
+    """Probability that these readings bear a right effect out."""
     confirmed_by: str
     """How it was confirmed before it entered."""
+
+    @property
+    def keeps_name(self) -> bool:
+        """Whether readings that it was not fitted to do not contradict it."""
+        return self.confirmed if self.borne_out is None else self.borne_out != "no"
 
 
 class AxisStep(StepPart):
@@ -162,7 +180,7 @@ class Unexplained(ResultPart):
     shape: str
     """Description; empty where nothing is left."""
     rms_um: Number
-    """Its root mean square, um."""
+    """Its root mean square, um: the larger of what the shape describes and the random drift that the model allows."""
     p_value: Number
     """p-value of any structure in the residual, family-wise over the shapes."""
     closest_effect: str
@@ -289,7 +307,7 @@ class DetectionLimit(ResultPart):
     worst_um: Number
     """The same for the candidate that is hardest to detect, um."""
     visible_share: Number
-    """Share of the effect's root mean square that is not absorbed by profile and declared effects, 1."""
+    """Share of the effect's root mean square that is not absorbed by profile and declared effects, 1; null where it does not vary."""
     confounded_with: tuple[str, ...]
     """Effects that are collinear with what is visible of it."""
     note: str
@@ -384,17 +402,28 @@ class Loop(HoldOutErrors):
     """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
     steps: tuple[StepPart, ...]
     """Effects that were added, in turn."""
+    separable: bool = True
+    """Whether a cause can be named: false where ridge regression with lagged copies predicts the hold-out better by a quarter."""
+    wandering_um: Number = None
+    """Root mean square of the random drift that the final model allows beside its effects, um; null in results of earlier versions."""
     verdict: Verdict
     """complete: nothing is missing; explained: effects added, nothing is left; partial: something is left; unexplained: something is left
-    and no effect is confirmed; no_skill: the model predicts no better than the last value or the mean, these data cannot tell."""
+    and no effect deserves its name; no_skill: the model predicts no better than the last value or the mean, these data cannot tell."""
     unconfirmed_effects: Mapping[str, Number]
     """Effects that are significant and were not admitted or not confirmed, with their p-value."""
+    left_out_of_forecast: tuple[str, ...] = ()
+    """Added effects without which the final error is predicted: the hold-out contradicts them, or is predicted worse with them."""
     unexplained: Unexplained
     """What is left."""
     not_tried: Mapping[str, str]
     """Effects that were not tried, with the reason."""
     not_admitted: Mapping[str, str]
     """Effects that were tried and not admitted, with the reason."""
+
+    @property
+    def named(self) -> tuple[StepPart, ...]:
+        """The added effects that keep their name: not contradicted, and a cause can be separated."""
+        return tuple(one for one in self.steps if self.separable and one.keeps_name)
 
 
 class AxisLoop(Loop):
@@ -500,6 +529,19 @@ class RunPart(HoldOutErrors):
     """Verdict by the errors in this run; empty where it is not held out."""
 
 
+class Tracking(ResultPart):
+    """Errors on the hold-out where the displacements are read again from time to time; means over the channels."""
+
+    every_min: Number
+    """Time from one reading to the next, min."""
+    model: ErrorInterval
+    """Of the final model, its random drift carried on from the readings by the Kalman filter."""
+    last_reading: ErrorInterval
+    """Of repeating the last reading."""
+    ridge: ErrorInterval
+    """Of ridge regression started at the last reading."""
+
+
 class RecordLoop(Loop):
     """What the closed loop found on a record; errors are means over the channels."""
 
@@ -509,6 +551,8 @@ class RecordLoop(Loop):
     """What is left."""
     channels: Mapping[str, ChannelErrors]
     """Errors by channel."""
+    tracking: Tracking | None = None
+    """Errors with a reading from time to time; null for several runs, and in results of earlier versions."""
     chained: tuple[ChainedPart, ...]
     """Forward-chained parts."""
     search: tuple[tuple[RecordScorePart, ...], ...]

@@ -164,7 +164,7 @@ def broken_invariants(results: dict[str, Any]) -> list[str]:
     walk(results, "results")
     loop = results.get("loop")
     if loop is not None:
-        steps, verdict = [step for step in loop["steps"] if step.get("confirmed", True)], loop["verdict"]
+        steps, verdict = [step for step in loop["steps"] if step.get("borne_out") != "no"], loop["verdict"]
         if (verdict == "complete" and steps) or (verdict in ("explained", "partial") and not loop["steps"]):
             faults.append(f"verdict {verdict} with {len(loop['steps'])} steps")
     return faults

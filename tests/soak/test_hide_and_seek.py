@@ -219,8 +219,8 @@ def ask(case: Case) -> Answer:
     assert isinstance(loop, RecordLoop)
     return Answer(
         loop.verdict,
-        tuple(step.effect for step in loop.steps if step.confirmed),
-        tuple(step.effect for step in loop.steps if not step.confirmed),
+        tuple(step.effect for step in loop.named),
+        tuple(step.effect for step in loop.steps if step not in loop.named),
         tuple(loop.unconfirmed_effects),
         tuple(f"{one.sensor.split('(')[0]} {one.state.replace('_', ' ')}" for one in loop.sensor_faults),
         loop.rmse_declared_um,

@@ -8,16 +8,17 @@ did not help on earlier parts of the record.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fusion.analysis.drift_model.record import declare, hold_out, search_record
+from fusion.analysis.drift_model.record import ask_unseen, declare, hold_out, search_record
 from fusion.analysis.drift_model.record_data import reduce_record
 from fusion.analysis.drift_model.search import open_hold_out
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
-from tests.soak.rates import campaigns, first_seed
+from tests.soak.rates import campaigns, first_seed, rate, wilson
 
 pytestmark = pytest.mark.slow
 
@@ -55,3 +56,31 @@ def test_rates_of_names_on_records(capsys: pytest.CaptureFixture[str]) -> None:
         print("\n" + "\n".join(rows))
     # Twice the error that the level of the search allows, plus three standard deviations of a count of RUNS.
     assert wrong["none"] <= 0.1 * RUNS + 3.0 * np.sqrt(0.1 * 0.9 * RUNS)
+
+
+#: Size of a random walk over the hold-out, in standard deviations of the displacement before.
+WALKS = (0.03, 0.1, 0.3, 1.0)
+
+
+@pytest.mark.parametrize("kind", ["unseen_heat_source", "periodic_disturbance"])
+def test_a_hold_out_that_wanders_at_random_bears_no_effect_out(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The displacements of the hold-out are replaced by random walks, in part alike in all channels, which follow nothing."""
+    rng, told = np.random.default_rng(FIRST_SEED), Counter[str]()
+    for seed in range(FIRST_SEED, FIRST_SEED + RUNS):
+        record = reduce_record(twin_table(KINDS[kind], seed=seed))
+        train, _ = hold_out(record)
+        problem, state = search_record(record, train, declare(["quasi_static"], record))
+        final, scale = problem.predict(state.model.terms), record.displacement[train].std(axis=0)
+        for size in WALKS:
+            steps = rng.standard_normal(((~train).sum(), scale.size)) + rng.standard_normal(((~train).sum(), 1))
+            displacement = record.displacement.copy()
+            walk = np.cumsum(steps, axis=0) / np.sqrt(2.0 * len(steps)) + 0.02 * rng.standard_normal(steps.shape)
+            displacement[~train] = displacement[train][-1] + size * scale * walk
+            wandering = replace(record, displacement=displacement)
+            lasting = [term.candidate.event_s is None for term in state.added]
+            left_out = [displacement] * (1 + len(lasting))
+            asked = ask_unseen(wandering, ~train, state, final, left_out)
+            told.update(one.word for one, lasts in zip(asked, lasting, strict=True) if lasts)
+    with capsys.disabled():
+        print(f"\n{kind}: borne out by a random walk {rate(told['yes'], told.total())}, {dict(told)}")
+    assert wilson(told["yes"], told.total())[0] <= 0.05

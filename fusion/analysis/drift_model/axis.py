@@ -49,12 +49,14 @@ from fusion.analysis.drift_model.fit import (
 from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
 from fusion.analysis.drift_model.search import (
     BASELINE_LAGS_MIN,
+    BEYOND_PLAIN,
     FINAL,
     HOLD_OUT_SHARE,
     LEVEL_TO_CONFIRM,
     MOST_EFFECTS,
     MOST_EVENTS,
     PENALTIES,
+    Answer,
     Confirmation,
     Confirmed,
     Decision,
@@ -64,12 +66,17 @@ from fusion.analysis.drift_model.search import (
     Reason,
     Round,
     Score,
+    Unseen,
+    answers,
     choose,
-    doubt_of,
     error_interval,
     errors_of_predictions,
+    exceeds_noise,
+    excess_um,
     has_skill,
+    is_separable,
     kept_on_disk,
+    left_out_of_forecast,
     no_progress,
     open_hold_out,
     refine,
@@ -87,6 +94,7 @@ from fusion.common import Array, FusionError
 from fusion.results import loop as schema
 from fusion.results.parts import Number
 from interferometry.common import one_thread
+from interferometry.drift.gls import DriftFit
 from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces
 
 if TYPE_CHECKING:
@@ -101,6 +109,8 @@ _ALIKE_SHARE = 0.9
 #: Largest size that is looked for, um per reading, and simulated campaigns that suffice for the scatter that a drift leaves.
 _LARGEST_UM = 1e3
 _DRAWS = 20
+#: Share of its size by which a column that never moves differs from its mean: rounding.
+_ROUNDING = 1e-9
 
 
 def detection_limits(
@@ -119,8 +129,9 @@ def detection_limits(
     own, left, spread = _beside(model, candidates)
     smallest = _smallest(products, spread, wanted)
     # A column that never moves has no size.
-    sizes = np.where(own > 0.0, own, np.inf) * smallest
-    share = left / np.maximum(own, 1e-300)
+    moves = own > 0.0
+    sizes = np.where(moves, own, np.inf) * smallest
+    share = np.divide(left, own, out=np.full(own.size, np.nan), where=moves)
     # Of every effect the candidate that shows like the median of them.
     places = {name: np.flatnonzero(names == name) for name in families}
     typical = [int(own_places[np.argsort(sizes[own_places])[own_places.size // 2]]) for own_places in places.values()]
@@ -135,12 +146,18 @@ def detection_limits(
                 detectable_um=float(np.median(seen)) if seen.size else None,
                 best_um=float(seen.min()) if seen.size else None,
                 worst_um=float(seen.max()) if seen.size else None,
-                visible_share=float(np.median(share[places[name]])),
+                visible_share=_median(share[places[name]]),
                 confounded_with=tuple(sorted(alike[row] - {name})),
                 note=_note(effects[name], candidates[int(places[name][np.argmin(here)])], model, seen.size),
             )
         )
     return limits
+
+
+def _median(values: Array) -> float | None:
+    """Median of the known values, None where there is none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
 
 
 def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Array, Array]:
@@ -151,7 +168,8 @@ def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Ar
     own, left, spread = np.empty((3, len(candidates)))
     for k, candidate in enumerate(candidates):
         column = candidate.columns[model.used][:, 0]
-        own[k] = np.sqrt(np.mean((column - (np.bincount(site, column) / number)[site]) ** 2))
+        about = column - (np.bincount(site, column) / number)[site]
+        own[k] = np.sqrt(np.mean(about**2)) if np.abs(about).max() > _ROUNDING * np.abs(column).max() else 0.0
         left[k] = np.sqrt(np.mean((column - q @ (q.T @ column)) ** 2))
         spread[k] = column.std()
     return own, left, spread
@@ -282,25 +300,27 @@ def close_loop(
     state = search(problem, start, progress=progress)
     state = reject_inconsistent_patterns(problem, state)
     progress(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the hold-out set")
-    state = problem.evaluate_on_hold_out(open_hold_out(problem, state))
-    decided = state.model.terms
-    state = replace(state, model=size_camera_errors(fit_model(readings, decided), effects))
+    before = problem.evaluate_on_hold_out(open_hold_out(problem, state))
+    state = replace(before, model=size_camera_errors(fit_model(readings, before.model.terms), effects))
     progress(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
     state = reject_inconsistent_patterns(problem, second_search(problem, state))
     left = examine_remainder(state.model, seed, set_aside)
-    steps = report_steps(state, inconsistent_patterns(state.model, state.added, effects))
-    # Effects that are not confirmed must not move the coefficients of the declared ones.
-    doubtful = [place for place, step in enumerate(steps) if not step.confirmed]
-    sure = fit_model(readings, state.kept(doubtful)) if doubtful else state.model
-    errors = {"declared": problem.hold_out_errors(terms), "final": problem.hold_out_errors(decided)}
-    errors |= plain_errors(readings, used)
+    wrong = inconsistent_patterns(state.model, state.added, effects)
+    steps = report_steps(state, wrong, problem.ask_hold_out(before, state))
+    # Effects that are contradicted must not move the coefficients of the declared ones.
+    contradicted = [place for place, step in enumerate(steps) if not step.keeps_name]
+    sure = fit_model(readings, state.kept(contradicted)) if contradicted else state.model
+    away = left_out_of_forecast(problem, before, contradicted)
+    final = problem.hold_out_errors(before.kept(away))
+    errors = {"declared": problem.hold_out_errors(terms), "final": final, **plain_errors(readings, used)}
     result = LoopResult(
         declared=list(declared),
         declared_coefficients=declared_coefficients(sure, len(terms)),
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
         rmse_declared_um=state.errors_um[0],
-        rmse_final_um=state.errors_um[-1],
+        rmse_final_um=rmse(final),
+        left_out_of_forecast=tuple(steps[place].effect for place in sorted(away)),
         hold_out={
             name: error_interval(missed, readings.cycle[~used], np.random.default_rng(seed))
             for name, missed in errors.items()
@@ -311,6 +331,7 @@ def close_loop(
         unnamed=state.unnamed(SECOND_LEVEL),
         remainder=left,
         residual_drift=residual_drift_size(state.model),
+        wandering_um=wandering_um(state.model.fit),
         state=state,
         before=start.model,
         after=state.model,
@@ -399,6 +420,28 @@ class AxisProblem(Problem[ModelFit]):
             used = self.used | fitted
             errors[~used] = fit_model(self.readings, terms, used=used).open_loop_errors()[0]
         return errors[~self.used]
+
+    def ask_hold_out(self, before: AxisState, state: AxisState) -> list[Answer | None]:
+        """What the hold-out cycles say of every step; None of an event and of what was found when they had been opened."""
+        model = self.fitted(before.model.terms)
+        lasting = [place for place, term in enumerate(before.added) if term.candidate.event_s is None]
+        here = ~self.used & np.isin(self.readings.site, self.readings.site[self.used])
+        readings, nothing = self.readings.subset(here), np.zeros(int(here.sum()))
+        share = {id(term): model.series(term)[0][here] for term in model.terms}
+        added = [share[id(term)] for term in before.added]
+        static = slice(0, model.profile.shape[1])
+        known = model.profile[here] @ model.fit.coefficients[static]
+        known = known + sum((one for place, one in enumerate(added) if place not in lasting), nothing)
+        variances, directions = np.linalg.eigh(model.fit.covariance[static, static])
+        uncertain = model.profile[here] @ directions * np.sqrt(np.maximum(variances, 0.0))
+        declared = sum((share[id(term)] for term in before.declared), nothing)
+        later = [term.candidate.columns[here] for term in state.added[len(before.added) :]]
+        beside = np.column_stack([readings.loadings[:, 1:], declared, *later])
+        shares = np.array([added[place] for place in lasting]).reshape(len(lasting), nothing.size).T
+        rows, left = np.arange(nothing.size), readings.response - known
+        asked = answers([Unseen(rows, readings.seconds, readings.loadings, left, beside, shares, uncertain)])
+        told = dict(zip(lasting, asked, strict=True))
+        return [told.get(place) for place in range(len(state.steps))]
 
     def is_late(self, term: Term) -> bool:
         """Whether a term is an event among the hold-out cycles, of which the cycles before say nothing."""
@@ -552,7 +595,10 @@ def on_corrected_fields(
         if step.is_from_second_search
     }
     decided = [term for term, old in zip(terms, kept, strict=True) if id(old) not in late]
-    errors_um = problem.hold_out_errors(decided)
+    away = result.left_out_of_forecast
+    errors_um = problem.hold_out_errors(
+        [one for one in decided if one.effect not in away or one.effect in result.declared]
+    )
     interval = error_interval(errors_um, readings.cycle[~used], np.random.default_rng(seed))
     return replace(
         result,
@@ -563,6 +609,7 @@ def on_corrected_fields(
         hold_out_errors={**result.hold_out_errors, "final": errors_um},
         remainder=examine_remainder(model, seed, ()),
         residual_drift=residual_drift_size(model),
+        wandering_um=wandering_um(model.fit),
         after=model,
     )
 
@@ -857,6 +904,10 @@ class LoopResult:
         Structure that the final model leaves.
     residual_drift : ResidualDrift
         Size of the unexplained drift.
+    left_out_of_forecast : tuple of str
+        Added effects without which the final error is predicted.
+    wandering_um : float, um
+        Root mean square of the unexplained drift, common part and stretch together.
     state : LoopState
         The last state of the loop: every round and every decision.
     before, after : ModelFit
@@ -876,6 +927,8 @@ class LoopResult:
     unnamed: Mapping[str, float]
     remainder: Remainder
     residual_drift: schema.ResidualDrift
+    left_out_of_forecast: tuple[str, ...]
+    wandering_um: float
     state: LoopState[ModelFit]
     before: ModelFit
     after: ModelFit
@@ -900,7 +953,7 @@ class LoopResult:
             (
                 "added",
                 f"{step.effect} ({', '.join(map(_words_of, step.parameters.items()))}), p = {step.p_value:.2g}, "
-                f"{'confirmed' if step.confirmed else 'not confirmed'}",
+                f"{step.doubt or 'borne out'}",
             )
             for step in self.steps
         ]
@@ -929,13 +982,30 @@ class LoopResult:
     @property
     def verdict(self) -> schema.Verdict:
         """Word for the outcome."""
+        kept = [step.keeps_name for step in self.steps]
         return verdict(
-            confirmed=any(step.confirmed for step in self.steps),
-            doubtful=not all(step.confirmed for step in self.steps),
+            named=any(kept),
+            left=bool(self.remainder.shape) or not all(kept) or self._falls_short,
             tested=bool(self.unnamed) or self.remainder.is_tested,
-            remains=bool(self.remainder.shape),
             skill=self.skill,
+            separable=self.separable,
         )
+
+    @property
+    def separable(self) -> bool:
+        """Whether a cause can be named: ridge regression with lagged copies does not predict better by a quarter."""
+        return is_separable(self._error("final"), self._error("ridge_with_lags"))
+
+    def _error(self, name: str) -> float:
+        """Error of a prediction of the hold-out set, um."""
+        return float(self.hold_out[name].rmse_um or 0.0)
+
+    @property
+    def _falls_short(self) -> bool:
+        """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
+        final, plain = self._error("final"), min(map(self._error, self.hold_out.keys() - {"declared", "final"}))
+        exceeds = exceeds_noise(final, self.noise_floor_um, remainder.DRIFT_SHARE)
+        return any(step.keeps_name for step in self.steps) and exceeds and final > plain
 
     def described(
         self,
@@ -957,6 +1027,9 @@ class LoopResult:
             steps=self.steps,
             verdict=self.verdict,
             unconfirmed_effects=self.unnamed,
+            separable=self.separable,
+            wandering_um=self.wandering_um,
+            left_out_of_forecast=self.left_out_of_forecast,
             unexplained=self._unexplained(),
             residual_drift=self.residual_drift,
             noise=_noise_of(self.after),
@@ -985,7 +1058,10 @@ class LoopResult:
                 "closest_effect_share": shares[best],
             }
         left = self.remainder
-        return schema.AxisUnexplained(shape=left.shape, rms_um=left.rms_um, p_value=left.p_value, **nearest)
+        shape = left.shape or (BEYOND_PLAIN if self._falls_short else "")
+        # The held-out error of a drift that is carried on at its rate says nothing of the size of what drifts.
+        size = max(left.rms_um or excess_um(self._error("final"), self.noise_floor_um), self.wandering_um)
+        return schema.AxisUnexplained(shape=shape, rms_um=size if shape else 0.0, p_value=left.p_value, **nearest)
 
 
 def _words_of(parameter: tuple[str, Any]) -> str:
@@ -1004,12 +1080,14 @@ def _score_of(score: Score) -> schema.AxisScore:
     )
 
 
-def report_steps(state: LoopState[ModelFit], wrong: Mapping[int, Decision]) -> list[AddedEffect]:
-    """Describe the steps of a loop whose hold-out set has been opened."""
-    return [_added_effect(state, place, wrong.get(place)) for place in range(len(state.steps))]
+def report_steps(
+    state: LoopState[ModelFit], wrong: Mapping[int, Decision], held_out: Sequence[Answer | None]
+) -> list[AddedEffect]:
+    """Describe the steps of a loop whose hold-out set has been opened, with what that set says of them."""
+    return [_added_effect(state, place, wrong.get(place), asked) for place, asked in enumerate(held_out)]
 
 
-def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None) -> AddedEffect:
+def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None, asked: Answer | None) -> AddedEffect:
     model, term, step = state.model, state.added[place], state.steps[place]
     event_s = term.candidate.event_s
     before_um, after_um, without_um = (np.nan,) * 3
@@ -1022,18 +1100,13 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
         # The cycle of the first reading at or after the event.
         later = np.flatnonzero(model.readings.seconds >= event_s)
         event_cycle = int(model.readings.cycle[later[0] if later.size else -1])
-    # The drift that is carried into the hold-out set has learnt an early step by then, and what happened only in the hold-out set makes
-    # every error there larger.
-    held_out_tells = event_s is None and not any(one.is_from_second_search for one in state.steps)
+    # The drift that is carried into the hold-out set has learnt an early step by then.
+    where = "on the hold-out set" if asked else "in blocks that are left out"
+    answer = asked or _ask_blocks(model, cross_before_um, cross_after_um)
     if wrong is not None:
-        doubt = wrong.sentence
-    elif held_out_tells:
-        doubt = doubt_of(state.errors_um[-1], without_um, model.fit.sigma, "on the hold-out set")
-    else:
-        errors_um = rmse(cross_after_um), rmse(cross_before_um)
-        doubt = doubt_of(*errors_um, model.fit.sigma, "of blocks that are left out")
+        answer = replace(answer, against=wrong.sentence)
     return AddedEffect(
-        **step.described(term.candidate, doubt),
+        **step.described(term.candidate, answer, where),
         coefficients=coefficients_of(model, term),
         held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
         rmse_before_um=before_um,
@@ -1046,6 +1119,14 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
         rms_um=_size(model, term),
         event_cycle=event_cycle,
     )
+
+
+def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
+    """What the blocks that are left out say of an effect, from their errors without it and with it."""
+    here = np.isfinite(before_um) & np.isfinite(after_um)
+    readings = model.readings.subset(model.used).subset(here)
+    rows, loadings, share = np.arange(int(here.sum())), readings.loadings, (before_um - after_um)[here, None]
+    return answers([Unseen(rows, readings.seconds, loadings, before_um[here], loadings[:, 1:], share)])[0]
 
 
 def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:
@@ -1092,6 +1173,12 @@ def _noise_of(model: ModelFit) -> schema.NoisePart:
         correlation_time_s=within.time_s if within else None,
         cycle_correlation=float(model.memory.weights.sum()),
     )
+
+
+def wandering_um(fit: DriftFit) -> float:
+    """Root mean square of the random drift beside everything that the model names, um."""
+    drift, _ = unexplained_drift(fit)
+    return float(np.sqrt(np.mean(drift.sum(axis=1) ** 2)))
 
 
 def residual_drift_size(model: ModelFit) -> schema.ResidualDrift:

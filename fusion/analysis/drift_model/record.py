@@ -30,16 +30,18 @@ from fusion.analysis.alignment.sensor_health import (
 )
 from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
-from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems
+from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems, unexplained_drift
 from fusion.analysis.drift_model.gains import by_width, profile_gains
 from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk, rank_p_value
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
 from fusion.analysis.drift_model.search import (
     BASELINE_LAGS_MIN,
+    BEYOND_PLAIN,
     BUILT_IN,
     HOLD_OUT_SHARE,
     MOST_EFFECTS,
     PENALTIES,
+    Answer,
     Confirmation,
     Confirmed,
     Decision,
@@ -50,11 +52,15 @@ from fusion.analysis.drift_model.search import (
     Reason,
     Round,
     Score,
-    doubt_of,
+    Unseen,
+    answers,
     error_interval,
     errors_of_predictions,
     exceeds_noise,
+    excess_um,
     has_skill,
+    is_separable,
+    left_out_of_forecast,
     no_progress,
     not_confirmed,
     open_hold_out,
@@ -71,7 +77,7 @@ from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.common import Array
 from fusion.results import loop as schema
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
-from interferometry.drift.kalman import DriftModelError
+from interferometry.drift.kalman import DriftModelError, drift_system
 
 # Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training
 # part.
@@ -205,6 +211,35 @@ def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Arr
         "ridge": predict(record, now, train).predicted,
         "ridge_with_lags": predict(record, np.column_stack([now, *late]), train).predicted,
     }
+
+
+#: Readings of the hold-out set that a prediction which tracks is given: often enough for an interval, seldom enough to need a model.
+_READINGS = 10
+
+
+def track(record: Record, train: NDArray[np.bool_], forecast: Array, ridge: Array) -> schema.Tracking:
+    """Predict the hold-out set with a reading of all channels from time to time, weighed by the drift of what the forecast misses."""
+    held = np.flatnonzero(~train)
+    every = max(1, held.size // _READINGS)
+    read = train.copy()
+    read[held[every - 1 :: every]] = True
+    # The last block that was read before each one.
+    before = np.maximum.accumulate(np.where(read, np.arange(read.size), 0))[held - 1]
+    carried = np.full(record.displacement.shape, np.nan)
+    for k in range(len(record.channels)):
+        rows = np.flatnonzero(np.isfinite(record.displacement[:, k]))
+        seconds, one = record.seconds[rows], np.ones((rows.size, 1))
+        off = (record.displacement - forecast)[rows, k]
+        # A random walk is carried on at its level: a rate would be carried on as well, and hours ahead it leads astray.
+        before_it = train[rows]
+        fit = estimate(seconds[before_it], one[before_it], off[before_it], one[before_it], order=1, robust=True)
+        told = drift_system(seconds, one, order=1, ratios=fit.system.ratios, observed=read[rows])
+        missed, _ = told.innovations(np.column_stack([off, one]))
+        carried[rows, k] = missed[:, 0] - missed[:, 1] * fit.coefficients[0]
+    last = record.displacement[held] - record.displacement[before]
+    errors = {"model": carried[held], "last_reading": last, "ridge": last - (ridge[held] - ridge[before])}
+    intervals = {name: error_interval(one, held, np.random.default_rng(1)) for name, one in errors.items()}
+    return schema.Tracking(every_min=every * record.block_s / 60.0, **intervals)
 
 
 def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:
@@ -1050,7 +1085,11 @@ class RecordResult:
     whole : the final model fitted to all blocks, for its residual
     remainder : structure that the final model leaves
     chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
-    without : predictions of the final model without each of its effects in turn; of a record of several runs
+    answers : what blocks that the coefficients were not fitted to say of every added effect
+    away : places of the effects that left the forecast
+    forecast : prediction with the others, from the training part
+    tracking : errors with a reading from time to time, None for several runs
+    wandering_um : root mean square of the random drift beside the final model, mean over the channels, um
     """
 
     state: RecordState
@@ -1064,7 +1103,11 @@ class RecordResult:
     whole: RecordFit
     remainder: RecordRemainder
     chained: list[ChainedResult]
-    without: list[Prediction] = field(default_factory=list)
+    answers: list[Answer]
+    away: set[int]
+    forecast: Prediction
+    tracking: schema.Tracking | None
+    wandering_um: float
 
     @property
     def noise_um(self) -> float:
@@ -1080,17 +1123,16 @@ class RecordResult:
     @property
     def hold_out_intervals(self) -> dict[str, schema.ErrorInterval]:
         """Errors on the hold-out set with their intervals: of the declared and the final model, and of plain predictions."""
-        declared, final = (self.predictions[k].predicted for k in (0, -1))
-        predicted = {"declared": declared, "final": final, **self.plain}
+        final = self.forecast.predicted
+        predicted = {"declared": self.predictions[0].predicted, "final": final, **self.plain}
         rows = np.flatnonzero(self.hold_out)
         errors = {name: (self.record.displacement - values)[rows] for name, values in predicted.items()}
         return {name: error_interval(one, rows, np.random.default_rng(1)) for name, one in errors.items()}
 
     @property
-    def skill(self) -> bool:
-        """Whether the final model predicts the hold-out set better than last value and mean of the training part."""
-        last, mean = self._plain_errors(self.hold_out)
-        return has_skill(float(known_mean(self.errors[-1])), last, mean, self.noise_um, RESIDUAL_SHARE)
+    def final_um(self) -> Array:
+        """Error of the forecast on the hold-out set (channels,), um."""
+        return channel_rmse(self.record, self.forecast.predicted, self.hold_out)
 
     def _plain_errors(self, here: NDArray[np.bool_]) -> tuple[float, float]:
         """Errors of repeating the last value, and of the better mean: of all values, or of the other runs' courses, um."""
@@ -1098,20 +1140,37 @@ class RecordResult:
         return errors["last_value"], min(errors["mean"], errors.get("mean_run", np.inf))
 
     @property
-    def doubts(self) -> list[str]:
-        """For every step why the hold-out set does not confirm it; empty where it does."""
-        after = float(known_mean(self.errors[-1]))
-        where = "on the hold-out set"
-        return [doubt_of(after, without, self.noise_um, where) for without in self.state.errors_without_um]
+    def falls_short(self) -> bool:
+        """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
+        final = float(known_mean(self.final_um))
+        exceeds = exceeds_noise(final, self.noise_um, RESIDUAL_SHARE)
+        plain = min(rmse(self.record, one, self.hold_out) for one in self.plain.values())
+        return any(self._kept) and exceeds and final > plain
+
+    @property
+    def _kept(self) -> list[bool]:
+        """For every step whether its name stands."""
+        return [one.word != "no" for one in self.answers]
 
     @property
     def verdict(self) -> schema.Verdict:
         """Word for the outcome."""
-        return self._verdict(self.doubts, remains=bool(self.remainder.shape), skill=self.skill)
+        return self._verdict(self.hold_out, remains=bool(self.remainder.shape) or self.falls_short)
 
-    def _verdict(self, doubts: Sequence[str], *, remains: bool, skill: bool) -> schema.Verdict:
-        tested = bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested
-        return verdict(confirmed=not all(doubts), doubtful=any(doubts), tested=tested, remains=remains, skill=skill)
+    def separable(self, here: NDArray[np.bool_]) -> bool:
+        """Whether a cause can be named: ridge regression with lagged copies does not predict these blocks better by a quarter."""
+        compared = (self.forecast.predicted, self.plain["ridge_with_lags"])
+        return is_separable(*(rmse(self.record, one, here) for one in compared))
+
+    def _verdict(self, here: NDArray[np.bool_], *, remains: bool) -> schema.Verdict:
+        final, plain = rmse(self.record, self.forecast.predicted, here), self._plain_errors(here)
+        return verdict(
+            named=any(self._kept),
+            left=remains or not all(self._kept),
+            tested=bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested,
+            skill=has_skill(final, *plain, self.noise_um, RESIDUAL_SHARE),
+            separable=self.separable(here),
+        )
 
     def _run(self, number: int) -> schema.RunPart:
         """One run, judged by its own errors where it is held out."""
@@ -1120,17 +1179,10 @@ class RecordResult:
         last = declared = final = np.nan
         word: schema.Verdict | Literal[""] = ""
         if described.held_out:
-            last, mean = self._plain_errors(here)
-            declared, final = (rmse(self.record, self.predictions[k].predicted, here) for k in (0, -1))
-            doubts = [
-                doubt_of(final, rmse(self.record, one.predicted, here), self.noise_um, "in this run")
-                for one in self.without
-            ]
-            word = self._verdict(
-                doubts,
-                remains=exceeds_noise(final, self.noise_um, RESIDUAL_SHARE),
-                skill=has_skill(final, last, mean, self.noise_um, RESIDUAL_SHARE),
-            )
+            last, _ = self._plain_errors(here)
+            predicted = (self.predictions[0].predicted, self.forecast.predicted)
+            declared, final = (rmse(self.record, one, here) for one in predicted)
+            word = self._verdict(here, remains=exceeds_noise(final, self.noise_um, RESIDUAL_SHARE))
         return schema.RunPart(
             file=described.name,
             held_out=described.held_out,
@@ -1144,7 +1196,9 @@ class RecordResult:
 
     def described(self, sensor_faults: Sequence[schema.SensorFaultPart]) -> schema.RecordLoop:
         """Return the part ``loop`` of results.json; errors are means over the channels."""
-        mean = known_mean(self.errors, axis=1)
+        mean, final_um = known_mean(self.errors, axis=1), self.final_um
+        shape = self.remainder.shape or (BEYOND_PLAIN if self.falls_short else "")
+        size = max(self.remainder.rms_um or excess_um(float(known_mean(final_um)), self.noise_um), self.wandering_um)
         persistence_um = channel_rmse(self.record, self.plain["last_value"], self.hold_out)
         last = self.state.rounds[-1].scores
         runs: dict[str, Any] = (
@@ -1156,30 +1210,34 @@ class RecordResult:
             noise_floor_um=self.noise_um,
             rmse_persistence_um=known_mean(persistence_um),
             rmse_declared_um=mean[0],
-            rmse_final_um=mean[-1],
+            rmse_final_um=known_mean(final_um),
             steps=[self._step(place) for place in range(len(self.state.steps))],
             **errors_of_predictions(self.hold_out_intervals),
             verdict=self.verdict,
+            separable=self.separable(self.hold_out),
+            wandering_um=self.wandering_um,
+            left_out_of_forecast=tuple(self.state.steps[place].effect for place in sorted(self.away)),
             unconfirmed_effects=self.state.unnamed(ENTRY_LEVEL),
             unexplained=schema.RecordUnexplained(
-                shape=self.remainder.shape,
-                rms_um=self.remainder.rms_um,
+                shape=shape,
+                rms_um=size if shape else 0.0,
                 p_value=self.remainder.p_value,
                 p_values=self.remainder.p_values,
                 variance_share=known_mean(self.remainder.variance_share),
-                closest_effect=last[0].name if self.remainder.shape and last else "",
+                closest_effect=last[0].name if shape and last else "",
             ),
             channels={
                 name: schema.ChannelErrors(
                     rmse_persistence_um=persistence_um[k],
                     rmse_declared_um=self.errors[0, k],
-                    rmse_final_um=self.errors[-1, k],
+                    rmse_final_um=final_um[k],
                     noise_um=self.whole.sigma[k],
                     variance_share=self.remainder.variance_share[k],
                 )
                 for k, name in enumerate(self.record.channels)
             },
             chained=self.chained,
+            tracking=self.tracking,
             **runs,
             search=[_round_scores(scored) for scored in self.state.rounds],
             not_tried=self.state.not_tried(),
@@ -1190,8 +1248,9 @@ class RecordResult:
     def _step(self, place: int) -> schema.RecordStep:
         step, term = self.state.steps[place], self.state.added[place]
         squares = self.contribution(term) ** 2
+        where = "on the hold-out set" if term.candidate.event_s is None else "in parts that are left out"
         return schema.RecordStep(
-            **step.described(term.candidate, self.doubts[place]),
+            **step.described(term.candidate, self.answers[place], where),
             rmse_before_um=known_mean(self.errors[place]),
             rmse_after_um=known_mean(self.errors[place + 1]),
             rmse_without_um=self.state.errors_without_um[place],
@@ -1256,24 +1315,75 @@ def close_record(
     whole = fit_record(record, state.model.terms, np.ones_like(train))
     predictions = [problem.predict(some) for some in state.chain]
     errors = np.array([channel_rmse(record, one.predicted, ~train) for one in predictions])
+    left_out = [
+        # The penalty is that from the training part.
+        predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
+        for terms in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
+    ]
+    told = ask_unseen(record, ~train, state, predictions[-1], left_out)
+    away = left_out_of_forecast(problem, state, {place for place, one in enumerate(told) if one.word == "no"})
+    forecast = problem.predict(state.kept(away))
+    final_um = channel_rmse(record, forecast.predicted, ~train)
+    plain, tracking = plain_predictions(record, train), None
+    if not record.runs:
+        tracking = track(record, train, forecast.predicted, plain["ridge"])
     return RecordResult(
         state=state,
         record=record,
         hold_out=~train,
         held_out=description,
         predictions=predictions,
-        without=[problem.predict(state.kept([place])) for place in range(len(state.steps))] if record.runs else [],
         errors=errors,
-        plain=plain_predictions(record, train),
-        left_out=[
-            # The penalty is that from the training part.
-            predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
-            for terms in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
-        ],
+        plain=plain,
+        left_out=left_out,
         whole=whole,
-        remainder=examine(whole, errors[-1], np.random.default_rng(seed)),
+        remainder=examine(whole, final_um, np.random.default_rng(seed)),
         chained=chained,
+        answers=told,
+        away=away,
+        forecast=forecast,
+        tracking=tracking,
+        wandering_um=float(np.mean([np.sqrt(np.mean(unexplained_drift(fit)[0] ** 2)) for fit in whole.channels])),
     )
+
+
+def ask_unseen(
+    record: Record, held_out: NDArray[np.bool_], state: RecordState, final: Prediction, left_out: Sequence[Array]
+) -> list[Answer]:
+    """What blocks that the coefficients were not fitted to say of every added effect: the hold-out set; of an event parts left out.
+
+    An event before the hold-out set is a constant there.
+    """
+    share = [
+        term.candidate.columns @ final.coefficients[place_of(state.model.terms, term)] for term in state.model.terms
+    ]
+    declared = np.sum([np.zeros(record.displacement.shape), *share[: len(state.declared)]], axis=0)
+    added = share[len(state.declared) :]
+    events = [place for place, term in enumerate(state.added) if term.candidate.event_s is not None]
+    lasting = [place for place in range(len(added)) if place not in events]
+    response = record.displacement - np.sum([np.zeros(declared.shape), *(added[place] for place in events)], axis=0)
+    asked = answers(_unseen(record, held_out, response, [declared], [added[place] for place in lasting]))
+    told = dict(zip(lasting, asked, strict=True))
+    everywhere = np.ones_like(held_out)
+    for place in events:
+        without = left_out[1 + place]
+        parts = _unseen(record, everywhere, record.displacement - without, [], [left_out[0] - without])
+        (told[place],) = answers(parts)
+    return [told[place] for place in range(len(added))]
+
+
+def _unseen(
+    record: Record, here: NDArray[np.bool_], response: Array, beside: Sequence[Array], shares: Sequence[Array]
+) -> list[Unseen]:
+    """Blocks of every channel with the columns of free size and the shares of the effects, each (blocks, channels) um."""
+    parts = []
+    for k in range(len(record.channels)):
+        rows = np.flatnonzero(here & np.isfinite(response[:, k]))
+        later = (record.run[rows, None] == np.unique(record.run[rows])[1:]).astype(float)
+        free = np.column_stack([later, *(one[rows, k] for one in beside)])
+        predicted = np.array([one[rows, k] for one in shares]).reshape(len(shares), rows.size).T
+        parts.append(Unseen(rows, record.seconds[rows], np.ones((rows.size, 1)), response[rows, k], free, predicted))
+    return parts
 
 
 def withdraw_unreplicated(

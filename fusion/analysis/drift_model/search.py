@@ -3,7 +3,7 @@
 One procedure for a campaign along an axis and for a record of channels. What differs between them, how candidates are made, fitted, scored
 and predicted, is behind :class:`Problem`. An effect enters only if its gain exceeds what the whole search finds under the null hypothesis,
 if it is admissible, and if it is confirmed on readings of the training part that its coefficients were not fitted to. The hold-out set
-decides nothing: an effect that it does not support is reported as not confirmed. Procedure and error rates: docs/method/closed-loop.md.
+adds nothing: it bears an effect out, contradicts it, or cannot tell. Procedure and error rates: docs/method/closed-loop.md.
 """
 
 from __future__ import annotations
@@ -17,14 +17,18 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from fusion.analysis.drift_model.fit import Term
 from fusion.analysis.drift_model.gains import Gains
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
+from fusion.analysis.drift_model.record_data import independent
 from fusion.analysis.effects.effect import Candidate, Effect, Separable, Wave
 from fusion.analysis.effects.library import LIBRARY
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
+from interferometry.drift.gls import estimate
+from interferometry.drift.kalman import DriftModelError
 from thermography.fields.large_arrays import IN_MEMORY_BYTES, copy_to_disk, give_back
 
 # Decisions of the search: which effect entered, was refused or was withdrawn, for which reason and on what evidence.
@@ -361,8 +365,8 @@ class Step:
         """Whether it entered after the hold-out set had been opened."""
         return self.confirmed is Confirmed.SECOND_SEARCH
 
-    def described(self, candidate: Candidate, doubt: str) -> dict[str, Any]:
-        """What results.json holds of every step, on a record and along an axis."""
+    def described(self, candidate: Candidate, answer: Answer, where: str) -> dict[str, Any]:
+        """What results.json holds of every step, on a record and along an axis; `where` says which readings gave the answer."""
         tied, runner_up = rivals(self.score, self.round.scores)
         return {
             "effect": self.effect,
@@ -371,8 +375,7 @@ class Step:
             "p_value": self.score.family_wise_p,
             "tied": tied,
             "runner_up": runner_up,
-            "confirmed": not doubt,
-            "doubt": doubt,
+            **answer.described(where),
             "confirmed_by": str(self.confirmed),
         }
 
@@ -865,17 +868,173 @@ def _rmse(squares: Array, number: Array) -> Array:
     return np.asarray(np.where(channels > 0, each.sum(axis=-1) / np.maximum(channels, 1), np.nan))
 
 
-#: An effect is confirmed where it takes at least this share from the squared error beyond the noise, 2 % of the error itself: a model that
-#: follows chance changes an error by less than that either way.
-GAIN_SHARE = 0.04
+# What readings that an effect was not fitted to say of it: regression of these readings on its predicted share.
+
+#: Probability of bearing out an effect that is not there, and of contradicting one that is.
+ANSWER_LEVEL = 0.05
+#: Sizes, over that predicted, between which an effect predicts better than none and than twice as much of it.
+_HALF, _TWICE = 0.5, 2.0
+#: Readings per column below which an interval says nothing.
+_READINGS_PER_COLUMN = 2
+#: Share of its length that a column keeps by rounding where the others contain it.
+_ROUNDING = 1e-6
+#: A size is not told where a right effect would hardly be borne out more often than one that is not there.
+_LEAST_POWER = 2.0 * ANSWER_LEVEL
 
 
-def doubt_of(with_um: float, without_um: float, noise_um: float, where: str) -> str:
-    """Why an effect is not confirmed, in words; empty where a prediction is better with it by more than chance changes it."""
-    beyond_noise = max(0.0, without_um**2 - noise_um**2)
-    if with_um < without_um and without_um**2 - with_um**2 >= GAIN_SHARE * beyond_noise:
-        return ""
-    return f"the error {where} is {without_um:.3g} µm without it and {with_um:.3g} µm with it"
+@dataclass(frozen=True)
+class Unseen:
+    """Readings of one channel that effects were not fitted to, and what is predicted of them, um.
+
+    Attributes
+    ----------
+    rows : (n,) number of each reading, by which channels share an instant
+    seconds, loadings : (n,) and (n, components) of the drift that acts there
+    response : (n,) the readings
+    beside : (n, q) what may be of any size there beside a level, such as the share of the declared effects
+    shares : (n, effects) the predicted share of every effect
+    uncertain : (n, r) errors of what was taken from the response beforehand, one column for each of unit variance; None for none
+    """
+
+    rows: NDArray[np.intp]
+    seconds: Array
+    loadings: Array
+    response: Array
+    beside: Array
+    shares: Array
+    uncertain: Array | None = None
+
+    def whitened(self) -> tuple[Array, Array, Array, int] | None:
+        """Response, shares and uncertain columns freed of `beside` and whitened by the drift and noise of these very readings, and the
+        degrees of freedom; None where they cannot be estimated.
+        """
+        level, number = np.ones((self.rows.size, 1)), self.shares.shape[1]
+        varying = np.column_stack([self.beside, self.shares])
+        design = np.column_stack([level, varying[:, independent(varying)]])
+        freedom = self.rows.size - design.shape[1]
+        if freedom < _READINGS_PER_COLUMN * design.shape[1]:
+            return None
+        try:
+            fit = estimate(self.seconds, self.loadings, self.response, design, memory=True)
+        except DriftModelError:
+            return None
+        if fit.sigma <= 0.0:
+            return None
+        rates = fit.design[:, design.shape[1] :]
+        asked = np.column_stack(
+            [self.response, self.shares, level[:, :0] if self.uncertain is None else self.uncertain]
+        )
+        laid = fit.system.whiten(np.column_stack([asked, level, self.beside, rates]))[0] / fit.sigma
+        asked, beside = laid[:, : asked.shape[1]], laid[:, asked.shape[1] :]
+        left = asked - beside @ np.linalg.lstsq(beside, asked, rcond=None)[0]
+        # What is of no size beside the others is rounding.
+        left[:, np.linalg.norm(left, axis=0) < _ROUNDING * np.linalg.norm(asked, axis=0)] = 0.0
+        return left[:, 0], left[:, 1 : 1 + number], left[:, 1 + number :], freedom
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Whether readings that an effect was not fitted to bear it out.
+
+    Attributes
+    ----------
+    slope, u : size with which it acts there over that predicted, 1 where it is right and 0 where it is not there, and its standard
+        uncertainty; infinite where these readings do not determine it
+    freedom : degrees of freedom of the uncertainty
+    against : what contradicts the effect without regard to its size, in words
+    """
+
+    slope: float = np.nan
+    u: float = np.inf
+    freedom: int = 1
+    against: str = ""
+
+    @property
+    def word(self) -> schema.BorneOut:
+        """Borne out where its size is more than zero and may be that predicted, contradicted where it is less and may be zero."""
+        reach = special.stdtrit(self.freedom, 1.0 - ANSWER_LEVEL) * self.u
+        if self.against:
+            return "no"
+        if not np.isfinite(reach):
+            return "cannot tell"
+        there, less, more = self.slope > reach, self.slope + reach < 1.0, self.slope - reach > 1.0
+        if there and (self.slope >= _HALF if less else self.slope <= _TWICE or not more):
+            return "yes"
+        return "no" if less and (not there or self.slope < _HALF) else "cannot tell"
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a size as large where the effect is not there."""
+        return float(special.stdtr(self.freedom, -self.slope / self.u)) if np.isfinite(self.u) else 1.0
+
+    @property
+    def power(self) -> float:
+        """Probability that such readings bear a right effect out."""
+        return float(special.stdtr(self.freedom, 1.0 / self.u - special.stdtrit(self.freedom, 1.0 - ANSWER_LEVEL)))
+
+    def described(self, where: str) -> dict[str, Any]:
+        """What results.json holds of it; `where` says which readings were asked."""
+        known = self.power >= _LEAST_POWER
+        size = f"{where} its size is {self.slope:.2f} ± {2.0 * self.u:.2f} (k = 2) of that predicted"
+        doubts = {
+            "yes": "",
+            "no": self.against or f"contradicted: {size}",
+            "cannot tell": f"not yet borne out: {size}" if known else f"not yet borne out: it hardly changes {where}",
+        }
+        return {
+            "confirmed": self.word == "yes",
+            "doubt": doubts[self.word],
+            "borne_out": self.word,
+            "borne_out_p": self.p_value,
+            "borne_out_size": self.slope if known else None,
+            "borne_out_size_u": self.u if known else None,
+            "borne_out_power": self.power,
+        }
+
+
+def answers(channels: Sequence[Unseen]) -> list[Answer]:
+    """Ask readings for the size of every effect, all effects together, over that predicted; channels share the sizes."""
+    effects = channels[0].shares.shape[1]
+    asked = [(one.rows, *found) for one in channels if (found := one.whitened()) is not None]
+    if not asked or not effects:
+        return [Answer()] * effects
+    readings = 1 + max(int(rows.max()) for rows, *_ in asked)
+    y, x = np.zeros((len(asked), readings)), np.zeros((len(asked), readings, effects))
+    for k, (rows, response, shares, _, _) in enumerate(asked):
+        y[k, rows], x[k, rows] = response, shares
+    normal = np.einsum("kni,knj->ij", x, x)
+    known = independent(x.reshape(-1, effects))
+    inverse = np.linalg.inv(normal[np.ix_(known, known)])
+    x = x[:, :, known]
+    slopes = inverse @ np.einsum("kni,kn->i", x, y)
+    # The drifts of the channels of one machine are alike, so that many channels say little more than one.
+    left = y - x @ slopes
+    alike = left @ left.T
+    size = np.sqrt(np.diag(alike))
+    products = np.einsum("kni,lnj->klij", x, x)
+    covariance = inverse @ np.einsum("kl,klij->ij", alike / np.outer(size, size), products) @ inverse
+    for k, (rows, _, _, uncertain, _) in enumerate(asked):
+        through = inverse @ x[k, rows].T @ uncertain
+        covariance = covariance + through @ through.T
+    freedom = min(found[-1] for found in asked)
+    told = {
+        k: Answer(float(a), float(u), freedom)
+        for k, a, u in zip(known, slopes, np.sqrt(np.diag(covariance)), strict=True)
+    }
+    return [told.get(k, Answer()) for k in range(effects)]
+
+
+#: A forecast may be worse than the declared model's by this share at most: chance alone changes an error by as much.
+_WORSE = 1.02
+
+
+def left_out_of_forecast(problem: Problem[M], state: LoopState[M], contradicted: Collection[int]) -> set[int]:
+    """Places of the steps that leave the forecast: contradicted ones, and those with which the hold-out set is predicted worse."""
+    steps = range(len(state.errors_without_um))
+    left = set(contradicted) & set(steps)
+    while problem.hold_out_error(state.kept(left)) > _WORSE * state.errors_um[0]:
+        left.add(min(set(steps) - left, key=lambda place: problem.hold_out_error(state.kept(left | {place}))))
+    return left
 
 
 def exceeds_noise(error_um: float, noise_um: float, share: float) -> bool:
@@ -883,17 +1042,33 @@ def exceeds_noise(error_um: float, noise_um: float, share: float) -> bool:
     return error_um**2 > (1.0 + share**2) * noise_um**2
 
 
+def excess_um(error_um: float, noise_um: float) -> float:
+    """What an error holds beside the noise, um."""
+    return float(np.sqrt(max(0.0, error_um**2 - noise_um**2)))
+
+
 def has_skill(error_um: float, last_value_um: float, mean_um: float, noise_um: float, share: float) -> bool:
     """Whether a model predicts the hold-out set better than the last value and the mean of the training part do."""
     return error_um < min(last_value_um, mean_um) or not exceeds_noise(error_um, noise_um, share)
 
 
-def verdict(*, confirmed: bool, doubtful: bool, tested: bool, remains: bool, skill: bool) -> schema.Verdict:
+#: What is left where a model with a name predicts neither to within the noise nor as well as the best plain prediction.
+BEYOND_PLAIN = "an error of predicting the hold-out beyond the noise, larger than that of the best plain prediction"
+#: A plain regression whose error is this share of the model's or less knows something that the model lacks.
+_BETTER = 0.75
+
+
+def is_separable(error_um: float, ridge_with_lags_um: float) -> bool:
+    """Whether a cause can be named: a plain regression with lagged copies does not predict better by a quarter."""
+    return not ridge_with_lags_um <= _BETTER * error_um
+
+
+def verdict(*, named: bool, left: bool, skill: bool, separable: bool, tested: bool) -> schema.Verdict:
     """Word for the outcome."""
-    if not skill and not tested:
+    if not skill and not tested and separable:
         return "no_skill"
-    left = doubtful or tested or remains
-    if confirmed:
+    left = left or tested or not separable
+    if named and separable:
         return "partial" if left else "explained"
     return "unexplained" if left else "complete"
 

@@ -47,6 +47,7 @@ from fusion.report.wording import (
     effect_words,
     iso230_values,
     quoted_window,
+    say,
     step_errors,
 )
 from fusion.results.axis import AnomalyPart
@@ -238,7 +239,7 @@ def _rounds(products: Products, loop: AxisLoop, linker: Linker) -> ui.Parts:
             continue
         step = later[0]
         phrase = f"{step_phrase(step, time, record=False)}, {p_words(step.p_value)}; {step_errors(step)}"
-        entry = "Entered" if step.confirmed else "Entered, not confirmed"
+        entry = f"Entered, {say('doubt', step)}" if step.doubt else "Entered"
         parts.append(ui.paragraph(f"{entry}: {phrase}. {action(step, time, record=False)}"))
         if stored is not None:
             part = stored["contribution"].isel(effect=stored.sizes["effect"] - len(later)).drop_vars("effect")

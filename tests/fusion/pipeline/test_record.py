@@ -107,7 +107,8 @@ def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[flo
     return SimpleNamespace(
         state=SimpleNamespace(model=SimpleNamespace(terms=terms)),
         predictions=predictions,
-        errors=np.array([[5.0, 5.0], [1.0, 2.0]]),
+        final_um=np.array([1.0, 2.0]),
+        forecast=predictions[-1],
         chained=[SimpleNamespace(channel_rmse_final_um=errors) for errors in chained],
         contribution=lambda term: np.full((50, 2), 10.0 + places[id(term)]),
         whole=SimpleNamespace(sigma=np.array([0.1, 0.2])),

@@ -160,7 +160,7 @@ def test_steps_start_with_the_declared_model_and_a_doubt_has_its_reason():
     assert added.cells[-1] == "dead path of the laser (log-likelihood lower by 4.0)"
     doubted = LOOP.steps[0].model_copy(update={"confirmed": False, "doubt": "0.4 µm without it, 0.5 µm with it"})
     _, added = model_section.steps_table(LOOP.model_copy(update={"steps": (doubted,)})).rows
-    assert added.cells[5] == "not confirmed: 0.4 µm without it, 0.5 µm with it"
+    assert added.cells[5] == "not confirmed: 0.4 µm without it, 0.5 µm with it"  # results of earlier versions
 
 
 def test_the_model_and_its_errors_are_told_in_numbers():

@@ -12,7 +12,17 @@ from fusion.report import numbers, wording
 from fusion.report.conclusions import action, next_steps, step_phrase
 from fusion.report.wording import Row, Words, effect_words, print_table, say, table
 from fusion.results.axis import DutyPart, Evidence, Iso230Direction, Iso230Window, SourcePart
-from fusion.results.loop import AxisStep, ChannelErrors, Coefficient, Loop, RecordStep, StepPart, Unexplained
+from fusion.results.loop import (
+    AxisStep,
+    Baselines,
+    ChannelErrors,
+    Coefficient,
+    ErrorInterval,
+    Loop,
+    RecordStep,
+    StepPart,
+    Unexplained,
+)
 from fusion.results.parts import AreaPart, InputsPart, Quantity, TimePart
 from fusion.results.results import AnomalyPart, CorrelationPart, Iso230Part, Notice, RecordLoop, Results, assemble
 from tests.fusion.results_sample import PARTS
@@ -146,6 +156,11 @@ def loop(verdict: str = "explained", *steps: StepPart, shape: str = "", **change
     return Loop.model_construct(**{**told, **changes})
 
 
+LAGGED = Baselines.model_construct(
+    ridge_with_lags=ErrorInterval.model_construct(rmse_um=0.31, low_um=0.3, high_um=0.32)
+)
+
+
 def results(found: Loop | None, **parts: Any) -> Results:
     return Results.model_construct(**{"loop": found, "warnings": (), **parts})
 
@@ -160,10 +175,21 @@ def results(found: Loop | None, **parts: Any) -> Results:
             ["lacks the laser's dead path and the refractive index of the air.", "no further cause"],
         ),
         (
-            loop("partial", step("dead_path"), step("air_index", confirmed=False)),
+            loop("partial", step("dead_path"), step("air_index", confirmed=False, borne_out="no")),
             ["lacks the laser's dead path.", "remains unexplained"],
         ),
-        (loop("unexplained", shape="a wave"), ["(0.20 µm rms)", "no effect of the library"]),
+        (
+            loop("explained", step("dead_path", confirmed=False, borne_out="cannot tell"), wandering_um=0.16),
+            ["lacks the laser's dead path (not yet borne out).", "A random drift of 0.16 µm rms was allowed for."],
+        ),
+        (
+            loop("unexplained", shape="a wave"),
+            ["predicted to 0.66 µm (last", "(0.20 µm rms)", "no effect of the library"],
+        ),
+        (
+            loop("unexplained", step("dead_path"), separable=False, baselines=LAGGED),
+            ["with lags predict it to 0.31 µm; a cause is not separable."],
+        ),
         (loop("unexplained"), ["Part of the drift remains unexplained"]),
         (loop("no_skill"), ["repeating the last cycle or the mean"]),
         (None, ["without a model"]),
@@ -223,6 +249,20 @@ def test_what_is_left_is_said_once():
     assert told.startswith(f"A{shape[1:]}: 0.20 µm rms.") and "dead path of the laser (p < 0.001)" in told
     assert told.count("rms") == 1
     assert "0.42 µm" in dict(answers.conclude(results(loop("complete"))))["What remains"]
+
+
+def test_nothing_is_not_said_to_remain_beside_an_effect_that_is_contradicted():
+    struck = step("air_index", confirmed=False, borne_out="no", doubt="contradicted: its size is 0.1", rms_um=0.4)
+    told = dict(answers.conclude(results(loop("unexplained", struck))))
+    assert "0.40 µm rms, has no name: contradicted" in told["What remains"] and "Nothing" not in told["What remains"]
+    assert "refractive index" not in answers.headline(results(loop("unexplained", struck)))
+
+
+def test_a_position_has_one_sentence_with_the_cause_of_its_most_significant_finding():
+    (anomaly,) = assemble("A", PARTS, []).anomalies or ()
+    weaker = anomaly.model_copy(update={"p_value": 0.5, "cause": "stick_slip", "direction": "negative"})
+    told = say("where", results(None, anomalies=(weaker, anomaly), inputs=None))
+    assert told.count("Position 3") == 1 and "stick-slip" not in told and "It also repeats worse" in told
 
 
 def correlation(verdict: str) -> CorrelationPart:

@@ -144,7 +144,7 @@ def test_what_was_decided_before_the_hold_out_set_was_opened_stays(monkeypatch):
     assert [step.effect for step in kept.steps] == ["a"] and kept.errors_um == (1.0, 1.0)
 
 
-def test_an_effect_that_is_not_confirmed_does_not_move_the_declared_coefficients(monkeypatch):
+def test_an_effect_that_is_contradicted_moves_no_declared_coefficient_and_no_forecast(monkeypatch):
     def offered(name: str, column: np.ndarray, **options) -> Effect:
         candidate = Candidate(column[:, None], {}, ("um",))
         return Effect(name, "", "", lambda readings, coefficients, near: iter([candidate]), **options)
@@ -153,8 +153,8 @@ def test_an_effect_that_is_not_confirmed_does_not_move_the_declared_coefficients
     effects = {"own": offered("own", WAVE, declarable=True), "other": offered("other", other)}
     report = axis.report_steps
 
-    def doubted(state, wrong):
-        return [step.model_copy(update={"confirmed": False}) for step in report(state, wrong)]
+    def doubted(state, wrong, held_out):
+        return [step.model_copy(update={"borne_out": "no"}) for step in report(state, wrong, held_out)]
 
     monkeypatch.setattr(axis, "report_steps", doubted)
     readings = problem_of(WAVE, other).readings
@@ -163,6 +163,7 @@ def test_an_effect_that_is_not_confirmed_does_not_move_the_declared_coefficients
     alone = axis.fit_model(readings, axis.declare(readings, ["own"], effects)).coefficients()["own"]
     assert found.declared_coefficients[0].value == pytest.approx(alone, rel=1e-9)
     assert found.after.coefficients()["own"] != pytest.approx(alone, rel=1e-6)
+    assert found.left_out_of_forecast == ("other",) and found.rmse_final_um == found.rmse_declared_um
 
 
 def second_look(problem: AxisProblem, monkeypatch, *rounds: Round) -> LoopState[ModelFit]:
