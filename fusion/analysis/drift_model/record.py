@@ -1182,7 +1182,7 @@ class RecordResult:
         step, term = self.state.steps[place], self.state.added[place]
         squares = self.contribution(term) ** 2
         return schema.RecordStep(
-            **step.described(term.candidate, self.doubts[place]),
+            **step.described(term.candidate, self.doubts[place], size=step.score.gain, withheld=""),
             rmse_before_um=known_mean(self.errors[place]),
             rmse_after_um=known_mean(self.errors[place + 1]),
             rmse_without_um=self.state.errors_without_um[place],

@@ -12,7 +12,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines
+from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines, withhold_names
 from fusion.analysis.drift_model.axis import declare
 from fusion.analysis.drift_model.fit import Term, fit_model
 from fusion.analysis.effects.library import library
@@ -261,3 +261,11 @@ def test_a_line_that_does_away_with_a_named_cause_needs_less(
     assert ("indicate 11.2 to 12.6 ppm/K" in check.evidence) is passed
     assert (f"(log-likelihood {gain:+.1f}" in check.evidence) is (gain > 0.0)
     assert ("without angular growth" in check.evidence) is (bool(superfluous) and not passed)
+
+
+@pytest.mark.parametrize(("value", "withheld"), [(11.5, False), (2.1, True)])
+def test_names_by_course_alone_are_withheld_where_the_expansion_contradicts(value: float, withheld: bool) -> None:
+    steps = [{"effect": name, "withheld": "", "coefficients": []} for name in ("unseen_heat_source", "dead_path")]
+    loop = withhold_names({**declared(value, 0.2), "steps": steps}, library())
+    assert bool(loop["steps"][0]["withheld"]) == withheld
+    assert not loop["steps"][1]["withheld"]
