@@ -101,7 +101,7 @@ SHAPES: dict[str, frozenset[str]] = {
     "hysteresis": frozenset({"thermal_lag"}),
     "growth along the stroke": frozenset({"unseen_heat_source"}),
     "conduction along a bar": frozenset({"unseen_heat_source"}),
-    "swelling with the logged humidity": frozenset({"logged_influence"}),
+    "swelling with the logged humidity": frozenset({"relative_humidity"}),
     "moving patch of sun": frozenset({"reflected_source"}),
 }  # fmt: skip
 
@@ -114,7 +114,9 @@ def ask(shape: str, number: int) -> tuple[bool, bool, str]:
     found = close_loop(
         replace(readings, response=readings.response + size * missing / max(missing.std(), 1e-9)), DECLARED
     )
-    named = [{step.effect, *step.tied} for step in found.steps if step.confirmed and not step.withheld]
+    given = [step for step in found.steps if step.confirmed and not step.withheld]
+    # Which of the logs it follows is the name of a logged influence.
+    named = [{step.effect, *step.tied, str(step.parameters.get("follows"))} for step in given]
     right = any(names & SHAPES[shape] for names in named)
     wrong = any(not names & SHAPES[shape] for names in named)
     steps = [(sorted({s.effect, *s.tied}), s.parameters, s.confirmed, s.withheld) for s in found.steps]

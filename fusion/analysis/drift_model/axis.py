@@ -1065,12 +1065,15 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
 
 
 def withheld_for(step: Step) -> str:
-    """Why a step that is told by its course in time alone has no name: a time constant that these data do not hold on both sides."""
-    effect, (low, high) = describe_effect(step.effect), step.score.ranges.get("time_constant_min", [0.0, 0.0])
-    if effect is None or not effect.excited_by or (low is not None and high is not None):
-        return ""
-    known = f"{low:.3g} min and more" if low else f"{high:.3g} min and less" if high else "any"
-    return f"its time constant is not determined ({known} fits)"
+    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side."""
+    effect = describe_effect(step.effect)
+    for name, words in (("time_constant_min", "time constant"), ("period_min", "period")):
+        low, high = step.score.ranges.get(name, [0.0, 0.0])
+        by_course = name == "period_min" or (effect is not None and effect.excited_by)
+        if by_course and (low is None or high is None):
+            known = f"{low:.3g} min and more" if low else f"{high:.3g} min and less" if high else "any"
+            return f"its {words} is not determined ({known} fits)"
+    return ""
 
 
 def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:

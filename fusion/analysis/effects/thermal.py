@@ -216,9 +216,11 @@ def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candid
                 yield Candidate(both, {**parameters, "start": "free"}, units, beside=len(along))
 
 
-#: What the camera or contact sensors along the axis show, and the pressure of the air, which moves no part of a machine.
+#: What shows the table itself (camera, sensors along the axis, the sensor of the material), and the pressure of the air, which moves no
+#: part of a machine.
 _NO_INFLUENCE = frozenset(
-    {"mean_rise", "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral", "air_pressure"}
+    {"mean_rise", "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral"}
+    | {"material_temperature", "air_pressure"}
 )
 
 
@@ -305,9 +307,7 @@ LOGGED_INFLUENCE = Effect(
     ),
     source="ISO 230-3, environmental temperature variation error",
     candidates=_logged_influence,
-    needs=lambda readings: (
-        None if _logged(readings) else "nothing was logged beside field, loads and pressure of the air"
-    ),
+    needs=lambda readings: None if _logged(readings) else "no room, coolant or humidity was logged",
     masked_by=unmeasured_expansion,
     excited_by="driver",
     label="influence of a logged quantity",

@@ -22,6 +22,7 @@ from fusion.analysis.drift_model.axis import (
     residual_drift_size,
     rmse,
     verdict,
+    withheld_for,
 )
 from fusion.analysis.drift_model.fit import ModelFit, coefficient_spread, fit_model, unexplained_drift
 from fusion.analysis.drift_model.search import (
@@ -513,3 +514,29 @@ SOUND = {"confirmed": False, "doubtful": False, "tested": False, "remains": Fals
 )
 def test_the_outcome_has_one_word(changed, word):
     assert verdict(**{**SOUND, **changed}) == word
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "interval", "why"),
+    [
+        ("unseen_heat_source", "time_constant_min", [17.0, 38.0], ""),
+        (
+            "unseen_heat_source",
+            "time_constant_min",
+            [130.0, None],
+            "its time constant is not determined (130 min and more fits)",
+        ),
+        (
+            "thermal_lag",
+            "time_constant_min",
+            [None, 7.5],
+            "its time constant is not determined (7.5 min and less fits)",
+        ),
+        ("periodic_disturbance", "period_min", [None, None], "its period is not determined (any fits)"),
+        # Told by its pattern along the axis.
+        ("reversal_drift", "time_constant_min", [None, 20.0], ""),
+    ],
+)
+def test_what_is_told_by_its_course_alone_needs_a_time_that_is_determined(effect, parameter, interval, why):
+    step = Step(score(effect, ranges={parameter: interval}), Round(()), Confirmed.LATER_CYCLES)
+    assert withheld_for(step) == why
