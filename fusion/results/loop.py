@@ -41,7 +41,7 @@ class Coefficient(Sensitivity):
 
 
 class DeclaredCoefficient(Coefficient):
-    """A coefficient of a declared effect; that of ``axis_expansion`` includes the share that comes late."""
+    """A coefficient of a declared effect; that of ``axis_expansion`` with the share of its lagged copies: of an axis that has settled."""
 
     effect: str
     """Name of the effect."""

@@ -128,13 +128,13 @@ class AxisGrounds:
 
     def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
         """Noise of the mean rise; a single warm-up needs a quieter temperature."""
-        single = warm_up_share(self._training, self.on_training(candidate)) > WARM_UP_SHARE
+        single = warm_up_share(self._training, self._on_training(candidate)) > WARM_UP_SHARE
         limit = NOISE_SHARE_OF_A_WARM_UP if single else NOISE_SHARE
         return "the mean rise", noise_share(self._training.series["mean_rise"]), limit
 
     def refuse_single_excitation(self, effect: str, excited_by: str, candidate: Candidate) -> Decision | None:
         """Refuse what a plain warm-up explains, unless it gains beside free warm-ups of every time constant."""
-        on_training = self.on_training(candidate)
+        on_training = self._on_training(candidate)
         share = warm_up_share(self._training, on_training)
         if share <= WARM_UP_SHARE:
             return None
@@ -148,7 +148,7 @@ class AxisGrounds:
 
     def follows_rate(self, candidate: Candidate) -> bool:
         """Whether the field and its delayed copy enter with opposite signs and nearly cancel in the long run."""
-        on_training = self.on_training(candidate)
+        on_training = self._on_training(candidate)
         model = self._model
         fit = fit_fixed_effects(
             model.fit.system, model.fit.response, np.column_stack([model.fit.design, on_training.columns])
@@ -158,8 +158,8 @@ class AxisGrounds:
             unit = direct_units.get(term.effect)
             if unit not in candidate.units:
                 continue
-            delayed = float(fit.coefficients[model.fit.design.shape[1] + candidate.units.index(unit)])
             direct = float(fit.coefficients[model.place(term)][0])
+            delayed = float(fit.coefficients[model.fit.design.shape[1] + candidate.units.index(unit)])
             if direct * delayed < 0.0 and abs(direct + delayed) < 0.5 * max(abs(direct), abs(delayed)):
                 return True
         return False
@@ -172,15 +172,10 @@ class AxisGrounds:
             for name, factor in (("mean_rise", 1.0), ("axis_integral", 1e-3))
         ]
         smoothed = Candidate(np.column_stack(columns), {}, ("um/K", "ppm/K"))
-        return _gain(self._model, self.on_training(candidate), None) - _gain(self._model, smoothed, None)
+        return _gain(self._model, self._on_training(candidate), None) - _gain(self._model, smoothed, None)
 
-    def on_training(self, candidate: Candidate) -> Candidate:
-        """The candidate on the training part; a delayed expansion with what is there at once, which its column lacks."""
-        columns = np.array(candidate.columns[self._model.used])
-        for term in self._model.terms if "ppm/K" in candidate.units else ():
-            if term.effect == "axis_expansion":
-                columns[:, candidate.units.index("ppm/K")] += term.candidate.columns[self._model.used][:, 0]
-        return replace(candidate, columns=columns)
+    def _on_training(self, candidate: Candidate) -> Candidate:
+        return candidate.on(self._model.used)
 
 
 def noise_share(series: Series) -> float:
@@ -341,8 +336,8 @@ def prior_rows(model: ModelFit, rng: np.random.Generator | None = None, *, draws
     priors = model.priors()
     design = np.zeros((len(priors), model.fit.design.shape[1]))
     response = np.zeros(len(priors))
-    for row, (place, prior) in enumerate(priors):
-        design[row, place] = model.fit.sigma / prior.u
+    for row, (combination, prior) in enumerate(priors):
+        design[row] = combination * model.fit.sigma / prior.u
         response[row] = model.fit.sigma * prior.mean / prior.u
     by_chance = np.empty((len(priors), 0)) if rng is None else rng.standard_normal((len(priors), draws))
     return PriorRows(design, response, model.fit.sigma * by_chance)

@@ -207,7 +207,7 @@ def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> s
     part = model.readings.subset(model.used)
     if not seen:
         return "the declared model contains it, or nothing excites it"
-    if effect.excited_by and warm_up_share(part, AxisGrounds(model).on_training(candidate)) > WARM_UP_SHARE:
+    if effect.excited_by and warm_up_share(part, candidate.on(model.used)) > WARM_UP_SHARE:
         return "one warm-up is all that excites it; switch the load on purpose to tell it from others"
     return effect.limitation(part)
 
@@ -1077,8 +1077,10 @@ def withheld_for(step: Step) -> str:
 
 
 def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:
-    """Coefficients of the declared effects, and how far they move when parts of the readings are left out."""
-    spread = coefficient_spread(model)
+    """Coefficients of the declared effects, lagged copies included, and how far they move when parts of the readings are left out."""
+    spread, static = coefficient_spread(model), model.static()
+    covariance = static.T @ model.fit.covariance @ static
+    model = replace(model, fit=replace(model.fit, coefficients=model.fit.coefficients @ static, covariance=covariance))
     return [
         schema.DeclaredCoefficient(effect=term.effect, jackknife_u=moved, **coefficient.model_dump(exclude_unset=True))
         for term in model.terms[:declared]

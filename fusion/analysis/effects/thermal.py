@@ -181,17 +181,14 @@ def _table_offset(readings: Readings, _: Mapping[str, float], near: Candidate | 
     yield Candidate(readings.at(readings.series["mean_rise"])[:, None], {}, ("um/K",))
 
 
-def _thermal_lag(readings: Readings, coefficients: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Delayed copies of the seen temperatures, flat and along the axis."""
-    # Where the expansion is in the model, the copy lacks what is there at once: the coefficient of the expansion then is that of an axis
-    # that has settled, of which something is known beforehand, and this one the share of it that comes late.
-    at_once = readings.at(readings.series["axis_integral"]) if "axis_expansion" in coefficients else 0.0
     # Between two frames the field is a straight line; a shorter lag is not in the data.
     frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
     for minutes in values_near(near, "time_constant_min", LAGS_MIN, ratio=1.5):
         if minutes < 2.0 * frames_min:
             continue
-        axis = (readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) - at_once) * 1e-3
+        axis = readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) * 1e-3
         offset = readings.at(readings.series["mean_rise"].lagged(60.0 * minutes))
         yield Candidate(offset[:, None], {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
         yield Candidate(axis[:, None], {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))

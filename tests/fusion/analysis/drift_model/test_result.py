@@ -405,8 +405,8 @@ def dense_errors(model: ModelFit, block: np.ndarray) -> np.ndarray:
     x, y, known = fit.design, fit.response, ~block
     whitening = np.linalg.inv(np.linalg.cholesky((drift + noise)[np.ix_(known, known)]))
     a, b = whitening @ x[known], whitening @ y[known]
-    for place, prior in model.priors():
-        a = np.vstack([a, np.eye(x.shape[1])[place] * fit.sigma / prior.u])
+    for combination, prior in model.priors():
+        a = np.vstack([a, combination * fit.sigma / prior.u])
         b = np.append(b, fit.sigma * prior.mean / prior.u)
     beta = np.linalg.lstsq(a, b, rcond=None)[0]
     gain = drift[np.ix_(block, known)] @ np.linalg.inv((drift + noise)[np.ix_(known, known)])
