@@ -12,7 +12,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.consistency.model import compare_lines, with_line
+from fusion.analysis.consistency.model import compare_lines, with_line, withhold_names
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
     FieldFault,
@@ -181,6 +181,7 @@ def model_drift(
     elif "axis_scale_u" in fused:
         scale_u = float(fused["axis_scale_u"])
         loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)
+    loop = withhold_names(loop, effects)
     parts = {
         "anomalies": [
             {**one, "position_mm": float(deviations["position"].sel(target=one["target"]))} for one in anomalies

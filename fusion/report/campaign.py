@@ -358,7 +358,7 @@ def steps_table(loop: Loop) -> Table:
 def _step_cells(step: StepPart, held_out: str) -> list[str]:
     text = parameters(step.parameters, step.parameter_ranges)
     return [
-        f"{effect_words(step.effect).name}{f': {text}' if text else ''}",
+        f"{say('names', step)}{f': {text}' if text else ''}{f'; without a name: {step.withheld}' if step.withheld else ''}",
         p_cell(step.p_value),
         held_out,
         " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),

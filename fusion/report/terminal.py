@@ -82,7 +82,9 @@ def _loop_rows(loop: Loop) -> list[tuple[str, str, Figures]]:
     rows: list[tuple[str, str, Figures]] = []
     for step in loop.steps:
         doubt = f", {say('doubt', step)}" if step.doubt else ""
-        rows.append(("added", f"{step.effect} ({p_words(step.p_value)}), {step_errors(step)}{doubt}", "causes"))
+        one_of = f"one of {', '.join((step.effect, *step.tied))}" if step.tied else step.effect
+        without = f", without a name: {step.withheld}" if step.withheld else ""
+        rows.append(("added", f"{one_of} ({p_words(step.p_value)}), {step_errors(step)}{doubt}{without}", "causes"))
     stages = (loop.errors.declared, loop.errors.final) if loop.steps else (loop.errors.declared,)
     numbers = iter(alike([value for one in stages for value in (one.rmse_um, one.low_um, one.high_um)], distinct=False))
     errors = " -> ".join(

@@ -45,7 +45,7 @@ class Coefficient(Sensitivity):
 
 
 class DeclaredCoefficient(Coefficient):
-    """A coefficient of a declared effect."""
+    """A coefficient of a declared effect; that of ``axis_expansion`` with the share of its lagged copies: of an axis that has settled."""
 
     effect: str
     """Name of the effect."""
@@ -121,7 +121,9 @@ class StepPart(ResultPart):
     rms_um: Number
     """Root mean square of its contribution, um."""
     tied: tuple[str, ...]
-    """Effects that these data cannot distinguish from it."""
+    """Effects that these data cannot distinguish from it: together with it they are one answer, "one of these"."""
+    withheld: str = ""
+    """Why its name is not given although the readings follow its columns; empty where it is."""
     runner_up: RunnerUp | Nothing
     """The next best effect."""
     confirmed: bool
@@ -190,6 +192,8 @@ class Unexplained(ResultPart):
 class AxisUnexplained(Unexplained):
     """Structure that the final model leaves along an axis."""
 
+    closest_effect_parameters: Mapping[str, Parameter] = {}
+    """Its parameters: what it follows, and how late."""
     closest_effect_p: Number
     """p-value of that effect in the search."""
     closest_effect_share: Number

@@ -134,9 +134,10 @@ def examine(names: tuple[str, ...], rms_um: float, seed: int) -> Outcome:
     clean, floor, fit = without(seed, jitter_mm)
     found = close_loop(readings, DECLARED)
     truth = {name.partition(":")[0] for name in names}
-    alone = {step.effect for step in found.steps}
-    said = alone | {name for step in found.steps for name in step.tied}
-    wrong = [step for step in found.steps if step.effect not in truth and not truth & set(step.tied)]
+    named = [step for step in found.steps if not step.withheld]
+    alone = {step.effect for step in named if not step.tied}
+    said = alone | {name for step in named for name in (step.effect, *step.tied)}
+    wrong = [step for step in named if step.effect not in truth and not truth & set(step.tied)]
     return Outcome(
         seed=seed,
         found=found,

@@ -16,7 +16,7 @@ from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.consistency.checks import Check, judge
 from fusion.analysis.drift_model.fit import ModelFit, Term, place_of, refit_fixed
-from fusion.analysis.effects.effect import Candidate, Prior
+from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.common import Array
 from fusion.results.loop import AxisLine
 from interferometry.drift.kalman import DriftModelError
@@ -243,7 +243,24 @@ def _absorbed(steps: Sequence[Mapping[str, Any]]) -> bool:
     return any("material_compensation" in (step["effect"], *step.get("tied", ())) for step in steps)
 
 
-def _expansion(entry: Mapping[str, Any], *, absorbed: bool) -> Check:
+def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> dict[str, Any]:
+    """The part ``loop`` of results.json, where the expansion contradicts the stated one without the names of effects that are told by
+    their course in time alone: one of them has taken, or left, a part of the expansion.
+    """
+    stated = [one for one in loop["declared_coefficients"] if one["effect"] == "axis_expansion" and one.get("prior")]
+    if not stated or abs(_asked_for(stated[0])[2]) <= _LIMIT:
+        return dict(loop)
+    alone, alone_u, _ = _asked_for(stated[0])
+    why = f"beside it the axis would expand by {alone:.3g} ± {alone_u:.2g} ppm/K, which the stated coefficient contradicts"
+    steps = [
+        {**step, "withheld": step["withheld"] or why} if effects[step["effect"]].excited_by else step
+        for step in loop["steps"]
+    ]
+    return {**loop, "steps": steps}
+
+
+def _asked_for(entry: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Expansion that the readings alone ask for, its standard uncertainty, and standard deviations from the stated one."""
     value, stated, stated_u = entry["value"], entry["prior"], entry["prior_u"]
     u = entry["u"] if entry.get("u_fit") is None else entry["u_fit"]
     weight = 1.0 / u**2 - 1.0 / stated_u**2
@@ -256,7 +273,12 @@ def _expansion(entry: Mapping[str, Any], *, absorbed: bool) -> Check:
         # The stated coefficient has diluted an error of the rise's scale as it has diluted the readings.
         scale_u = (entry.get("u_scale") or 0.0) / (1.0 - u**2 / stated_u**2)
         alone_u = math.hypot(math.sqrt(1.0 / weight), moved, scale_u)
-    off = (alone - stated) / math.hypot(alone_u, stated_u)
+    return alone, alone_u, (alone - stated) / math.hypot(alone_u, stated_u)
+
+
+def _expansion(entry: Mapping[str, Any], *, absorbed: bool) -> Check:
+    stated, stated_u = entry["prior"], entry["prior_u"]
+    alone, alone_u, off = _asked_for(entry)
     evidence = (
         f"The readings ask for an expansion of {alone:.3g} ± {alone_u:.2g} ppm/K, stated are {stated:.3g} ± {stated_u:.2g} ppm/K "
         f"({off:+.1f} standard deviations, limit {_LIMIT:g})."

@@ -336,8 +336,8 @@ def prior_rows(model: ModelFit, rng: np.random.Generator | None = None, *, draws
     priors = model.priors()
     design = np.zeros((len(priors), model.fit.design.shape[1]))
     response = np.zeros(len(priors))
-    for row, (place, prior) in enumerate(priors):
-        design[row, place] = model.fit.sigma / prior.u
+    for row, (combination, prior) in enumerate(priors):
+        design[row] = combination * model.fit.sigma / prior.u
         response[row] = model.fit.sigma * prior.mean / prior.u
     by_chance = np.empty((len(priors), 0)) if rng is None else rng.standard_normal((len(priors), draws))
     return PriorRows(design, response, model.fit.sigma * by_chance)

@@ -66,6 +66,7 @@ from fusion.analysis.drift_model.search import (
     Reason,
     Round,
     Score,
+    Step,
     Unseen,
     answers,
     choose,
@@ -89,7 +90,7 @@ from fusion.analysis.drift_model.search import (
 from fusion.analysis.effects.effect import Candidate, Effect
 from fusion.analysis.effects.events import cycle_starts
 from fusion.analysis.effects.laser_and_camera import CAMERA_OFFSET, REFLECTED_SOURCE
-from fusion.analysis.effects.library import library
+from fusion.analysis.effects.library import describe_effect, library
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
 from fusion.results.parts import Number
@@ -481,9 +482,23 @@ class AxisProblem(Problem[ModelFit]):
         inside = (one for one in offered if one.event_s is None or starts[2] <= one.event_s <= starts[-2])
         if near is not None:
             return list(inside)
-        # One event happens once, however its column was weighed when it was found.
+        # One event happens once, however its column was weighed when it was found; a harmonic of a rhythm is that rhythm.
         happened = {(term.effect, term.candidate.event_s) for term in model.terms if term.candidate.event_s is not None}
-        return list(kept_on_disk(one for one in inside if (name, one.event_s) not in happened))
+        rhythms = [float(term.candidate.parameters.get("period_min", 0.0)) for term in model.terms]
+        line = 60.0 / float(np.ptp(self.readings.seconds))
+        new = (
+            one
+            for one in inside
+            if (name, one.event_s) not in happened
+            and not any(is_harmonic(float(one.parameters.get("period_min", np.inf)), of, line) for of in rhythms)
+        )
+        return list(kept_on_disk(new))
+
+
+def is_harmonic(period_min: float, of_min: float, line: float) -> bool:
+    """Whether a wave is a higher harmonic of another, to the width of a line of the spectrum (1/min)."""
+    order = round(of_min / period_min)
+    return order > 1 and abs(order / of_min - 1.0 / period_min) < line
 
 
 def hold_out(readings: Readings) -> tuple[NDArray[np.bool_], str]:
@@ -1054,6 +1069,7 @@ class LoopResult:
             best = int(np.argmax(shares))
             nearest = {
                 "closest_effect": others[best].name,
+                "closest_effect_parameters": others[best].best.parameters,
                 "closest_effect_p": others[best].family_wise_p,
                 "closest_effect_share": shares[best],
             }
@@ -1106,7 +1122,7 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
     if wrong is not None:
         answer = replace(answer, against=wrong.sentence)
     return AddedEffect(
-        **step.described(term.candidate, answer, where),
+        **step.described(term.candidate, answer, where, size=model.size(term), withheld=withheld_for(step)),
         coefficients=coefficients_of(model, term),
         held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
         rmse_before_um=before_um,
@@ -1129,9 +1145,23 @@ def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
     return answers([Unseen(rows, readings.seconds, loadings, before_um[here], loadings[:, 1:], share)])[0]
 
 
+def withheld_for(step: Step) -> str:
+    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side."""
+    effect = describe_effect(step.effect)
+    for name, words in (("time_constant_min", "time constant"), ("period_min", "period")):
+        low, high = step.score.ranges.get(name, [0.0, 0.0])
+        by_course = name == "period_min" or (effect is not None and effect.excited_by)
+        if by_course and (low is None or high is None):
+            known = f"{low:.3g} min and more" if low else f"{high:.3g} min and less" if high else "any"
+            return f"its {words} is not determined ({known} fits)"
+    return ""
+
+
 def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:
-    """Coefficients of the declared effects, and how far they move when parts of the readings are left out."""
-    spread = coefficient_spread(model)
+    """Coefficients of the declared effects, lagged copies included, and how far they move when parts of the readings are left out."""
+    spread, static = coefficient_spread(model), model.static()
+    covariance = static.T @ model.fit.covariance @ static
+    model = replace(model, fit=replace(model.fit, coefficients=model.fit.coefficients @ static, covariance=covariance))
     return [
         schema.DeclaredCoefficient(effect=term.effect, jackknife_u=moved, **coefficient.model_dump(exclude_unset=True))
         for term in model.terms[:declared]

@@ -132,10 +132,28 @@ class ModelFit:
         """Where the coefficients of a term stand in the fit."""
         return place_of(self.terms, term, self.profile.shape[1])
 
-    def priors(self) -> list[tuple[int, Prior]]:
-        """Places of the coefficients that something is known of beforehand, and what."""
-        known = [(self.place(term).start, term.candidate.prior) for term in self.terms]
-        return [(place, prior) for place, prior in known if prior is not None]
+    def static(self) -> Array:
+        """The coefficients as combinations (p, p) of those of the fit: one that something is known of beforehand is that of a machine which
+        has settled, the share of its lagged copies included.
+        """
+        combined = np.eye(self.fit.coefficients.size)
+        lags = [term for term in self.terms if term.effect == "thermal_lag"]
+        for term in self.terms:
+            for lag in lags if term.candidate.prior is not None else ():
+                alike = [unit == term.candidate.units[0] for unit in lag.candidate.units]
+                combined[self.place(lag), self.place(term).start] = alike
+        return combined
+
+    def priors(self) -> list[tuple[Array, Prior]]:
+        """Combinations (p,) of coefficients that something is known of beforehand, and what."""
+        known = [(self.static()[:, self.place(term).start], term.candidate.prior) for term in self.terms]
+        return [(combination, prior) for combination, prior in known if prior is not None]
+
+    def size(self, term: Term) -> float:
+        """Half the square of what a term explains beside the static profile, in units of the noise, as the drift leaves it visible."""
+        own = term.candidate.columns[self.used] @ self.fit.coefficients[self.place(term)]
+        whitened, _ = self.fit.system.whiten(np.column_stack([own, self.profile[self.used]]))
+        return 0.5 * residual_squares(whitened[:, 0], whitened[:, 1:]) / self.fit.sigma**2
 
     def coefficients(self) -> dict[str, float]:
         """First coefficient of every term by effect name; the first term counts where an effect enters twice."""
@@ -215,8 +233,8 @@ def fit_model(readings: Readings, terms: Sequence[Term], *, used: NDArray[np.boo
     # Coefficients of slow columns are means over many cycles, which noise with a memory makes less certain.
     fit = replace(fit, covariance=fit.covariance * max(memory.long_run, 1.0))
     model = ModelFit(readings, used, tuple(terms), fit, profile, memory)
-    for place, prior in model.priors():
-        fit = condition(fit, place, prior)
+    for combination, prior in model.priors():
+        fit = condition(fit, combination, prior)
     return replace(model, fit=fit)
 
 
@@ -234,13 +252,14 @@ def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
     return np.asarray(drift - q @ (q.T @ drift)), np.asarray(q)
 
 
-def condition(fit: DriftFit, place: int, prior: Prior) -> DriftFit:
-    """Observe one coefficient once more, as its prior says; the variances are kept."""
-    gain = fit.covariance[:, place] / (fit.covariance[place, place] + prior.u**2)
+def condition(fit: DriftFit, combination: Array, prior: Prior) -> DriftFit:
+    """Observe one combination (p,) of coefficients once more, as its prior says; the variances are kept."""
+    along = fit.covariance @ combination
+    gain = along / (combination @ along + prior.u**2)
     return replace(
         fit,
-        coefficients=fit.coefficients + gain * (prior.mean - fit.coefficients[place]),
-        covariance=fit.covariance - np.outer(gain, fit.covariance[place]),
+        coefficients=fit.coefficients + gain * (prior.mean - combination @ fit.coefficients),
+        covariance=fit.covariance - np.outer(gain, along),
     )
 
 
@@ -334,7 +353,9 @@ PARTS = 6
 
 
 def coefficient_spread(model: ModelFit) -> Array:
-    """Standard deviation of every coefficient by the delete-a-group jackknife, over targets and over parts of the test."""
+    """Standard deviation of every coefficient by the delete-a-group jackknife, over targets and over parts of the test; of one that
+    something is known of beforehand with the share of its lagged copies.
+    """
     readings = model.readings.subset(model.used)
     cycles = np.unique(readings.cycle)
     part = np.searchsorted(cycles, readings.cycle) * PARTS // cycles.size
@@ -343,6 +364,9 @@ def coefficient_spread(model: ModelFit) -> Array:
 
 def _jackknife(model: ModelFit, group: NDArray[np.int64]) -> Array:
     values = np.array([_without(model, group == number) for number in np.unique(group)])
+    static = model.static() != 0.0
+    for place in np.flatnonzero(static.sum(axis=0) > 1):
+        values[:, place] = values[:, static[:, place]].sum(axis=1)
     count = values.shape[0]
     spread = np.sqrt((count - 1.0) ** 2 / count * values.var(axis=0, ddof=1))
     spread[np.isnan(values).any(axis=0)] = np.inf

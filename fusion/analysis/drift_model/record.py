@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -1250,7 +1250,7 @@ class RecordResult:
         squares = self.contribution(term) ** 2
         where = "on the hold-out set" if term.candidate.event_s is None else "in parts that are left out"
         return schema.RecordStep(
-            **step.described(term.candidate, self.answers[place], where),
+            **step.described(term.candidate, self.answers[place], where, size=step.score.gain, withheld=""),
             rmse_before_um=known_mean(self.errors[place]),
             rmse_after_um=known_mean(self.errors[place + 1]),
             rmse_without_um=self.state.errors_without_um[place],

@@ -173,50 +173,56 @@ class Decision:
 _WITHIN = 1.92
 #: Values that differ by less than this share are one value, computed twice.
 _SAME = 1e-6
-#: Words that only spell out a number: what a wave may be mistaken for, and the time constants of a chain of parts.
-DERIVED_WORDS = frozenset({"possible_leads", "chain"})
+#: Words that only spell out a number: what a wave may be mistaken for, its harmonics, and the time constants of a chain of parts.
+DERIVED_WORDS = frozenset({"possible_leads", "course", "chain"})
 
 #: Lowest and highest value, None where what was looked at ends before the likelihood has fallen; or the words that fit as well.
 Range = list[float | None] | list[str]
+Parameters = Mapping[str, float | str]
+#: Parameters of a candidate, and what it gains.
+Tried = tuple[Parameters, float]
 
 
-def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, best_gain: float) -> dict[str, Range]:
+def parameter_ranges(tried: Sequence[Tried], best: Parameters, best_gain: float) -> dict[str, Range]:
     """Values of the parameters that fit as well as the best, by profile likelihood (95 %)."""
-    alike = [candidate for candidate, gain in zip(near, gains, strict=True) if gain >= best_gain - _WITHIN]
+    alike = [parameters for parameters, gain in tried if gain >= best_gain - _WITHIN]
     ranges: dict[str, Range] = {}
     words = _words(best, DERIVED_WORDS)
-    for name, value in best.parameters.items():
+    for name, value in best.items():
         if name in DERIVED_WORDS:
             continue
         if isinstance(value, str):
-            others = {str(candidate.parameters[name]) for candidate in alike if name in candidate.parameters} - {value}
+            others = {str(parameters[name]) for parameters in alike if name in parameters} - {value}
             if others:
                 ranges[name] = sorted(others)
             continue
         # A body that is not there has a time constant of zero.
-        tried, fitting = (
-            np.array([float(one.parameters.get(name, 0.0)) for one in some if _words(one, DERIVED_WORDS) == words])
-            for some in (near, alike)
+        values, fitting = (
+            np.array([float(one.get(name, 0.0)) for one in some if _words(one, DERIVED_WORDS) == words])
+            for some in ([parameters for parameters, _ in tried], alike)
         )
-        if np.unique(tried).size > 1:
+        if np.unique(values).size > 1:
             # The values next to those that fit: the likelihood falls somewhere between, so the interval is rather too wide.
             low, high = min([value, *fitting]), max([value, *fitting])
-            below, above = tried[tried < low - _SAME * abs(low)], tried[tried > high + _SAME * abs(high)]
+            below, above = values[values < low - _SAME * abs(low)], values[values > high + _SAME * abs(high)]
             lowest = float(below.max()) if below.size else 0.0 if low == 0.0 else None
             ranges[name] = [lowest, float(above.min()) if above.size else None]
     return ranges
 
 
-def _words(candidate: Candidate, left_out: Collection[str]) -> dict[str, str]:
+def _words(parameters: Parameters, left_out: Collection[str]) -> dict[str, str]:
     """Parameters of a candidate that are words."""
-    named = candidate.parameters.items()
-    return {name: value for name, value in named if isinstance(value, str) and name not in left_out}
+    return {name: value for name, value in parameters.items() if isinstance(value, str) and name not in left_out}
 
 
 # State of the closed loop: an immutable value that every step takes and returns.
 
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
+#: Share of an effect's rms by which its shape in the library is wrong on a real machine: what a bar that conducts heat leaves of the best
+#: response of one or two lumped bodies has a median of 4.5 % (60 bars; docs/method/closed-loop.md). A difference of this size between two
+#: effects is worth no more than a tie, however little noise there is.
+DISCREPANCY = 0.045
 #: An effect that is not significant by itself is no rival.
 _RIVAL_LEVEL = 0.05
 
@@ -271,6 +277,7 @@ class Score:
     critical : gain at which the effect becomes significant
     confirmation : on readings that were not used for the coefficients, None where it was not worth asking
     ranges : values of the parameters that fit as well (profile likelihood, 95 %), where they were looked at closely
+    tried : all candidates of the search, by their parameters
     """
 
     name: str
@@ -284,6 +291,7 @@ class Score:
     critical: float = np.inf
     confirmation: Confirmation | None = None
     ranges: Mapping[str, Range] = field(default_factory=dict)
+    tried: Sequence[Tried] = field(default=(), repr=False)
 
     @property
     def best(self) -> Candidate:
@@ -319,10 +327,23 @@ class Score:
         }
 
 
-def rivals(score: Score, scores: Sequence[Score]) -> tuple[list[str], schema.RunnerUp | schema.Nothing]:
-    """Effects that these data cannot separate from the chosen one, and the runner-up."""
+def rivals(
+    score: Score, scores: Sequence[Score], size: float = 0.0
+) -> tuple[list[str], schema.RunnerUp | schema.Nothing]:
+    """Effects that these data cannot separate from the chosen one, and the runner-up; ``size`` is half the square of what the chosen one
+    explains, in units of the noise.
+    """
     others = [other for other in scores if other.name != score.name and other.candidate is not None]
-    tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
+    # Every shape is wrong by its discrepancy, whose variance adds to that of the noise along the difference of two shapes. What a search
+    # among more candidates gains by chance is not touched by it.
+    blurred = 1.0 + size * DISCREPANCY**2 / TIE_GAIN
+
+    def is_rival(other: Score) -> bool:
+        ahead = score.gain - other.gain
+        chance = (other.gain - other.excess) - (score.gain - score.excess)
+        return other.p_value < _RIVAL_LEVEL and (ahead / blurred if ahead > 0.0 else ahead) + chance < TIE_GAIN
+
+    tied = [other.name for other in others if is_rival(other)]
     if not others:
         return tied, schema.Nothing()
     behind = score.excess - others[0].excess
@@ -365,15 +386,21 @@ class Step:
         """Whether it entered after the hold-out set had been opened."""
         return self.confirmed is Confirmed.SECOND_SEARCH
 
-    def described(self, candidate: Candidate, answer: Answer, where: str) -> dict[str, Any]:
-        """What results.json holds of every step, on a record and along an axis; `where` says which readings gave the answer."""
-        tied, runner_up = rivals(self.score, self.round.scores)
+    def described(
+        self, candidate: Candidate, answer: Answer, where: str, *, size: float, withheld: str
+    ) -> dict[str, Any]:
+        """What results.json holds of every step, on a record and along an axis.
+
+        `where` says which readings gave the answer, ``size`` is as in :func:`rivals`.
+        """
+        tied, runner_up = rivals(self.score, self.round.scores, size)
         return {
             "effect": self.effect,
             "parameters": candidate.parameters,
             "parameter_ranges": self.score.ranges,
             "p_value": self.score.family_wise_p,
             "tied": tied,
+            "withheld": withheld,
             "runner_up": runner_up,
             **answer.described(where),
             "confirmed_by": str(self.confirmed),
@@ -790,6 +817,7 @@ def score_effects(
                 collinear,
                 int(gains.drift_place[best]),
                 critical_gain(sidak_level(level, len(families)), null),
+                tried=[(candidates[row - int(rows[0])].parameters, float(gains.gain[row, 0])) for row in usable],
             )
         )
     return sorted(scores, key=lambda score: -score.excess), decisions
@@ -814,9 +842,11 @@ def _best_near(score: Score, near: Sequence[Candidate], gains: Callable[[Sequenc
             f"effect {score.name!r} offers no candidate near one it offered before: {dict(score.best.parameters)}"
         )
     looked = gains(near)
-    best = int(np.argmax(np.where(looked.separable, looked.gain[:, 0], -np.inf)))
+    # More columns must be the better description by odds of 20 to 1.
+    needed = TIE_GAIN * np.array([one.columns.shape[1] > score.best.columns.shape[1] for one in near])
+    best = int(np.argmax(np.where(looked.separable, looked.gain[:, 0] - needed, -np.inf)))
     gain = float(looked.gain[best, 0])
-    if looked.separable[best] and gain >= score.gain:
+    if looked.separable[best] and gain >= score.gain + needed[best]:
         score = replace(
             score,
             candidate=near[best],
@@ -824,12 +854,13 @@ def _best_near(score: Score, near: Sequence[Candidate], gains: Callable[[Sequenc
             excess=score.excess + gain - score.gain,
             drift_place=int(looked.drift_place[best]),
         )
-    return replace(score, ranges=parameter_ranges(near, looked.gain[:, 0], score.best, score.gain))
+    closer = [(one.parameters, float(gain)) for one, gain in zip(near, looked.gain[:, 0], strict=True)]
+    return replace(score, ranges=parameter_ranges([*closer, *score.tried], score.best.parameters, score.gain))
 
 
 def of_same_kind(candidate: Candidate, chosen: Candidate) -> bool:
     """Whether two candidates differ in numbers only, or in words that a closer look may change."""
-    return _words(chosen, _OPEN_WORDS).items() <= candidate.parameters.items()
+    return _words(chosen.parameters, _OPEN_WORDS).items() <= candidate.parameters.items()
 
 
 # What the evidence allows to say: intervals of errors, whether a name is confirmed, whether the model has skill, and the verdict.

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import ENVIRONMENT, Readings, Series
-from fusion.analysis.effects.effect import Candidate, Effect, Separable, Wave
+from fusion.analysis.effects.effect import Candidate, Effect, Parameters, Separable, Wave
 from fusion.common import Array
 
 # Episodes in what was logged or seen: isolated jumps, sensors that stick, and the instants at which a reading could
@@ -96,23 +97,36 @@ def detect_stuck_sensors(readings: Readings) -> list[tuple[str, float]]:
 
 #: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
 _MOST_PERIODS = 300
+#: Shortest period that is tried.
+_SHORTEST_MIN = 3.0
+#: Numbers of harmonics of a closer look, and orders of which a wave that was chosen may be: a square wave has the odd ones, whose power
+#: falls with the square of the order, while the drift hides the slow ones.
+_HARMONICS, _ORDERS = (1, 3, 7), (2, 3, 5)
 #: So many readings have waves that are held: they take 60 MB, and the search 1/20 less time than if computed for every block.
 _HELD_READINGS = 12_000
 
 
 def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
-    """Steps at the instants that can be tried."""
+    """Steps of zero, scale and reversal at the instants that can be tried."""
     tried = event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
-    place, alike = np.zeros(readings.seconds.size, int), np.ones((1, 1))
+    place, approach = readings.site, np.tile([0.5, -0.5], readings.targets.size)
+    along = np.repeat(1e-3 * readings.positions_mm, 2)
+    weights = {"flat": (np.ones(approach.size), "um"), "linear": (along, "um/m"), "reversal": (approach, "um")}
+    if np.unique(readings.sign).size < 2:
+        del weights["reversal"]
     for instant in tried:
-        late = Separable((readings.seconds >= instant,), place, alike)
-        yield Candidate(late, {"time_s": float(instant)}, ("um",), instant)
+        late = (readings.seconds >= instant,)
+        for shape, (weight, unit) in weights.items():
+            parameters: Parameters = {"time_s": float(instant), "shape": shape}
+            yield Candidate(Separable(late, place, weight[:, None]), parameters, (unit,), instant)
 
 
 def periods_min(readings: Readings) -> Array:
     """Periods that are tried: evenly spaced in frequency at half the resolution of the recording, from 3 min to a third of it."""
     span = _span_min(readings)
-    return np.asarray(1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
+    return np.asarray(
+        1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64))
+    )
 
 
 def _span_min(readings: Readings) -> float:
@@ -121,45 +135,59 @@ def _span_min(readings: Readings) -> float:
 
 def off_the_cycle(readings: Readings, frequencies: Array) -> Array:
     """Leave out frequencies within four lines of the cycle's own frequency or a multiple of it."""
+    return np.asarray(frequencies[_off(readings, frequencies)])
+
+
+def _off(readings: Readings, frequencies: Array) -> NDArray[np.bool_]:
     cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
     order = np.maximum(1.0, np.round(frequencies / cycle))
-    return np.asarray(frequencies[np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings)])
+    return np.asarray(np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings))
 
 
 def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Waves in time, flat or along the axis."""
-    # A long campaign tells so many periods apart that the shortest are left out: the search stays linear in the readings.
-    periods = (
-        periods_min(readings)[:_MOST_PERIODS]
-        if near is None
-        else _close_periods(readings, float(near.parameters["period_min"]))
-    )
     place, share = readings.target_index, readings.positions_mm / readings.span_mm
     weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
-    for period in periods:
+    for period, harmonics in _rhythms(readings, near):
+        orders = np.arange(harmonics) + 1
+        orders = orders[(period >= _SHORTEST_MIN * orders) & ((orders == 1) | _off(readings, orders / period))]
         waves: tuple[Array | Wave, ...] = tuple(
-            Wave(shape, readings.seconds, 60.0 * period) for shape in (np.cos, np.sin)
+            Wave(shape, readings.seconds, 60.0 * period / order) for order in orders for shape in (np.cos, np.sin)
         )
         if readings.seconds.size <= _HELD_READINGS:
             waves = tuple(map(np.asarray, waves))
+        course: Parameters = {"course": f"no sine, {orders.size} harmonics"} if orders.size > 1 else {}
         for shape, weight in weights.items():
-            yield Candidate(
-                Separable(waves, place, weight), {"period_min": float(period), "shape": shape}, ("um", "um")
-            )
+            columns = Separable(waves, place, np.tile(weight, orders.size))
+            parameters: Parameters = {"period_min": float(period), "shape": shape, **course}
+            yield Candidate(columns, parameters, ("um",) * len(waves))
+
+
+def _rhythms(readings: Readings, near: Candidate | None) -> list[tuple[float, int]]:
+    """Periods, and harmonics of each; of what switches the wave that was chosen may be a harmonic, which is not another effect."""
+    if near is None:
+        # A long campaign tells so many periods apart that the shortest are left out: the search stays linear in the readings.
+        return [(period, 1) for period in periods_min(readings)[:_MOST_PERIODS].tolist()]
+    close = _close_periods(readings, float(near.parameters["period_min"])).tolist()
+    slow = [order * period for period in close for order in _ORDERS if 3.0 * order * period <= _span_min(readings)]
+    return [(period, some) for period in close for some in _HARMONICS] + [(period, _HARMONICS[-1]) for period in slow]
 
 
 def _close_periods(readings: Readings, chosen_min: float) -> Array:
     """Periods about a chosen one, as close as the recording can separate; none beyond those of the search."""
     span = _span_min(readings)
     near = 1.0 / chosen_min + np.linspace(-0.5, 0.5, 21) / span
-    near = near[(near > 2.999 / span) & (near < 1.001 / 3.0)]
+    near = near[(near > 2.999 / span) & (near < 1.001 / _SHORTEST_MIN)]
     return np.asarray(1.0 / off_the_cycle(readings, near))
 
 
 STEP_EVENT = Effect(
     name="step_event",
-    physics="A mount, clamp or optic slips once, or the laser gets a new zero: all readings after that instant are shifted.",
-    source="level shift at one instant",
+    physics=(
+        "A mount, clamp or optic slips once, or the laser gets a new zero: all readings after that instant are shifted. A mirror that is "
+        "realigned or a compensation that is switched on changes them in proportion to the position, that of the backlash by the approach."
+    ),
+    source="level shift at one instant, flat, in proportion to the position, or by the direction of approach",
     candidates=_step_event,
     repeats=True,
     label="sudden step or new zero",

@@ -23,6 +23,7 @@ from fusion.analysis.effects.laser_and_camera import (
 from fusion.analysis.effects.thermal import (
     ANGULAR_GROWTH,
     AXIS_EXPANSION,
+    LOGGED_INFLUENCE,
     PITCH_ERROR,
     QUASI_STATIC_RESPONSE,
     REVERSAL_DRIFT,
@@ -36,6 +37,7 @@ LIBRARY: tuple[Effect, ...] = (
     TABLE_OFFSET,
     THERMAL_LAG,
     UNSEEN_HEAT_SOURCE,
+    LOGGED_INFLUENCE,
     DEAD_PATH,
     AIR_INDEX,
     MATERIAL_COMPENSATION,

@@ -155,6 +155,8 @@ EXPANSION_U_PPM_PER_K = 2.0
 QUASI_STATIC = "quasi_static"
 #: Prefix of the series that are temperature sensors of a record.
 SENSOR_PREFIX = "temperature "
+#: Patterns along the axis by the powers of the position that they hold.
+_SHAPES = {"flat": (0,), "linear": (1,), "flat and linear": (0, 1)}
 #: Time constant of a second body that the search tries, as a share of the first one's.
 _SECOND_BODY_TRIED = (0.25,)
 
@@ -204,18 +206,39 @@ def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candid
             settled = readings.at(lagged)
             # What the body was before the log began is not known; its memory of it dies away with the same time constant.
             memory = np.exp(-readings.seconds / (60.0 * float(response["time_constant_min"])))
-            for shape, along in (
-                ("flat", (1.0,)),
-                ("linear", (readings.share,)),
-                ("flat and linear", (1.0, readings.share)),
-            ):
+            for shape, along in _SHAPES.items():
                 parameters: Parameters = {"follows": name, **response, "shape": shape}
-                follow = [settled * factor for factor in along]
-                start = [memory * factor for factor in along]
+                follow = [settled * readings.share**power for power in along]
+                start = [memory * readings.share**power for power in along]
                 units = (unit,) * len(along)
                 yield Candidate(np.column_stack(follow), {**parameters, "start": "settled"}, units)
                 both, units = np.column_stack([*follow, *start]), units + ("um",) * len(along)
                 yield Candidate(both, {**parameters, "start": "free"}, units, beside=len(along))
+
+
+#: What shows the table itself (camera, sensors along the axis, the sensor of the material), and the pressure of the air, which moves no
+#: part of a machine.
+_NO_INFLUENCE = frozenset(
+    {"mean_rise", "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral"}
+    | {"material_temperature", "air_pressure"}
+)
+
+
+def _logged(readings: Readings) -> list[str]:
+    """Names of the series that are logged beside the field and the drivers."""
+    return [name for name in readings.series if name not in _NO_INFLUENCE and name not in readings.drivers]
+
+
+def _logged_influence(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Delayed copies of every logged series, flat and along the axis."""
+    for name in _logged(readings):
+        unit = um_per(readings.series[name].units)
+        for lagged, response in first_order_responses(readings.series[name], near, LAGS_MIN, ratio=1.5):
+            late = readings.at(lagged)
+            for shape, along in _SHAPES.items():
+                parameters: Parameters = {"follows": name, **response, "shape": shape}
+                columns = np.column_stack([late * readings.share**power for power in along])
+                yield Candidate(columns, parameters, (unit,) * len(along))
 
 
 def _quasi_static(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
@@ -275,6 +298,20 @@ UNSEEN_HEAT_SOURCE = Effect(
     remedy=(
         "Look for the source where neither camera nor sensors reach: spindle, motor, drive, screw bearing, hydraulics; log its duty."
     ),
+)
+LOGGED_INFLUENCE = Effect(
+    name="logged_influence",
+    physics=(
+        "A part of the machine or of the laser's set-up follows a quantity that was logged beside field and loads (temperature of room or "
+        "coolant, humidity) with a time constant of its own."
+    ),
+    source="ISO 230-3, environmental temperature variation error",
+    candidates=_logged_influence,
+    needs=lambda readings: None if _logged(readings) else "no room, coolant or humidity was logged",
+    masked_by=unmeasured_expansion,
+    excited_by="driver",
+    label="influence of a logged quantity",
+    remedy="Keep that quantity steady, or let a compensation follow it; look for the part that it reaches so late.",
 )
 QUASI_STATIC_RESPONSE = Effect(
     name=QUASI_STATIC,

@@ -141,7 +141,7 @@ def test_the_terminal_shows_every_cell():
 def step(effect: str, **changes: Any) -> StepPart:
     told = {
         "effect": effect, "parameters": {}, "parameter_ranges": {}, "confirmed": True, "doubt": "", "event_time": None, "p_value": 1e-6,
-        "rmse_before_um": 1.94, "rmse_after_um": 0.66, "cross_rmse_before_um": 0.57, "cross_rmse_after_um": 0.45,
+        "tied": (), "rmse_before_um": 1.94, "rmse_after_um": 0.66, "cross_rmse_before_um": 0.57, "cross_rmse_after_um": 0.45,
     }  # fmt: skip
     return StepPart.model_construct(**{**told, **changes})
 
@@ -361,6 +361,21 @@ def test_what_an_effect_follows_is_told_with_its_time_constant():
     assert step_phrase(axis_step("bed_bending"), None, record=False) == "bed bending"
 
 
+def test_effects_that_are_not_separated_are_told_as_one_of_these():
+    tied = axis_step("unseen_heat_source", tied=("thermal_lag",), parameters={"follows": "duty"})
+    told = say("verdict", loop("explained", tied), None, False)
+    assert (
+        "it lacks one of these, which these data do not separate: a heat source that the camera does not see (follows"
+        in told
+    )
+    assert "or a part of the machine that follows the measured temperatures with a lag" in told
+    asked = action(tied, None, record=False)
+    assert effect_words("thermal_lag").remedy in asked and effect_words("unseen_heat_source").remedy in asked
+    open_end = axis_step("thermal_lag", withheld="its time constant is not determined (130 min and more fits)")
+    words = step_phrase(open_end, None, record=False)
+    assert words.startswith("something that moves like a part") and words.endswith("130 min and more fits)")
+
+
 def test_an_event_is_told_with_its_size_and_its_local_time():
     assert say("when", JUMP, LOCAL) == "2026-03-09 10:08 CET, cycle 38"
     assert say("when", JUMP, None).startswith("2026-03-09 09:08 UTC")
@@ -369,6 +384,9 @@ def test_an_event_is_told_with_its_size_and_its_local_time():
         effect="step_event", parameters={}, parameter_ranges={}, event_s=7200.0, event_time=None
     )
     assert say("when", late, None) == "2.0 h after the start"
+    scale = axis_step("step_event", event_cycle=38, parameters={"shape": "linear"})
+    assert step_phrase(scale, None, record=False).startswith("a sudden change in proportion to the position (2.10")
+    assert "was a mirror realigned" in action(scale, None, record=False)
 
 
 def test_an_action_names_the_time_or_the_load():

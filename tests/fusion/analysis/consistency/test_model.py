@@ -12,7 +12,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines, with_line
+from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines, with_line, withhold_names
 from fusion.analysis.drift_model.axis import declare
 from fusion.analysis.drift_model.fit import Term, fit_model
 from fusion.analysis.effects.library import library
@@ -277,3 +277,11 @@ def test_lines_that_fit_as_well_are_part_of_the_uncertainty_of_the_expansion() -
     }
     assert with_line(entry, near) == with_line(entry, None) == entry
     assert with_line({**entry, "effect": "table_offset"}, far)["u"] == 0.5
+
+
+@pytest.mark.parametrize(("value", "withheld"), [(11.5, False), (2.1, True)])
+def test_names_by_course_alone_are_withheld_where_the_expansion_contradicts(value: float, withheld: bool) -> None:
+    steps = [{"effect": name, "withheld": "", "coefficients": []} for name in ("unseen_heat_source", "dead_path")]
+    loop = withhold_names({**declared(value, 0.2), "steps": steps}, library())
+    assert bool(loop["steps"][0]["withheld"]) == withheld
+    assert not loop["steps"][1]["withheld"]

@@ -14,6 +14,7 @@ from fusion.analysis.drift_model.fit import (
     SINGLE,
     ModelFit,
     PriorRows,
+    Term,
     coefficient_spread,
     condition,
     density_ahead,
@@ -75,7 +76,7 @@ def test_a_prior_is_one_more_observation_of_its_coefficient(rng):
     design, y = rng.standard_normal((n, 3)), rng.standard_normal(n)
     system = drift_system(np.arange(n), np.ones((n, 1)), order=1, ratios=np.zeros(1))
     fit = fit_fixed_effects(system, y, design)
-    told = condition(fit, 1, Prior(mean=2.0, u=0.1))
+    told = condition(fit, np.eye(3)[1], Prior(mean=2.0, u=0.1))
     # One further row that observes the second coefficient, weighted by sigma over its uncertainty.
     row = np.array([0.0, fit.sigma / 0.1, 0.0])
     augmented = np.vstack([design, row])
@@ -498,3 +499,20 @@ def test_variances_are_drawn_in_proportion_to_their_restricted_likelihood(rng):
 def test_a_drift_estimated_as_zero_is_still_drawn(rng):
     draws = plausible_ratios(fit_of(0.0, rng.standard_normal(40)), rng, draws=50)
     assert (draws > 0.0).all()
+
+
+def test_what_is_known_of_the_expansion_is_known_of_its_direct_and_lagged_share_together(rng):
+    """3.7 ppm/K at once and 8.1 ppm/K late are 11.8 ppm/K of a table that has settled."""
+    bare = campaign(cycles=30)
+    direct = np.sin(bare.seconds / 700.0) * bare.position_mm * 1e-2
+    late = np.sin(bare.seconds / 700.0 - 1.0) * bare.position_mm * 1e-2
+    readings = with_response(bare, rng, (3.7, direct), (8.1, late))
+    expansion = Term("axis_expansion", Candidate(direct[:, None], {}, ("ppm/K",), prior=Prior(11.7, 0.01)))
+    lag = Term("thermal_lag", Candidate(np.column_stack([late, late**2]), {}, ("ppm/K", "um/K")))
+    model = fit_model(readings, [expansion, lag])
+    place = model.place(expansion).start
+    assert 11.7 < (model.fit.coefficients @ model.static())[place] < 11.8
+    assert model.fit.coefficients[place] == pytest.approx(3.7, abs=0.5)
+    assert coefficient_spread(model)[place] < 1.0
+    alone = fit_model(readings, [expansion])
+    np.testing.assert_array_equal(alone.static(), np.eye(alone.fit.coefficients.size))

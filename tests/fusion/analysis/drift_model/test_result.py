@@ -21,6 +21,7 @@ from fusion.analysis.drift_model.axis import (
     residual_drift_size,
     rmse,
     verdict,
+    withheld_for,
 )
 from fusion.analysis.drift_model.fit import ModelFit, coefficient_spread, fit_model, unexplained_drift
 from fusion.analysis.drift_model.search import (
@@ -431,8 +432,8 @@ def dense_errors(model: ModelFit, block: np.ndarray) -> np.ndarray:
     x, y, known = fit.design, fit.response, ~block
     whitening = np.linalg.inv(np.linalg.cholesky((drift + noise)[np.ix_(known, known)]))
     a, b = whitening @ x[known], whitening @ y[known]
-    for place, prior in model.priors():
-        a = np.vstack([a, np.eye(x.shape[1])[place] * fit.sigma / prior.u])
+    for combination, prior in model.priors():
+        a = np.vstack([a, combination * fit.sigma / prior.u])
         b = np.append(b, fit.sigma * prior.mean / prior.u)
     beta = np.linalg.lstsq(a, b, rcond=None)[0]
     gain = drift[np.ix_(block, known)] @ np.linalg.inv((drift + noise)[np.ix_(known, known)])
@@ -598,3 +599,29 @@ def test_the_outcome_has_one_word(changed, word):
 
 def test_no_cause_is_separable_where_a_plain_regression_is_better_by_a_quarter():
     assert is_separable(2.06, 1.93) and is_separable(1.0, 0.76) and not is_separable(1.0, 0.75)
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "interval", "why"),
+    [
+        ("unseen_heat_source", "time_constant_min", [17.0, 38.0], ""),
+        (
+            "unseen_heat_source",
+            "time_constant_min",
+            [130.0, None],
+            "its time constant is not determined (130 min and more fits)",
+        ),
+        (
+            "thermal_lag",
+            "time_constant_min",
+            [None, 7.5],
+            "its time constant is not determined (7.5 min and less fits)",
+        ),
+        ("periodic_disturbance", "period_min", [None, None], "its period is not determined (any fits)"),
+        # Told by its pattern along the axis.
+        ("reversal_drift", "time_constant_min", [None, 20.0], ""),
+    ],
+)
+def test_what_is_told_by_its_course_alone_needs_a_time_that_is_determined(effect, parameter, interval, why):
+    step = Step(score(effect, ranges={parameter: interval}), Round(()), Confirmed.LATER_CYCLES)
+    assert withheld_for(step) == why

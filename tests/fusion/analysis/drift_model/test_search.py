@@ -600,6 +600,18 @@ def test_effects_within_three_units_that_are_significant_by_themselves_are_tied(
     assert runner_up.model_dump() == {"effect": "close", "gain_deficit": pytest.approx(2.9), "p_value": 0.3}
 
 
+def test_effects_tie_that_differ_by_less_than_a_shape_of_the_library_differs_from_a_machine():
+    """Twelve units behind is nothing where the effect is ten thousand units large, unless the rival had more chances to fit as well."""
+    chosen = replace(scored_as("chosen", 900.0), gain=901.0)
+    rival = replace(scored_as("rival", 888.0, p_value=0.001), gain=889.0)
+    assert rivals(chosen, (chosen, rival))[0] == []
+    assert rivals(chosen, (chosen, rival), 1e4)[0] == ["rival"]
+    searched = replace(rival, excess=885.0)
+    assert rivals(chosen, (chosen, searched), 1e4)[0] == []
+    better = replace(rival, gain=920.0, excess=919.0)
+    assert rivals(chosen, (chosen, better), 1e4)[0] == ["rival"]
+
+
 def test_an_effect_without_rivals_has_no_runner_up():
     chosen = scored_as("chosen")
     assert rivals(chosen, (chosen, Score("collinear", None))) == ([], Nothing())
@@ -679,7 +691,8 @@ def states(*minutes: float, follows: str = "duty") -> list[Candidate]:
     ],
 )
 def test_a_range_holds_the_values_that_fit_as_well(near, gains, best, expected):
-    assert parameter_ranges(near, np.array(gains), near[best], 10.0) == expected
+    tried = [(one.parameters, gain) for one, gain in zip(near, gains, strict=True)]
+    assert parameter_ranges(tried, near[best].parameters, 10.0) == expected
 
 
 @pytest.mark.parametrize(

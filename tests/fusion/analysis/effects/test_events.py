@@ -29,11 +29,14 @@ def span_min(readings) -> float:
 def test_a_step_is_zero_before_its_instant_and_one_from_it_on():
     readings = campaign(cycles=12)
     candidates = list(STEP_EVENT.candidates(readings, {}, None))
-    assert len(candidates) == 32
+    assert len(candidates) == 3 * 32
+    heights = {"flat": 1.0, "linear": 1e-3 * readings.position_mm, "reversal": 0.5 * readings.sign}
     for candidate in candidates:
-        instant = candidate.event_s
-        assert candidate.parameters == {"time_s": instant} and candidate.units == ("um",)
-        np.testing.assert_array_equal(candidate.columns[:, 0], np.where(readings.seconds < instant, 0.0, 1.0))
+        instant, shape = candidate.event_s, candidate.parameters["shape"]
+        assert candidate.parameters["time_s"] == instant and candidate.units == ("um/m" if shape == "linear" else "um",)
+        np.testing.assert_array_equal(
+            candidate.columns[:, 0], np.where(readings.seconds < instant, 0.0, heights[shape])
+        )
     # 390 s is the first reading of the fourth cycle: it is shifted.
     at_reading = next(candidate for candidate in candidates if candidate.event_s == 390.0)
     assert at_reading.columns[readings.seconds == 390.0, 0] == 1.0
@@ -42,8 +45,10 @@ def test_a_step_is_zero_before_its_instant_and_one_from_it_on():
 def test_a_step_is_looked_at_more_closely_at_the_readings():
     readings = campaign(cycles=12)
     chosen = Candidate(np.empty((0, 1)), {"time_s": 325.0}, ("um",), event_s=325.0)
-    near = list(STEP_EVENT.candidates(readings, {}, chosen))
+    near = [one for one in STEP_EVENT.candidates(readings, {}, chosen) if one.parameters["shape"] == "flat"]
     assert [candidate.event_s for candidate in near] == [300.0, 310.0, 320.0, 330.0]
+    one_way = campaign(cycles=12, both_directions=False)
+    assert {one.parameters["shape"] for one in STEP_EVENT.candidates(one_way, {}, None)} == {"flat", "linear"}
 
 
 def test_a_wave_has_its_period_in_minutes_flat_or_along_the_axis():
@@ -106,13 +111,26 @@ def test_a_closer_look_stays_within_half_a_line_and_within_the_search():
     def frequencies_about(period: float) -> np.ndarray:
         chosen = Candidate(np.empty((0, 2)), {"period_min": period}, ("um", "um"))
         near = PERIODIC_DISTURBANCE.candidates(readings, {}, chosen)
-        return np.array([1.0 / candidate.parameters["period_min"] for candidate in near])[::2]
+        sines = [one for one in near if len(one.units) == 2 and one.parameters["period_min"] < 1.5 * period]
+        return np.unique([1.0 / one.parameters["period_min"] for one in sines])
 
     # No period is shorter than three minutes.
     np.testing.assert_allclose(frequencies_about(3.0), 1.0 / 3.0 + np.linspace(-0.5, 0.0, 11) / span)
     near = frequencies_about(10.0)
     np.testing.assert_allclose(near, 0.1 + np.linspace(-0.5, 0.5, 21) / span)
     np.testing.assert_allclose(frequencies_about(span / 3.0), 3.0 / span + np.linspace(0.0, 0.5, 11) / span)
+
+
+def test_a_closer_look_at_a_wave_holds_the_rhythm_of_which_it_is_a_harmonic():
+    """The drift hides the slow wave of a rhythm that switches, so that the search meets its third harmonic first."""
+    readings = campaign(cycles=80)
+    chosen = Candidate(np.empty((0, 2)), {"period_min": 10.0}, ("um", "um"))
+    near = PERIODIC_DISTURBANCE.candidates(readings, {}, chosen)
+    rhythm = [one for one in near if one.parameters["period_min"] == pytest.approx(30.0) and len(one.units) > 2]
+    assert rhythm and all(str(one.parameters["course"]).startswith("no sine") for one in rhythm)
+    third = np.cos(2.0 * np.pi * readings.seconds / 600.0)
+    left = third - rhythm[0].columns[:] @ np.linalg.lstsq(rhythm[0].columns[:], third, rcond=None)[0]
+    assert np.abs(left).max() < 1e-9
 
 
 # Jumps, stuck sensors and the instants of events, each at its limit and just beyond it.

@@ -45,7 +45,8 @@ def test_every_effect_keeps_its_contract(effect):
     readings = everything()
     assert effect.label and effect.remedy and effect.physics and effect.source
     assert effect.words == effect.label != effect.name
-    assert effect.excited_by == {"thermal_lag": "field", "unseen_heat_source": "driver"}.get(effect.name, "")
+    by_switching = {"thermal_lag": "field", "unseen_heat_source": "driver", "logged_influence": "driver"}
+    assert effect.excited_by == by_switching.get(effect.name, "")
     assert effect.needs(readings) is None
     candidates = list(effect.candidates(readings, {"table_offset": 2.0, "axis_expansion": 10.0}, None))
     assert candidates

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Prior, thermal_s
 from fusion.analysis.effects.thermal import (
     ANGULAR_GROWTH,
     AXIS_EXPANSION,
+    LOGGED_INFLUENCE,
     PITCH_ERROR,
     QUASI_STATIC_RESPONSE,
     REVERSAL_DRIFT,
@@ -253,3 +256,22 @@ def test_even_targets_hide_the_leads_that_divide_their_spacing():
     assert hidden_leads_mm(warmed(UNEVEN)) == ""
     # Targets closer than the shortest lead hide none.
     assert hidden_leads_mm(warmed(tuple(np.arange(1, 8) * 1.5))) == ""
+
+
+def test_every_log_beside_field_and_loads_may_be_followed_late():
+    wave = np.sin(np.arange(60) / 7.0)
+    series = {
+        "mean_rise": logged(wave, "K"),
+        "duty": logged(wave, "1"),
+        "air_pressure": logged(wave, "hPa"),
+        "relative_humidity": logged(wave, "percent"),
+    }
+    readings = campaign(cycles=14, series=series, drivers=("duty",))
+    offered = list(LOGGED_INFLUENCE.candidates(readings, {}, None))
+    assert {one.parameters["follows"] for one in offered} == {"relative_humidity"}
+    assert {one.parameters["shape"] for one in offered} == {"flat", "linear", "flat and linear"}
+    late = readings.at(series["relative_humidity"].lagged(300.0))
+    linear = next(one for one in offered if one.parameters["shape"] == "linear")
+    np.testing.assert_allclose(linear.columns[:, 0], late * readings.share)
+    bare = replace(readings, series={name: one for name, one in series.items() if name != "relative_humidity"})
+    assert LOGGED_INFLUENCE.needs(bare) == "no room, coolant or humidity was logged"
