@@ -51,7 +51,7 @@ def test_bad_pixels_are_counted_by_kind(rng):
     assert notice.code == "bad_pixels"
     assert notice.message.startswith("3 pixels do not follow their neighbours (1 dead, ")
     assert "off its neighbours" in notice.message
-    assert notice.message.endswith("1 noisy); they are included in the cell averages.")
+    assert notice.message.endswith("1 noisy); they are included in the averages.")
 
 
 def test_the_offset_of_a_periodic_test_is_said_as_an_assumption():

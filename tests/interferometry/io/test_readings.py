@@ -444,7 +444,9 @@ def test_a_rotary_axis_keeps_its_units_and_is_refused_elsewhere(tmp_path):
     test = read(tmp_path, text, rotary=True)
     assert (test["deviation"].attrs["units"], test["position"].attrs["units"]) == ("arcsec", "deg")
     assert test["deviation"].values == pytest.approx(EXPECTED, abs=1e-6)
-    with pytest.raises(LaserFormatError, match=r"the positions are angles; .* only the evaluation by ISO 230-2 is"):
+    with pytest.raises(
+        LaserFormatError, match=r"the positions are angles; a rotary axis is evaluated by ISO 230-2 alone"
+    ):
         read(tmp_path, text)
 
 
