@@ -70,6 +70,7 @@ def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
         "verdict": loop.verdict,
         "headline": headline(results),
         "doubts": (),
+        "unverified": (),
         "untouched": "",
         "measured": (
             f"{counted(record.sizes['channel'], 'displacement')} and {counted(record.sizes['sensor'], 'temperature')} over "
