@@ -31,11 +31,11 @@ EXPONENTS = (1, 2)
 _REST_SHARE = 0.02
 #: A driver is switched where it changes by this share of its range from one block to the next.
 _SWITCHED = 0.2
-#: Coordinate that names the columns, smallest and largest value of every variable: absolute zero and 3000 degC, a displacement of 1 m, and
-#: for a driver, whose unit is free, a tenth of the largest single-precision number, which loggers write for no value.
+#: Coordinate that names the columns, smallest and largest value of every variable: absolute zero and 3000 degC, a position of 100 m,
+#: and for a driver, whose unit is free, a tenth of the largest single-precision number, which loggers write for no value.
 _POSSIBLE = {
     "temperature": ("sensor", -273.15, 3000.0),
-    "displacement": ("channel", -1e6, 1e6),
+    "displacement": ("channel", -1e8, 1e8),
     "driver": ("driver_name", -3e37, 3e37),
 }
 #: Share of its largest size by which a constant may differ from its mean.
