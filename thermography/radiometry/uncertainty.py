@@ -178,7 +178,7 @@ def temperature_uncertainty(
     ... )
     >>> budget = temperature_uncertainty([25.0, 40.0], sc660, frames=10)
     >>> budget.total_u.round(3), budget.per_frame_u.round(3), budget.common["emissivity"].round(3)
-    (array([1.258, 1.315]), array([0.018, 0.015]), array([-0.051, -0.191]))
+    (array([1.267, 1.422]), array([0.018, 0.015]), array([-0.154, -0.574]))
     """
     inputs = inputs or InputUncertainty()
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
