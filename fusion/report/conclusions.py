@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fusion.report.wording import randomised_causes, say
+from fusion.report.wording import conditional, randomised_causes, say
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import StepPart
 from fusion.results.parts import TimePart
@@ -76,7 +76,8 @@ def next_steps(results: Results) -> list[str]:
     steps = [check.remedy for check in (*inputs.doubts, *inputs.unverified)] if inputs else []
     loop, correlation = results.loop, results.correlation
     if loop is not None:
-        steps += [action(step, results.time, record=results.registration is None) for step in loop.steps]
+        actions = [action(step, results.time, record=results.registration is None) for step in loop.steps]
+        steps += [conditional(one, inputs, "causes") for one in actions]
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
     steps += [

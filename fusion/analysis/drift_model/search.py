@@ -1041,7 +1041,8 @@ def answers(channels: Sequence[Unseen]) -> list[Answer]:
     # The drifts of the channels of one machine are alike, so that many channels say little more than one.
     left = y - x @ slopes
     alike = left @ left.T
-    size = np.sqrt(np.diag(alike))
+    # A channel that is predicted exactly has no drift to share.
+    size = np.sqrt(np.maximum(np.diag(alike), np.finfo(float).tiny))
     products = np.einsum("kni,lnj->klij", x, x)
     covariance = inverse @ np.einsum("kl,klij->ij", alike / np.outer(size, size), products) @ inverse
     for k, (rows, _, _, uncertain, _) in enumerate(asked):

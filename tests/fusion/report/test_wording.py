@@ -414,6 +414,12 @@ def test_the_model_comes_first_and_what_asks_for_nothing_is_left_out():
     assert nothing.startswith("Nothing has to be done")
 
 
+def test_what_to_do_about_a_cause_is_conditional_where_a_doubted_input_endangers_it():
+    steps = next_steps(results(loop("explained", step("dead_path")), inputs=doubted("signs")))
+    (about,) = [one for one in steps if one.endswith(effect_words("dead_path").remedy[1:])]
+    assert about.startswith("Only if ")
+
+
 def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
     source = SourcePart.model_construct(x_mm=355.0, y_mm=95.0, area=None)
     seen = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
