@@ -76,7 +76,9 @@ def next_steps(results: Results) -> list[str]:
     steps = [check.remedy for check in (*inputs.doubts, *inputs.unverified)] if inputs else []
     loop, correlation = results.loop, results.correlation
     if loop is not None:
-        actions = [action(step, results.time, record=results.registration is None) for step in loop.steps]
+        # Where no cause is separable, none is to be looked for.
+        shown = loop.steps if loop.separable else ()
+        actions = [action(step, results.time, record=results.registration is None) for step in shown]
         steps += [conditional(one, inputs, "causes") for one in actions]
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))

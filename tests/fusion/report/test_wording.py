@@ -420,6 +420,11 @@ def test_what_to_do_about_a_cause_is_conditional_where_a_doubted_input_endangers
     assert about.startswith("Only if ")
 
 
+def test_no_cause_is_to_be_looked_for_where_none_is_separable():
+    (nothing,) = next_steps(results(loop("unexplained", step("dead_path")).model_copy(update={"separable": False})))
+    assert effect_words("dead_path").remedy not in nothing
+
+
 def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
     source = SourcePart.model_construct(x_mm=355.0, y_mm=95.0, area=None)
     seen = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
