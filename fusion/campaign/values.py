@@ -22,8 +22,11 @@ from fusion.common import FusionError, suggest
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "mm": {
         "nm": (1e-6, 0.0), "um": (1e-3, 0.0), "mm": (1.0, 0.0), "cm": (10.0, 0.0), "m": (1e3, 0.0), "in": (25.4, 0.0),
+        "mil": (25.4e-3, 0.0),
     },
-    "um": {"nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0), "in": (25.4e3, 0.0)},
+    "um": {
+        "nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0), "in": (25.4e3, 0.0), "mil": (25.4, 0.0),
+    },
     "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)},
     "K": {"mK": (1e-3, 0.0), "K": (1.0, 0.0), "degC": (1.0, 0.0), "degF": (5.0 / 9.0, 0.0)},
     "s": {"ms": (1e-3, 0.0), "s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
@@ -42,6 +45,7 @@ _WORDS = {
     "deg c": "degC", "degree c": "degC", "degrees c": "degC", "celsius": "degC", "degree celsius": "degC", "degrees celsius": "degC",
     "kelvin": "K", "deg f": "degF", "fahrenheit": "degF", "micron": "um", "microns": "um", "micrometer": "um", "micrometers": "um",
     "micrometre": "um", "micrometres": "um", "millimeter": "mm", "millimetre": "mm", "second": "s", "seconds": "s", "minute": "min",
+    "grad c": "degC", "inch": "in", "inches": "in", "mils": "mil", "thou": "mil",
     "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
 }  # fmt: skip
 #: Other units, and what loggers write in a row of units for their own columns.

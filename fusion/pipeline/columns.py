@@ -50,6 +50,7 @@ _FAR = 50.0
 _FORMATS = (
     "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
     "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M", "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y %I:%M %p",
+    "%d-%b-%y %H:%M:%S", "%d-%b-%y %H:%M", "%d-%b-%y %I:%M:%S %p", "%d-%b-%y %I:%M %p",
 )  # fmt: skip
 #: Day and month of a date whose year comes last; with dots between them the day stands first.
 _SWAPPED = re.compile(r"^%([md])([-/])%([md])")
@@ -77,7 +78,20 @@ _WIDEST_LONG = 6
 #: Columns of a table of changes that say how a value was read.
 _STATE = re.compile(r"quality|alarm|status|severity|state|flag|güte", re.I)
 #: Units at the end of a heading, after a space or an underscore.
-_SUFFIXES = {"um": "um", "µm": "um", "mm": "mm", "nm": "nm", "degc": "degC", "°c": "degC", "c": "degC", "degf": "degF"}
+_SUFFIXES = {
+    "um": "um",
+    "µm": "um",
+    "mm": "mm",
+    "nm": "nm",
+    "degc": "degC",
+    "°c": "degC",
+    "c": "degC",
+    "degf": "degF",
+    "inch": "in",
+    "mil": "mil",
+}
+#: The same of letters that end other names as well, such as that of a temperature at an inlet, by the role that the name must have.
+_SUFFIXES_OF = {"displacement": {"in": "in"}, "temperature": {"f": "degF"}}
 _UNIT_OF_WORD = {"rpm": "1/min", "drehzahl": "1/min", "转速": "1/min", "power": "W", "current": "A", "voltage": "V"}
 
 
@@ -445,7 +459,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     name, in_heading = name_and_unit(heading)
     if in_heading.isdecimal() and "[" not in heading:
         in_heading = ""  # TC(1), TC(2): a number, no unit
-    unit = unit_name(unit or in_heading or _SUFFIXES.get(read_heading(heading).unit or "", ""))
+    suffix = read_heading(heading).unit or ""
+    suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
+    unit = unit_name(unit or in_heading or suffixes.get(suffix, ""))
     first = _first(series)
     if not numbers.size:
         return Column(heading, "out", unit, first, remark=_NO_NUMBERS)

@@ -153,7 +153,7 @@ def is_temperature(heading: str) -> bool:
 
 def is_displacement(heading: str) -> bool:
     """Return whether a heading is that of a displacement."""
-    return column_unit(heading) in ("um", "nm", "mm")
+    return column_unit(heading) in ("um", "nm", "mm", "in", "mil")
 
 
 def is_time(heading: str) -> bool:

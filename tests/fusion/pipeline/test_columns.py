@@ -304,3 +304,28 @@ def test_a_battery_without_headings_is_asked_about(tmp_path: Path, real_file: Ca
     table = propose_table(real_file(name))
     assert [one.heading for one in table.of("temperature")] == ["5", "7"]
     assert table.keys["time"] == "1" and table.rows == 3548
+
+
+def test_inches_mils_and_fahrenheit_are_read_from_headings_and_an_inlet_is_no_inch(tmp_path: Path) -> None:
+    minutes = np.arange(120.0)
+    warm = 70.0 + 20.0 * (1.0 - np.exp(-minutes / 30.0))
+    stamps = pd.Timestamp("2026-03-04 21:30") + pd.to_timedelta(minutes, unit="min")
+    table = pd.DataFrame(
+        {
+            "Date": stamps.strftime("%d-%b-%y"),
+            "Time": stamps.strftime("%I:%M %p"),
+            "Temp_spindle_F": warm,
+            "T_in": warm / 3.0,
+            "disp_Z_in": 1e-5 * (warm - 70.0),
+            "Y [mil]": 1e-2 * (warm - 70.0),
+        }
+    )
+    table.round(7).to_csv(tmp_path / "log.csv", index=False)
+    write_campaign(tmp_path, Asker(None))
+    record = read_record(load_campaign(tmp_path / "campaign.toml"))
+    assert record["temperature"].sel(sensor="Temp_spindle_F")[0] == pytest.approx((70.0 - 32.0) / 1.8, abs=1e-6)
+    assert record["temperature"].sel(sensor="T_in")[0] == pytest.approx(70.0 / 3.0, abs=1e-6)
+    last = warm[-1] - 70.0
+    assert record["displacement"].sel(channel="disp_Z_in")[-1] == pytest.approx(1e-5 * last * 25.4e3, abs=3e-3)
+    assert record["displacement"].sel(channel="Y")[-1] == pytest.approx(1e-2 * last * 25.4, abs=3e-3)
+    assert (record["time"].values[[0, -1]] == stamps.values[[0, -1]]).all()
