@@ -27,7 +27,7 @@ def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
     rows = dict(summary_rows(assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])))
     condition = "(only if the datum of the laser stayed the same)"
     touched = {name for name, text in rows.items() if condition[1:-1] in text.lower()}
-    of_laser = "verdict, how much, where, how sure, scatter per position, added, held-out error, plain predictions, noise floor"
+    of_laser = "verdict, how much, where, how sure, scatter per position, added, held-out error, plain predictions, noise floor, next"
     assert touched == set(of_laser.split(", "))
 
 
