@@ -540,6 +540,8 @@ def check_picture(fields: xr.Dataset) -> list[Check]:
     if not shown:
         return []
     pattern_K, zero_K = shown["pattern_K"], shown["zero_K"]
+    moved = zero_K > _PICTURE_K
+    keep_in_view = "Keep a surface of constant temperature in view (reference_patch under [thermography])."
     return [
         judge(
             "camera_picture",
@@ -557,12 +559,8 @@ def check_picture(fields: xr.Dataset) -> list[Check]:
             f"Zero not verified: discs of low emissivity change by {zero_K:.2g} K with the table around them and not with the logged room: "
             "the camera's zero, a window, or what the discs reflect. The uncertainty of the rise contains it.",
             passed=True,
-            unverified="Keep a surface of constant temperature in view (reference_patch under [thermography])."
-            if zero_K > _PICTURE_K
-            else "",
-            sound=""
-            if zero_K > _PICTURE_K
-            else f"The discs show no change of the camera's zero (largest {zero_K:.2g} K).",
+            unverified=keep_in_view if moved else "",
+            sound="" if moved else f"The discs show no change of the camera's zero (largest {zero_K:.2g} K).",
         ),
     ]
 
