@@ -523,7 +523,8 @@ def _filter_with_average(
         kalman.predict_state(state, components, order, memory, step)
         kalman.predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
         for c in range(components):
-            predicted[k, c] = covariance[c * order]
+            for i in range(size):
+                predicted[k, c, i] = covariance[c * order, i]
         if observed[k]:
             total = kalman.innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
             kalman.update_covariance(covariance, cross_covariance, total)
@@ -532,9 +533,12 @@ def _filter_with_average(
                 gains[k, i] = cross_covariance[i] / total
         if weights[k] != 0.0:
             for c in range(components):
-                state[m + c] += weights[k] * state[c * order]
-                covariance[m + c] += weights[k] * covariance[c * order]
-                covariance[:, m + c] += weights[k] * covariance[:, c * order]
+                for j in range(columns.shape[1]):
+                    state[m + c, j] += weights[k] * state[c * order, j]
+                for i in range(size):
+                    covariance[m + c, i] += weights[k] * covariance[c * order, i]
+                for i in range(size):
+                    covariance[i, m + c] += weights[k] * covariance[i, c * order]
     return state, covariance, predicted, gains
 
 
@@ -554,7 +558,8 @@ def _covariance_with_average(
     for k in range(n - 1, -1, -1):
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
         if memory.size:
-            onward[:, last] *= np.exp(-step / memory[1])
+            for i in range(components):
+                onward[i, last] *= np.exp(-step / memory[1])
         if order == 2:
             for c in range(components):
                 for i in range(components):

@@ -162,7 +162,8 @@ def filter_covariance(
         predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
         if keep:
             for c in range(components):
-                covariances[k, c] = covariance[c * order]
+                for i in range(m):
+                    covariances[k, c, i] = covariance[c * order, i]
         innovation_variances[k] = innovation_variance(
             covariance, order, loadings, k, memory, variance[k], cross_covariance
         )
@@ -189,7 +190,8 @@ def filter_columns(
         predict_state(state, components, order, memory, step)
         if keep:
             for c in range(components):
-                states[k, c] = state[c * order]
+                for j in range(p):
+                    states[k, c, j] = state[c * order, j]
         # One loop over the columns for every term: the compiler then takes several columns at a time.
         innovation = innovations[k]
         for j in range(p):
@@ -300,9 +302,12 @@ def smooth(
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
         if memory.size:
             kept = np.exp(-step / memory[1])
-            r[last] *= kept
-            N[last] *= kept
-            N[:, last] *= kept
+            for j in range(p):
+                r[last, j] *= kept
+            for j in range(m):
+                N[last, j] *= kept
+            for j in range(m):
+                N[j, last] *= kept
         if order == 2:
             for c in range(components):
                 for j in range(p):
@@ -333,15 +338,18 @@ def smooth(
                 for e in range(components):
                     N[level, e * order] += loading * loadings[k, e] * D[k]
             if memory.size:
-                r[last] += u[k]
-                N[last] -= NM
-                N[:, last] -= NM
+                for j in range(p):
+                    r[last, j] += u[k, j]
+                for j in range(m):
+                    N[last, j] -= NM[j]
+                    N[j, last] -= NM[j]
                 N[last, last] += D[k]
                 for c in range(components):
                     N[c * order, last] += loadings[k, c] * D[k]
                     N[last, c * order] += loadings[k, c] * D[k]
         else:
-            u[k] = 0.0
+            for j in range(p):
+                u[k, j] = 0.0
         _smooth_levels(order, covariances[k], r, N, levels[k], level_covariance[k])
     return levels, level_covariance, u, D
 
@@ -400,7 +408,8 @@ def normal_equations(
         if held == 4:
             _add_products(gram, innovations, precision)
             held = 0
-    precision[held:] = 0.0
+    for unused in range(held, 4):
+        precision[unused] = 0.0
     _add_products(gram, innovations, precision)
     for i in range(p):
         for j in range(i):
@@ -430,15 +439,16 @@ def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
         if pivot < tolerance:
             return swept, log_determinant, k - 1
         log_determinant += np.log(pivot)
-        row = swept[k] / pivot
+        row = swept[k]
+        for j in range(size):
+            row[j] /= pivot
         for i in range(size):
             if i != k:
                 factor = swept[i, k]
                 for j in range(size):
                     swept[i, j] -= factor * row[j]
                 swept[i, k] = -factor / pivot
-        swept[k] = row
-        swept[k, k] = 1.0 / pivot
+        row[k] = 1.0 / pivot
     return swept, log_determinant, -1
 
 

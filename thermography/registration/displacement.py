@@ -202,22 +202,23 @@ def _dot(a: Array, b: Array) -> np.float32:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
 def _displacements(sums: Array, least: Array, arms: Array) -> Array:
     """Displacement by the discs whose sum exceeds `least`, (frames, 4) px; NaN where those are fewer than three."""
+    shows = np.abs(sums[..., 0]) > least
+    shows &= (shows.sum(axis=1) >= 3)[:, None]
+    measured = shows.any(axis=1)
     displacements = np.full((len(sums), 4), np.nan)
-    for frame in range(len(sums)):
-        shows = np.abs(sums[frame, :, 0]) > least
-        if shows.sum() < 3:
-            continue
-        column = sums[frame, shows, 1] / sums[frame, shows, 0]
-        row = sums[frame, shows, 2] / sums[frame, shows, 0]
-        displacements[frame, 0], displacements[frame, 1] = np.median(column), np.median(row)
-        across, down = arms[shows, 0] - arms[shows, 0].mean(), arms[shows, 1] - arms[shows, 1].mean()
-        column, row = column - displacements[frame, 0], row - displacements[frame, 1]
-        squares = (across**2 + down**2).sum()
-        displacements[frame, 2] = (across * column + down * row).sum() / squares
-        displacements[frame, 3] = (across * row - down * column).sum() / squares
+    sums, shows = sums[measured], shows[measured]
+    # NaN where a disc does not show, so that it takes no part.
+    moved = np.divide(sums[..., 1:], sums[..., :1], out=np.full((*shows.shape, 2), np.nan), where=shows[..., None])
+    reach = np.where(shows[..., None], arms, np.nan)
+    shift = np.nanmedian(moved, axis=1)
+    across, down = np.moveaxis(reach - np.nanmean(reach, axis=1, keepdims=True), -1, 0)
+    column, row = np.moveaxis(moved - shift[:, None], -1, 0)
+    squares = np.nansum(across**2 + down**2, axis=1)
+    displacements[measured, :2] = shift
+    displacements[measured, 2] = np.nansum(across * column + down * row, axis=1) / squares
+    displacements[measured, 3] = np.nansum(across * row - down * column, axis=1) / squares
     return displacements
 
 

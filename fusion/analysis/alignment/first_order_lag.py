@@ -12,13 +12,16 @@ from fusion.common import Array
 
 @njit(cache=True)
 def _respond(values: Array, seconds: Array, time_constant_s: float, start: Array) -> Array:
+    # Element by element, here and in every kernel: an assignment of whole rows takes seconds to compile.
     response = np.empty_like(values)
-    response[0] = start
+    for j in range(start.size):
+        response[0, j] = start[j]
     for k in range(seconds.size - 1):
         step = seconds[k + 1] - seconds[k]
         decay = np.exp(-step / time_constant_s)
-        ramp = (values[k + 1] - values[k]) / step * time_constant_s
-        response[k + 1] = (response[k] - values[k] + ramp) * decay + values[k + 1] - ramp
+        for j in range(start.size):
+            ramp = (values[k + 1, j] - values[k, j]) / step * time_constant_s
+            response[k + 1, j] = (response[k, j] - values[k, j] + ramp) * decay + values[k + 1, j] - ramp
     return response
 
 
