@@ -10,6 +10,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,12 +25,12 @@ pytestmark = [
 ]
 
 #: Runs a campaign in one process, as ``thermofuse run --processes 1`` does, and prints MB at the peak of every stage, with mapped files
-#: and without, and s of processor.
+#: and without, and s of processor, of the whole and from each stage's first progress to the next one's.
 MEASURE = """
 import json, sys, threading, time
 from fusion.pipeline.run import run_campaign
 
-peaks, label = {}, "start"
+peaks, seconds, label, since = {}, {}, "start", time.process_time()
 
 def memory(name):
     with open("/proc/self/status") as status:
@@ -46,17 +47,19 @@ def watch():
         time.sleep(0.01)
 
 def report(step, done, total):
-    global label
+    global label, since
     note()
     if step != label:
-        label = step
+        now = time.process_time()
+        seconds[label] = seconds.get(label, 0.0) + now - since
+        label, since = step, now
         with open("/proc/self/clear_refs", "w") as peak:
             peak.write("5")
 
 threading.Thread(target=watch, daemon=True).start()
 run_campaign(sys.argv[1], sys.argv[2], resume=len(sys.argv) > 3, report=report)
-note()
-print(json.dumps({"peaks": peaks, "processor_s": time.process_time()}))
+report("end", 1, 1)
+print(json.dumps({"peaks": peaks, "seconds": seconds, "processor_s": time.process_time()}))
 """
 
 
@@ -71,15 +74,21 @@ def write_both(folder: Path, cycles: int) -> Path:
     return write_campaign(simulate(recipe), folder)
 
 
-def measure(path: Path, out: Path, *, resume: bool = False) -> tuple[float, float]:
-    """MB at the peak of a run, with mapped files and without, and s of processor; prints the stages that come nearest to it."""
+def run_measured(path: Path, out: Path, *, resume: bool = False) -> dict[str, Any]:
+    """What `MEASURE` prints of a run in a process of its own."""
     told = subprocess.run(
         [sys.executable, "-c", MEASURE, str(path), str(out), *(["resume"] if resume else [])],
         check=True,
         capture_output=True,
         text=True,
     )
-    found = json.loads(told.stdout.splitlines()[-1])
+    found: dict[str, Any] = json.loads(told.stdout.splitlines()[-1])
+    return found
+
+
+def measure(path: Path, out: Path, *, resume: bool = False) -> tuple[float, float]:
+    """MB at the peak of a run, with mapped files and without; prints the stages that come nearest to it and s of processor."""
+    found = run_measured(path, out, resume=resume)
     print(f"\n{out.name}: {found['processor_s']:.0f} s of processor")
     for stage, (whole, private) in found["peaks"].items():
         print(f"  {stage:40s} {whole:6.0f} MB, without files {private:6.0f} MB")

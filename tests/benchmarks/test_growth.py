@@ -1,0 +1,98 @@
+"""How processor time and memory of each stage grow when cycles, targets, frames, pixels, cells or logs are doubled, one at a time.
+
+The exponent is the logarithm to base 2 of the ratio: 1 grows with the size, 0 does not grow. Stages below 0.2 s are left out, their time
+being that of the calls.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fusion.twin.instruments import write_campaign
+from fusion.twin.recipe import EffectRecipe, Recipe
+from fusion.twin.simulate import simulate
+from tests.benchmarks.test_memory_long_campaigns import run_measured
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is read from /proc"),
+]
+
+_LEAST_S = 0.2
+#: A stage whose time grows faster than this has its reason in docs/measured.csv.
+_STEEP = 1.2
+_BASE = Recipe(
+    effect=(EffectRecipe("unseen_heat_source", amplitude_um=0.8, parameters={"time_constant_min": 14.0}),)
+).vary(
+    test={"cycles": 60, "period_s": 300.0},
+    camera={"columns": 320, "rows": 240, "focal_px": 765.0, "file": "seq", "frames_per_cycle": 4},
+)
+
+
+def _finer_cells(campaign: Path) -> None:
+    """Half the area of a cell."""
+    text = campaign.read_text(encoding="utf-8")
+    campaign.write_text(
+        text.replace('cell_size = "5 mm"', f'cell_size = "{5 / math.sqrt(2):.4f} mm"'), encoding="utf-8"
+    )
+
+
+def _second_log(campaign: Path) -> None:
+    """A second load beside the first one, switched at random, by which nothing is driven."""
+    chance, load = random.Random(5), 0.0
+    path = campaign.with_name("drivers.csv")
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    rows[0].append("coolant [1]")
+    for row in rows[1:]:
+        load = chance.random() if chance.random() < 0.04 else load
+        row.append(f"{load:.3f}")
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows(rows)
+
+
+def _as_written(campaign: Path) -> None:
+    """Nothing to change."""
+
+
+#: What is doubled -> the recipe, and what is changed in the campaign that it writes.
+DOUBLED: dict[str, tuple[Recipe, Callable[[Path], None]]] = {
+    "nothing": (_BASE, _as_written),
+    "cycles": (_BASE.vary(test={"cycles": 120}), _as_written),
+    "targets": (_BASE.vary(test={"targets": 32, "spacing_mm": 300 / 31}), _as_written),
+    "frames": (_BASE.vary(camera={"frames_per_cycle": 8}), _as_written),
+    "pixels": (_BASE.vary(camera={"columns": 452, "rows": 340, "focal_px": 1081.0}), _as_written),
+    "cells": (_BASE, _finer_cells),
+    "logs": (_BASE, _second_log),
+}
+
+
+def test_growth_of_every_stage(tmp_path: Path) -> None:
+    seconds: dict[str, dict[str, float]] = {}
+    peaks: dict[str, float] = {}
+    for what, (recipe, change) in DOUBLED.items():
+        campaign = write_campaign(simulate(recipe), tmp_path / what)
+        change(campaign)
+        found = run_measured(campaign, tmp_path / f"{what}_results")
+        seconds[what] = {**found["seconds"], "whole run": found["processor_s"]}
+        peaks[what] = max(private for _, private in found["peaks"].values())
+    base = seconds.pop("nothing")
+    steep = []
+    print(f"\n{'doubled':<10}" + "".join(f"{what:>10}" for what in seconds))
+    for stage, spent in base.items():
+        exponents = {what: math.log2(other.get(stage, spent) / spent) for what, other in seconds.items()}
+        if spent >= _LEAST_S:
+            print(f"{stage:<28}{spent:6.2f} s" + "".join(f"{exponents[what]:8.2f}" for what in seconds))
+            steep += [f"{stage}: {what} {exponent:.2f}" for what, exponent in exponents.items() if exponent > _STEEP]
+    print(
+        f"{'peak memory':<28}{peaks['nothing']:6.0f} MB"
+        + "".join(f"{math.log2(peaks[one] / peaks['nothing']):7.2f}" for one in seconds)
+    )
+    print(f"steeper than {_STEEP}: {'; '.join(steep) or 'none'}")
+    assert all(other.keys() == base.keys() for other in seconds.values())
