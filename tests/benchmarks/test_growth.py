@@ -1,7 +1,7 @@
-"""How processor time and memory of each stage grow when cycles, targets, frames, pixels, cells or logs are doubled, one at a time.
+"""How processor time and memory of each stage grow with cycles, targets, frames, pixels, cells or logs, one at a time.
 
-The exponent is the logarithm to base 2 of the ratio: 1 grows with the size, 0 does not grow. Stages below 0.2 s are left out, their time
-being that of the calls.
+The exponent is the logarithm of the ratio over that of the factor: 1 grows with the size, 0 does not grow. Stages below 0.2 s are left
+out, their time being that of the calls.
 """
 
 from __future__ import annotations
@@ -36,11 +36,9 @@ _BASE = Recipe(
 
 
 def _finer_cells(campaign: Path) -> None:
-    """Half the area of a cell."""
+    """Four times the cells."""
     text = campaign.read_text(encoding="utf-8")
-    campaign.write_text(
-        text.replace('cell_size = "5 mm"', f'cell_size = "{5 / math.sqrt(2):.4f} mm"'), encoding="utf-8"
-    )
+    campaign.write_text(text.replace('cell_size = "5 mm"', 'cell_size = "2.5 mm"'), encoding="utf-8")
 
 
 def _second_log(campaign: Path) -> None:
@@ -61,38 +59,40 @@ def _as_written(campaign: Path) -> None:
     """Nothing to change."""
 
 
-#: What is doubled -> the recipe, and what is changed in the campaign that it writes.
-DOUBLED: dict[str, tuple[Recipe, Callable[[Path], None]]] = {
-    "nothing": (_BASE, _as_written),
-    "cycles": (_BASE.vary(test={"cycles": 120}), _as_written),
-    "targets": (_BASE.vary(test={"targets": 32, "spacing_mm": 300 / 31}), _as_written),
-    "frames": (_BASE.vary(camera={"frames_per_cycle": 8}), _as_written),
-    "pixels": (_BASE.vary(camera={"columns": 452, "rows": 340, "focal_px": 1081.0}), _as_written),
-    "cells": (_BASE, _finer_cells),
-    "logs": (_BASE, _second_log),
+#: What is enlarged -> by which factor, the recipe, and what is changed in the campaign that it writes.
+ENLARGED: dict[str, tuple[float, Recipe, Callable[[Path], None]]] = {
+    "nothing": (1.0, _BASE, _as_written),
+    "cycles": (2.0, _BASE.vary(test={"cycles": 120}), _as_written),
+    "targets": (2.0, _BASE.vary(test={"targets": 32, "spacing_mm": 300 / 31}), _as_written),
+    "frames": (2.0, _BASE.vary(camera={"frames_per_cycle": 8}), _as_written),
+    "pixels": (4.0, _BASE.vary(camera={"columns": 640, "rows": 480, "focal_px": 1530.0}), _as_written),
+    "cells": (4.0, _BASE, _finer_cells),
+    "logs": (2.0, _BASE, _second_log),
 }
 
 
 def test_growth_of_every_stage(tmp_path: Path) -> None:
     seconds: dict[str, dict[str, float]] = {}
     peaks: dict[str, float] = {}
-    for what, (recipe, change) in DOUBLED.items():
+    for what, (_, recipe, change) in ENLARGED.items():
         campaign = write_campaign(simulate(recipe), tmp_path / what)
         change(campaign)
         found = run_measured(campaign, tmp_path / f"{what}_results")
         seconds[what] = {**found["seconds"], "whole run": found["processor_s"]}
         peaks[what] = max(private for _, private in found["peaks"].values())
     base = seconds.pop("nothing")
+
+    def exponent(what: str, ratio: float) -> float:
+        return math.log(ratio) / math.log(ENLARGED[what][0])
+
     steep = []
-    print(f"\n{'doubled':<10}" + "".join(f"{what:>10}" for what in seconds))
+    print(f"\n{'grows with':<28}{'':>8}" + "".join(f"{what:>9}" for what in seconds))
     for stage, spent in base.items():
-        exponents = {what: math.log2(other.get(stage, spent) / spent) for what, other in seconds.items()}
         if spent >= _LEAST_S:
-            print(f"{stage:<28}{spent:6.2f} s" + "".join(f"{exponents[what]:8.2f}" for what in seconds))
-            steep += [f"{stage}: {what} {exponent:.2f}" for what, exponent in exponents.items() if exponent > _STEEP]
-    print(
-        f"{'peak memory':<28}{peaks['nothing']:6.0f} MB"
-        + "".join(f"{math.log2(peaks[one] / peaks['nothing']):7.2f}" for one in seconds)
-    )
+            exponents = {what: exponent(what, other[stage] / spent) for what, other in seconds.items()}
+            print(f"{stage:<28}{spent:6.2f} s" + "".join(f"{value:9.2f}" for value in exponents.values()))
+            steep += [f"{stage} by {what} {value:.2f}" for what, value in exponents.items() if value > _STEEP]
+    memory = "".join(f"{exponent(what, peaks[what] / peaks['nothing']):9.2f}" for what in seconds)
+    print(f"{'peak memory':<28}{peaks['nothing']:5.0f} MB{memory}")
     print(f"steeper than {_STEEP}: {'; '.join(steep) or 'none'}")
     assert all(other.keys() == base.keys() for other in seconds.values())
