@@ -1107,11 +1107,20 @@ def report_steps(
 ) -> list[AddedEffect]:
     """Describe the steps of a loop whose hold-out set has been opened, with what that set says of them."""
     averaged = average_over_drifts(state.model) if held_out else state.model
-    return [_added_effect(state, place, wrong.get(place), asked, averaged) for place, asked in enumerate(held_out)]
+    steps: list[AddedEffect] = []
+    for place, asked in enumerate(held_out):
+        beside = next((step.effect for step in steps if step.withheld), "")
+        steps.append(_added_effect(state, place, wrong.get(place), asked, averaged, beside))
+    return steps
 
 
 def _added_effect(
-    state: LoopState[ModelFit], place: int, wrong: Decision | None, asked: Answer | None, averaged: ModelFit
+    state: LoopState[ModelFit],
+    place: int,
+    wrong: Decision | None,
+    asked: Answer | None,
+    averaged: ModelFit,
+    beside: str,
 ) -> AddedEffect:
     model, term, step = state.model, state.added[place], state.steps[place]
     event_s = term.candidate.event_s
@@ -1131,7 +1140,7 @@ def _added_effect(
     if wrong is not None:
         answer = replace(answer, against=wrong.sentence)
     size_um, smooth_um = _size(model, term), wandering_um(model.fit) if model.fit.system.order == 2 else 0.0
-    withheld = withheld_for(step, size_um=size_um, smooth_drift_um=smooth_um)
+    withheld = withheld_for(step, size_um=size_um, smooth_drift_um=smooth_um, beside=beside)
     return AddedEffect(
         **step.described(term.candidate, answer, where, size=model.size(term), withheld=withheld),
         coefficients=coefficients_of(averaged, term),
@@ -1160,9 +1169,9 @@ def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
 _SMOOTH_SHARE = 0.5
 
 
-def withheld_for(step: Step, *, size_um: float = np.inf, smooth_drift_um: float = 0.0) -> str:
-    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side, or
-    a smooth drift of which it may be a part.
+def withheld_for(step: Step, *, size_um: float = np.inf, smooth_drift_um: float = 0.0, beside: str = "") -> str:
+    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side, a
+    smooth drift of which it may be a part, or an effect without a name ``beside`` which it was found.
     """
     effect, parameters = describe_effect(step.effect), step.score.best.parameters
     is_trend = parameters.get("follows") == "warm_up"
@@ -1177,6 +1186,8 @@ def withheld_for(step: Step, *, size_um: float = np.inf, smooth_drift_um: float 
         return (
             f"a smooth drift of {smooth_drift_um:.2g} µm is left beside its {size_um:.2g} µm, of which it may be a part"
         )
+    if beside and step.score.best.event_s is None and "period_min" not in parameters:
+        return f"it was found beside {beside.replace('_', ' ')}, which has no name itself"
     return ""
 
 

@@ -705,3 +705,15 @@ def test_a_trend_or_a_part_of_a_smooth_drift_has_no_name(effect, parameters, ran
     chosen = replace(score(effect, ranges=ranges), candidate=Candidate(WAVE[:, None], parameters, ("um",)))
     step = Step(chosen, Round(()), Confirmed.LATER_CYCLES)
     assert withheld_for(step, size_um=0.4, smooth_drift_um=0.2) == why
+
+
+def test_what_was_found_beside_an_effect_without_a_name_has_none_unless_it_has_an_instant_or_a_period():
+    def step(parameters: dict[str, float], event_s: float | None = None) -> Step:
+        candidate = Candidate(WAVE[:, None], parameters, ("um",), event_s)
+        return Step(replace(score("a"), candidate=candidate), Round(()), Confirmed.LATER_CYCLES)
+
+    assert (
+        withheld_for(step({}), beside="angular_growth")
+        == "it was found beside angular growth, which has no name itself"
+    )
+    assert withheld_for(step({}, event_s=9.0), beside="angular_growth") == ""
