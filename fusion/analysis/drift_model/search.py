@@ -219,10 +219,10 @@ def _words(parameters: Parameters, left_out: Collection[str]) -> dict[str, str]:
 
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
-#: Share of an effect's rms by which its shape in the library is wrong on a real machine: what a bar that conducts heat leaves of the best
-#: response of one or two lumped bodies has a median of 4.5 % (60 bars; docs/method/closed-loop.md). A difference of this size between two
+#: Share of an effect's rms by which its shape in the library may be wrong on a real machine: the upper quartile of what a bar that conducts
+#: heat leaves of the best response of one or two lumped bodies (60 bars; docs/method/closed-loop.md). A difference of this size between two
 #: effects is worth no more than a tie, however little noise there is.
-DISCREPANCY = 0.045
+DISCREPANCY = 0.062
 #: An effect that is not significant by itself is no rival.
 _RIVAL_LEVEL = 0.05
 
