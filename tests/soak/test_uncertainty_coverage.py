@@ -5,16 +5,19 @@ Campaigns of the twin whose true emissivity, reflections, air and distance are d
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from fusion.analysis.alignment.align import align
+from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
-from fusion.analysis.drift_model.axis import coefficients_of, declare
+from fusion.analysis.drift_model.axis import average_over_drifts, coefficients_of, declare
 from fusion.analysis.drift_model.fit import fit_model
+from fusion.analysis.effects.library import library
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
 from fusion.pipeline.drift_model import axis_scale_u, library_for, scaled
@@ -23,6 +26,8 @@ from fusion.results.progress import silent
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
 from fusion.twin.recipe import Recipe
+from fusion.twin.simulate import driver_log, environment_log
+from fusion.twin.truth import deviations_of, fields_of
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.thermography.flir_mutations import PARAMETERS
 from tests.thermography.rise_budget import temperature_rise_uncertainty
@@ -118,6 +123,47 @@ def test_errors_of_drawn_campaigns_are_covered(tmp_path: Path, capsys: pytest.Ca
     for column in (0, 1, 3):
         low, high = wilson(int((np.abs(ratios[:, column]) <= 2.0).sum()), runs)
         assert low <= 0.954 <= high or low > 0.9, COLUMNS[column]
+
+
+SMOOTH_UM = 0.6
+DRIFTS = {
+    "no smooth drift": lambda time_s, phase: np.zeros_like(time_s),
+    "settling like sqrt(t)": lambda time_s, phase: np.sqrt(time_s),
+    "rhythm of a day": lambda time_s, phase: np.sin(2.0 * np.pi * (time_s / 86400.0 + phase)),
+}
+
+
+@pytest.mark.parametrize("drift", list(DRIFTS))
+def test_coefficients_beside_a_smooth_drift_are_covered(drift: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A random walk as usual, and 0.6 um rms of a smooth drift: common, a stretch, or both, in turn; constant and random loads in turn."""
+    runs, first = campaigns(20), first_seed(500)
+    errors = {name: np.empty((2, 2, runs)) for name in ("axis_expansion", "table_offset")}
+    for number, seed in enumerate(range(first, first + runs)):
+        recipe = Recipe().vary(campaign={"seed": seed}, duty={"kind": ("constant", "random")[number % 2]})
+        truth = simulate(recipe)
+        axis = AxisGeometry((500.0, 90.0), (-1.0, 0.0))
+        logs = {"environment": environment_log(truth), "drivers": driver_log(truth)}
+        readings = read_fused(align(deviations_of(truth), fields_of(truth), axis, **logs))
+        course = DRIFTS[drift](readings.seconds, np.random.default_rng([seed, 5]).uniform())
+        along = [np.ones_like(readings.share), readings.share, 0.7 + 0.3 * readings.share][number % 3]
+        size = np.sqrt(np.mean(((course - course.mean()) * along) ** 2)) or 1.0
+        response = readings.response + SMOOTH_UM / size * course * along
+        model = fit_model(replace(readings, response=response), declare(readings, [*errors], library()))
+        true = {"axis_expansion": recipe.drift.expansion_ppm_per_K, "table_offset": recipe.drift.offset_um_per_K}
+        for term, (way, one) in product(model.terms, enumerate((model, average_over_drifts(model)))):
+            (coefficient,) = coefficients_of(one, term)
+            errors[term.effect][way, :, number] = float(coefficient.value) - true[term.effect], float(coefficient.u)
+    told = []
+    for name, of_name in errors.items():
+        for way, (error, u) in zip(("fit alone", "reported"), of_name, strict=True):
+            covered = int((np.abs(error) <= 2.0 * u).sum())
+            told.append((way, covered))
+            with capsys.disabled():
+                rms = np.sqrt(np.mean(error**2))
+                print(
+                    f"\n{drift}, {name}, {way}: rms error {rms:.3f}, median u {np.median(u):.3f}, within 2 u {rate(covered, runs)}"
+                )
+    assert all(wilson(covered, runs)[1] >= 0.9 for way, covered in told if way == "reported")
 
 
 @pytest.mark.parametrize(

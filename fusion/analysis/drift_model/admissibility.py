@@ -148,6 +148,9 @@ class AxisGrounds:
 
     def follows_rate(self, candidate: Candidate) -> bool:
         """Whether the field and its delayed copy enter with opposite signs and nearly cancel in the long run."""
+        if candidate.parameters.get("shape") == "bending":
+            # A difference of both by its physics.
+            return False
         on_training = self._on_training(candidate)
         model = self._model
         fit = fit_fixed_effects(

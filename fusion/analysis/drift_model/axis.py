@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
+from itertools import product
 from operator import is_
 from typing import TYPE_CHECKING, Any
 
@@ -36,12 +37,14 @@ from fusion.analysis.drift_model.admissibility import (
     warm_up_share,
 )
 from fusion.analysis.drift_model.fit import (
+    SHIFT_AND_STRETCH,
     ModelFit,
     Term,
     coefficient_spread,
     fit_model,
     recompute_term,
     refit_fixed,
+    scaled_systems,
     size_camera_errors,
     solve,
     unexplained_drift,
@@ -440,7 +443,10 @@ class AxisProblem(Problem[ModelFit]):
         beside = np.column_stack([readings.loadings[:, 1:], declared, *later])
         shares = np.array([added[place] for place in lasting]).reshape(len(lasting), nothing.size).T
         rows, left = np.arange(nothing.size), readings.response - known
-        asked = answers([Unseen(rows, readings.seconds, readings.loadings, left, beside, shares, uncertain)])
+        asked = answers(
+            [Unseen(rows, readings.seconds, readings.loadings, left, beside, shares, uncertain)],
+            family=len(state.steps),
+        )
         told = dict(zip(lasting, asked, strict=True))
         return [told.get(place) for place in range(len(state.steps))]
 
@@ -1100,10 +1106,22 @@ def report_steps(
     state: LoopState[ModelFit], wrong: Mapping[int, Decision], held_out: Sequence[Answer | None]
 ) -> list[AddedEffect]:
     """Describe the steps of a loop whose hold-out set has been opened, with what that set says of them."""
-    return [_added_effect(state, place, wrong.get(place), asked) for place, asked in enumerate(held_out)]
+    averaged = average_over_drifts(state.model) if held_out else state.model
+    steps: list[AddedEffect] = []
+    for place, asked in enumerate(held_out):
+        beside = next((step.effect for step in steps if step.withheld), "")
+        steps.append(_added_effect(state, place, wrong.get(place), asked, averaged, beside))
+    return steps
 
 
-def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None, asked: Answer | None) -> AddedEffect:
+def _added_effect(
+    state: LoopState[ModelFit],
+    place: int,
+    wrong: Decision | None,
+    asked: Answer | None,
+    averaged: ModelFit,
+    beside: str,
+) -> AddedEffect:
     model, term, step = state.model, state.added[place], state.steps[place]
     event_s = term.candidate.event_s
     before_um, after_um, without_um = (np.nan,) * 3
@@ -1121,9 +1139,11 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
     answer = asked or _ask_blocks(model, cross_before_um, cross_after_um)
     if wrong is not None:
         answer = replace(answer, against=wrong.sentence)
+    size_um, smooth_um = _size(model, term), wandering_um(model.fit) if model.fit.system.order == 2 else 0.0
+    withheld = withheld_for(step, size_um=size_um, smooth_drift_um=smooth_um, beside=beside)
     return AddedEffect(
-        **step.described(term.candidate, answer, where, size=model.size(term), withheld=withheld_for(step)),
-        coefficients=coefficients_of(model, term),
+        **step.described(term.candidate, answer, where, size=model.size(term), withheld=withheld),
+        coefficients=coefficients_of(averaged, term),
         held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
         rmse_before_um=before_um,
         rmse_after_um=after_um,
@@ -1132,7 +1152,7 @@ def _added_effect(state: LoopState[ModelFit], place: int, wrong: Decision | None
         cross_errors_after_um=cross_after_um,
         cross_rmse_before_um=rmse(cross_before_um),
         cross_rmse_after_um=rmse(cross_after_um),
-        rms_um=_size(model, term),
+        rms_um=size_um,
         event_cycle=event_cycle,
     )
 
@@ -1145,21 +1165,87 @@ def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
     return answers([Unseen(rows, readings.seconds, loadings, before_um[here], loadings[:, 1:], share)])[0]
 
 
-def withheld_for(step: Step) -> str:
-    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side."""
-    effect = describe_effect(step.effect)
+#: A slow effect may be a part of a smooth drift without a name that is left beside it and has this share of its size.
+_SMOOTH_SHARE = 0.5
+
+
+def withheld_for(step: Step, *, size_um: float = np.inf, smooth_drift_um: float = 0.0, beside: str = "") -> str:
+    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side, a
+    smooth drift of which it may be a part, or an effect without a name ``beside`` which it was found.
+    """
+    effect, parameters = describe_effect(step.effect), step.score.best.parameters
+    is_trend = parameters.get("follows") == "warm_up"
     for name, words in (("time_constant_min", "time constant"), ("period_min", "period")):
-        low, high = step.score.ranges.get(name, [0.0, 0.0])
-        by_course = name == "period_min" or (effect is not None and effect.excited_by)
+        # A value of which no other was tried is as open as one of which all fit.
+        low, high = step.score.ranges.get(name, [None, None] if name in parameters else [0.0, 0.0])
+        by_course = name == "period_min" or is_trend or (effect is not None and effect.excited_by)
         if by_course and (low is None or high is None):
             known = f"{low:.3g} min and more" if low else f"{high:.3g} min and less" if high else "any"
             return f"its {words} is not determined ({known} fits)"
+    if "time_constant_min" in parameters and smooth_drift_um >= _SMOOTH_SHARE * size_um:
+        return (
+            f"a smooth drift of {smooth_drift_um:.2g} µm is left beside its {size_um:.2g} µm, of which it may be a part"
+        )
+    if beside and step.score.best.event_s is None and "period_min" not in parameters:
+        return f"it was found beside {beside.replace('_', ' ')}, which has no name itself"
     return ""
+
+
+#: Courses of a smooth drift, as powers of the time since the first reading: settling, trend, slow rhythm.
+_POWERS = (0.5, 1.0, 1.5)
+#: Its root mean square in units of a reading's noise: from what no test shows to what hides everything else.
+_SMOOTH_DRIFT = tuple((10.0 ** np.arange(-2.0, 1.6, 0.5)).tolist())
+
+
+def average_over_drifts(model: ModelFit) -> ModelFit:
+    """The same model with coefficients and covariance averaged over the drifts that the readings leave possible.
+
+    A warm-up that settles, or the rhythm of a day, looks like the effects themselves, and a random walk as large as what is left of it
+    beside them knows nothing of it. Drifts are random walks of scaled variances with a smooth common drift and a smooth stretch, each of
+    normal coefficients, weighed by their marginal likelihood (Hoeting et al. 1999, Stat. Sci. 14, 382).
+    """
+    fit = model.fit
+    seconds, loadings = fit.system.seconds, fit.system.loadings
+    powers = ((seconds - seconds[0]) / np.ptp(seconds))[:, None] ** np.array(_POWERS)
+    courses = (powers - powers.mean(axis=0)) / powers.std(axis=0)
+    smooth = np.hstack([courses * loading[:, None] for loading in loadings.T])
+    columns, priors = np.column_stack([fit.response, fit.design, smooth]), prior_rows(model)
+    known = np.column_stack([priors.response, priors.design, np.zeros((priors.response.size, smooth.shape[1]))])
+    own, other = np.arange(1, 1 + fit.design.shape[1]), np.r_[0, 1 + fit.design.shape[1] : columns.shape[1]]
+    freedom = seconds.size + priors.response.size - own.size
+    found: list[tuple[float, Array, Array]] = []
+    for system in scaled_systems(fit, SHIFT_AND_STRETCH):
+        gram, log_spread = system.normal_equations(columns)
+        gram += known.T @ known
+        normal = gram[np.ix_(own, own)]
+        scale = np.sqrt(np.diag(normal))
+        log_spread += float(np.linalg.slogdet(normal / np.outer(scale, scale))[1])
+        through = solve(normal, gram[np.ix_(own, other)])
+        inverse = solve(normal, np.eye(own.size)) * max(model.memory.long_run, 1.0)
+        left = gram[np.ix_(other, other)] - gram[np.ix_(other, own)] @ through
+        for sizes in product(_SMOOTH_DRIFT, repeat=loadings.shape[1]):
+            precision = np.repeat(np.array(sizes) ** -2.0, len(_POWERS))
+            inner = left[1:, 1:] + np.diag(precision)
+            drift = np.linalg.solve(inner, left[1:, 0])
+            squares = float(left[0, 0] - left[1:, 0] @ drift)
+            log_size = float(np.linalg.slogdet(inner)[1] - np.log(precision).sum())
+            likelihood = -0.5 * (freedom * np.log(squares) + log_spread + log_size)
+            covariance = inverse + through[:, 1:] @ np.linalg.solve(inner, through[:, 1:].T)
+            found.append((likelihood, through[:, 0] - through[:, 1:] @ drift, squares / freedom * covariance))
+    likelihood = np.array([one[0] for one in found])
+    weight = np.exp(likelihood - likelihood.max())
+    weight /= weight.sum()
+    values = np.array([one[1] for one in found])
+    mean = weight @ values
+    about = values - mean
+    covariance = np.tensordot(weight, np.array([one[2] for one in found]), 1) + (about.T * weight) @ about
+    return replace(model, fit=replace(fit, coefficients=mean, covariance=covariance))
 
 
 def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:
     """Coefficients of the declared effects, lagged copies included, and how far they move when parts of the readings are left out."""
     spread, static = coefficient_spread(model), model.static()
+    model = average_over_drifts(model)
     covariance = static.T @ model.fit.covariance @ static
     model = replace(model, fit=replace(model.fit, coefficients=model.fit.coefficients @ static, covariance=covariance))
     return [

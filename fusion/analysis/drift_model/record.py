@@ -1362,13 +1362,15 @@ def ask_unseen(
     events = [place for place, term in enumerate(state.added) if term.candidate.event_s is not None]
     lasting = [place for place in range(len(added)) if place not in events]
     response = record.displacement - np.sum([np.zeros(declared.shape), *(added[place] for place in events)], axis=0)
-    asked = answers(_unseen(record, held_out, response, [declared], [added[place] for place in lasting]))
+    asked = answers(
+        _unseen(record, held_out, response, [declared], [added[place] for place in lasting]), family=len(added)
+    )
     told = dict(zip(lasting, asked, strict=True))
     everywhere = np.ones_like(held_out)
     for place in events:
         without = left_out[1 + place]
         parts = _unseen(record, everywhere, record.displacement - without, [], [left_out[0] - without])
-        (told[place],) = answers(parts)
+        (told[place],) = answers(parts, family=len(added))
     return [told[place] for place in range(len(added))]
 
 

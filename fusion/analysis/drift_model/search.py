@@ -219,10 +219,10 @@ def _words(parameters: Parameters, left_out: Collection[str]) -> dict[str, str]:
 
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
-#: Share of an effect's rms by which its shape in the library is wrong on a real machine: what a bar that conducts heat leaves of the best
-#: response of one or two lumped bodies has a median of 4.5 % (60 bars; docs/method/closed-loop.md). A difference of this size between two
+#: Share of an effect's rms by which its shape in the library may be wrong on a real machine: the upper quartile of what a bar that conducts
+#: heat leaves of the best response of one or two lumped bodies (60 bars; docs/method/closed-loop.md). A difference of this size between two
 #: effects is worth no more than a tie, however little noise there is.
-DISCREPANCY = 0.045
+DISCREPANCY = 0.062
 #: An effect that is not significant by itself is no rival.
 _RIVAL_LEVEL = 0.05
 
@@ -400,7 +400,7 @@ class Step:
             "parameter_ranges": self.score.ranges,
             "p_value": self.score.family_wise_p,
             "tied": tied,
-            "withheld": withheld,
+            "withheld": withheld or (answer.other_size(where) if answer.is_of_other_size else ""),
             "runner_up": runner_up,
             **answer.described(where),
             "confirmed_by": str(self.confirmed),
@@ -901,8 +901,10 @@ def _rmse(squares: Array, number: Array) -> Array:
 
 # What readings that an effect was not fitted to say of it: regression of these readings on its predicted share.
 
-#: Probability of bearing out an effect that is not there, and of contradicting one that is.
+#: Probability of bearing out any effect that is not there, and of contradicting any that is, over all effects of a model.
 ANSWER_LEVEL = 0.05
+#: Chance at which a right effect is denied its name because unseen readings follow it by another size than that predicted.
+_SIZE_LEVEL = 1e-3
 #: Sizes, over that predicted, between which an effect predicts better than none and than twice as much of it.
 _HALF, _TWICE = 0.5, 2.0
 #: Readings per column below which an interval says nothing.
@@ -972,18 +974,20 @@ class Answer:
     slope, u : size with which it acts there over that predicted, 1 where it is right and 0 where it is not there, and its standard
         uncertainty; infinite where these readings do not determine it
     freedom : degrees of freedom of the uncertainty
+    level : probability of each false statement
     against : what contradicts the effect without regard to its size, in words
     """
 
     slope: float = np.nan
     u: float = np.inf
     freedom: int = 1
+    level: float = ANSWER_LEVEL
     against: str = ""
 
     @property
     def word(self) -> schema.BorneOut:
         """Borne out where its size is more than zero and may be that predicted, contradicted where it is less and may be zero."""
-        reach = special.stdtrit(self.freedom, 1.0 - ANSWER_LEVEL) * self.u
+        reach = special.stdtrit(self.freedom, 1.0 - self.level) * self.u
         if self.against:
             return "no"
         if not np.isfinite(reach):
@@ -1001,12 +1005,24 @@ class Answer:
     @property
     def power(self) -> float:
         """Probability that such readings bear a right effect out."""
-        return float(special.stdtr(self.freedom, 1.0 / self.u - special.stdtrit(self.freedom, 1.0 - ANSWER_LEVEL)))
+        return float(special.stdtr(self.freedom, 1.0 / self.u - special.stdtrit(self.freedom, 1.0 - self.level)))
+
+    @property
+    def is_of_other_size(self) -> bool:
+        """Whether its size differs from that predicted by more than chance and the discrepancy of a library's shape explain."""
+        wide = np.hypot(self.u, DISCREPANCY)
+        return bool(abs(self.slope - 1.0) > special.stdtrit(self.freedom, 1.0 - 0.5 * _SIZE_LEVEL) * wide)
+
+    def other_size(self, where: str) -> str:
+        """Why an effect whose size is another than that predicted has no name."""
+        return f"{self._size(where)}: what acts has another course"
+
+    def _size(self, where: str) -> str:
+        return f"{where} its size is {self.slope:.2f} ± {2.0 * self.u:.2f} (k = 2) of that predicted"
 
     def described(self, where: str) -> dict[str, Any]:
         """What results.json holds of it; `where` says which readings were asked."""
-        known = self.power >= _LEAST_POWER
-        size = f"{where} its size is {self.slope:.2f} ± {2.0 * self.u:.2f} (k = 2) of that predicted"
+        known, size = self.power >= _LEAST_POWER, self._size(where)
         doubts = {
             "yes": "",
             "no": self.against or f"contradicted: {size}",
@@ -1023,37 +1039,48 @@ class Answer:
         }
 
 
-def answers(channels: Sequence[Unseen]) -> list[Answer]:
-    """Ask readings for the size of every effect, all effects together, over that predicted; channels share the sizes."""
+def answers(channels: Sequence[Unseen], *, family: int = 1) -> list[Answer]:
+    """Ask readings for the size of every effect, all effects together, over that predicted; channels share the sizes.
+
+    ``family`` is the number of effects of the model: with Bonferroni's level none of them is told falsely with the stated probability.
+    """
     effects = channels[0].shares.shape[1]
     asked = [(one.rows, *found) for one in channels if (found := one.whitened()) is not None]
     if not asked or not effects:
         return [Answer()] * effects
-    readings = 1 + max(int(rows.max()) for rows, *_ in asked)
-    y, x = np.zeros((len(asked), readings)), np.zeros((len(asked), readings, effects))
-    for k, (rows, response, shares, _, _) in enumerate(asked):
-        y[k, rows], x[k, rows] = response, shares
-    normal = np.einsum("kni,knj->ij", x, x)
-    known = independent(x.reshape(-1, effects))
-    inverse = np.linalg.inv(normal[np.ix_(known, known)])
-    x = x[:, :, known]
-    slopes = inverse @ np.einsum("kni,kn->i", x, y)
-    # The drifts of the channels of one machine are alike, so that many channels say little more than one.
-    left = y - x @ slopes
+    known = independent(np.vstack([shares for _, _, shares, _, _ in asked]))
+    parts = [(rows, response, shares[:, known], uncertain) for rows, response, shares, uncertain, _ in asked]
+    inverse = np.linalg.inv(np.sum([x.T @ x for _, _, x, _ in parts], axis=0))
+    slopes = inverse @ np.sum([x.T @ y for _, y, x, _ in parts], axis=0)
+    # The drifts of the channels of one machine are alike, so that many channels say little more than one, whenever each was read.
+    instants = np.unique(np.concatenate([rows for rows, *_ in parts]))
+    left = np.array([_at_nearest(y - x @ slopes, rows, instants) for rows, y, x, _ in parts])
+    laid = np.array([_at_nearest(x, rows, instants) for rows, _, x, _ in parts])
     alike = left @ left.T
     # A channel that is predicted exactly has no drift to share.
     size = np.sqrt(np.maximum(np.diag(alike), np.finfo(float).tiny))
-    products = np.einsum("kni,lnj->klij", x, x)
+    products = np.einsum("kni,lnj->klij", laid, laid)
     covariance = inverse @ np.einsum("kl,klij->ij", alike / np.outer(size, size), products) @ inverse
-    for k, (rows, _, _, uncertain, _) in enumerate(asked):
-        through = inverse @ x[k, rows].T @ uncertain
+    for _, _, x, uncertain in parts:
+        through = inverse @ x.T @ uncertain
         covariance = covariance + through @ through.T
     freedom = min(found[-1] for found in asked)
     told = {
-        k: Answer(float(a), float(u), freedom)
+        k: Answer(float(a), float(u), freedom, ANSWER_LEVEL / family)
         for k, a, u in zip(known, slopes, np.sqrt(np.diag(covariance)), strict=True)
     }
     return [told.get(k, Answer()) for k in range(effects)]
+
+
+def _at_nearest(values: Array, rows: NDArray[np.intp], instants: NDArray[np.intp]) -> Array:
+    """Values (n,) or (n, q) at all instants, each that of the nearest reading; their sum of squares, column by column, is kept."""
+    after = np.clip(np.searchsorted(rows, instants), 1, rows.size - 1)
+    nearest = after - (instants - rows[after - 1] <= rows[after] - instants)
+    laid = values[nearest]
+    length = np.linalg.norm(laid, axis=0)
+    return np.asarray(
+        laid * np.divide(np.linalg.norm(values, axis=0), length, out=np.ones_like(length), where=length > 0.0)
+    )
 
 
 #: A forecast may be worse than the declared model's by this share at most: chance alone changes an error by as much.

@@ -194,6 +194,9 @@ def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | N
         yield Candidate(axis[:, None], {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))
         both: Parameters = {"time_constant_min": minutes, "shape": "flat and linear"}
         yield Candidate(np.column_stack([offset, axis]), both, ("um/K", "ppm/K"))
+        # A bed that is warmer above than below bends; with the Abbe offset its angle makes an error that grows along the axis.
+        bending = (readings.at(readings.series["mean_rise"]) - offset) * readings.share
+        yield Candidate(bending[:, None], {"time_constant_min": minutes, "shape": "bending"}, ("um/K",))
 
 
 def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
@@ -274,8 +277,11 @@ TABLE_OFFSET = Effect(
 )
 THERMAL_LAG = Effect(
     name="thermal_lag",
-    physics="A remote or massive part follows the seen table late, with a time constant of its own, and goes on moving after it.",
-    source="first-order response of a lumped heat capacity",
+    physics=(
+        "A remote or massive part follows the seen table late, with a time constant of its own, and goes on moving after it; a bed whose "
+        "lower side is late bends meanwhile."
+    ),
+    source="first-order response of a lumped heat capacity; Bryan 1979 for the Abbe offset of a bending bed",
     candidates=_thermal_lag,
     needs=needs_field,
     follows_field=True,

@@ -11,6 +11,7 @@ from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.diagnosis.residual import Remainder
 from fusion.analysis.drift_model.axis import (
     LoopResult,
+    average_over_drifts,
     coefficients_of,
     cross_errors,
     declared_coefficients,
@@ -150,12 +151,12 @@ def test_the_rmse_leaves_sites_without_a_prediction_out():
 
 def test_coefficients_are_told_with_their_prior():
     model = fitted()
-    place = model.place(model.terms[0]).start
+    place, averaged = model.place(model.terms[0]).start, average_over_drifts(model).fit
     assert [one.model_dump(exclude_unset=True) for one in declared_coefficients(model, 1)] == [
         {
             "effect": "axis_expansion",
-            "value": model.fit.coefficients[place],
-            "u": model.fit.coefficients_u[place],
+            "value": averaged.coefficients[place],
+            "u": averaged.coefficients_u[place],
             "unit": "ppm/K",
             "prior": 11.7,
             "prior_u": 2.0,
@@ -167,6 +168,23 @@ def test_coefficients_are_told_with_their_prior():
     assert [entry.model_fields_set - {"value", "u", "unit"} for entry in told] == [{"prior", "prior_u"}, set()]
     assert [entry.unit for entry in told] == ["um", "um/K"]
     assert [entry.effect for entry in declared_coefficients(fitted(), 2)] == ["axis_expansion", "step_event"]
+
+
+def test_a_smooth_drift_that_resembles_an_effect_is_in_its_uncertainty():
+    """A drift that settles like the square root of time beside an effect that approaches its end exponentially, ten noises."""
+    warm = 1.0 - np.exp(-BARE.seconds / 600.0)
+    settling = np.sqrt(BARE.seconds / BARE.seconds.max())
+    beyond, beyond_before, clean_u, moved_u = 0, 0, [], []
+    for seed in range(10):
+        noise = 0.05 * np.random.default_rng(seed).standard_normal(BARE.seconds.size)
+        for drift, u in ((0.0, clean_u), (1.0, moved_u)):
+            model = fit_model(replace(BARE, response=2.0 * warm + drift * settling + noise), [term(warm)])
+            averaged = average_over_drifts(model).fit
+            u.append(averaged.coefficients_u[-1])
+            beyond += drift * (abs(averaged.coefficients[-1] - 2.0) > 2.0 * u[-1])
+            beyond_before += drift * (abs(model.fit.coefficients[-1] - 2.0) > 2.0 * model.fit.coefficients_u[-1])
+    assert beyond <= 1 < 5 < beyond_before
+    assert np.median(clean_u) < np.median(moved_u)
 
 
 def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
@@ -189,8 +207,8 @@ def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
     assert step.event_cycle == 6
     # A coefficient times a column of zeros and ones, about its mean at every site.
     shares = np.array([LATE[BARE.site == site].mean() for site in range(8)])[BARE.site]
-    height = step.coefficients[0].value
-    assert height == pytest.approx(0.5, abs=0.2)
+    assert step.coefficients[0].value == pytest.approx(0.5, abs=0.2)
+    height = model.fit.coefficients[-1]
     assert step.rms_um == pytest.approx(abs(height) * np.sqrt(np.mean((LATE - shares) ** 2)))
 
 
@@ -511,6 +529,28 @@ def test_the_size_on_unseen_readings_has_three_answers(slope, u, word):
     assert told["confirmed"] is (word == "yes") and (told["doubt"] == "") is (word == "yes")
 
 
+def test_many_effects_share_the_probability_of_a_false_answer():
+    """One of four is borne out beyond the 98.75 % point of Student's t with 100 degrees of freedom, 2.28."""
+    assert Answer(0.8, 0.4, 100).word == "yes" and Answer(0.8, 0.4, 100, level=0.05 / 4).word == "cannot tell"
+    assert Answer(0.8, 0.4, 100, level=0.05 / 4).power < Answer(0.8, 0.4, 100).power
+
+
+@pytest.mark.parametrize(
+    ("slope", "u", "other"),
+    [(0.65, 0.05, True), (1.35, 0.05, True), (0.65, 0.2, False), (0.9, 0.001, False), (np.nan, np.inf, False)],
+)
+def test_a_name_is_withheld_where_unseen_readings_follow_by_another_size(slope, u, other):
+    """3.39 standard uncertainties at the level 0.001, of which the discrepancy of a shape is a part."""
+    answer = Answer(slope, u, 100)
+    assert answer.is_of_other_size is other
+    told = (
+        state(fitted())
+        .steps[0]
+        .described(Candidate(WAVE[:, None], {}, ("um",)), answer, "there", size=0.0, withheld="")
+    )
+    assert (told["withheld"] != "") is other
+
+
 def test_the_power_is_the_chance_that_a_right_effect_is_borne_out():
     assert Answer(0.0, 1e-3, 100).power == pytest.approx(1.0)
     assert Answer(0.0, np.inf, 100).power == pytest.approx(0.05)
@@ -540,6 +580,19 @@ def test_an_effect_is_borne_out_or_contradicted_whatever_drift_acts_there(size, 
 def test_channels_that_drift_alike_count_as_one(rng):
     (alone,) = answers(unseen(rng, 1.0, channels=1))
     (four,) = answers(unseen(rng, 1.0, channels=4, alike=1.0))
+    # The same drift read at other instants is the same drift.
+    turns = [
+        replace(
+            one,
+            **{
+                name: getattr(one, name)[k::2]
+                for name in ("rows", "seconds", "loadings", "response", "beside", "shares")
+            },
+        )
+        for k, one in enumerate(unseen(rng, 1.0, channels=2, alike=1.0))
+    ]
+    (first,), (both,) = answers(turns[:1]), answers(turns)
+    assert both.u > 0.85 * first.u
     (apart,) = answers(unseen(rng, 1.0, channels=4))
     # The spread of an estimated uncertainty of some 100 readings is a tenth.
     assert four.u == pytest.approx(alone.u, rel=0.4) and apart.u < 0.7 * alone.u
@@ -625,3 +678,42 @@ def test_no_cause_is_separable_where_a_plain_regression_is_better_by_a_quarter()
 def test_what_is_told_by_its_course_alone_needs_a_time_that_is_determined(effect, parameter, interval, why):
     step = Step(score(effect, ranges={parameter: interval}), Round(()), Confirmed.LATER_CYCLES)
     assert withheld_for(step) == why
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameters", "ranges", "why"),
+    [
+        ("unseen_heat_source", {"time_constant_min": 17.0}, {}, "its time constant is not determined (any fits)"),
+        ("air_index", {}, {}, ""),
+        # A trend in a pattern: any slow drift is one.
+        (
+            "angular_growth",
+            {"time_constant_min": 240.0, "follows": "warm_up"},
+            {"time_constant_min": [60.0, None]},
+            "its time constant is not determined (60 min and more fits)",
+        ),
+        (
+            "angular_growth",
+            {"time_constant_min": 20.0, "follows": "duty"},
+            {"time_constant_min": [10.0, 40.0]},
+            "a smooth drift of 0.2 µm is left beside its 0.4 µm, of which it may be a part",
+        ),
+        ("step_event", {"time_s": 20.0}, {}, ""),
+    ],
+)
+def test_a_trend_or_a_part_of_a_smooth_drift_has_no_name(effect, parameters, ranges, why):
+    chosen = replace(score(effect, ranges=ranges), candidate=Candidate(WAVE[:, None], parameters, ("um",)))
+    step = Step(chosen, Round(()), Confirmed.LATER_CYCLES)
+    assert withheld_for(step, size_um=0.4, smooth_drift_um=0.2) == why
+
+
+def test_what_was_found_beside_an_effect_without_a_name_has_none_unless_it_has_an_instant_or_a_period():
+    def step(parameters: dict[str, float], event_s: float | None = None) -> Step:
+        candidate = Candidate(WAVE[:, None], parameters, ("um",), event_s)
+        return Step(replace(score("a"), candidate=candidate), Round(()), Confirmed.LATER_CYCLES)
+
+    assert (
+        withheld_for(step({}), beside="angular_growth")
+        == "it was found beside angular growth, which has no name itself"
+    )
+    assert withheld_for(step({}, event_s=9.0), beside="angular_growth") == ""

@@ -54,12 +54,12 @@ def test_the_table_shifts_all_positions_alike():
     assert candidate.units == ("um/K",)
 
 
-def test_a_lag_delays_the_field_flat_along_the_axis_or_both():
+def test_a_lag_delays_the_field_flat_along_the_axis_or_both_or_bends_the_bed():
     readings = seen()
     candidates = list(THERMAL_LAG.candidates(readings, {}, None))
-    assert len(candidates) == 3 * len(LAGS_MIN)
-    flat, linear, both = candidates[3:6]
-    assert [c.parameters["time_constant_min"] for c in (flat, linear, both)] == [7.5] * 3
+    assert len(candidates) == 4 * len(LAGS_MIN)
+    flat, linear, both, bending = candidates[4:8]
+    assert [c.parameters["time_constant_min"] for c in (flat, linear, both, bending)] == [7.5] * 4
     # A ramp is followed late by the time constant, once the start has died away as an exponential.
     t, tau = readings.seconds, 7.5 * 60.0
     expected = (t - tau * (1.0 - np.exp(-t / tau))) / 30.0
@@ -69,6 +69,10 @@ def test_a_lag_delays_the_field_flat_along_the_axis_or_both():
     np.testing.assert_array_equal(both.columns, np.column_stack([flat.columns, linear.columns]))
     assert (flat.units, linear.units, both.units) == (("um/K",), ("ppm/K",), ("um/K", "ppm/K"))
     assert [c.parameters["shape"] for c in (flat, linear, both)] == ["flat", "linear", "flat and linear"]
+    # The lower side of a bed is late by the time constant times the rate of the ramp.
+    tilt = (t / 30.0 - expected) * readings.position_mm / readings.span_mm
+    np.testing.assert_allclose(bending.columns[sampled, 0], tilt[sampled], atol=1e-9)
+    assert bending.parameters["shape"] == "bending" and bending.units == ("um/K",)
 
 
 @pytest.mark.parametrize(("step_s", "shortest"), [(150.0, 5.0), (151.0, 7.5)])
