@@ -378,10 +378,13 @@ def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
     left, changes = np.inf, np.full(_PARTS + 1, np.nan)
     # What a sensor makes of the course between two frames is not noise: its weight is judged by leaving out parts of the test.
     part = np.minimum((_PARTS * np.arange(len(logged))) // len(logged), _PARTS - 1)
-    # A sensor shows the place through a time constant between two of those that are tried.
-    for faster, slower in pairwise(lagged):
-        centred = faster - faster.mean()
-        design = np.column_stack([np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred])
+    # A sensor shows the place through a time constant between two of those that are tried, from a state that is not known: what was
+    # before the first frame fades with that time constant, and in a table that warms ever more slowly it looks like a change of gain.
+    for (faster, slower), lag_s in zip(pairwise(lagged), SENSOR_LAGS_S[1:], strict=True):
+        centred, fades = faster - faster.mean(), np.exp(-seconds / lag_s)
+        design = np.column_stack(
+            [np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred, fades]
+        )
         fits = [np.linalg.lstsq(design[part != k], logged[part != k], rcond=None)[0] for k in range(-1, _PARTS)]
         rest = logged - design @ fits[0]
         if float(rest @ rest) < left and all(values[1] + values[2] > 0.0 for values in fits):
