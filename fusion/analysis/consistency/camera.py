@@ -539,6 +539,10 @@ def check_picture(fields: xr.Dataset) -> list[Check]:
     shown = json.loads(fields.attrs.get("discs", "{}"))
     if not shown:
         return []
+    if "untested" in shown:
+        words = f"Picture not verified: whether a pattern of the camera or a reflection grew in it cannot be tested ({shown['untested']})."
+        remedy = "Take frames of the table at rest, with five or more discs of low emissivity over the whole plan."
+        return [judge("camera_picture", 0.0, _PICTURE_K, words, unverified=remedy)]
     pattern_K, zero_K = shown["pattern_K"], shown["zero_K"]
     moved = zero_K > _PICTURE_K
     keep_in_view = "Keep a surface of constant temperature in view (reference_patch under [thermography])."

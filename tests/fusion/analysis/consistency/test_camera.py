@@ -433,4 +433,10 @@ def test_a_pattern_in_the_picture_is_doubted_and_a_zero_that_may_be_a_reflection
     picture, zero = check_picture(xr.Dataset(attrs={"discs": json.dumps(shown)}))
     assert picture.passed is (pattern_K < 0.1) and ("F3" in picture.evidence) is (pattern_K > 0.1)
     assert zero.passed and zero.verified is (zero_K < 0.1) and bool(zero.remedy) is (zero_K > 0.1)
+    # Fields of earlier versions do not say.
     assert check_picture(xr.Dataset()) == []
+
+
+def test_a_picture_that_no_disc_confirms_is_not_verified() -> None:
+    (picture,) = check_picture(xr.Dataset(attrs={"discs": json.dumps({"untested": "the table moves"})}))
+    assert picture.passed and not picture.verified and "(the table moves)" in picture.evidence and picture.remedy
