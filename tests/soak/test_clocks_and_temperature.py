@@ -133,6 +133,25 @@ def test_wrong_emissivities(emissivity: float, capsys: pytest.CaptureFixture[str
         )
 
 
+@pytest.mark.parametrize("duty", ["random", "switched", "constant"])
+def test_windows_that_get_dirty(duty: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A transmission that falls steadily through the test, to 1 (a clean window), 0.9 and 0.85; the window is at 24 degC."""
+    runs, told = campaigns(60), Counter[tuple[float, str]]()
+    for seed in range(first_seed(67000), first_seed(67000) + runs):
+        test = record(sound_recipe(seed).vary(duty={"kind": duty, "mean_hold_min": 25.0}, effect=(), anomaly=()))
+        passed = xr.DataArray(np.linspace(0.0, 1.0, test.fields.sizes["time"]), dims="time")
+        for left in (1.0, 0.9, 0.85):
+            seen = 24.0 + (1.0 - (1.0 - left) * passed) * (test.fields["frame_temperature"] - 24.0)
+            checks = of_logs(replace(test, fields=test.fields.assign(frame_temperature=seen)), stated=True)
+            gain = next(check for check in checks if check.code == "material_gain")
+            told[
+                left, "noticed" if not gain.passed else "not told" if "does not show" in gain.evidence else "told"
+            ] += 1
+    with capsys.disabled():
+        print(f"\nload {duty}: {dict(told)}")
+    assert told[1.0, "noticed"] <= 0.02 * runs
+
+
 def _of(log: xr.Dataset, **columns: np.ndarray) -> xr.Dataset:
     """A log with other values in some columns."""
     return log.assign({name: log[name].copy(data=values) for name, values in columns.items()})
