@@ -22,7 +22,7 @@ from fusion.analysis.consistency.camera import (
     find_gaps,
     gap_words,
 )
-from fusion.analysis.consistency.checks import CODES, Check, Severity
+from fusion.analysis.consistency.checks import CODES, Check
 from tests.fusion.analysis.consistency.twin_fields import recorded
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CalibratedRange
@@ -132,15 +132,6 @@ def test_what_changes_from_a_frame_on_or_is_implausible_is_doubted_unless_it_is_
 ) -> None:
     found = failed([*frames[:first], *map(change, frames[first:])], overridden)
     assert {code: found[code] for code in expected} == expected and bool(found) == bool(expected)
-
-
-def test_a_frozen_camera_is_doubted(frames: list[FrameReference]) -> None:
-    held = [replace(frames[0], time=one.time) for one in frames]
-    (check,) = (check for check in check_frames(held, overridden=STATED) if not check.passed)
-    assert (check.code, check.severity) == ("frozen_camera", Severity.DOUBT)
-    assert "hold the same image, count for count: the camera was frozen" in check.evidence
-    # Two frames may be alike by a copied file.
-    assert failed(held[:2], STATED) == {}
 
 
 # Consistency checks of the camera's stamps: order, rate of its clock, place in the motion of the axis.
