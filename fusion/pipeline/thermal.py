@@ -218,7 +218,7 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
     source = camera.source
     shown = compare_discs(source.frames, registration)
     if shown is None:
-        return camera, {}
+        return camera, {"untested": "fewer than five discs of low emissivity are in view, or few frames"}
     change = np.ptp(shown.pattern_K, axis=0)
     strongest = int(np.argmax(change))
     found = {
@@ -588,9 +588,12 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     offset_s = clock["value"]
-    if source.thermography.table == "still" and not json.loads(fields.attrs.get("knocks", "[]")):
+    shown: dict[str, Any] = {"untested": "camera or table was displaced, and the discs in the picture with it"}
+    if source.thermography.table == "moving":
+        shown = {"untested": "the discs move through the picture with the table"}
+    elif not json.loads(fields.attrs.get("knocks", "[]")):
         camera, shown = _held_against_discs(camera, registration)
-        fields = fields.assign_attrs(discs=json.dumps(shown))
+    fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     damaged = [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
     repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]

@@ -14,7 +14,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry
 from fusion.analysis.consistency.camera import check_phase
 from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.courses import check_load_scale
+from fusion.analysis.consistency.courses import check_load_course, check_load_kind, check_load_scale
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.logs import check_material
 from fusion.twin import simulate
@@ -22,6 +22,7 @@ from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion.analysis.consistency.twin_fields import FILES, Recorded, clocks, scaled, with_late, without_ends
+from tests.soak.lies.logs import in_blocks, of_another_test, starts
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import sound_recipe
 from thermography.fields.survey import stray_frames
@@ -132,6 +133,25 @@ def test_wrong_emissivities(emissivity: float, capsys: pytest.CaptureFixture[str
         )
 
 
+@pytest.mark.parametrize("duty", ["random", "switched", "constant"])
+def test_windows_that_get_dirty(duty: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A transmission that falls steadily through the test, to 1 (a clean window), 0.9 and 0.85; the window is at 24 degC."""
+    runs, told = campaigns(60), Counter[tuple[float, str]]()
+    for seed in range(first_seed(67000), first_seed(67000) + runs):
+        test = record(sound_recipe(seed).vary(duty={"kind": duty, "mean_hold_min": 25.0}, effect=(), anomaly=()))
+        passed = xr.DataArray(np.linspace(0.0, 1.0, test.fields.sizes["time"]), dims="time")
+        for left in (1.0, 0.9, 0.85):
+            seen = 24.0 + (1.0 - (1.0 - left) * passed) * (test.fields["frame_temperature"] - 24.0)
+            checks = of_logs(replace(test, fields=test.fields.assign(frame_temperature=seen)), stated=True)
+            gain = next(check for check in checks if check.code == "material_gain")
+            told[
+                left, "noticed" if not gain.passed else "not told" if "does not show" in gain.evidence else "told"
+            ] += 1
+    with capsys.disabled():
+        print(f"\nload {duty}: {dict(told)}")
+    assert told[1.0, "noticed"] <= 0.02 * runs
+
+
 def _of(log: xr.Dataset, **columns: np.ndarray) -> xr.Dataset:
     """A log with other values in some columns."""
     return log.assign({name: log[name].copy(data=values) for name, values in columns.items()})
@@ -181,6 +201,44 @@ def test_lying_logs(lie: str, capsys: pytest.CaptureFixture[str]) -> None:
         print(
             f"\nlog {lie}: noticed with the sensor's place {rate(noticed[True], runs)}, without {rate(noticed[False], runs)}; {dict(codes)}"
         )
+
+
+LYING_LOADS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "as it is": lambda duty: duty,
+    "inverted": lambda duty: 1.0 - duty,
+    "starts": starts,
+    "blocks": in_blocks,
+    "clipped": lambda duty: np.minimum(duty, 0.2),
+    "switch": lambda duty: (duty > 0.5).astype(float),
+    "backwards": lambda duty: duty[::-1],
+    "counter": np.cumsum,
+    "another test": of_another_test,
+    "stands still": lambda duty: np.full(duty.size, duty[0]),
+}
+
+
+def test_lying_loads(capsys: pytest.CaptureFixture[str]) -> None:
+    """What a load explains of the field's rate once it lies, and whether that is noticed, in tests of several lengths and paces."""
+    runs, told = campaigns(40), {name: Counter[str]() for name in LYING_LOADS}
+    for seed in range(first_seed(59000), first_seed(59000) + runs):
+        rng = np.random.default_rng([seed, 3])
+        duty = {"mean_hold_min": float(rng.choice([8.0, 15.0, 25.0, 40.0]))}
+        test = record(Recipe().vary(campaign={"seed": seed}, test={"cycles": int(rng.integers(30, 61))}, duty=duty))
+        field, logged = thin_fields(test.fields), test.drivers["duty"].values
+        for name, change in LYING_LOADS.items():
+            log = _of(test.drivers, duty=np.asarray(change(logged), float))
+            (course,) = check_load_course(field, log, file="drivers.csv")
+            (kind,) = check_load_kind(log, file="drivers.csv") or (course,)
+            little = "explains little" if course.value > course.limit else "explains most"
+            little = little if np.ptp(log["duty"].values) > 0.0 else "constant"
+            told[name][f"{little}, {'silent' if course.passed and kind.passed else 'noticed'}"] += 1
+    with capsys.disabled():
+        for name, counts in told.items():
+            print(f"\nload {name}: {dict(counts)}")
+    assert told["as it is"] == {"explains most, silent": runs} == told["inverted"]
+    # What is left of a load in marks, blocks and beyond a limit is noticed where it explains little; few changes do not show it.
+    for name in ("starts", "blocks", "clipped"):
+        assert told[name]["explains little, silent"] <= 0.2 * runs
 
 
 def test_frames_of_another_campaign(capsys: pytest.CaptureFixture[str]) -> None:

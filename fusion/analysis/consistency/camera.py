@@ -236,13 +236,11 @@ def check_frames(frames: Sequence[FrameReference], *, overridden: Collection[str
         changing.append(
             FileWarning("range", f"the camera's range changes ({len({*ranges})} ranges).", "Use one range.")
         )
-    pixels = _spread(frames)
     implausible = [warning for warning in warnings if warning.code not in _CHANGING]
     return [
         _collected("camera_settings", changing, "The settings of the camera stay the same over the series."),
         _collected("camera_parameters", implausible, "The stored parameters of the measurement are plausible."),
-        _range(pixels),
-        *_frozen(pixels),
+        _range(_spread(frames)),
     ]
 
 
@@ -291,23 +289,6 @@ def _spread(frames: Sequence[FrameReference]) -> list[Frame]:
             # A damaged frame is counted where the frames are reduced.
             continue
     return read
-
-
-def _frozen(frames: Sequence[Frame]) -> list[Check]:
-    """Whether the first, the middle and the last frame are the same image: the noise of a detector repeats none, rounded numbers may."""
-    if len(frames) < 3:
-        return []
-    compared = f"The frames of {frames[0].time}Z, {frames[1].time}Z and {frames[2].time}Z"
-    return [
-        judge(
-            "frozen_camera",
-            all(np.array_equal(frames[0].counts, frame.counts) for frame in frames[1:]),
-            0.0,
-            f"{compared} hold the same image, count for count: the camera was frozen, or the frames are rounded to more than they change.",
-            "Provide the frames of the test as the camera stored them; copies of one image show no change of temperature.",
-            sound=f"{compared} are different images.",
-        )
-    ]
 
 
 # Checks of what the frames show over the series: the place of the camera, frames left out, and parts of the table
@@ -539,6 +520,10 @@ def check_picture(fields: xr.Dataset) -> list[Check]:
     shown = json.loads(fields.attrs.get("discs", "{}"))
     if not shown:
         return []
+    if "untested" in shown:
+        words = f"Picture not verified: whether a pattern of the camera or a reflection grew in it cannot be tested ({shown['untested']})."
+        remedy = "Take frames of the table at rest, with five or more discs of low emissivity over the whole plan."
+        return [judge("camera_picture", 0.0, _PICTURE_K, words, unverified=remedy)]
     pattern_K, zero_K = shown["pattern_K"], shown["zero_K"]
     moved = zero_K > _PICTURE_K
     keep_in_view = "Keep a surface of constant temperature in view (reference_patch under [thermography])."

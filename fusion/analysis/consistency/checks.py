@@ -138,7 +138,6 @@ CONDITIONS = {
     ),
     "camera_picture": Condition("no pattern of the camera or of a reflection grew in the picture", _CAMERA, _FIELDS),
     "camera_zero": Condition("the zero of the camera stayed the same", _CAMERA, _RISES),
-    "frozen_camera": Condition("every frame was taken at its time", _CAMERA, _RISES),
     "camera_place": Condition("the camera stayed in its place", _CAMERA, _FIELDS),
     "frames_left_out": Condition("the frames that are left show the whole test", _CAMERA, _FIELDS),
     "frames_gaps": Condition(

@@ -375,20 +375,31 @@ def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
     limit, seconds = _rise_limit(logged, stated=True), near.seconds[inside]
     passed = np.asarray((seconds - seconds.mean()) / np.ptp(seconds))
     lagged = [near.lagged(lag_s)[inside, 0] for lag_s in SENSOR_LAGS_S]
-    left, changes = np.inf, np.full(_PARTS + 1, np.nan)
     # What a sensor makes of the course between two frames is not noise: its weight is judged by leaving out parts of the test.
     part = np.minimum((_PARTS * np.arange(len(logged))) // len(logged), _PARTS - 1)
-    # A sensor shows the place through a time constant between two of those that are tried.
-    for faster, slower in pairwise(lagged):
-        centred = faster - faster.mean()
-        design = np.column_stack([np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred])
-        fits = [np.linalg.lstsq(design[part != k], logged[part != k], rcond=None)[0] for k in range(-1, _PARTS)]
-        rest = logged - design @ fits[0]
-        if float(rest @ rest) < left and all(values[1] + values[2] > 0.0 for values in fits):
-            left = float(rest @ rest)
-            changes = np.array([-values[4] / (values[1] + values[2]) for values in fits])
-    change = float(changes[0])
-    u = float(np.sqrt((_PARTS - 1) * np.var(changes[1:])))
+    fits = []
+    # A sensor shows the place through a time constant between two of those that are tried, from a state that is not known: what was
+    # before the first frame fades with that time constant, and in a table that warms ever more slowly it looks like a change of gain.
+    for (faster, slower), lag_s in zip(pairwise(lagged), SENSOR_LAGS_S[1:], strict=True):
+        centred, fades = faster - faster.mean(), np.exp(-seconds / lag_s)
+        design = np.column_stack(
+            [np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred, fades]
+        )
+        found = np.array(
+            [np.linalg.lstsq(design[part != k], logged[part != k], rcond=None)[0] for k in range(-1, _PARTS)]
+        )
+        gains = found[:, 1] + found[:, 2]
+        if (gains > 0.0).all():
+            changes = -found[:, 4] / gains
+            rest = logged - design @ found[0]
+            fits.append((float(rest @ rest), float(changes[0]), float(np.sqrt((_PARTS - 1) * np.var(changes[1:])))))
+    # Of the time constants that fit as well as the best one, the one that asks for the least change.
+    as_good = min((left for left, _, _ in fits), default=0.0) * np.exp(2.0 * _AS_GOOD / len(logged))
+    change, u = min(
+        ((change, u) for left, change, u in fits if left <= as_good),
+        key=lambda fit: abs(fit[0]) - _PARTS_95 * fit[1],
+        default=(0.0, np.inf),
+    )
     testable = float(np.ptp(logged)) >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES and u <= limit
     evidence = (
         "The camera's rise at the sensor's place per K of the logged material temperature changes by "

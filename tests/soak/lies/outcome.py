@@ -25,6 +25,7 @@ _CATCH_ALL = {"expansion_coefficient"}
 _NOT_VERIFIED = {
     "material_rise": ("expansion", "temperature"),
     "camera_zero": ("expansion", "temperature"),
+    "camera_picture": ("expansion", "temperature"),
     "axis_line": ("expansion",),
 }
 

@@ -9,6 +9,7 @@ import xarray as xr
 from fusion.analysis.consistency.checks import Severity, judge
 from fusion.analysis.consistency.clocks import QUARTERS, Recording, check_clocks, without_consequences
 from fusion.analysis.consistency.courses import (
+    _coarse_kind,
     check_load_course,
     check_load_kind,
     check_load_scale,
@@ -26,6 +27,7 @@ from tests.fusion.analysis.consistency.twin_fields import (
     with_late,
     without_ends,
 )
+from tests.soak.lies.logs import starts
 
 
 @pytest.mark.parametrize("effect", ["", "unseen_heat_source", "thermal_lag"])
@@ -163,6 +165,29 @@ def test_logs_that_are_no_load_of_the_table_are_doubted_and_named(change, words:
     log = xr.Dataset({"duty": duty[changed].copy(data=change(duty.values.astype(float)))})
     checks = [*check_load_kind(log, file="drivers.csv"), *check_load_course(field, log, file="drivers.csv")]
     assert words in " ".join(check.evidence for check in checks if not check.passed)
+
+
+@pytest.mark.parametrize(
+    ("load", "words"),
+    [
+        ([0.3, 0.3, 0.3], "stays at one value"),
+        ([0, 1, 0, 0, 0, 1, 0], "holds marks"),
+        ([0, 1, 1, 0, 0, 1, 1], "knows two states"),
+        ([0.1, 0.5, 0.5, 0.3, 0.5, 0.2, 0.1], "is 0.5, its largest value, in 43 % of the rows"),
+        ([0.1, *[0.4] * 20, *[0.9] * 40, *[0.2] * 20, 0.7], "changes every 20 min only"),
+        ([0.1, 0.5, 0.5, 0.3, 0.2, 0.4, 0.1], ""),
+    ],
+)
+def test_a_log_that_shows_less_than_the_load_is_named_after_its_shape(load, words: str) -> None:
+    found = _coarse_kind(60.0 * np.arange(len(load)), np.array(load, float))
+    assert found.startswith(words) and bool(found) == bool(words)
+
+
+def test_a_log_of_starts_of_a_varying_load_is_doubted() -> None:
+    test = recorded(duty="random")
+    log = test.drivers.assign(duty=test.drivers["duty"].copy(data=starts(test.drivers["duty"].values)))
+    (check,) = check_load_course(thin_fields(test.fields), log, file="drivers.csv")
+    assert not check.passed and check.value > check.limit and "holds marks, as of starts" in check.evidence
 
 
 def test_a_load_that_drives_the_table_a_staircase_and_a_constant_one_are_loads() -> None:

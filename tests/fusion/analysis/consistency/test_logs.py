@@ -227,8 +227,8 @@ def test_a_gain_that_falls_through_the_test_is_doubted_and_a_steady_drift_of_the
     dirty = test.fields.assign(frame_temperature=24.0 + (1.0 - 0.15 * passed) * (shown - 24.0))
     creeps = test.fields.assign(frame_temperature=shown + 0.5 * passed)
     found = of_log(test.environment, dirty, stated=True)["material_gain"]
-    # The value is what lies beyond the uncertainty.
-    assert not found.passed and 0.08 < found.value < 0.15 and "window" in found.remedy
+    # The value is what lies beyond the uncertainty; a transmission that falls to 0.85 lets the log grow to 1 / 0.85 of what is shown.
+    assert not found.passed and 0.08 < found.value < 1.0 / 0.85 - 1.0 and "window" in found.remedy
     for fields in (test.fields, creeps):
         assert of_log(test.environment, fields, stated=True)["material_gain"].passed
 

@@ -1,0 +1,78 @@
+"""Errors of the operator and the recorder: what is noticed and what sound readings cost; quoted in docs/method/consistency.md.
+
+THERMOFUSE_RUNS campaigns (40 by default), THERMOFUSE_FIRST_SEED.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fusion.analysis.consistency.readings import check_readings, check_signs
+from fusion.common import Array
+from fusion.twin import simulate
+from fusion.twin.truth import deviations_of
+from tests.soak.rates import campaigns, first_seed, rate
+from tests.soak.test_sound_inputs import sound_recipe
+
+pytestmark = pytest.mark.slow
+
+
+def copied_target(values: Array, rng: np.random.Generator) -> Array:
+    """One target holds the readings of the next one, in both approaches."""
+    target = int(rng.integers(values.shape[2] - 1))
+    values[:, :, target] = values[:, :, target + 1]
+    return values
+
+
+def clipped(values: Array, rng: np.random.Generator) -> Array:
+    return np.minimum(values, round(float(np.quantile(values, 0.7)), 3))
+
+
+def zeros(values: Array, rng: np.random.Generator) -> Array:
+    """A tenth of the readings is 0."""
+    return np.where(rng.random(values.shape) < 0.1, 0.0, values)
+
+
+def missed_trigger(values: Array, rng: np.random.Generator) -> Array:
+    """From the middle on every target reads what the one before it in the order of travel should."""
+    late = values[len(values) // 2 :]
+    late[:, 0, 1:] = late[:, 0, :-1].copy()
+    late[:, 1, :-1] = late[:, 1, 1:].copy()
+    return values
+
+
+LIES: dict[str, tuple[str, Callable[[Array, np.random.Generator], Array]]] = {
+    "as they are": ("", lambda values, rng: values),
+    "rounded to 0.1 µm": ("", lambda values, rng: np.round(values, 1)),
+    "a copied target": ("copied_targets", copied_target),
+    "clipped at the 70th percentile": ("repeated_value", clipped),
+    "zeros for a tenth": ("repeated_value", zeros),
+    "a trigger missed in the middle": ("missed_trigger", missed_trigger),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_errors_of_operator_and_recorder(lie: str, capsys: pytest.CaptureFixture[str]) -> None:
+    runs, (code, change) = campaigns(40), LIES[lie]
+    doubted, named = 0, 0
+    for seed in range(first_seed(66000), first_seed(66000) + runs):
+        deviations = deviations_of(simulate(sound_recipe(seed)))
+        # A laser is read to the nanometre.
+        read = np.round(deviations["deviation"].values, 3)
+        deviations["deviation"].values = change(read, np.random.default_rng([seed, 5]))
+        failed = {
+            check.code
+            for check in (*check_readings(deviations, plan_extent_mm=None), *check_signs(deviations))
+            if not check.passed
+        }
+        doubted, named = doubted + bool(failed), named + (code in failed)
+    with capsys.disabled():
+        print(f"\nreadings {lie}: doubted {rate(doubted, runs)}, by {code or 'any check'} {named if code else doubted}")
+    if code:
+        # Three of four: what scatters little or has a straight profile does not show it.
+        assert named >= 0.75 * runs
+    else:
+        assert doubted <= 0.02 * runs
