@@ -51,6 +51,10 @@ class ExportFormat(StrEnum):
     siemens840d_temperature = "siemens840d-temperature"
     heidenhain = "heidenhain"
     renishaw = "renishaw"
+    model_json = "model-json"
+    model_c = "model-c"
+    model_st = "model-st"
+    model_linuxcnc = "model-linuxcnc"
 
 
 class FrameFormat(StrEnum):
@@ -571,9 +575,11 @@ def export(
     reference: Annotated[
         str | None, Option(help='Position at which the correction is zero, "0 mm"; left out: the first target.')
     ] = None,
+    sampling: Annotated[str, Option(help="With model-...: time from step to step of the control.")] = "1 s",
+    reduced: Annotated[bool, Option("--reduced", help="With model-...: the fewest sensors that suffice.")] = False,
     fields: Annotated[bool, Option("--fields", help="With csv: the fields too, a large file.")] = False,
     force: Annotated[
-        bool, Option("--force", help="Write a compensation table even if the results do not support it.")
+        bool, Option("--force", help="Write a compensation even if the results do not support it.")
     ] = False,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
@@ -593,6 +599,8 @@ def export(
             axis=axis,
             spacing_mm=None if spacing is None else read_option("--spacing", spacing, "mm"),
             reference_mm=None if reference is None else read_option("--reference", reference, "mm"),
+            sampling_s=read_option("--sampling", sampling, "s"),
+            reduced=reduced,
             fields=fields,
             force=force,
             overwrite=overwrite,
