@@ -51,6 +51,10 @@ class ExportFormat(StrEnum):
     siemens840d_temperature = "siemens840d-temperature"
     heidenhain = "heidenhain"
     renishaw = "renishaw"
+    model_json = "model-json"
+    model_c = "model-c"
+    model_st = "model-st"
+    model_linuxcnc = "model-linuxcnc"
 
 
 class FrameFormat(StrEnum):
@@ -544,6 +548,40 @@ def iso230(
             errors.print(f"page: {out.resolve()}")
 
 
+@app.command("iso230-3")
+def iso230_3(
+    test: Annotated[
+        Path,
+        Argument(
+            metavar="CAMPAIGN.toml|RESULTS",
+            help="A campaign file with a [record] or readings of a linear axis, or a results folder.",
+        ),
+    ],
+    out: Annotated[Path | None, Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
+    as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Evaluate a test of thermal effects by ISO 230-3.
+
+    Distortion in the first and the last hour and over the whole test, tilts, drift of zero and scale, settling time.
+    """
+    from fusion.common import versions
+    from fusion.pipeline.iso230_3 import read_thermal_tests
+    from fusion.report.page import render_thermal_tests, write_iso230
+    from fusion.report.thermal_test import thermal_test_tables
+
+    with _answering():
+        title, tests = read_thermal_tests(test)
+        if as_json:
+            print_json([one.model_dump(mode="json") for one in tests])
+        else:
+            for table in thermal_test_tables(tests, title=title):
+                _wide().print(table)
+            _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
+        if out is not None:
+            write_iso230(out, render_thermal_tests(title, tests, versions=versions()))
+            errors.print(f"page: {out.resolve()}")
+
+
 @app.command()
 def schema(
     name: Annotated[str, Argument(metavar="results|campaign|recipe", help="Which file to describe.")] = "results",
@@ -571,9 +609,11 @@ def export(
     reference: Annotated[
         str | None, Option(help='Position at which the correction is zero, "0 mm"; left out: the first target.')
     ] = None,
+    sampling: Annotated[str, Option(help="With model-...: time from step to step of the control.")] = "1 s",
+    reduced: Annotated[bool, Option("--reduced", help="With model-...: the fewest sensors that suffice.")] = False,
     fields: Annotated[bool, Option("--fields", help="With csv: the fields too, a large file.")] = False,
     force: Annotated[
-        bool, Option("--force", help="Write a compensation table even if the results do not support it.")
+        bool, Option("--force", help="Write a compensation even if the results do not support it.")
     ] = False,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
@@ -593,6 +633,8 @@ def export(
             axis=axis,
             spacing_mm=None if spacing is None else read_option("--spacing", spacing, "mm"),
             reference_mm=None if reference is None else read_option("--reference", reference, "mm"),
+            sampling_s=read_option("--sampling", sampling, "s"),
+            reduced=reduced,
             fields=fields,
             force=force,
             overwrite=overwrite,

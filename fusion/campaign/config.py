@@ -759,6 +759,24 @@ class RecordTable(LoggedTable):
         return self
 
 
+class TiltTable(Table):
+    """Two displacements of one direction whose difference is a tilt, and the distance of their sensors along the tool or the axis."""
+
+    channels: tuple[str, str]
+    distance_mm: Annotated[PositiveMillimetres, Field(gt=0.0)]
+
+
+class ThermalTestTable(Table):
+    """``[thermal_test]``: what a test by ISO 230-3 needs to be told."""
+
+    kind: Literal["environment", "spindle", "linear axis", "rotary axis"] | None = None
+    tilts: dict[str, TiltTable] = {}
+    #: Standard uncertainty of the sensitivity of the displacement sensors, as a share.
+    sensor_calibration: FractionU | None = None
+    mounting_length_mm: PositiveMillimetres | None = None
+    mounting_expansion_ppm_per_K: PartsPerMillion = 11.7
+
+
 class ModelTable(Table):
     """``[model]``: the effects that are known to act."""
 
@@ -786,6 +804,7 @@ class Campaign(Table):
     accept: AcceptTable = AcceptTable()
     acceptance: AcceptanceTable = AcceptanceTable()
     report: ReportTable = ReportTable()
+    thermal_test: ThermalTestTable = ThermalTestTable()
 
     @model_validator(mode="before")
     @classmethod

@@ -19,7 +19,7 @@ from fusion.analysis.drift_model.record import (
     examine_record,
     known_mean,
 )
-from fusion.analysis.drift_model.record_data import Record, reduce_record
+from fusion.analysis.drift_model.record_data import EXPONENTS, Record, reduce_record
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import Campaign
 from fusion.campaign.inputs import DATED, pipe_notices, read_record
@@ -236,11 +236,15 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
     terms = result.state.model.terms
     names = [term.effect for term in terms]
     unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
-    drivers = np.array([powers[1] for powers in record.drivers.values()]).reshape(-1, record.seconds.size).T
+    drivers, squares = (
+        np.array([powers[exponent] for powers in record.drivers.values()]).reshape(-1, record.seconds.size).T
+        for exponent in EXPONENTS
+    )
     sizes, units = ([record.driver_sizes[name][k] for name in record.drivers] for k in (0, 1))
     contributions = np.array([result.contribution(term) for term in terms])
     um: dict[str, Any] = {"units": "um"}
     celsius = {"units": "degC", "units_metadata": "temperature: on_scale"}
+    elapsed = "time since the first sample" + (", time between runs left out" if record.runs else "")
     unseen = "from parts that the model had not seen"
     dims = ("time", "channel")
     # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the hold-out set.
@@ -251,6 +255,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
             "temperature": (("time", "sensor"), record.temperature, celsius),
             "driver": (("time", "driver_name"), drivers, {"units": "1", "long_name": "driver over its largest size"}),
+            "driver_square": (("time", "driver_name"), squares, {"units": "1", "long_name": "mean square of that"}),
             "driver_size": ("driver_name", sizes, {"long_name": "largest size of the driver, in driver_units"}),
             "driver_units": ("driver_name", np.array(units, dtype=object)),
             **_predictions(record, result),
@@ -258,6 +263,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             "contribution": (("effect", *dims), contributions.reshape(len(terms), *record.displacement.shape), um),
             "noise": ("channel", result.whole.sigma, {**um, "long_name": "noise of a block mean"}),
             "sealed": ("time", result.hold_out, {"long_name": "held-out block"}),
+            "elapsed": ("time", record.seconds, {"units": "s", "long_name": elapsed}),
             "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),
         },
         coords={
@@ -272,8 +278,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
     if not record.runs:
         return dataset
     number_of = {"long_name": "number of the run", "runs": ", ".join(one.name for one in record.runs)}
-    elapsed = {"units": "s", "long_name": "time since the start, time between runs left out"}
-    return dataset.assign(run=("time", record.run + 1, number_of), elapsed=("time", record.seconds, elapsed))
+    return dataset.assign(run=("time", record.run + 1, number_of))
 
 
 def _predictions(record: Record, result: RecordResult) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from fusion.report.numbers import (
     small,
     upper_first,
 )
+from fusion.report.thermal_test import describe_thermal_tests
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     CONTRIBUTORS,
@@ -456,6 +457,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
 _SECTIONS = (
     ("pictures", "regions", "Pictures"),
     ("iso230", "iso230", "ISO 230-2"),
+    ("iso230-3", "iso230_3", "ISO 230-3"),
     ("drift", "drift", "Drift"),
     ("anomalies", "anomalies", "Positions"),
     ("fields", "hotspots", "Heat"),
@@ -474,7 +476,7 @@ _SECTIONS = (
 )
 #: Section of the report -> what its figures rest on.
 _RESTS_ON: dict[str, Figures] = {
-    "fields": "field", "drift": "positions", "paper": "positions", "iso230": "positions", "anomalies": "positions",
+    "fields": "field", "drift": "positions", "paper": "positions", "iso230": "positions", "iso230-3": "positions", "anomalies": "positions",
     "place": "attribution", "correlation": "attribution", "cause": "causes", "loop": "causes",
 }  # fmt: skip
 _SIGNS = {"positive": "+", "negative": "−"}
@@ -517,7 +519,9 @@ def describe_campaign(
         "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
         "answers": conclude(results),
         "next": next_steps(results)[:MOST_STEPS],
-        "contents": [(at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) is not None],
+        "contents": [
+            (at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) not in (None, ())
+        ],
         "laser": laser,
         "camera": None if fields is None else _camera(fields),
         "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
@@ -526,6 +530,7 @@ def describe_campaign(
         "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
         "comparison": None if results.neighbours is None or deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
+        "thermal_tests": describe_thermal_tests(results.iso230_3 or ()),
         "anomalies": [
             {
                 "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",

@@ -28,11 +28,13 @@ from fusion.report.charts.style import Chart, EmbeddedChart, chart_scripts, embe
 from fusion.report.conclusions import headline
 from fusion.report.numbers import moment, number, place
 from fusion.report.record import describe_record, draw_record
+from fusion.report.thermal_test import describe_thermal_tests, draw_thermal_tests
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, print_table, say, sentences, table
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
 from fusion.results.store import group, is_file_list, read_fusion, read_product, write_atomically, write_text
+from fusion.results.thermal_test import ThermalTest
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -121,7 +123,11 @@ def render_report(
     context: dict[str, Any] = {"results": results, "provenance": provenance}
     if "record" in datasets:
         context["summary"] = describe_record(results, datasets["record"])
-        return render_page("record.html.j2", embed(draw_record(datasets["record"])), **context)
+        return render_page(
+            "record.html.j2",
+            embed({**draw_record(datasets["record"]), **draw_thermal_tests(results.iso230_3 or ())}),
+            **context,
+        )
     context["summary"] = describe_campaign(results, provenance, datasets, joint)
     charts, context["thermal_map"] = draw_campaign(results, datasets) if drawn is None else drawn()
     return render_page("report.html.j2", charts, **context)
@@ -245,6 +251,14 @@ def render_iso230(
     shown = {"title": title, "iso230": part, "remarks": remarks}
     summary = {"iso230": describe_iso230(part, dataset), "assumptions": {"iso230": ""}}
     return render_page("iso230.html.j2", embed(draw_iso230(dataset)), summary=summary, versions=versions, **shown)
+
+
+def render_thermal_tests(title: str, tests: Sequence[ThermalTest], *, versions: Mapping[str, str]) -> str:
+    """Return the page of a test as HTML text."""
+    summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
+    return render_page(
+        "iso230_3.html.j2", embed(draw_thermal_tests(tests)), summary=summary, title=title, versions=versions
+    )
 
 
 def write_iso230(path: Path, page: str) -> None:

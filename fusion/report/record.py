@@ -15,6 +15,7 @@ from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import Chart
 from fusion.report.conclusions import conclude, headline, next_steps
 from fusion.report.numbers import duration, join, moment
+from fusion.report.thermal_test import describe_thermal_tests
 from fusion.results.loop import RecordLoop
 from fusion.results.progress import counted
 from fusion.results.results import Results
@@ -23,8 +24,8 @@ from fusion.results.results import Results
 _MOST_CHANNELS = 6
 #: Sections of the report with their titles in the contents.
 _SECTIONS = (
-    ("record", "Record"), ("loop", "Cause"), ("chained", "Forward chaining"), ("data", "Data"), ("uncertainty", "Uncertainty"),
-    ("glossary", "Glossary"), ("provenance", "Provenance"),
+    ("record", "Record"), ("iso230-3", "ISO 230-3"), ("loop", "Cause"), ("chained", "Forward chaining"), ("data", "Data"),
+    ("uncertainty", "Uncertainty"), ("glossary", "Glossary"), ("provenance", "Provenance"),
 )  # fmt: skip
 _ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 
@@ -78,7 +79,9 @@ def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
         ),
         "answers": conclude(results),
         "next": next_steps(results)[:MOST_STEPS],
-        "contents": _SECTIONS,
+        "contents": [one for one in _SECTIONS if one[0] != "iso230-3" or results.iso230_3],
+        "thermal_tests": describe_thermal_tests(results.iso230_3 or ()),
+        "assumptions": {"iso230-3": ""},
         "laser": None,
         "camera": None,
         "data": [

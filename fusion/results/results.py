@@ -42,6 +42,7 @@ from fusion.results.parts import (
     TimePart,
 )
 from fusion.results.store import Product, plain, require_own
+from fusion.results.thermal_test import ThermalTest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -148,6 +149,8 @@ class Results(ResultPart):
     """Both instruments on one clock."""
     iso230: Iso230Part | None = None
     """Axis values by ISO 230-2."""
+    iso230_3: tuple[ThermalTest, ...] | None = None
+    """Distortion by temperature, by ISO 230-3: of every run of a record, or of a linear axis."""
     neighbours: NeighboursPart | None = None
     """Neighbour differences."""
     drift: DriftPart | None = None

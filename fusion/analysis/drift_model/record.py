@@ -472,7 +472,7 @@ def channel_gains(model: RecordFit, candidates: Sequence[Candidate], draws: Sequ
 MEAN = "mean of all"
 #: A load acts at once (bearings widen with the speed), warms the part beside it, then what that part is joined to: states a factor of
 #: four apart in their time constants.
-_CHAIN = (0.0, 0.25, 1.0, 4.0)
+SOURCE_CHAIN = (0.0, 0.25, 1.0, 4.0)
 #: Time constants of the middle part, min.
 _SOURCE_MIN = (5.0, 10.0, 20.0, 40.0, 80.0)
 #: An event needs this share of the record on either side to be told from a drift.
@@ -511,13 +511,13 @@ def _unseen_heat_source(record: Record, near: Candidate | None) -> Iterator[Cand
         for minutes in _around(near, _SOURCE_MIN):
             states = [
                 record.series(powers[exponent], "1").lagged(60.0 * minutes * share).values
-                for share in _CHAIN
+                for share in SOURCE_CHAIN
                 for exponent in EXPONENTS
             ]
             parameters: dict[str, float | str] = {
                 "follows": name,
                 "time_constant_min": minutes,
-                "chain": "at once, " + ", ".join(f"{minutes * share:.3g} min" for share in _CHAIN[1:]),
+                "chain": "at once, " + ", ".join(f"{minutes * share:.3g} min" for share in SOURCE_CHAIN[1:]),
             }
             yield Candidate(np.column_stack(states), parameters, ("um",) * len(states))
 

@@ -16,6 +16,7 @@ from fusion.report.charts import model, plan, readings
 from fusion.report.charts.plan import MapControls, plot_thermal_map
 from fusion.report.charts.style import Chart, EmbeddedChart, embed
 from fusion.report.charts.thermograms import draw_thermograms
+from fusion.report.thermal_test import draw_thermal_tests
 from fusion.results.results import Results
 from fusion.results.store import group, has
 from interferometry.plots import evaluate_common_start, hours_since_start
@@ -107,7 +108,7 @@ def draw_placed(
         charts["thermal_map"], controls = plot_thermal_map(
             fields, results.hotspots or (), position, sensors=results.sensors or ()
         )
-    return Drawn(embed(charts), controls)
+    return Drawn(embed({**charts, **draw_thermal_tests(results.iso230_3 or ())}), controls)
 
 
 def _clock_charts(fused: xr.Dataset, deviations: xr.Dataset | None) -> dict[str, Chart]:

@@ -439,9 +439,9 @@ def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
 def header_lines(origin: Origin, **facts: Any) -> list[str]:
     """Return the header of a table as lines of ASCII text, from the facts that ``templates/compensation_header.j2`` states."""
     # A text from a file must not end its line: a control would run what follows.
-    made = environment(html=False).overlay(finalize=lambda value: _one_line(value) if isinstance(value, str) else value)
+    made = environment(html=False).overlay(finalize=lambda value: one_line(value) if isinstance(value, str) else value)
     text = made.get_template("compensation_header.j2").render(origin=origin, **{"exported": datetime.now(UTC), **facts})
-    return [_one_line(line) for line in text.splitlines() if line]
+    return [one_line(line) for line in text.splitlines() if line]
 
 
 def _parameters(path: Path) -> Mapping[str, Any]:
@@ -456,7 +456,7 @@ def _parameters(path: Path) -> Mapping[str, Any]:
         ) from None
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
     """Return a text without line breaks and control characters, in ASCII: it may come from a file, and controls read no UTF-8."""
     plain = "".join(letter if letter.isprintable() else " " for letter in text)
     for found, written in (("µ", "u"), ("μ", "u"), ("−", "-"), ("–", "-"), ("±", "+-"), ("°C", "degC")):

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from fusion.analysis.drift_model.recursion import make_recursion
 from fusion.messages import naming
 from fusion.report.conclusions import headline
 from fusion.report.exports import tables
@@ -33,11 +34,13 @@ from fusion.report.exports.controls import (
     siemens_temperature,
     tabulate,
 )
+from fusion.report.exports.recursions import MODELS, emit, objections_to_model
 from fusion.report.numbers import number
 from fusion.report.wording import anomaly_cause, anomaly_place
 from fusion.results.axis import AnomalyPart
+from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
-from fusion.results.store import has, read_product, write_atomically
+from fusion.results.store import file_sha256, has, read_product, write_atomically
 
 # The guard of compensation tables: why a run's profile should not go into a control, and what to know where it may.
 
@@ -146,7 +149,7 @@ def _at_targets(profile: Profile, table: ErrorTable) -> Array:
 
 #: Setting data that follow a temperature.
 TEMPERATURE_FORMAT = "siemens840d-temperature"
-FORMATS = ("csv", "xlsx", *CONTROLS, TEMPERATURE_FORMAT)
+FORMATS = ("csv", "xlsx", *CONTROLS, TEMPERATURE_FORMAT, *MODELS)
 #: Name of an axis that every control accepts.
 _AXIS = re.compile(r"[A-Za-z][A-Za-z0-9]{0,9}")
 
@@ -177,18 +180,22 @@ def export_results(
     axis: str | None = None,
     spacing_mm: float | None = None,
     reference_mm: float | None = None,
+    sampling_s: float = 1.0,
+    reduced: bool = False,
     fields: bool = False,
     force: bool = False,
     overwrite: bool = False,
 ) -> Exported:
-    """Write tables of a run, or the drift-free profile as the compensation table of a control.
+    """Write tables of a run, the drift-free profile as the compensation table of a control, or the drift model for a control.
 
     Parameters
     ----------
     results : str or Path
         Folder of a finished run.
-    format : {"csv", "xlsx", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw"}
-        Tables, a workbook, or a control; ``siemens840d-temperature`` is the part of the drift that follows the material temperature.
+    format : {"csv", "xlsx", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw", "model-json", "model-c", \
+"model-st", "model-linuxcnc"}
+        Tables, a workbook, or a control; ``siemens840d-temperature`` is the part of the drift that follows the material temperature. The
+        model of a record's drift as JSON, as a header in C, in Structured Text, or as a HAL component.
     out : str or Path
         Folder for the files; created where it is absent.
     axis : str, optional
@@ -197,6 +204,10 @@ def export_results(
         Distance of the table's points. None: the targets themselves.
     reference_mm : float, optional
         Position at which the correction is zero. None: the first target.
+    sampling_s : float
+        Time from one step of a model to the next, s.
+    reduced : bool
+        Whether a model uses the fewest sensors that suffice.
     fields : bool
         Whether ``csv`` writes the fields too, which makes a large file.
     force : bool
@@ -229,6 +240,10 @@ def export_results(
     if format not in FORMATS:
         raise ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
     results, out = Path(results), Path(out)
+    if format in MODELS:
+        return _export_model(
+            results, format, out, sampling_s=sampling_s, reduced=reduced, force=force, overwrite=overwrite
+        )
     if not (results / "deviations.nc").is_file():
         return _export_camera(results, format, out, overwrite=overwrite)
     found, deviations = read_results(results), read_product(results, "deviations")
@@ -315,12 +330,47 @@ def _temperature_text(
     return {f"temperature_{name}.MPF": siemens_temperature(line, name, header)}, _forced(against)
 
 
+def _export_model(
+    folder: Path, format: str, out: Path, *, sampling_s: float, reduced: bool, force: bool, overwrite: bool
+) -> Exported:
+    """Write the drift model of a record for a control."""
+    results = read_results(folder)
+    if not isinstance(results.loop, RecordLoop):
+        raise ExportError(
+            f"{folder}: a drift model is written from a test with temperature sensors ([record]); that of an axis follows a camera, which "
+            "does not stay at the machine: export a compensation table, or siemens840d-temperature"
+        )
+    if not 0.0 < sampling_s <= 60.0:
+        raise ExportError(
+            f"--sampling {sampling_s:g} s does not suit a thermal state; write a time above 0 and up to 60 s"
+        )
+    against = _forced(_judge(objections_to_model(results), force=force))
+    with naming(folder):
+        model = make_recursion(
+            read_product(folder, "record"),
+            results.loop,
+            campaign=results.campaign,
+            results_sha256=file_sha256(folder / "results.json"),
+            sampling_s=sampling_s,
+            reduced=reduced,
+            remarks=against,
+        )
+        file, text = emit(model, format)
+    writer: Writer = partial(Path.write_text, data=text, encoding="utf-8")
+    curve = [
+        f"{len(one.sensors)} of {len(model.sensor_curve[0].sensors)} sensors: {one.cross_rmse:.3g} um by cross-validation, "
+        f"{one.held_out_rmse:.3g} um on the hold-out set ({', '.join(one.sensors) or 'none'})"
+        for one in model.sensor_curve
+    ]
+    return Exported(_write(out, {file: writer}, overwrite=overwrite), (*model.remarks, *curve))
+
+
 def _judge(against: list[str], *, force: bool) -> list[str]:
     """Return the objections of an export that is forced; refuse one that is not."""
     if against and not force:
         raise ExportError(
-            f"no compensation table is written: {'; '.join(against)}. Remove the cause and run again, or add --force: the reason "
-            "is then written into the table"
+            f"no compensation is written: {'; '.join(against)}. Remove the cause and run again, or add --force: the reason "
+            "is then written into it"
         )
     return against
 

@@ -82,7 +82,7 @@ def unexplained(tmp_path_factory):
 
 @pytest.mark.parametrize("format", ["linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw"])
 def test_the_guard_refuses_and_a_forced_table_says_why(unexplained, tmp_path, format):
-    with pytest.raises(ExportError, match=r"no compensation table is written: the verdict is unexplained: .* add"):
+    with pytest.raises(ExportError, match=r"no compensation is written: the verdict is unexplained: .* add"):
         export_results(unexplained, format, tmp_path, axis="X")
     assert not list(tmp_path.iterdir())
     forced = export_results(unexplained, format, tmp_path, axis="X", force=True)

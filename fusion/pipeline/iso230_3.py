@@ -1,0 +1,256 @@
+"""Evaluation of a test by ISO 230-3: a record of displacements and temperatures, or a positioning test of a linear axis."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
+from fusion.campaign.inputs import read_laser, read_record
+from fusion.common import Array
+from fusion.results.parts import Quantity
+from fusion.results.results import read_results
+from fusion.results.thermal_test import TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
+from interferometry.iso230.thermal import (
+    AVERAGED_S,
+    Distortion,
+    average,
+    axis_courses,
+    evaluate_distortion,
+    resolution,
+    scatter,
+    tilt,
+)
+
+#: Standard uncertainty of the sensitivity of a displacement sensor where none is stated: one percent of the reading.
+ASSUMED_CALIBRATION = 0.01
+#: Values of a course that are kept for its chart.
+_KEPT = 120
+DEFINITIONS = (
+    "ISO 230-3:2020 names four tests in its open scope; its text is not open. Stated here is what is computed.",
+    "A distortion is the largest less the smallest value, as in the manual of a spindle analyser that refers to ISO 230-3 (Lion Precision "
+    "M017-7500, total drift per axis); the periods (first 60 min, whole test, last 60 min) follow no open text.",
+    "Settled: the time after which a displacement stays within a tenth of its range about its mean of the last 60 min, for two "
+    "hours at least; no open text.",
+    "Uncertainties follow the GUM with the sources of the budget, each with its origin; ISO/TR 230-9 is not open, and its list of sources "
+    "was not compared.",
+)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """A quantity over the test: values (n,), sources of the uncertainty of one value, and of its sensitivity (share), with origins."""
+
+    name: str
+    unit: str
+    values: Array
+    absolute: Mapping[str, tuple[float | None, str]]
+    share: tuple[float, str]
+
+
+def evaluate_record_test(table: xr.Dataset, stated: ThermalTestTable) -> list[ThermalTest]:
+    """Evaluate every run of a record."""
+    runs = json.loads(table.attrs.get("runs", '[""]'))
+    number = table["run"].values if "run" in table.coords else np.zeros(table.sizes["time"], int)
+    return [_of_run(table.isel(time=np.flatnonzero(number == k)), name, stated) for k, name in enumerate(runs)]
+
+
+def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTest:
+    time = table["time"].values.astype("datetime64[ns]")
+    elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), float)
+    remarks = ["Readings are averaged over one minute first, so that a range is not that of the noise."]
+    remarks += [] if stated.kind else ["The kind of test is not stated; write kind under [thermal_test]."]
+    channels = [str(one) for one in table["channel"].values]
+    raw = table["displacement"].values
+    per_piece = max(1.0, AVERAGED_S / float(np.median(np.diff(elapsed)))) if elapsed.size > 1 else 1.0
+    seconds, displacement = average(elapsed, raw)
+    temperature = average(elapsed, table["temperature"].values)[1]
+    share = (
+        (ASSUMED_CALIBRATION, "assumed, 1 % of the reading")
+        if stated.sensor_calibration is None
+        else (stated.sensor_calibration, "stated")
+    )
+    courses = []
+    for k, channel in enumerate(channels):
+        noise = scatter(raw[:, k]) / np.sqrt(per_piece)
+        digit = resolution(raw[:, k]) / np.sqrt(12.0)
+        sources: dict[str, tuple[float | None, str]] = {
+            "noise": (noise, "from the second differences of the readings, mean of one minute"),
+            "resolution": (digit, "from the digits of the readings"),
+            "mounting": _mounting(stated, temperature),
+        }
+        courses.append(_Course(channel, "um", displacement[:, k], sources, share))
+    courses += list(_tilts(courses, stated))
+    missing = [one for tilted in stated.tilts.values() for one in tilted.channels if one not in channels]
+    if missing:
+        raise CampaignError(
+            f"[thermal_test.tilts] names {', '.join(missing)}; the displacements of the record are {', '.join(channels)}"
+        )
+    if not stated.tilts:
+        remarks.append(
+            'No tilt: write [thermal_test.tilts], for example A = {channels = ["Y1", "Y2"], distance = "150 mm"}.'
+        )
+    sensors = [
+        _Course(str(one), "K", temperature[:, k], {"noise": (scatter(temperature[:, k]), "")}, (0.0, ""))
+        for k, one in enumerate(table["sensor"].values)
+    ]
+    return _test(stated.kind or "not stated", name, seconds, courses, sensors, remarks)
+
+
+def _mounting(stated: ThermalTestTable, temperature: Array) -> tuple[float | None, str]:
+    """Return the standard uncertainty of one value by the expansion of what holds sensors and target."""
+    if stated.mounting_length_mm is None:
+        return None, "not known, not contained; write mounting_length under [thermal_test]"
+    swing = float(np.nanmin(np.nanmax(temperature, axis=0) - np.nanmin(temperature, axis=0)))
+    u = stated.mounting_expansion_ppm_per_K * stated.mounting_length_mm * 1e-3 * swing / np.sqrt(12.0)
+    return u, (
+        f"{stated.mounting_expansion_ppm_per_K:g} ppm/K over {stated.mounting_length_mm:g} mm, rectangular over the {swing:.2g} K of the "
+        "sensor that moves least"
+    )
+
+
+def _tilts(courses: Sequence[_Course], stated: ThermalTestTable) -> Iterator[_Course]:
+    """Yield the tilts that two displacements show."""
+    by_name = {one.name: one for one in courses}
+    for name, tilted in stated.tilts.items():
+        if not set(tilted.channels) <= set(by_name):
+            continue
+        first, second = (by_name[one] for one in tilted.channels)
+        per_um = 1e3 / tilted.distance_mm
+        sources = {
+            source: (None if u is None or other is None else float(np.hypot(u, other)) * per_um, origin)
+            for (source, (u, origin)), (other, _) in zip(first.absolute.items(), second.absolute.values(), strict=True)
+        }
+        # What holds both sensors moves both alike.
+        sources["mounting"] = (None, "not known, not contained: only the difference of both sensors' mountings tilts")
+        values = tilt(first.values, second.values, distance_mm=tilted.distance_mm)
+        yield _Course(f"{name} ({first.name}, {second.name})", "um/m", values, sources, first.share)
+
+
+def evaluate_axis_test(deviations: xr.Dataset, stated: ThermalTestTable) -> list[ThermalTest]:
+    """Evaluate the drift of zero and scale of a linear axis; none without times, or of fewer than two cycles or targets."""
+    timed = ~np.isnat(deviations["time"].values)
+    few = deviations.sizes["cycle"] < 2 or np.unique(deviations["position"].values).size < 2
+    if not timed.any() or few or deviations["deviation"].attrs["units"] != "um":
+        return []
+    seconds, values, u = axis_courses(deviations)
+    known = np.isfinite(seconds)
+    first, last = np.sort(deviations["position"].values)[[0, -1]]
+    names = {"zero": f"zero, at {first:g} mm", "end": f"end, at {last:g} mm", "scale": "scale"}
+    scatter_words = "scatter of all targets about the straight line"
+    courses = [
+        _Course(
+            names[key],
+            "um/m" if key == "scale" else "um",
+            values[key][known],
+            {
+                "noise": (float(np.nanmedian(u[key])), scatter_words),
+                "compensation of the laser": (None, "not contained: drift of its sensors during the test"),
+            },
+            (0.0, ""),
+        )
+        for key in names
+    ]
+    remarks = [
+        f"Zero and scale are those of a straight line through the drift of all {deviations.sizes['target']} targets, both approaches; the "
+        "standard's test needs the end positions only."
+    ]
+    return [_test(stated.kind or "linear axis", "", seconds[known], courses, [], remarks)]
+
+
+def _test(
+    kind: TestKind,
+    run: str,
+    seconds: Array,
+    courses: Sequence[_Course],
+    sensors: Sequence[_Course],
+    remarks: Sequence[str],
+) -> ThermalTest:
+    """Return a test from its courses."""
+    every = max(1, -(-seconds.size // _KEPT))
+    return ThermalTest(
+        run=run,
+        kind=kind,
+        duration_h=float((seconds[-1] - seconds[0]) / 3600.0),
+        distortions=tuple(_distortion(one, seconds) for one in courses),
+        temperatures=tuple(_distortion(one, seconds) for one in sensors),
+        contributions=tuple(
+            ThermalContribution(name=one.name, source=source, u=u, origin=origin)
+            for one in courses
+            for source, u, origin in _budget(one, evaluate_distortion(seconds, one.values).whole)
+        ),
+        courses=tuple(
+            ThermalCourse(
+                name=one.name,
+                unit="degC" if one.unit == "K" else one.unit,
+                hours=tuple(np.round((seconds[::every] - seconds[0]) / 3600.0, 4).tolist()),
+                values=tuple(None if np.isnan(value) else round(value, 4) for value in one.values[::every].tolist()),
+            )
+            for one in (*courses, *sensors)
+        ),
+        remarks=(*remarks, *DEFINITIONS),
+    )
+
+
+def _budget(course: _Course, size: float) -> list[tuple[str, float | None, str]]:
+    """Return the sources of the uncertainty of a range: a difference of two values, and the sensitivity of the sensor."""
+    of_two = [
+        (source, None if u is None else u * np.sqrt(2.0), origin) for source, (u, origin) in course.absolute.items()
+    ]
+    share, origin = course.share
+    return [*of_two, ("calibration", share * abs(size), origin)] if origin else of_two
+
+
+def _distortion(course: _Course, seconds: Array) -> ThermalDistortion:
+    """Return the ranges of a course with their uncertainties."""
+    found: Distortion = evaluate_distortion(seconds, course.values)
+
+    def quantity(value: float) -> Quantity:
+        if not np.isfinite(value):
+            return Quantity(value=None, u=None)
+        known = [u for _, u, _ in _budget(course, value) if u is not None and np.isfinite(u)]
+        return Quantity(value=value, u=float(np.sqrt(np.sum(np.square(known)))))
+
+    return ThermalDistortion(
+        name=course.name,
+        unit=course.unit,
+        first_hour=quantity(found.first_hour),
+        whole=quantity(found.whole),
+        last_hour=quantity(found.last_hour),
+        change=quantity(found.change),
+        settling_min=None if np.isnan(found.settling_s) else found.settling_s / 60.0,
+    )
+
+
+def read_thermal_tests(path: Path) -> tuple[str, tuple[ThermalTest, ...]]:
+    """Return title and tests of a campaign file or of a results folder."""
+    if path.is_dir():
+        results = read_results(path)
+        if not results.iso230_3:
+            raise CampaignError(f"{path}: these results hold no test by ISO 230-3; run the campaign again")
+        return results.campaign, results.iso230_3
+    if path.suffix != ".toml":
+        raise CampaignError(
+            f"{path}: name a campaign file or a results folder; thermofuse init writes a campaign file for a table"
+        )
+    campaign = load_campaign(path)
+    found = thermal_tests(campaign)
+    if not found:
+        raise CampaignError(
+            f"{path}: a test by ISO 230-3 needs a [record], or readings of a linear axis with their times in two cycles or more"
+        )
+    return campaign.campaign.title, tuple(found)
+
+
+def thermal_tests(campaign: Campaign) -> list[ThermalTest]:
+    """Read and evaluate the tests of a campaign."""
+    if campaign.record is not None:
+        return evaluate_record_test(read_record(campaign), campaign.thermal_test)
+    if campaign.interferometry is None:
+        return []
+    return evaluate_axis_test(read_laser(campaign)["deviations"], campaign.thermal_test)

@@ -1,0 +1,95 @@
+"""A test by ISO 230-3 as report, page and terminal show it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rich.table
+
+from fusion.report.charts.style import Chart, Courses, new_figure, of_rank, span_words
+from fusion.report.numbers import number, print_unit, small
+from fusion.report.wording import Table, Words, print_table, quantity, table
+from fusion.results.thermal_test import ThermalDistortion, ThermalTest
+
+_PERIODS = ("first_hour", "whole", "last_hour", "change")
+_TITLES = ("first 60 min", "whole test", "last 60 min", "last − first")
+#: Curves of one chart; the others are in the table.
+_DRAWN = 8
+_KINDS = {
+    "environment": "Environmental temperature variation (ETVE)",
+    "spindle": "Distortion by the rotating spindle",
+    "linear axis": "Distortion by a moving linear axis",
+    "rotary axis": "Distortion by rotary motion",
+    "not stated": "Kind of test not stated",
+}
+
+
+def describe_thermal_tests(tests: Sequence[ThermalTest]) -> list[dict[str, Any]]:
+    """Return what the templates state of every test."""
+    return [
+        {
+            "title": f"{_KINDS[test.kind]}{', run ' + test.run if test.run else ''}, {number(test.duration_h)} h",
+            "distortions": _distortions(test.distortions, "Displacement or tilt"),
+            "temperatures": _distortions(test.temperatures, "Temperature") if test.temperatures else None,
+            "budget": table(
+                [Words("Quantity"), Words("Source"), "u (k = 1)", Words("Origin")],
+                [
+                    [one.name, one.source, "–" if one.u is None else small(one.u), one.origin]
+                    for one in test.contributions
+                ],
+            ),
+            "remarks": test.remarks,
+        }
+        for test in tests
+    ]
+
+
+def _distortions(found: Sequence[ThermalDistortion], title: str) -> Table:
+    rows = [
+        [
+            one.name,
+            print_unit(one.unit),
+            *(quantity(getattr(one, period)) for period in _PERIODS),
+            "–" if one.settling_min is None else number(one.settling_min, 3),
+        ]
+        for one in found
+    ]
+    return table([Words(title), Words("Unit"), *_TITLES, "settled after / min"], rows)
+
+
+def draw_thermal_tests(tests: Sequence[ThermalTest]) -> dict[str, Chart]:
+    """Return the charts of every test: what has the same unit over time."""
+    charts = {}
+    for k, test in enumerate(tests):
+        for unit in dict.fromkeys(one.unit for one in test.courses):
+            shown = [one for one in test.courses if one.unit == unit][:_DRAWN]
+            printed = print_unit(unit)
+            drawn = new_figure(
+                x="time since start / h", y=f"{'temperature' if unit == 'degC' else 'drift'} / {printed}"
+            )
+            courses = Courses(drawn, {"time since start / h": np.array(shown[0].hours)})
+            for rank, one in enumerate(shown):
+                values = np.array([np.nan if value is None else value for value in one.values])
+                told = span_words(values, printed)
+                courses.add(
+                    np.array(one.hours),
+                    values,
+                    one.name,
+                    heading=f"{one.name} / {printed}",
+                    seen=f"{one.name} {told}",
+                    **of_rank(rank),
+                )
+            charts[f"thermal_{k}_{unit.replace('/', '_')}"] = courses.chart("Course of the test")
+    return charts
+
+
+def thermal_test_tables(tests: Sequence[ThermalTest], *, title: str) -> list[rich.table.Table]:
+    """Return the tables of tests for the terminal."""
+    return [
+        print_table(shown, f"{title}, {described['title']}" if name == "distortions" else name)
+        for described in describe_thermal_tests(tests)
+        for name in ("distortions", "temperatures", "budget")
+        if (shown := described[name]) is not None
+    ]

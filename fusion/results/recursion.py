@@ -1,0 +1,239 @@
+"""A drift model as a control runs it: a discrete-time recursion of first-order states, with everything that it may not exceed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from fusion.common import Array, FusionError
+from fusion.results.parts import ResultPart
+
+#: What a step found: all readings within their range; one held at the end of its range, or a correction at its limit; a failed reading.
+OK, SATURATED, FAILED = 0, 1, 2
+
+
+class RecursionError(FusionError):
+    """A model description that cannot be read or run; the message names the file and what is wrong."""
+
+
+class RecursionInput(ResultPart):
+    """A reading that the control supplies in every step."""
+
+    name: str
+    """Name of the sensor or driver."""
+    unit: str
+    """Unit of the reading."""
+    reference: float
+    """Reading at which it contributes nothing."""
+    low: float
+    """Lowest reading of the test; a lower one is held here."""
+    high: float
+    """Highest reading of the test; a higher one is held here."""
+    failed_below: float
+    """A reading below this value, or one that is no number, is that of a failed sensor."""
+    failed_above: float
+    """The same for a reading above."""
+
+
+class RecursionState(ResultPart):
+    """A first-order state: ``x = decay x + now v + before v'`` with the signal v of this step and v' of the step before."""
+
+    input: int
+    """Place of its input, from 0."""
+    size: float
+    """The signal is the reading less its reference, over this size."""
+    exponent: Literal[1, 2]
+    """Power to which the signal is raised."""
+    time_constant_s: float
+    """Time constant, s; 0: the signal itself."""
+    decay: float
+    """Weight of the state before."""
+    now: float
+    """Weight of the signal of this step."""
+    before: float
+    """Weight of the signal of the step before."""
+
+
+class RecursionOutput(ResultPart):
+    """A correction: minus the sum of coefficients times states, to be added to the commanded value."""
+
+    name: str
+    """Name of the displacement that it corrects."""
+    unit: Literal["um", "um/m"]
+    """Unit of the correction."""
+    coefficients: tuple[float, ...]
+    """Predicted displacement per state."""
+    limit: float
+    """Largest correction of the test; a larger one is held here."""
+    max_step: float
+    """Largest change of the correction in one step."""
+    before: float
+    """Root mean square displacement of the hold-out set from the last value before it, without a correction."""
+    u: float
+    """Standard uncertainty of the correction: root mean square error of predicting what the coefficients were not fitted to."""
+
+
+class SensorCurvePoint(ResultPart):
+    """The error that a number of sensors leaves."""
+
+    sensors: tuple[str, ...]
+    """The sensors."""
+    cross_rmse: float
+    """Error of the parts of the training time, each predicted from the others; mean over the channels, um."""
+    held_out_rmse: float
+    """Error on the hold-out set, which decides nothing; mean over the channels, um."""
+
+
+class Recursion(ResultPart):
+    """A drift model as a discrete-time recursion."""
+
+    format: Literal["thermofuse recursion 1"] = "thermofuse recursion 1"
+    """Version of this layout."""
+    campaign: str
+    """Title of the campaign that it was made from."""
+    results_sha256: str
+    """SHA-256 of its results.json."""
+    held_out: str
+    """What the uncertainties were judged on."""
+    sampling_s: float
+    """Time from one step to the next, s."""
+    inputs: tuple[RecursionInput, ...]
+    """Readings, in the order in which they are passed."""
+    states: tuple[RecursionState, ...]
+    """States."""
+    outputs: tuple[RecursionOutput, ...]
+    """Corrections."""
+    sensor_curve: tuple[SensorCurvePoint, ...] = ()
+    """Error over the number of sensors; of a reduced model only."""
+    remarks: tuple[str, ...] = ()
+    """What to know of it, one sentence each."""
+
+    def at_sampling(self, sampling_s: float) -> Recursion:
+        """The same model with another time from step to step."""
+        outputs = [
+            one.model_copy(update={"max_step": one.max_step * sampling_s / self.sampling_s}) for one in self.outputs
+        ]
+        states = [
+            one.model_copy(
+                update=dict(zip(_WEIGHTS, first_order_weights(one.time_constant_s, sampling_s), strict=True))
+            )
+            for one in self.states
+        ]
+        return self.model_copy(update={"sampling_s": sampling_s, "states": tuple(states), "outputs": tuple(outputs)})
+
+
+_WEIGHTS = ("decay", "now", "before")
+
+
+def first_order_weights(time_constant_s: float, sampling_s: float) -> tuple[float, float, float]:
+    """Weights of the state before, of the signal now and of the signal before: exact for a signal that is linear between two steps."""
+    if time_constant_s <= 0.0:
+        return 0.0, 1.0, 0.0
+    decay = float(np.exp(-sampling_s / time_constant_s))
+    ramp = float(-np.expm1(-sampling_s / time_constant_s)) * time_constant_s / sampling_s
+    return decay, 1.0 - ramp, ramp - decay
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What a recursion gives.
+
+    Attributes
+    ----------
+    correction : (steps, outputs) ndarray
+        In the unit of each output.
+    status : (steps,) ndarray of int
+        `OK`, `SATURATED` or `FAILED`.
+    """
+
+    correction: Array
+    status: NDArray[np.int64]
+
+
+def run_recursion(
+    model: Recursion, readings: Array, *, zero: NDArray[np.bool_] | None = None, reset: NDArray[np.bool_] | None = None
+) -> Corrections:
+    """Run a recursion over readings (steps, inputs), as the emitted programs do, operation by operation.
+
+    Parameters
+    ----------
+    model : Recursion
+        The model.
+    readings : (steps, inputs) ndarray
+        One row per step of `sampling_s`; NaN for a reading that is missing.
+    zero : (steps,) ndarray of bool, optional
+        Steps that take the present state of the machine as the one without a correction.
+    reset : (steps,) ndarray of bool, optional
+        Steps that end the rest after a failed reading.
+
+    Returns
+    -------
+    Corrections
+        A reading outside its range is held at the end of it. After a failed reading the corrections go to zero, within one minute from
+        their limit, and stay there until a reset.
+    """
+    columns = {name: np.array([getattr(one, name) for one in model.inputs]) for name in RecursionInput.model_fields}
+    readings = np.asarray(readings, float)
+    if readings.ndim != 2 or readings.shape[1] != len(model.inputs):
+        raise RecursionError(f"readings of shape {readings.shape}; the model takes (steps, {len(model.inputs)})")
+    of = np.array([one.input for one in model.states])
+    size, exponent, decay, now, before = (
+        np.array([getattr(one, name) for one in model.states]) for name in ("size", "exponent", *_WEIGHTS)
+    )
+    coefficients = np.array([one.coefficients for one in model.outputs])
+    limit, most = (np.array([getattr(one, name) for one in model.outputs]) for name in ("limit", "max_step"))
+    held, signal, state = columns["reference"].copy(), np.zeros(of.size), np.zeros(of.size)
+    zeroed, out = np.zeros(limit.size), np.zeros(limit.size)
+    latched = False
+    correction, status = np.zeros((len(readings), limit.size)), np.zeros(len(readings), np.int64)
+    for step, row in enumerate(readings):
+        good = (row >= columns["failed_below"]) & (row <= columns["failed_above"])
+        held = np.where(good, np.clip(row, columns["low"], columns["high"]), held)
+        latched = not good.all() or (latched and not (reset is not None and reset[step]))
+        last = signal
+        signal = (held[of] - columns["reference"][of]) / size
+        signal = np.where(exponent == 2, signal * signal, signal)
+        state = signal if step == 0 else decay * state + now * signal + before * last
+        wanted = -(coefficients @ state)
+        if zero is not None and zero[step]:
+            zeroed = wanted
+        wanted = wanted - zeroed
+        bounded = np.zeros(limit.size) if latched else np.clip(wanted, -limit, limit)
+        out = out + np.clip(bounded - out, -most, most)
+        saturated = (good & (held != row)).any() or (not latched and bool((bounded != wanted).any()))
+        status[step] = FAILED if latched else SATURATED if saturated else OK
+        correction[step] = out
+    return Corrections(correction, status)
+
+
+def read_recursion(path: str | Path) -> Recursion:
+    """Read a model description that `export --format json` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Recursion
+        The model.
+
+    Raises
+    ------
+    RecursionError
+        If the file is no such description.
+    """
+    try:
+        return Recursion.model_validate(json.loads(Path(path).read_text(encoding="utf-8")))
+    except (OSError, ValueError, ValidationError) as error:
+        told = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise RecursionError(
+            f"{path}: no model description of thermofuse ({told}); write one with --format json"
+        ) from None

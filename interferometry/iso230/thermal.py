@@ -1,0 +1,191 @@
+"""ISO 230-3: what temperature does to the displacement of a machine over hours.
+
+The four tests (environmental temperature variation error, rotating spindle, moving linear axis, rotary motion) are named in the scope of
+ISO 230-3:2020 (iso.org). The text of the standard is not open. What is computed here:
+
+* The range of a displacement, largest minus smallest: so does a maker's manual of a spindle analyser that refers to ISO 230-3 (Lion
+  Precision, M017-7500, "total drift per axis").
+* Over the first 60 min, over the whole test and over its last 60 min: no open text was found that states these periods.
+* Readings are averaged over one minute before, so that the range is not that of their noise: no open text.
+* The tilt is the difference of two displacements over the distance of their sensors: geometry, for angles this small.
+* The settling time is the time after which a displacement stays within a tenth of its whole range about its mean of the last 60 min, for
+  two hours at least: no open text.
+* Scale and zero of a linear axis are slope and value at its first target of a straight line through the drift of all targets; with two
+  targets they are those of the end positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+HOUR_S = 3600.0
+#: Readings are averaged over this time, s.
+AVERAGED_S = 60.0
+#: A displacement has settled where it stays within this share of its whole range.
+SETTLED_SHARE = 0.1
+#: Turns in which profile and drift of an axis are found where readings are missing; each leaves about the missing share of the error.
+_TURNS = 20
+#: Time for which it must have stayed there, s.
+SETTLED_FOR_S = 2.0 * HOUR_S
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """How far a quantity moved, in its own unit.
+
+    Attributes
+    ----------
+    first_hour, whole, last_hour : float
+        Largest minus smallest value over the period; NaN where the test is shorter than it or the period holds fewer than two values.
+    change : float
+        Mean of the last minute less that of the first.
+    settling_s : float
+        Time from the start after which it has settled, s; NaN where it has not, two hours before the end at the latest.
+    """
+
+    first_hour: float
+    whole: float
+    last_hour: float
+    change: float
+    settling_s: float
+
+
+def average(seconds: Array, values: Array, *, length_s: float = AVERAGED_S) -> tuple[Array, Array]:
+    """Average values (samples, n) over pieces of time; NaN counts as missing.
+
+    Parameters
+    ----------
+    seconds : (samples,) ndarray
+        Time since the start, s.
+    values : (samples, n) ndarray
+        Any unit.
+    length_s : float
+        Length of a piece, s.
+
+    Returns
+    -------
+    (pieces,) and (pieces, n) ndarray
+        Mean time and mean values of the pieces that hold samples.
+    """
+    number = np.floor(seconds / length_s).astype(int)
+    numbers, place = np.unique(number, return_inverse=True)
+    known = np.isfinite(values)
+    total, count = np.zeros((2, numbers.size, values.shape[1]))
+    np.add.at(total, place, np.where(known, values, 0.0))
+    np.add.at(count, place, known)
+    time = np.bincount(place, seconds) / np.bincount(place)
+    return time, np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
+    """Evaluate the course of one quantity.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time since the start of the test, s.
+    values : (n,) ndarray
+        The quantity, averaged; NaN where it is missing.
+
+    Returns
+    -------
+    Distortion
+        In the unit of the values.
+    """
+    known = np.isfinite(values)
+    seconds, values = seconds[known], values[known]
+    if values.size < 2:
+        return Distortion(*[np.nan] * 5)
+    since = seconds - seconds[0]
+    last = since >= since[-1] - HOUR_S
+    is_long = since[-1] >= HOUR_S
+    whole = float(np.ptp(values))
+    settling = np.nan
+    if is_long:
+        outside = np.abs(values - values[last].mean()) > SETTLED_SHARE * whole
+        after = int(np.flatnonzero(outside).max(initial=-1)) + 1
+        if after < since.size and since[after] <= since[-1] - SETTLED_FOR_S:
+            settling = float(since[after])
+    return Distortion(
+        first_hour=float(np.ptp(values[since <= HOUR_S])) if is_long else np.nan,
+        whole=whole,
+        last_hour=float(np.ptp(values[last])) if is_long else np.nan,
+        change=float(values[-1] - values[0]),
+        settling_s=settling,
+    )
+
+
+def scatter(values: Array) -> float:
+    """Return the standard deviation of the noise of a slow course (n,) from its second differences."""
+    second = np.diff(values[np.isfinite(values)], 2)
+    return float(np.std(second) / np.sqrt(6.0)) if second.size else np.nan
+
+
+def resolution(values: Array) -> float:
+    """Return the smallest step between the values of a course (n,); 0 where there is none."""
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    # Sums of decimal fractions differ by rounding from one another.
+    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))]
+    return float(steps.min()) if steps.size else 0.0
+
+
+def tilt(first_um: Array, second_um: Array, *, distance_mm: float) -> Array:
+    """Return the tilt, um/m (microradian), that two displacements (n,) in um show over the distance of their sensors."""
+    return (second_um - first_um) / distance_mm * 1e3
+
+
+def axis_courses(deviations: xr.Dataset) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    """Return the drift of zero and scale of a linear axis.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        Readings (cycle, direction, target), um, with their times.
+
+    Returns
+    -------
+    seconds : (cycles,) ndarray
+        Mean time of each cycle since the first, s; without times the number of the cycle counts as NaN.
+    courses : dict of str to (cycles,) ndarray
+        ``zero`` and ``end``, um: drift at the first and at the last target by the straight line; ``scale``, um/m.
+    u : dict of str to (cycles,) ndarray
+        Their standard uncertainties from the scatter about the line.
+    """
+    readings = deviations["deviation"].transpose("cycle", "direction", "target")
+    values = readings.values.reshape(readings.sizes["cycle"], -1)
+    position = deviations["position"].values.astype(float)
+    length = float(np.ptp(position))
+    share = np.tile((position - position.min()) / length, readings.sizes["direction"])
+    line = np.column_stack([np.ones(share.size), share])
+    known = np.isfinite(values)
+    found = np.zeros((len(values), 2))
+    inverse = np.full((len(values), 2, 2), np.nan)
+    for cycle, here in enumerate(known):
+        if np.unique(share[here]).size > 1:
+            inverse[cycle] = np.linalg.inv(line[here].T @ line[here])
+    # The profile is the mean of what the lines leave, the lines fit what the profile leaves: where readings are missing, in turn.
+    for _ in range(_TURNS if not known.all() else 2):
+        left = np.where(known, values - found @ line.T, 0.0)
+        drift = np.where(known, values - left.sum(axis=0) / np.maximum(known.sum(axis=0), 1), 0.0)
+        found = np.nan_to_num(np.einsum("cij,cj->ci", inverse, drift @ line))
+    residual = np.where(known, drift - found @ line.T, 0.0)
+    free = max(1, int(known.sum()) - 2 * len(values) - share.size)
+    covariance = float((residual**2).sum()) / free * inverse
+    found = np.where(np.isfinite(inverse[:, 0, :]), found, np.nan)
+    times = deviations["time"].transpose("cycle", "direction", "target").values.astype("datetime64[ns]")
+    elapsed = np.where(np.isnat(times), np.nan, (times - times[~np.isnat(times)].min()) / np.timedelta64(1, "s"))
+    seconds = np.array([np.mean(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in elapsed])
+    metres = length * 1e-3
+    courses = {"zero": found[:, 0], "end": found.sum(axis=1), "scale": found[:, 1] / metres}
+    variance = {
+        "zero": covariance[:, 0, 0],
+        "end": covariance.sum(axis=(1, 2)),
+        "scale": covariance[:, 1, 1] / metres**2,
+    }
+    return seconds, courses, {name: np.sqrt(one) for name, one in variance.items()}

@@ -1,0 +1,79 @@
+"""A test by ISO 230-3 from a record and from a campaign: ranges, tilts, budget, refusals, and the command."""
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import CampaignError, ThermalTestTable
+from fusion.pipeline.iso230_3 import evaluate_record_test, read_thermal_tests
+from tests.fusion.record_tables import runs_table, table_of
+
+SAMPLES = 6 * 60
+
+
+def table():
+    """Six hours, a sample per minute: a displacement that warms by 20 um, another one by 35 um, and a sensor by 8 K."""
+    rng = np.random.default_rng(5)
+    state = 1.0 - np.exp(-np.arange(SAMPLES) / 60.0)
+    noise = 0.05 * rng.standard_normal((SAMPLES, 2))
+    displacement = np.round(state[:, None] * [20.0, 35.0] + noise, 2)
+    return table_of(displacement, 20.0 + 8.0 * state[:, None] + 0.01 * rng.standard_normal((SAMPLES, 1)))
+
+
+def test_ranges_tilt_and_temperature_of_a_record():
+    stated = ThermalTestTable.model_validate(
+        {
+            "kind": "spindle",
+            "tilts": {"B": {"channels": ["ch1", "ch2"], "distance": "150 mm"}},
+            "sensor_calibration": "0.2 %",
+        }
+    )
+    (test,) = evaluate_record_test(table(), stated)
+    assert (test.kind, test.run) == ("spindle", "")
+    first, second, tilted = test.distortions
+    assert (first.name, second.name, tilted.name) == ("ch1", "ch2", "B (ch1, ch2)")
+    warm = 1.0 - np.exp(-1.0)
+    for one, whole in ((first, 20.0), (second, 35.0), (tilted, 100.0)):
+        # Noise widens the range of hundreds of values by some of its standard deviations.
+        within = 10.0 * one.whole.u
+        assert one.whole.value == pytest.approx(whole, abs=within)
+        assert one.first_hour.value == pytest.approx(whole * warm, abs=within)
+        # A tenth below the mean of the last hour, at which the state is still a little below 1; noise moves it by a minute or two.
+        assert one.settling_min == pytest.approx(-60.0 * np.log(0.1 + np.exp(-5.0) - np.exp(-6.0)), abs=3.0)
+    assert tilted.unit == "um/m"
+    assert test.temperatures[0].whole.value == pytest.approx(8.0, abs=0.1)
+    sources = {(one.name, one.source): one for one in test.contributions}
+    # Two values with noise of 0.05 um; the digit of 0.01 um, rectangular; 0.2 % of 20 um.
+    assert sources["ch1", "noise"].u == pytest.approx(0.05 * np.sqrt(2.0), rel=0.15)
+    assert sources["ch1", "resolution"].u == pytest.approx(0.01 / np.sqrt(6.0))
+    assert sources["ch1", "calibration"].u == pytest.approx(0.04, rel=0.02)
+    assert sources["ch1", "mounting"].u is None
+    assert "not contained" in sources["ch1", "mounting"].origin
+    known = [one.u for (name, _), one in sources.items() if name == "ch1" and one.u is not None]
+    assert first.whole.u == pytest.approx(np.sqrt(np.sum(np.square(known))))
+
+
+def test_what_holds_the_sensors_widens_every_displacement():
+    stated = ThermalTestTable.model_validate({"mounting_length": "200 mm"})
+    (test,) = evaluate_record_test(table(), stated)
+    (u,) = (one.u for one in test.contributions if (one.name, one.source) == ("ch1", "mounting"))
+    # 11.7 ppm/K over 200 mm and 8 K, rectangular, at both ends of the range.
+    assert u == pytest.approx(11.7e-3 * 200.0 * 8.0 / np.sqrt(6.0), rel=0.02)
+    assert test.kind == "not stated"
+    assert any(line.startswith("The kind of test is not stated") for line in test.remarks)
+
+
+def test_every_run_of_a_record_is_a_test():
+    tests = evaluate_record_test(runs_table(0.0, 40.0), ThermalTestTable())
+    assert [one.run for one in tests] == ["r1.csv", "r2.csv"]
+    assert tests[0].distortions[0].last_hour.value is None, "the run is shorter than an hour"
+
+
+def test_a_tilt_of_a_displacement_that_is_not_there_is_refused():
+    stated = ThermalTestTable.model_validate({"tilts": {"A": {"channels": ["ch1", "Y2"], "distance": "100 mm"}}})
+    with pytest.raises(CampaignError, match=r"names Y2; the displacements of the record are ch1, ch2"):
+        evaluate_record_test(table(), stated)
+
+
+def test_another_file_is_refused_with_what_to_name(tmp_path):
+    with pytest.raises(CampaignError, match="name a campaign file or a results folder; thermofuse init writes"):
+        read_thermal_tests(tmp_path / "record.csv")
