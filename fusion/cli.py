@@ -516,7 +516,7 @@ def iso230(
     cycles: Annotated[
         str | None, Option(help="Window, for example 1-5; left out: the most settled five cycles.")
     ] = None,
-    out: Annotated[Path | None, Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
+    out: Annotated[Path | None, Option(help="Write the sheet to sign: sheet.html, sheet.pdf, or sheet.docx.")] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
     as_csv: Annotated[bool, Option("--csv", help="Print the values per target as CSV.")] = False,
 ) -> None:
@@ -526,7 +526,7 @@ def iso230(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230 import read_test
-    from fusion.report.page import iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
+    from fusion.report.sheet import describe_sheet, iso230_csv, iso230_json, iso230_tables, write_iso230
 
     with _answering():
         found = read_test(test, cycles)
@@ -539,8 +539,8 @@ def iso230(
                 _wide().print(table)
             _print_lines(found.remarks)
         if out is not None:
-            page = render_iso230(found.title, found.part, found.dataset, remarks=found.remarks, versions=versions())
-            write_iso230(out, page)
+            sheet = describe_sheet(found.title, found.part, files=found.files, version=versions()["thermofuse"])
+            write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)
             errors.print(f"page: {out.resolve()}")
 
 

@@ -9,6 +9,7 @@
       started.set(figure, Bokeh.embed.embed_item(item).then((views) => {
         const view = [...views.roots][0];
         roots.set(figure, view);
+        plots(view).forEach(fit);
         if (figure.querySelector(".controls")) steer(figure, view);
         return view;
       }));
@@ -16,6 +17,16 @@
     return started.get(figure);
   }
   const plots = (view) => view.model.type === "Figure" ? [view] : view.child_views.flatMap(plots);
+
+  // A plan has millimetres of one length in both directions: its height follows the width that the page leaves it.
+  const tallest = 340;
+  function fit(plot) {
+    if (plot.model.name !== "plan" || !plot.frame.bbox.width) return;
+    const { x_range, y_range } = plot.model, ratio = Math.abs((y_range.end - y_range.start) / (x_range.end - x_range.start));
+    plot.model.frame_height = Math.round(Math.min(tallest, plot.frame.bbox.width * ratio));
+    plot.model.height = null;
+  }
+  window.addEventListener("resize", () => setTimeout(() => roots.forEach((view) => plots(view).forEach(fit)), 100));
 
   const near = new IntersectionObserver((entries) => {
     for (const entry of entries) if (entry.isIntersecting) { near.unobserve(entry.target); draw(entry.target); }
