@@ -609,7 +609,6 @@ def report(
     out: Annotated[
         Path | None, Option(help="File to write, which must not exist; left out: report.html or report.pdf in RESULTS.")
     ] = None,
-    full: Annotated[bool, Option("--full", help="With --pdf: also the parts that are folded on the screen.")] = False,
     browser: Annotated[
         str | None, Option(help="With --pdf: the browser that prints; left out: one is looked for.")
     ] = None,
@@ -622,7 +621,7 @@ def report(
     with _answering():
         page = report_of(results)
         file = claim_file(results, "report.pdf" if pdf else "report.html", out)
-        written = print_pdf(page, file, browser=browser, full=full) if pdf else write_text(file, page)
+        written = print_pdf(page, file, browser=browser) if pdf else write_text(file, page)
         console.print(str(written), soft_wrap=True)
 
 

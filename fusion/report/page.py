@@ -189,13 +189,13 @@ def find_browser(named: str | None = None) -> str:
     )
 
 
-def print_pdf(page: str, out: Path, *, browser: str | None = None, full: bool = False) -> Path:
-    """Print a page to a PDF file."""
+def print_pdf(page: str, out: Path, *, browser: str | None = None) -> Path:
+    """Print a page to a PDF file, with everything that is folded on the screen."""
     program = find_browser(browser)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "report.html"
         file.write_text(page, encoding="utf-8")
-        address = f"{file.as_uri()}#on-a4{'-full' if full else ''}"
+        address = f"{file.as_uri()}#on-a4"
         return write_atomically(out, lambda temporary: _print(program, address, temporary, folder))
 
 

@@ -99,7 +99,7 @@ def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset
         return
     page = render_iso230(sheet, part, dataset, remarks=remarks)
     if kind == ".pdf":
-        print_pdf(page, path, full=True)
+        print_pdf(page, path)
     else:
         write_text(path, page)
 

@@ -46,7 +46,7 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
     colours = ordered_colours(position.size)
     # Room for names at the right.
     first_h, last_h = float(np.nanmin(hours)), float(np.nanmax(hours))
-    times = (first_h - 0.02 * (last_h - first_h), last_h + 0.18 * (last_h - first_h))
+    times = (first_h - 0.02 * (last_h - first_h), last_h + 0.3 * (last_h - first_h))
     drawn = new_figure(x="time since first reading / h", y="drift / µm", height=360, x_range=times, zero=True)
     ends = (0, position.size - 1)
     for rank in ends:

@@ -223,7 +223,7 @@ def test_what_is_assumed_and_what_is_missing_is_said(part):
         for entry in part.settled.contributions
     ]
     sentence = say("iso230_uncertainty", part.settled.model_copy(update={"contributions": tuple(unknown)}))
-    assert "It does not contain the environmental variation" in sentence
+    assert "U does not contain the environmental variation" in sentence
 
 
 def test_results_of_an_older_run_show_their_only_window(part):
