@@ -520,7 +520,7 @@ def iso230(
     cycles: Annotated[
         str | None, Option(help="Window, for example 1-5; left out: the most settled five cycles.")
     ] = None,
-    out: Annotated[Path | None, Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
+    out: Annotated[Path | None, Option(help="Write the sheet to sign: sheet.html, sheet.pdf, or sheet.docx.")] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
     as_csv: Annotated[bool, Option("--csv", help="Print the values per target as CSV.")] = False,
 ) -> None:
@@ -530,7 +530,7 @@ def iso230(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230 import read_test
-    from fusion.report.page import iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
+    from fusion.report.sheet import describe_sheet, iso230_csv, iso230_json, iso230_tables, write_iso230
 
     with _answering():
         found = read_test(test, cycles)
@@ -543,8 +543,8 @@ def iso230(
                 _wide().print(table)
             _print_lines(found.remarks)
         if out is not None:
-            page = render_iso230(found.title, found.part, found.dataset, remarks=found.remarks, versions=versions())
-            write_iso230(out, page)
+            sheet = describe_sheet(found.title, found.part, files=found.files, version=versions()["thermofuse"])
+            write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)
             errors.print(f"page: {out.resolve()}")
 
 
@@ -566,7 +566,7 @@ def iso230_3(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230_3 import read_thermal_tests
-    from fusion.report.page import render_thermal_tests, write_iso230
+    from fusion.report.sheet import write_thermal_tests
     from fusion.report.thermal_test import thermal_test_tables
 
     with _answering():
@@ -578,7 +578,7 @@ def iso230_3(
                 _wide().print(table)
             _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
         if out is not None:
-            write_iso230(out, render_thermal_tests(title, tests, versions=versions()))
+            write_thermal_tests(out, title, tests, versions=versions())
             errors.print(f"page: {out.resolve()}")
 
 
@@ -651,7 +651,6 @@ def report(
     out: Annotated[
         Path | None, Option(help="File to write, which must not exist; left out: report.html or report.pdf in RESULTS.")
     ] = None,
-    full: Annotated[bool, Option("--full", help="With --pdf: also the parts that are folded on the screen.")] = False,
     browser: Annotated[
         str | None, Option(help="With --pdf: the browser that prints; left out: one is looked for.")
     ] = None,
@@ -664,7 +663,7 @@ def report(
     with _answering():
         page = report_of(results)
         file = claim_file(results, "report.pdf" if pdf else "report.html", out)
-        written = print_pdf(page, file, browser=browser, full=full) if pdf else write_text(file, page)
+        written = print_pdf(page, file, browser=browser) if pdf else write_text(file, page)
         console.print(str(written), soft_wrap=True)
 
 

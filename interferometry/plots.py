@@ -271,6 +271,34 @@ def plot_drift(
     return ax
 
 
+def plot_iso230(settled: xr.Dataset, position: xr.DataArray, ax: Axes | None = None) -> Axes:
+    """Plot the chart of ISO 230-2: mean deviation of each approach with its 2 s.
+
+    Parameters
+    ----------
+    settled : xarray.Dataset
+        Result of `interferometry.iso230.evaluate_iso230`, um (arcsec).
+    position : (target) DataArray
+        Target positions, mm (deg).
+    ax : matplotlib Axes, optional
+
+    Returns
+    -------
+    matplotlib Axes
+    """
+    axes, order = new_axes(ax), np.argsort(position.values, kind="stable")
+    for direction in settled["direction"].values:
+        one = settled.sel(direction=direction).isel(target=order)
+        mean, spread = one["mean_unidirectional"].values, 2 * one["standard_deviation"].values
+        if np.isfinite(mean).any():
+            label = f"mean {ARROWS[direction]} ± 2 s"
+            axes.errorbar(position.values[order], mean, spread, color=COLOURS[direction], capsize=3, label=label)
+    unit = str(settled["A"].attrs.get("units", "um")).replace("um", "µm")
+    axes.set(xlabel=f"position / {position.attrs.get('units', 'mm')}", ylabel=f"deviation / {unit}")
+    axes.legend(frameon=False)
+    return axes
+
+
 def plot_scatter(deviations: xr.Dataset, estimated: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:
     """Plot the standard deviation of every position: conventional, of the differences of neighbours (figure 10), and free of drift.
 

@@ -175,12 +175,15 @@ class InstrumentTable(Table):
 class ReportTable(Table):
     """``[report]``: conditions of the test as ISO 230-2 asks for them; every key may be left out, the page then says "not stated"."""
 
+    report_number: str = ""
     machine: str = ""
     machine_serial_number: str = ""
     control: str = ""
     location: str = ""
     operator: str = ""
+    approved_by: str = ""
     customer: str = ""
+    sign_convention: str = ""
     axis_travel_mm: PositiveMillimetres | None = None
     screw_lead_mm: PositiveMillimetres | None = None
     feed_mm_per_min: Feed | None = None

@@ -26,7 +26,7 @@ from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
-from fusion.results.store import group, has, joined, plain, read_product
+from fusion.results.store import file_sha256, group, has, joined, plain, read_product
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import NoScatterError, estimate_drift
 from interferometry.drift.planning import estimate_settling
@@ -252,14 +252,18 @@ def _conditions(
         for name in ("air_temperature", "material_temperature")
     }
     conditions = {
+        "Report number": report.report_number,
+        "Customer": report.customer,
         "Date of the test": _date(dataset, None if campaign is None else campaign.zone_of("interferometry")),
         "Machine": report.machine,
         "Serial number of the machine": report.machine_serial_number,
         "Control": report.control,
         "Location": report.location,
-        "Customer": report.customer,
         "Operator": report.operator,
+        "Approved by": report.approved_by,
         "Axis": "" if campaign is None else campaign.campaign.axis,
+        **_instruments(report),
+        "Sign convention": report.sign_convention,
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
         "Measured travel": f"{np.ptp(position):g}{unit}, {position.min():g} to {position.max():g}{unit}",
         "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
@@ -267,7 +271,6 @@ def _conditions(
         "Dwell at a target": "" if dwell is None else f"{dwell:g} s",
         "Warm-up": report.warm_up,
         "Compensation of the machine": report.machine_compensation,
-        **_instruments(report),
         "Air temperature before, after": temperatures["air_temperature"],
         "Material temperature before, after": temperatures["material_temperature"],
         "Places of the sensors": report.sensor_places,
@@ -343,12 +346,15 @@ class StandardTest:
         Readings, with the group ``settled``.
     remarks : tuple of str
         What was left out or assumed when the file was read.
+    files : dict of str to str
+        SHA-256 of the files that it was read from, by name.
     """
 
     title: str
     part: Iso230Part
     dataset: xr.Dataset
     remarks: tuple[str, ...]
+    files: dict[str, str]
 
 
 def read_test(path: Path, cycles: str | None) -> StandardTest:
@@ -363,11 +369,12 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
             raise CampaignError(f"{path}: this campaign has no [interferometry]; name one with readings of the axis")
         laser = read_laser(campaign)
         read = (laser["deviations"], laser["iso_budget"], cycles, campaign, laser["environment"])
-        return _evaluate(campaign.campaign.title, *read)
+        named = {path.name: path, **campaign.files_of("interferometry")}
+        return _evaluate(campaign.campaign.title, named, *read)
     deviations = read_deviations(path, rotary=True)
     budget = ROTARY_BUDGET if is_rotary(deviations) else StatedBudget(Iso230Budget(), dict.fromkeys(_INPUTS, "assumed"))
     try:
-        return _evaluate(path.name, deviations, budget, cycles)
+        return _evaluate(path.name, {path.name: path}, deviations, budget, cycles)
     except InterferometryError as error:
         raise CampaignError(f"{path}: {error}") from None
 
@@ -384,15 +391,21 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )
     dataset = read_product(folder, "deviations")
-    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset))
+    named = {name: folder / name for name in ("results.json", "deviations.nc", "provenance.json")}
+    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), _hashed(named))
 
 
 def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
     return (*describe_notes(deviations), *(notice.message for notice in left_out_notices(deviations, "left_out")))
 
 
+def _hashed(files: Mapping[str, Path]) -> dict[str, str]:
+    return {name: file_sha256(path) for name, path in files.items() if path.is_file()}
+
+
 def _evaluate(
     title: str,
+    files: Mapping[str, Path],
     deviations: xr.Dataset,
     budget: StatedBudget,
     cycles: str | None,
@@ -413,7 +426,7 @@ def _evaluate(
     )
     dataset = joined(deviations, iso=windows, settled=settled, **({} if drift is None else {"drift": drift}))
     found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
-    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks)
+    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, _hashed(files))
 
 
 def read_window(text: str, deviations: xr.Dataset) -> list[int]:

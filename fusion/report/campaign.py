@@ -12,7 +12,7 @@ from fusion.analysis.attribution.significance import LEVEL
 from fusion.analysis.diagnosis.residual import LEVEL as REMAINDER_LEVEL
 from fusion.analysis.drift_model.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
 from fusion.report.charts.model import rate_text
-from fusion.report.conclusions import conclude, describe_anomaly, headline, next_steps
+from fusion.report.conclusions import describe_anomaly, first_screen, headline, next_steps, sharpen
 from fusion.report.numbers import (
     alike,
     decimals_of,
@@ -30,6 +30,7 @@ from fusion.report.numbers import (
 from fusion.report.thermal_test import describe_thermal_tests
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
+    ARROWS,
     CONTRIBUTORS,
     ISO230_TERMS,
     ONE_WAY_TERMS,
@@ -47,6 +48,7 @@ from fusion.report.wording import (
     in_words,
     parameters,
     quantity,
+    quoted_window,
     randomised_causes,
     say,
     spaced,
@@ -183,7 +185,6 @@ def _camera_prediction(sensors: xr.Dataset) -> dict[str, Any] | None:
 
 #: Columns of the budget, of a test from both sides.
 _BUDGETED = ("A", "R", "E", "M", "B", "mean_reversal")
-_ARROWS = {"positive": "↑", "negative": "↓"}
 #: Missing readings that are listed one by one.
 _NAMED = 8
 
@@ -191,11 +192,11 @@ _NAMED = 8
 def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict[str, Any]:
     """Return the tables of the section on ISO 230-2, as page and terminal show them."""
     shown, unit = part.settled, print_unit(part.unit)
-    tables: dict[str, Any] = dict.fromkeys(("positions", "budget", "tolerances"))
+    tables: dict[str, Any] = dict.fromkeys(("positions", "budget"))
     if shown is None:
         rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
         axis = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
-        return {**tables, "quoted": part, "axis": axis, "missing": ""}
+        return {**tables, "quoted": part, "axis": axis, "missing": "", "sharper": None}
     if dataset is not None and has(dataset, "settled"):
         tables["positions"] = _iso230_positions_table(group(dataset, "settled"), dataset["position"], unit)
     return {
@@ -204,7 +205,7 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict
         "axis": _values_table(part, shown, unit),
         # Of one cycle nothing is known of the uncertainty.
         "budget": _budget_table(shown, unit) if len(shown.cycles) > 1 else None,
-        "tolerances": _tolerances_table(part, unit) if part.tolerances else None,
+        "sharper": sharpen(part),
         "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
     }
 
@@ -229,10 +230,10 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
         ]
         for target, place, row, counts in zip(along, places_mm, values, counted, strict=True)
     ]
-    titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in _ARROWS.values()]
+    titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in ARROWS.values()]
     unit_along = str(position.attrs.get("units", "mm"))
     return table(
-        ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"B_i / {unit}", f"R_i / {unit}", "n↑, n↓"], rows
+        ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"Bᵢ / {unit}", f"Rᵢ / {unit}", "n↑, n↓"], rows
     )
 
 
@@ -251,7 +252,7 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
     for cycle, direction, target in missing[:_NAMED]:
         bits = int(within["quality_flag"].values[cycle, direction, target])
         why = join([flag.name.replace("_", " ") for flag in REGISTRY if bits & flag.mask]) or "missing"
-        approach = _ARROWS[str(within["direction"].values[direction])]
+        approach = ARROWS[str(within["direction"].values[direction])]
         named.append(
             f"cycle {within['cycle'].values[cycle]}, target {within['target'].values[target]}{approach} ({why})"
         )
@@ -260,35 +261,53 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
     return f"{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
 
 
-def _tolerances_table(part: Iso230Part, unit: str) -> Table:
-    """Return every quantity that was judged."""
+def values_to_sign(part: Iso230Part) -> Table:
+    """Return the axis values of the settled window, and of each direction what has a tolerance, with their decisions."""
+    shown, unit = quoted_window(part), print_unit(part.unit)
+    judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
+    found = [(f"{term}", symbol, shown) for symbol, term in ISO230_TERMS.items()]
+    if isinstance(shown, Iso230Window):
+        one_way = bool(approach_of(shown))
+        found += [
+            (f"{term}{arrow}", f"{symbol}{arrow}", getattr(shown, direction))
+            for symbol, term in ONE_WAY_TERMS.items()
+            for direction, arrow in ARROWS.items()
+            if one_way or f"{symbol}{arrow}" in judged
+        ]
     rows = []
-    for row in part.tolerances:
-        value = measured(row.value_um, None if row.expanded_u_um is None else row.expanded_u_um / 2)
-        cells = [row.quantity, value, f"{row.limit_um:g}", row.decision]
-        rows.append(Row(cells, marked=row.decision != "pass"))
-    return table([Words("Quantity"), f"Value ± U / {unit}", f"Tolerance / {unit}", Words("Decision")], rows)
+    for term, symbol, values in found:
+        value = getattr(values, f"{symbol[0]}_um")
+        if value.value is not None:
+            limit, decision = judged.get(symbol, ("–", "no tolerance stated"))
+            rows.append(Row([term, quantity(value), limit, decision], marked=decision not in ("pass", "no tolerance stated")))
+    titles = (f"Value ± U (k = 2) / {unit}", f"Tolerance / {unit}", Words("Decision (ISO 14253-1)"))
+    return table([Words("Quantity of the axis"), *titles], rows)
 
 
 def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
-    """Return the axis values of the settled window, those of the first one and their range over the windows."""
+    """Return the axis values of the settled window with their decisions, those of the first one and their range over the windows."""
     several = part.first is not None and part.first.window != shown.window
+    judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
     rows = []
+
+    def add(title: str, symbol: str, *cells: str, marked: bool = False) -> None:
+        rows.append(Row([title, cells[0], *(judged.get(symbol, ("–", "–")) if judged else ()), *cells[1:]], marked))
+
     for symbol, term in ISO230_TERMS.items():
         found = part.range_um.get(symbol)
         first = quantity(getattr(part, f"{symbol}_um"))
         spread = "–" if found is None else f"{number(found.lowest)} to {number(found.highest)}"
-        values = [quantity(getattr(shown, f"{symbol}_um"))]
-        rows.append(Row([term, *values, *([first, spread] if several else [])], marked=True))
-        for direction, arrow in _ARROWS.items():
+        value = quantity(getattr(shown, f"{symbol}_um"))
+        add(term, symbol, value, *([first, spread] if several else []), marked=True)
+        for direction, arrow in ARROWS.items():
             if symbol not in ONE_WAY_TERMS:
                 continue
             of_shown = quantity(getattr(getattr(shown, direction), f"{symbol}_um"))
             of_first = quantity(getattr(getattr(part.first, direction), f"{symbol}_um")) if part.first else "–"
-            rows.append(Row([f"{ONE_WAY_TERMS[symbol]}{arrow}", of_shown, *([of_first, "–"] if several else [])]))
-    mean = [quantity(shown.mean_reversal_um), *([quantity(part.mean_reversal_um), "–"] if several else [])]
-    rows.append(Row(["Mean reversal error, with its sign", *mean]))
-    columns = [f"{shown.window} / {unit}"]
+            add(f"{ONE_WAY_TERMS[symbol]}{arrow}", f"{symbol}{arrow}", of_shown, *([of_first, "–"] if several else []))
+    mean = quantity(shown.mean_reversal_um)
+    add("Mean reversal error, with its sign", "", mean, *([quantity(part.mean_reversal_um), "–"] if several else []))
+    columns = [f"{shown.window} / {unit}", *([f"Tolerance / {unit}", Words("Decision")] if judged else [])]
     if several:
         columns += [f"First window, {part.window} / {unit}", f"Range over windows without overlap / {unit}"]
     return table([Words("Quantity of the axis (± U, k = 2)"), *columns], rows)
@@ -301,7 +320,7 @@ def _budget_table(shown: Iso230Window, unit: str) -> Table:
     titles = [name.replace("_", " ") for name in _BUDGETED]
     if side:
         names = tuple(f"{symbol}_{side}" for symbol in ONE_WAY_TERMS)
-        titles = [f"{symbol}{_ARROWS[side]}" for symbol in ONE_WAY_TERMS]
+        titles = [f"{symbol}{ARROWS[side]}" for symbol in ONE_WAY_TERMS]
     rows: list[Row] = []
     for entry in shown.contributions:
         u = "–" if entry.u is None else f"{number(entry.u, 2)} {unit if entry.unit == 'um' else entry.unit}"
@@ -505,8 +524,8 @@ def describe_campaign(
             "candidates": describe_candidates,
         }
         loop = {name: describe(results.loop) for name, describe in tables.items()}
+    axis = provenance["parameters"]["campaign"].get("axis", "") if deviations is not None else ""
     return {
-        "axis": provenance["parameters"]["campaign"].get("axis", "") if deviations is not None else "",
         "first": laser["first"] if laser else None,
         "zone": results.time.zone if results.time else None,
         "figures": figures,
@@ -517,7 +536,7 @@ def describe_campaign(
         "unverified": results.inputs.unverified if results.inputs else (),
         "untouched": untouched(results.inputs, figures),
         "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
-        "answers": conclude(results),
+        "first_screen": first_screen(results, provenance["parameters"].get("report", {}), axis),
         "next": next_steps(results)[:MOST_STEPS],
         "contents": [
             (at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) not in (None, ())

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-from fusion.report.wording import conditional, randomised_causes, say
-from fusion.results.axis import AnomalyPart
+from fusion.report.wording import ARROWS, approach_of, conditional, randomised_causes, say
+from fusion.results.axis import AnomalyPart, Iso230Part
 from fusion.results.loop import StepPart
 from fusion.results.parts import TimePart
 from fusion.results.results import Results
+from interferometry.iso230 import Iso230Budget
+from interferometry.iso230.conditions import decide
 
 #: Question of a reader, and the statement that answers it.
 _QUESTIONS = {
@@ -38,6 +43,43 @@ def headline(results: Results) -> str:
     return say("headline", results)
 
 
+#: Most actions on the first screen, and words of each.
+_FIRST_STEPS, _WORDS = 3, 12
+_BRACKETS = re.compile(r" \([^()]*\)")
+_DANGLING = re.compile(r"(?: (?:a|an|and|as|at|does|for|from|in|is|it|not|of|on|or|that|the|this|to|was|where|whether|which|with))+$")
+_CONDITION = re.compile(r"^Only if [^:]+: ")
+
+
+def in_brief(step: str) -> str:
+    """Return the beginning of an action: its clauses as far as a line holds them, without what stands in brackets."""
+    words = _BRACKETS.sub("", _if_so(step)).split(". ")[0].split()
+    if len(words) <= _WORDS:
+        return " ".join(words).rstrip(".") + "."
+    line = _DANGLING.sub("", " ".join(words[:_WORDS]))
+    end = max(line.rfind(sign) for sign in ",;:")
+    return (line[:end] if end > len(line) // 2 else line) + " …"
+
+
+def _if_so(statement: str) -> str:
+    """Return a conditional statement below the inputs that it is conditional on."""
+    return _CONDITION.sub("If so: ", statement)
+
+
+def first_screen(results: Results, report: Mapping[str, Any], axis: str) -> dict[str, Any]:
+    """Return what a reader learns before anything else: which machine, whether it passes, why, what to doubt, what to do."""
+    iso, inputs = results.iso230, results.inputs
+    serial = report.get("machine_serial_number", "")
+    named = [report.get("machine") or "machine not stated", f"no. {serial}" if serial else ""]
+    return {
+        "identity": [*named, f"{axis} axis" if axis else "", report.get("operator", "")],
+        "decision": "" if iso is None else _if_so(conditional(say("decision", iso), inputs, "positions")),
+        "unmet": "" if iso is None else say("unmet", iso),
+        "cause": _if_so(say("headline", results, False)),
+        "open": "" if inputs is None else say("open_inputs", inputs),
+        "next": [in_brief(step) for step in next_steps(results)[:_FIRST_STEPS]],
+    }
+
+
 def describe_anomaly(anomaly: AnomalyPart) -> str:
     """Return one sentence on a position that stands out: what it does, by how much, and what that speaks for."""
     return say("anomaly_sentence", anomaly)
@@ -59,6 +101,61 @@ def step_phrase(step: StepPart, time: TimePart | None, *, record: bool) -> str:
 def action(step: StepPart, time: TimePart | None, *, record: bool) -> str:
     """Return what to check on machine or instruments where an effect was missing; empty where the effect states nothing."""
     return say("action", step, time, record)
+
+
+# What would make the uncertainty of the axis values smaller.
+
+#: Coefficient of which the budget of a file without a campaign is, ppm/K.
+_ASSUMED = f"{Iso230Budget().nominal_expansion_ppm_per_K:g}"
+#: An uncertainty that becomes no smaller than this share of itself is not worth a line.
+_WORTH = 0.8
+#: Line of the campaign file and standard uncertainty of an input that is stated in place of an assumption: a coefficient that was measured
+#: or certified; a contact sensor of class A (IEC 60751: 0.15 K at 0 degC, rectangular).
+_STATED: dict[str, tuple[str, float]] = {
+    "expansion_coefficient": ('expansion_coefficient = "{value} +- 0.3 ppm/K"', 0.3),
+    "material_temperature": ('uncertainty.material_temperature = "0.1 K"', 0.1),
+}
+
+
+class Sharper(NamedTuple):
+    """The largest term of the uncertainty of A, and the line of the campaign file that shrinks it most; an empty `line` where none does."""
+
+    symbol: str
+    contributor: str
+    share: float
+    origin: str
+    expanded_um: float
+    line: str = ""
+    sharper_um: float = math.inf
+    decision: str = ""
+
+
+def sharpen(iso: Iso230Part | None) -> Sharper | None:
+    """Return what the uncertainty of the quoted A mostly is, and by how much a stated input would shrink it (k = 2); None without one."""
+    if iso is None or iso.settled is None:
+        return None
+    side = approach_of(iso.settled)
+    found = (getattr(iso.settled, side) if side else iso.settled).A_um
+    if not found.u:
+        return None
+    terms = {
+        one.contributor: (one, (one.unidirectional_um.get(f"A_{side}") if side else one.A_um) or 0.0)
+        for one in iso.settled.contributions
+    }
+    largest, term = max(terms.values(), key=lambda each: each[1])
+    symbol = f"A{ARROWS[side]}" if side else "A"
+    told = Sharper(symbol, largest.contributor, (term / found.u) ** 2, largest.origin, 2 * found.u)
+    for name, (line, stated_u) in _STATED.items():
+        one, term = terms.get(name, (None, 0.0))
+        if one is None or not one.u or not one.origin.startswith("assumed"):
+            continue
+        expanded = 2 * (found.u**2 - term**2 + (term * stated_u / one.u) ** 2) ** 0.5
+        if expanded < _WORTH * min(told.sharper_um, told.expanded_um):
+            value = next((row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text), _ASSUMED)
+            limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)
+            decision = "" if limit is None or found.value is None else decide(found.value, expanded, limit)
+            told = told._replace(line=line.format(value=value), sharper_um=expanded, decision=decision)
+    return told
 
 
 # What to do next, in the order of importance; every action names the place, the time or the part that it is about.
@@ -90,5 +187,8 @@ def next_steps(results: Results) -> list[str]:
         steps.append(say("test_place", correlation.source))
     steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))
+    if (sharper := sharpen(results.iso230)) is not None and sharper.line:
+        # What makes a decision possible comes first.
+        unique.insert(0 if sharper.decision in ("pass", "fail") else len(unique), say("sharper_step", sharper))
     values = "profile" if results.drift else "values by ISO 230-2" if results.iso230 else "temperatures"
     return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]

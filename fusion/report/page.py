@@ -13,28 +13,22 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pandas as pd
-import rich.table
-import xarray as xr
 from markupsafe import Markup
 
 from fusion.analysis.attribution.significance import LEVEL
 from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
 from fusion.common import FusionError
-from fusion.report.campaign import describe_campaign, describe_iso230
+from fusion.report.campaign import describe_campaign
 from fusion.report.charts.campaign import Drawn, draw_campaign
-from fusion.report.charts.readings import plot_test, plot_windows
-from fusion.report.charts.style import Chart, EmbeddedChart, chart_scripts, embed
+from fusion.report.charts.style import EmbeddedChart, chart_scripts, embed
 from fusion.report.conclusions import headline
 from fusion.report.numbers import moment, number, place
 from fusion.report.record import describe_record, draw_record
-from fusion.report.thermal_test import describe_thermal_tests, draw_thermal_tests
-from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, print_table, say, sentences, table
-from fusion.results.axis import Iso230Part
+from fusion.report.thermal_test import draw_thermal_tests
+from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
-from fusion.results.store import group, is_file_list, read_fusion, read_product, write_atomically, write_text
-from fusion.results.thermal_test import ThermalTest
+from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -44,7 +38,7 @@ def render_page(template: str, charts: Mapping[str, EmbeddedChart], **context: A
     """Return a page as HTML text."""
     own = Markup((TEMPLATES / "page.js").read_text(encoding="utf-8"))
     scripts = (*chart_scripts(), own) if charts else (own,)
-    shared = {"figures": charts, "scripts": scripts, "policy": content_security_policy(scripts)}
+    shared = {"figures": dict(charts), "scripts": scripts, "policy": content_security_policy(scripts)}
     return environment(html=True).get_template(template).render(**shared, css_string=_css_string, **context)
 
 
@@ -120,9 +114,9 @@ def render_report(
     >>> from pathlib import Path
     >>> page = render_report(read_results(Path("results")), provenance, datasets)  # doctest: +SKIP
     """
-    context: dict[str, Any] = {"results": results, "provenance": provenance}
+    context: dict[str, Any] = {"results": results, "provenance": provenance, "thermal_map": None}
     if "record" in datasets:
-        context["summary"] = describe_record(results, datasets["record"])
+        context["summary"] = describe_record(results, datasets["record"], provenance)
         return render_page(
             "record.html.j2",
             embed({**draw_record(datasets["record"]), **draw_thermal_tests(results.iso230_3 or ())}),
@@ -200,13 +194,13 @@ def find_browser(named: str | None = None) -> str:
     )
 
 
-def print_pdf(page: str, out: Path, *, browser: str | None = None, full: bool = False) -> Path:
-    """Print a page to a PDF file."""
+def print_pdf(page: str, out: Path, *, browser: str | None = None) -> Path:
+    """Print a page to a PDF file, with everything that is folded on the screen."""
     program = find_browser(browser)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "report.html"
         file.write_text(page, encoding="utf-8")
-        address = f"{file.as_uri()}#on-a4{'-full' if full else ''}"
+        address = f"{file.as_uri()}#on-a4"
         return write_atomically(out, lambda temporary: _print(program, address, temporary, folder))
 
 
@@ -228,88 +222,6 @@ def _print(program: str, address: str, out: Path, profile: str) -> None:
             f"{program} ended with {done.returncode} and printed nothing{': ' + said[-1] if said else ''}; name another browser with "
             "--browser FILE"
         )
-
-
-# A test by ISO 230-2 without a campaign: its page, its tables for the terminal, and its values for programs.
-
-
-class Iso230PageError(FusionError):
-    """A test whose page or values cannot be written; the message says why."""
-
-
-def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
-    """Return the charts of the section on ISO 230-2, by name."""
-    charts = {"iso230": plot_test(group(dataset, "settled"), dataset["position"])}
-    windows = group(dataset, "iso")
-    return charts if windows.sizes["window"] < 3 else {**charts, "windows": plot_windows(windows)}
-
-
-def render_iso230(
-    title: str, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...], versions: Mapping[str, str]
-) -> str:
-    """Return the page of a test as HTML text."""
-    shown = {"title": title, "iso230": part, "remarks": remarks}
-    summary = {"iso230": describe_iso230(part, dataset), "assumptions": {"iso230": ""}}
-    return render_page("iso230.html.j2", embed(draw_iso230(dataset)), summary=summary, versions=versions, **shown)
-
-
-def render_thermal_tests(title: str, tests: Sequence[ThermalTest], *, versions: Mapping[str, str]) -> str:
-    """Return the page of a test as HTML text."""
-    summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
-    return render_page(
-        "iso230_3.html.j2", embed(draw_thermal_tests(tests)), summary=summary, title=title, versions=versions
-    )
-
-
-def write_iso230(path: Path, page: str) -> None:
-    """Write the page of a test; nothing is replaced."""
-    if path.exists():
-        raise Iso230PageError(f"{path} exists already; name another file with --out, or remove it")
-    if path.suffix.lower() not in (".html", ".htm", ".pdf"):
-        raise Iso230PageError(f"{path}: the sheet is written as .html or .pdf; name such a file with --out")
-    if path.suffix.lower() == ".pdf":
-        print_pdf(page, path)
-    else:
-        write_text(path, page)
-
-
-def iso230_tables(part: Iso230Part, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
-    """Return the tables of a test for the terminal."""
-    described = describe_iso230(part, dataset)
-    shown: list[tuple[str, Table | None]] = [
-        (f"{title}, {described['quoted'].window}", described["axis"]),
-        ("per target position", described["positions"]),
-        ("uncertainty budget", described["budget"]),
-        ("tolerances", described["tolerances"]),
-    ]
-    return [print_table(found, name) for name, found in shown if found is not None]
-
-
-def iso230_json(part: Iso230Part, dataset: xr.Dataset) -> dict[str, Any]:
-    """Return the values of a test for programs: the part ``iso230`` of results.json, and the values per target."""
-    records = _of_targets(dataset).astype(object).to_dict("records")
-    rows = [{name: None if value != value else value for name, value in record.items()} for record in records]
-    return {**part.model_dump(mode="json"), "targets": rows}
-
-
-def iso230_csv(dataset: xr.Dataset) -> str:
-    """Return the values per target as CSV text, one line per target."""
-    return _of_targets(dataset).to_csv(index=False, lineterminator="\n")
-
-
-def _of_targets(dataset: xr.Dataset) -> pd.DataFrame:
-    """Return the values of each target; headings carry the units of the dataset."""
-    unit, place = dataset["deviation"].attrs["units"], dataset["position"].attrs["units"]
-    columns = {"target": dataset["target"].values, f"position_{place}": dataset["position"].values}
-    settled = group(dataset, "settled").sel(target=dataset["target"].values)
-    for direction in dataset["direction"].values:
-        here = settled.sel(direction=direction)
-        for symbol, name in (("mean", "mean_unidirectional"), ("s", "standard_deviation"), ("R", "repeatability")):
-            columns[f"{symbol}_{direction}_{unit}"] = here[name].values
-        columns[f"readings_{direction}"] = here["count"].values.astype(int)
-    for symbol, name in (("mean", "mean_bidirectional"), ("B_i", "reversal"), ("R_i", "repeatability_bidirectional")):
-        columns[f"{symbol}_{unit}"] = settled[name].values
-    return pd.DataFrame(columns)
 
 
 # Two campaigns of one machine on a page of their own: which session is which, what both show, and what only one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from fusion.report.campaign import DECIDED_BEFORE, MOST_STEPS, errors_table, ref
 from fusion.report.charts import record as charts
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import Chart
-from fusion.report.conclusions import conclude, headline, next_steps
+from fusion.report.conclusions import first_screen, headline, next_steps
 from fusion.report.numbers import duration, join, moment
 from fusion.report.thermal_test import describe_thermal_tests
 from fusion.results.loop import RecordLoop
@@ -51,7 +52,7 @@ def _shown_channels(record: xr.Dataset) -> list[str]:
     return [str(name) for name in record["channel"].values[:_MOST_CHANNELS]]
 
 
-def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
+def describe_record(results: Results, record: xr.Dataset, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Return the facts of a record that the templates of its report state."""
     loop = results.loop
     assert isinstance(loop, RecordLoop)
@@ -64,7 +65,6 @@ def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
     zone = "" if any(notice.code == "record_no_zone" for notice in results.warnings) else None
     begun = "start not stated" if start is None else moment(start, zone)
     return {
-        "axis": "",
         "first": start,
         "zone": zone,
         "figures": (),
@@ -77,13 +77,14 @@ def describe_record(results: Results, record: xr.Dataset) -> dict[str, Any]:
             f"{counted(record.sizes['channel'], 'displacement')} and {counted(record.sizes['sensor'], 'temperature')} over "
             f"{_measured_time(loop, span)}" + (f", with {drivers} as driver" if drivers else "")
         ),
-        "answers": conclude(results),
+        "first_screen": first_screen(results, provenance["parameters"].get("report", {}), ""),
         "next": next_steps(results)[:MOST_STEPS],
         "contents": [one for one in _SECTIONS if one[0] != "iso230-3" or results.iso230_3],
         "thermal_tests": describe_thermal_tests(results.iso230_3 or ()),
         "assumptions": {"iso230-3": ""},
         "laser": None,
         "camera": None,
+        "thermograms": None,
         "data": [
             ("Channels", channels),
             ("Sensors", join([str(name) for name in record["sensor"].values])),

@@ -243,6 +243,8 @@ ONE_WAY_TERMS = {
     "R": "Unidirectional positioning repeatability R",
     "E": "Unidirectional systematic positioning error E",
 }
+#: Signs of the directions of approach.
+ARROWS = {"positive": "↑", "negative": "↓"}
 #: Inputs of the uncertainty of a positioning test in words.
 CONTRIBUTORS = {
     "device": "laser with its air compensation",
@@ -334,7 +336,7 @@ def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
     of_side = getattr(iso, side) if side else iso
     once = of_side.A_um.value is None and of_side.E_um.value is not None
     symbols, arrow = (
-        ("E" if once else "AR", {"positive": "↑", "negative": "↓"}[side]) if side else ("EMB" if once else "ARB", "")
+        ("E" if once else "AR", ARROWS[side]) if side else ("EMB" if once else "ARB", "")
     )
     return {f"{symbol}{arrow}": quantity(getattr(of_side, f"{symbol}_um"), unit) for symbol in symbols}
 

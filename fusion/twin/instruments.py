@@ -111,6 +111,7 @@ def _campaign_text(truth: Truth) -> str:
     if duty.kind == "randomised":
         law = f'mean_dwell = "{duty.mean_hold_min:g} min"\nleast_dwell = "{duty.least_hold_min:g} min"\n'
         law = f'randomised = ["duty [1]"]\n{law}'
+    further = recipe.campaign.further and f"\n{recipe.campaign.further}"
     return f"""[campaign]
 title = {json.dumps(recipe.campaign.title)}
 axis = {json.dumps(recipe.campaign.axis)}
@@ -145,7 +146,7 @@ file = "drivers.csv"
 {law}
 [model]
 declared = ["axis_expansion", "table_offset"]
-"""
+{further}"""
 
 
 def _write_laser(truth: Truth, out: Path) -> None:

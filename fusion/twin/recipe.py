@@ -39,12 +39,15 @@ class Campaign(_TomlTable):
         Start of the test, UTC, ISO 8601.
     seed : int
         Seed of every random series; the same recipe with the same seed writes the same files.
+    further : str
+        Tables that are added to the campaign file as they are: what a laboratory states of a test.
     """
 
     title: str = "Twin"
     axis: str = "X"
     start: str = "2026-03-09T06:30:00"
     seed: int = 1
+    further: str = ""
 
 
 @dataclass(frozen=True)

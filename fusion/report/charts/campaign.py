@@ -105,8 +105,10 @@ def draw_placed(
     if logged is not None:
         charts["sensors"] = plan.plot_sensors(logged)
     if fields is not None:
+        correlation = results.correlation
+        followed = correlation.source.area if correlation and correlation.verdict == "attributable" else None
         charts["thermal_map"], controls = plot_thermal_map(
-            fields, results.hotspots or (), position, sensors=results.sensors or ()
+            fields, results.hotspots or (), position, sensors=results.sensors or (), followed=followed
         )
     return Drawn(embed({**charts, **draw_thermal_tests(results.iso230_3 or ())}), controls)
 

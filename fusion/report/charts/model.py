@@ -70,7 +70,7 @@ def plot_sensitivity(maps: xr.Dataset, channel: str) -> Chart:
     passed = p <= LEVEL
     limit = float(np.nanmax(np.abs(values[passed]))) if passed.any() else 1.0
     mapper = LinearColorMapper(palette(DIVERGING), low=-limit, high=limit, nan_color="rgba(0, 0, 0, 0)")
-    drawn = new_plan(extent, title=CHANNELS.get(channel, channel), height=300)
+    drawn = new_plan(extent, title=CHANNELS.get(channel, channel))
     _add_blank(drawn, extent, "not significant (p > 0.05)")
     tips = [("sensitivity", "@own{0.00} µm/K"), ("family-wise p", "@p{0.000}")]
     add_cells(drawn, np.where(passed, values, np.nan), extent, mapper, tips, own=values, p=p)
@@ -87,7 +87,7 @@ def plot_significance(maps: xr.Dataset, channel: str) -> Chart:
     extent, p = extent_of(maps), maps["p_value"].sel(channel=channel).fillna(1.0).values
     step = np.digitize(p, _P_STEPS, right=True).astype(float)
     mapper = LinearColorMapper(list(_P_COLOURS), low=0.0, high=float(len(_P_STEPS)), nan_color="rgba(0, 0, 0, 0)")
-    drawn = new_plan(extent, title=CHANNELS.get(channel, channel), height=300)
+    drawn = new_plan(extent, title=CHANNELS.get(channel, channel))
     _add_blank(drawn, extent, "p > 0.1")
     blank = step == len(_P_STEPS)
     add_cells(drawn, np.where(blank, np.nan, step + 0.5), extent, mapper, [("family-wise p", "@p{0.000}")], p=p)
@@ -117,7 +117,7 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None 
     p, lag = (float(one[name].sel(channel=channel)) for name in ("p_value", "lag"))
     significant = p <= LEVEL
     title = f"mode {mode}: {'significant, ' if significant else ''}p {p_cell(p, least_p)}, lag {duration(lag)}"
-    drawn = new_plan(extent, title=title, height=250)
+    drawn = new_plan(extent, title=title)
     mapper = LinearColorMapper(palette("PuOr_r"), low=-1.0, high=1.0, nan_color="#e1e5e7")
     pattern = one["pattern"].values
     add_cells(drawn, pattern, extent, mapper, [("warming relative to the cross", "@image{0.00}")])
@@ -138,7 +138,7 @@ def plot_clusters(clusters: xr.Dataset) -> Chart:
     count = int(group.max())
     colours = [_GROUPS[at % len(_GROUPS)] for at in range(max(count, 1))]
     mapper = LinearColorMapper(colours, low=0.5, high=max(count, 1) + 0.5, nan_color="#ffffff")
-    drawn = new_plan(extent, height=300)
+    drawn = new_plan(extent)
     add_cells(drawn, np.where(group == 0, np.nan, group), extent, mapper, [("group", "@image{0}")])
     places = _label_places(clusters, count)
     drawn.text(

@@ -27,7 +27,7 @@ from fusion.report.charts.style import (
 )
 from fusion.report.numbers import join, number, place
 from fusion.results.axis import HotspotPart
-from fusion.results.parts import ContactSensorPart
+from fusion.results.parts import AreaPart, ContactSensorPart
 from interferometry.plots import ACCENT, INK
 from thermography.fields.large_arrays import in_pieces
 
@@ -48,13 +48,21 @@ def extent_of(cells: xr.Dataset) -> Extent:
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
-def new_plan(extent: Extent, *, title: str = "", height: int = 260) -> figure:
-    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both."""
+def new_plan(extent: Extent, *, title: str = "", height: int | None = None) -> figure:
+    """Return an empty plan view of the table as the camera sees it: x to the right, y downwards from its origin, which is marked.
+
+    ``templates/charts.js`` keeps a millimetre as long in both directions in whatever width the page has.
+    """
     left, right, bottom, top = extent
-    ranges: dict[str, Any] = {"x_range": (left, right), "y_range": (bottom, top)}
+    ranges: dict[str, Any] = {"x_range": (left, right), "y_range": (top, bottom)}
+    # The height for a common width, of which scale and colour bar take their part.
+    height = height or round(min(420.0, 560 * (top - bottom) / (right - left))) + 110
     drawn = new_figure(x="x / mm", y="y / mm", title=title, height=height, **ranges)
-    drawn.match_aspect = True
+    drawn.name = "plan"
     drawn.grid.grid_line_color = None
+    if left <= 0 <= right and bottom <= 0 <= top:
+        drawn.scatter([0], [0], marker="cross", size=16, line_color=INK, line_width=2)
+        add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16)
     return drawn
 
 
@@ -321,8 +329,9 @@ def plot_thermal_map(
     position: xr.DataArray | None = None,
     *,
     sensors: Sequence[ContactSensorPart] = (),
+    followed: AreaPart | None = None,
 ) -> tuple[Chart, MapControls]:
-    """Draw the plan of the table with measured line, targets and hotspots."""
+    """Draw the plan of the table with measured line, targets, hotspots and the area that the drift follows."""
     shown = [layer for layer in LAYERS if layer.variable in fields]
     kept, note = _thin(fields[[layer.variable for layer in shown]])
     steps = {layer.words: _in_steps(kept[layer.variable].values, layer) for layer in shown}
@@ -330,6 +339,12 @@ def plot_thermal_map(
     last = kept[shown[0].variable].values[-1]
     drawn = draw_map(last, extent_of(kept), shown[0], scales[0])
     draw_places(drawn, fields, position, hotspots, sensors)
+    if followed is not None:
+        sides = {"left": followed.x_low_mm, "right": followed.x_high_mm, "bottom": followed.y_low_mm, "top": followed.y_high_mm}
+        for colour, width in ((INK, 4), ("#ffffff", 2)):
+            drawn.quad(**sides, fill_color=None, line_color=colour, line_width=width)
+        middle = (followed.x_low_mm + followed.x_high_mm) / 2
+        add_names(drawn, [middle], [followed.y_high_mm], ["the drift follows this"], y_offset=-4, text_align="center")
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
@@ -342,7 +357,7 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
     """Draw one quantity in one cycle on the plan of the table."""
     left, right, bottom, top = extent
     room = _ROOM * (right - left)
-    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=330)
+    drawn = new_plan((left - room, right + room, bottom - room, top + room))
     mapper = LinearColorMapper(
         palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
         name="scale",

@@ -46,7 +46,7 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
     colours = ordered_colours(position.size)
     # Room for names at the right.
     first_h, last_h = float(np.nanmin(hours)), float(np.nanmax(hours))
-    times = (first_h - 0.02 * (last_h - first_h), last_h + 0.18 * (last_h - first_h))
+    times = (first_h - 0.02 * (last_h - first_h), last_h + 0.3 * (last_h - first_h))
     drawn = new_figure(x="time since first reading / h", y="drift / µm", height=360, x_range=times, zero=True)
     ends = (0, position.size - 1)
     for rank in ends:
@@ -197,8 +197,9 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
     left = x[0] - 0.04 * room
     unit, along = (print_unit(str(values.attrs.get("units", "um"))) for values in (settled["A"], position))
     drawn = new_figure(
-        x=f"position / {along}", y=f"deviation / {unit}", height=420, x_range=(left, x[-1] + room), zero=True
+        x=f"position / {along}", y=f"deviation / {unit}", height=360, x_range=(left, x[-1] + room), zero=True, legend_columns=3
     )
+    drawn.min_border_right = 52  # the label of E, whatever the width
     columns: dict[str, np.ndarray] = {"target": settled["target"].values, f"position / {along}": x}
     for direction in settled["direction"].values:
         row = settled.sel(direction=direction)

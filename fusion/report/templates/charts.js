@@ -9,6 +9,7 @@
       started.set(figure, Bokeh.embed.embed_item(item).then((views) => {
         const view = [...views.roots][0];
         roots.set(figure, view);
+        fit(figure, view);
         if (figure.querySelector(".controls")) steer(figure, view);
         return view;
       }));
@@ -16,6 +17,19 @@
     return started.get(figure);
   }
   const plots = (view) => view.model.type === "Figure" ? [view] : view.child_views.flatMap(plots);
+
+  // A plan has millimetres of one length in both directions: its height follows the width that the page leaves it.
+  const tallest = 340;
+  function fit(figure, view) {
+    if (view.model.name !== "plan") return;
+    figure.classList.add("plan");
+    if (!view.frame.bbox.width) return;
+    const { x_range, y_range } = view.model, ratio = Math.abs((y_range.end - y_range.start) / (x_range.end - x_range.start));
+    view.model.frame_height = Math.round(Math.min(tallest, view.frame.bbox.width * ratio));
+    view.model.height = null;
+  }
+  const fitAll = () => roots.forEach((view, figure) => fit(figure, view));
+  window.addEventListener("resize", () => setTimeout(fitAll, 100));
 
   const near = new IntersectionObserver((entries) => {
     for (const entry of entries) if (entry.isIntersecting) { near.unobserve(entry.target); draw(entry.target); }
@@ -115,16 +129,22 @@
   }
 
   // Paper: charts in the width that they have on A4, so that their text keeps its size; then each becomes a drawing in SVG.
-  const flatter = 0.68, heights = new Map();
+  const flatter = 0.72, flattest = 0.62, tallestTable = 620, heights = new Map();
   const later = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
   async function toPaper() {
     document.documentElement.classList.add("paper");
     for (const figure of figures) if (figure.offsetParent) await draw(figure);
+    // A table that a part of the page holds is not split.
+    for (const part of document.querySelectorAll(".scroll")) part.classList.toggle("whole", part.offsetHeight < tallestTable);
     for (const view of roots.values()) for (const plot of plots(view)) {
+      for (const axis of [...plot.model.left, ...plot.model.below]) if (axis.axis_label) axis.axis_label_text_font_size = "10px";
+      if (plot.model.height === null || plot.model.sizing_mode === "scale_width") continue;  // a plan or a picture keeps its proportions
       heights.set(plot.model, plot.model.height);
-      plot.model.height = Math.round(flatter * plot.model.height);
+      plot.model.height = Math.round((plots(view).length > 2 ? flattest : flatter) * plot.model.height);
     }
-    await later(600);
+    await later(300);
+    fitAll();
+    await later(400);
     freeze();
   }
   function toScreen() {
@@ -149,8 +169,8 @@
   window.addEventListener("beforeprint", () => { if (!document.documentElement.classList.contains("paper")) freeze(); });
   window.addEventListener("afterprint", () => { if (!document.documentElement.classList.contains("paper")) thaw(); });
   window.charts = { toPaper, toScreen };
-  if (location.hash.startsWith("#on-a4")) {  // opened to be printed by a program; "#on-a4-full" with every part that folds
-    if (location.hash === "#on-a4-full") document.querySelectorAll("details").forEach((part) => { part.open = true; });
+  if (location.hash === "#on-a4") {  // opened to be printed by a program: an archive copy holds what folds as well
+    document.querySelectorAll("details").forEach((part) => { part.open = true; });
     window.addEventListener("load", () => { toPaper().then(() => { document.documentElement.dataset.paper = "ready"; }); });
   }
 })();

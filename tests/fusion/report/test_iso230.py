@@ -12,7 +12,15 @@ import xarray as xr
 from fusion.campaign.recompensation import ROTARY_BUDGET
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard
 from fusion.report.campaign import describe_iso230
-from fusion.report.page import Iso230PageError, iso230_csv, iso230_json, iso230_tables, render_iso230, write_iso230
+from fusion.report.sheet import (
+    Iso230PageError,
+    describe_sheet,
+    iso230_csv,
+    iso230_json,
+    iso230_tables,
+    render_iso230,
+    write_iso230,
+)
 from fusion.report.wording import say
 from fusion.results.axis import Iso230Part
 from fusion.results.store import joined, plain
@@ -23,7 +31,16 @@ from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 
 X = np.random.default_rng(21).normal(0, 0.6, (5, 2, 7)) + np.array([[1.1], [-0.4]]) + 1.7 * np.arange(7.0)
-VERSIONS = {"thermofuse": "0"}
+
+
+def sheet_of(title: str, part: Iso230Part):
+    """The sheet of a test read from a file."""
+    return describe_sheet(title, part, files={"x.csv": "ab12"}, version="0")
+
+
+def page_of(title: str, part: Iso230Part, dataset: xr.Dataset, *remarks: str) -> str:
+    """The page of a test."""
+    return render_iso230(sheet_of(title, part), part, dataset, remarks=remarks)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +66,7 @@ def as_number(text: str) -> float:
 
 
 def test_the_values_of_the_axis_are_those_of_the_definitions(test_sheet):
-    page = render_iso230("A", *test_sheet, remarks=(), versions=VERSIONS)
+    page = page_of("A", *test_sheet)
     mean, s, seen = X.mean(axis=0), X.std(axis=0, ddof=1), 0
     true = {**by_hand(X), "sign": (mean[0] - mean[1]).mean()}
     for m, q, arrow in zip(mean, s, "\u2191\u2193", strict=True):
@@ -71,7 +88,7 @@ def test_the_values_of_the_axis_are_those_of_the_definitions(test_sheet):
 
 
 def test_the_values_of_the_targets_are_those_of_the_readings(test_sheet):
-    page = render_iso230("A", *test_sheet, remarks=(), versions=VERSIONS)
+    page = page_of("A", *test_sheet)
     rows = [cells for cells in cells_of(page) if len(cells) == 12 and cells[0].isdigit()]
     assert len(rows) == 7
     mean, s = X.mean(axis=0), X.std(axis=0, ddof=1)
@@ -106,13 +123,13 @@ def test_json_and_csv_hold_full_precision(test_sheet):
 def test_missing_readings_are_named_under_the_table():
     x = X.copy()
     x[3, 1, 2] = np.nan
-    page = render_iso230("A", *evaluated(x), remarks=(), versions=VERSIONS)
+    page = page_of("A", *evaluated(x))
     assert "1 of 70 readings of the window are missing: cycle 4, target 3\u2193 (missing)." in page
 
 
 def test_one_cycle_has_e_m_and_b_alone_and_says_why():
     part, dataset = evaluated(X[:1])
-    page = render_iso230("A", part, dataset, remarks=("1 line left out",), versions=VERSIONS)
+    page = page_of("A", part, dataset, "1 line left out")
     assert "One cycle has no standard deviation s" in page and "<li>1 line left out</li>" in page
     rows = [cells for cells in cells_of(page) if cells and cells[0].isdigit()]
     assert [as_number(cells[3]) for cells in rows] == pytest.approx(X[0, 1], abs=0.0051)
@@ -124,13 +141,14 @@ def test_one_cycle_has_e_m_and_b_alone_and_says_why():
 
 
 def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_path):
-    page = render_iso230("<i>A</i>", *test_sheet, remarks=("<script>",), versions=VERSIONS)
+    page = page_of("<i>A</i>", *test_sheet, "<script>")
     assert "<i>A</i>" not in page and "<li>&lt;script&gt;</li>" in page
-    with pytest.raises(Iso230PageError, match=r"page\.docx: the sheet is written as \.html or \.pdf"):
-        write_iso230(tmp_path / "page.docx", page)
-    write_iso230(tmp_path / "page.html", page)
+    sheet = sheet_of("A", test_sheet[0])
+    with pytest.raises(Iso230PageError, match=r"page\.odt: the sheet is written as \.html, \.pdf or \.docx"):
+        write_iso230(tmp_path / "page.odt", sheet, *test_sheet, remarks=())
+    write_iso230(tmp_path / "page.html", sheet, *test_sheet, remarks=())
     with pytest.raises(Iso230PageError, match="exists already"):
-        write_iso230(tmp_path / "page.html", page)
+        write_iso230(tmp_path / "page.html", sheet, *test_sheet, remarks=())
     assert iso230_tables(*test_sheet, title="A")[0].title == "A, cycles 1 to 5"
 
 
@@ -145,7 +163,7 @@ def test_a_rotary_axis_keeps_its_units_everywhere():
     assert tables[0].columns[1].header == "cycles 1 to 5 / arcsec" and tables[1].columns[1].header == "Position / deg"
     assert iso230_csv(dataset).startswith("target,position_deg,mean_positive_arcsec")
     assert iso230_json(found, dataset)["unit"] == "arcsec"
-    page = render_iso230("A", found, dataset, remarks=(), versions=VERSIONS)
+    page = page_of("A", found, dataset)
     text = " ".join(cell for cells in cells_of(page) for cell in cells)
     assert "deviation / arcsec" in page and "µm" not in text and "ppm" not in text and " mm" not in text
 
@@ -205,7 +223,7 @@ def test_what_is_assumed_and_what_is_missing_is_said(part):
         for entry in part.settled.contributions
     ]
     sentence = say("iso230_uncertainty", part.settled.model_copy(update={"contributions": tuple(unknown)}))
-    assert "It does not contain the environmental variation" in sentence
+    assert "U does not contain the environmental variation" in sentence
 
 
 def test_results_of_an_older_run_show_their_only_window(part):

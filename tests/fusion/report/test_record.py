@@ -42,8 +42,9 @@ def page_of(**changes: Any) -> str:
     results = assemble("R", {"loop": {**RECORD_LOOP, **changes}}, [])
     assert isinstance(results.loop, RecordLoop)
     return render_page(
-        "record.html.j2", {}, results=results, provenance=ORIGIN, summary=describe_record(results, record())
-    )
+        "record.html.j2", {}, results=results, provenance=ORIGIN, thermal_map=None,
+        summary=describe_record(results, record(), ORIGIN),
+    )  # fmt: skip
 
 
 def test_a_record_is_told_with_its_channels_and_its_driver():
@@ -61,7 +62,7 @@ def test_a_record_is_told_with_its_channels_and_its_driver():
 
 
 def test_the_page_stays_readable_with_many_channels():
-    told = describe_record(assemble("R", {"loop": RECORD_LOOP}, []), record(channels=9, drivers=0))
+    told = describe_record(assemble("R", {"loop": RECORD_LOOP}, []), record(channels=9, drivers=0), ORIGIN)
     assert (len(told["shown"]), told["omitted"]) == (6, 3)
     assert "driver" not in told["measured"]
     charts = draw_record(record(channels=9, drivers=0))

@@ -172,7 +172,7 @@ def results(found: Loop | None, **parts: Any) -> Results:
         (loop("complete", declared=()), ["No effect is declared"]),
         (
             loop("explained", step("dead_path"), step("air_index")),
-            ["lacks the laser's dead path and the refractive index of the air.", "no further cause"],
+            ["lacks the laser's dead path and the refractive index of the air.", "No further cause"],
         ),
         (
             loop("partial", step("dead_path"), step("air_index", confirmed=False, borne_out="no")),
@@ -365,7 +365,7 @@ def test_effects_that_are_not_separated_are_told_as_one_of_these():
     tied = axis_step("unseen_heat_source", tied=("thermal_lag",), parameters={"follows": "duty"})
     told = say("verdict", loop("explained", tied), None, False)
     assert (
-        "it lacks one of these, which these data do not separate: a heat source that the camera does not see (follows"
+        "lacks one of these, which these data do not separate: a heat source that the camera does not see (follows"
         in told
     )
     assert "or a part of the machine that follows the measured temperatures with a lag" in told
@@ -429,6 +429,6 @@ def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
     source = SourcePart.model_construct(x_mm=355.0, y_mm=95.0, area=None)
     seen = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
     (step,) = next_steps(results(loop("complete"), correlation=seen))
-    assert step.startswith("To find out whether the place around x 355 mm, y 95 mm is a cause: repeat the test")
+    assert step.startswith("Repeat the test") and "whether the place around x 355 mm, y 95 mm is a cause" in step
     shown = seen.model_copy(update={"randomised_duty": (DutyPart.model_construct(name="spindle", cause=True),)})
     assert "Nothing has to be done" in next_steps(results(loop("complete"), correlation=shown))[0]

@@ -1,0 +1,207 @@
+"""The sheet of a test by ISO 230-2, one page to be signed and what it rests on: as HTML, PDF or Word, and its values for programs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import rich.table
+import xarray as xr
+
+from fusion.common import FusionError
+from fusion.report.campaign import describe_iso230, values_to_sign
+from fusion.report.charts.readings import plot_test, plot_windows
+from fusion.report.charts.style import Chart, embed
+from fusion.report.page import print_pdf, render_page
+from fusion.report.thermal_test import describe_thermal_tests, draw_thermal_tests
+from fusion.report.wording import Table, Words, print_table, table
+from fusion.results.axis import Iso230Part
+from fusion.results.store import group, write_atomically, write_text
+from fusion.results.thermal_test import ThermalTest
+from interferometry.plots import plot_iso230
+
+#: Conditions that say whose test of which axis a sheet is of; the others follow the values. Instruments are numbered.
+_IDENTITY = (
+    "Report number", "Customer", "Date of the test", "Machine", "Serial number of the machine", "Control", "Location", "Axis", "Operator",
+    "Instrument", "Sign convention",
+)  # fmt: skip
+#: Conditions that stand where somebody signs.
+_SIGNED = {"Measured by": "Operator", "Approved by": "Approved by"}
+#: What the standard means by a deviation, where a laboratory states no convention.
+_CONVENTION = "not stated; taken as actual minus target position (ISO 230-2)"
+_MET = {True: "yes", False: "no", None: "not known"}
+
+
+class Iso230PageError(FusionError):
+    """A test whose page or values cannot be written; the message says why."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a sheet shows, in words: pairs of name and text, tables, names of those who sign, and SHA-256 of files by name."""
+
+    title: str
+    identity: list[tuple[str, str]]
+    window: str
+    values: Table
+    requirements: Table
+    conditions: list[tuple[str, str]]
+    signatures: list[tuple[str, str]]
+    files: Mapping[str, str]
+    version: str
+
+
+def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], version: str) -> Sheet:
+    """Return what the sheet of a test shows."""
+    stated = {row.name: row.text for row in part.conditions}
+    told = {name: text or (_CONVENTION if name == "Sign convention" else "not stated") for name, text in stated.items()}
+    identity = [(name, text) for name, text in told.items() if name.startswith(_IDENTITY)]
+    named = dict(identity).keys() | _SIGNED.values()
+    requirements = [[check.name, _MET[check.met], check.evidence] for check in part.checks]
+    return Sheet(
+        title=title,
+        identity=identity,
+        window=(part.settled or part).window,
+        values=values_to_sign(part),
+        requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
+        conditions=[(name, text) for name, text in told.items() if name not in named],
+        signatures=[(role, stated.get(name, "")) for role, name in _SIGNED.items()],
+        files=files,
+        version=version,
+    )
+
+
+def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
+    """Return the charts of the section on ISO 230-2, by name."""
+    charts = {"iso230": plot_test(group(dataset, "settled"), dataset["position"])}
+    windows = group(dataset, "iso")
+    return charts if windows.sizes["window"] < 3 else {**charts, "windows": plot_windows(windows)}
+
+
+def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> str:
+    """Return the page of a test as HTML text: the sheet, then what it rests on."""
+    summary = {"iso230": describe_iso230(part, dataset), "assumptions": {"iso230": ""}}
+    shown = {"sheet": sheet, "iso230": part, "remarks": remarks, "summary": summary}
+    return render_page("iso230.html.j2", embed(draw_iso230(dataset)), **shown)
+
+
+def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> None:
+    """Write the sheet of a test in the format of the file's name; nothing is replaced."""
+    if _kind(path, ".html", ".pdf", ".docx") == ".docx":
+        write_atomically(path, lambda temporary: _write_word(temporary, sheet, dataset))
+    else:
+        _write_page(path, render_iso230(sheet, part, dataset, remarks=remarks))
+
+
+def write_thermal_tests(path: Path, title: str, tests: Sequence[ThermalTest], *, versions: Mapping[str, str]) -> None:
+    """Write the page of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
+    _kind(path, ".html", ".pdf")
+    summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
+    shown = {"summary": summary, "title": title, "versions": versions}
+    _write_page(path, render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), **shown))
+
+
+def _kind(path: Path, *kinds: str) -> str:
+    """Return the format that a file's name asks for, one of the kinds; the file must not exist."""
+    if path.exists():
+        raise Iso230PageError(f"{path} exists already; name another file with --out, or remove it")
+    kind = ".html" if path.suffix.lower() == ".htm" else path.suffix.lower()
+    if kind not in kinds:
+        raise Iso230PageError(
+            f"{path}: the sheet is written as {', '.join(kinds[:-1])} or {kinds[-1]}; name such a file with --out"
+        )
+    return kind
+
+
+def _write_page(path: Path, page: str) -> None:
+    if path.suffix.lower() == ".pdf":
+        print_pdf(page, path)
+    else:
+        write_text(path, page)
+
+
+def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
+    """Write the sheet as a document of Word that a laboratory may complete with its own heading."""
+    import docx
+    from docx.shared import Mm, Pt
+
+    document = docx.Document()
+    page = document.sections[0]
+    page.page_width, page.page_height = Mm(210), Mm(297)
+    page.left_margin = page.right_margin = Mm(16)
+    page.top_margin = page.bottom_margin = Mm(12)
+    normal = document.styles["Normal"]
+    normal.font.size, normal.paragraph_format.space_after = Pt(8), Pt(2)
+
+    def put(rows: Iterable[Sequence[str]], titles: Sequence[str] = ()) -> None:
+        every = [*([titles] if titles else []), *rows]
+        grid = document.add_table(rows=len(every), cols=len(every[0]), style="Light Grid")
+        for cells, texts in zip(grid.rows, every, strict=True):
+            for cell, text in zip(cells.cells, texts, strict=True):
+                cell.text = text
+        document.add_paragraph()
+
+    document.add_heading(f"Test of positioning by ISO 230-2:2014: {sheet.title}", level=1)
+    put(in_pairs(sheet.identity))
+    axes = plot_iso230(group(dataset, "settled"), dataset["position"])
+    picture = io.BytesIO()
+    axes.figure.savefig(picture, format="png", dpi=200, transparent=False)
+    document.add_picture(picture, width=Mm(150))
+    put([row.cells for row in sheet.values.rows], sheet.values.titles)
+    if sheet.requirements.rows:
+        put([row.cells for row in sheet.requirements.rows], sheet.requirements.titles)
+    if sheet.conditions:
+        put(in_pairs(sheet.conditions))
+    put([[f"{role}: {name}", "Date, signature:"] for role, name in sheet.signatures])
+    hashes = "; ".join(f"{name} {sha256}" for name, sha256 in sheet.files.items())
+    document.add_paragraph(f"thermofuse {sheet.version}. SHA-256: {hashes}")
+    document.save(str(path))
+
+
+def in_pairs(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str, str, str]]:
+    """Return names and texts as rows of two pairs, down the first column and then the second."""
+    half = (len(rows) + 1) // 2
+    right = [*rows[half:], ("", "")]
+    return [(*rows[k], *right[k]) for k in range(half)]
+
+
+def iso230_tables(part: Iso230Part, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
+    """Return the tables of a test for the terminal."""
+    described = describe_iso230(part, dataset)
+    shown: list[tuple[str, Table | None]] = [
+        (f"{title}, {described['quoted'].window}", described["axis"]),
+        ("per target position", described["positions"]),
+        ("uncertainty budget", described["budget"]),
+    ]
+    return [print_table(found, name) for name, found in shown if found is not None]
+
+
+def iso230_json(part: Iso230Part, dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the values of a test for programs: the part ``iso230`` of results.json, and the values per target."""
+    records = _of_targets(dataset).astype(object).to_dict("records")
+    rows = [{name: None if value != value else value for name, value in record.items()} for record in records]
+    return {**part.model_dump(mode="json"), "targets": rows}
+
+
+def iso230_csv(dataset: xr.Dataset) -> str:
+    """Return the values per target as CSV text, one line per target."""
+    return _of_targets(dataset).to_csv(index=False, lineterminator="\n")
+
+
+def _of_targets(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return the values of each target; headings carry the units of the dataset."""
+    unit, place = dataset["deviation"].attrs["units"], dataset["position"].attrs["units"]
+    columns = {"target": dataset["target"].values, f"position_{place}": dataset["position"].values}
+    settled = group(dataset, "settled").sel(target=dataset["target"].values)
+    for direction in dataset["direction"].values:
+        here = settled.sel(direction=direction)
+        for symbol, name in (("mean", "mean_unidirectional"), ("s", "standard_deviation"), ("R", "repeatability")):
+            columns[f"{symbol}_{direction}_{unit}"] = here[name].values
+        columns[f"readings_{direction}"] = here["count"].values.astype(int)
+    for symbol, name in (("mean", "mean_bidirectional"), ("B_i", "reversal"), ("R_i", "repeatability_bidirectional")):
+        columns[f"{symbol}_{unit}"] = settled[name].values
+    return pd.DataFrame(columns)

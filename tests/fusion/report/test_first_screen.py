@@ -1,0 +1,137 @@
+"""What a reader learns from the first screen of a report alone: which machine, whether it passes, how sure, why, what next."""
+
+import shutil
+
+import pytest
+from playwright.sync_api import sync_playwright
+
+from fusion.pipeline.iso230 import read_test
+from fusion.pipeline.run import run_campaign
+from fusion.report.conclusions import in_brief, sharpen
+from fusion.report.page import render_report
+from fusion.results.results import assemble, read_results
+from tests.browser import CHROMIUM, visible_words
+from tests.fusion.campaign_parts import change, without
+from tests.fusion.report.test_campaign import ORIGIN
+from tests.fusion.report.test_record import record
+from tests.fusion.results_sample import RECORD_LOOP
+
+#: Words that are read in half a minute.
+MOST = 150
+STATED = """
+[acceptance]
+A = "20 um"
+B = "1 um"
+
+[report]
+machine = "Mill 900"
+machine_serial_number = "4711"
+operator = "J. Doe"
+"""
+
+
+@pytest.fixture(scope="module")
+def reports(campaign_folder, tmp_path_factory):
+    """Reports of a campaign with both instruments, of either one alone, and of a record."""
+    folder = shutil.copytree(campaign_folder, tmp_path_factory.mktemp("first") / "campaign")
+    path = folder / "campaign.toml"
+    path.write_text(path.read_text(encoding="utf-8") + STATED, encoding="utf-8")
+    camera = without(path, "interferometry", "plan.axis", "model", "acceptance", name="camera.toml")
+    change(camera, 'table = "still"', 'window = "6 min"\ntable = "still"')
+    parts = {
+        "both": path,
+        "laser": without(path, "thermography", "plan", "model", name="laser.toml"),
+        "camera": camera,
+        "pictures": without(path, "plan", "plan.axis", "interferometry", "model", "drivers", "acceptance", name="pictures.toml"),
+    }
+    pages = {}
+    for name, campaign in parts.items():
+        run_campaign(campaign, folder / name)
+        pages[name] = folder / name / "report.html"
+    pages["record"] = folder / "record.html"
+    results = assemble("Spindle", {"loop": RECORD_LOOP}, [])
+    pages["record"].write_text(render_report(results, ORIGIN, {"record": record(drivers=0)}), encoding="utf-8")
+    return pages
+
+
+@pytest.fixture(scope="module")
+def new_page():
+    """Return a function that opens a page in a window of a size."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+
+        def open_page(path, width, height):
+            page = browser.new_page(viewport={"width": width, "height": height}, bypass_csp=True)
+            page.goto(path.as_uri())
+            page.wait_for_function("document.querySelectorAll('.story canvas, .story .bk-Figure').length > 0")
+            return page
+
+        yield open_page
+        browser.close()
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("kind", ["both", "laser", "camera", "pictures", "record"])
+def test_the_first_screen_is_a_picture_and_few_words(reports, new_page, kind):
+    page = new_page(reports[kind], 1400, 900)
+    words = visible_words(page)
+    print(kind, len(words), " ".join(words))
+    assert 20 < len(words) <= MOST, words
+    summary, story = page.locator("#summary"), page.locator("#summary .story .chart")
+    box = summary.bounding_box()
+    assert box["y"] + box["height"] <= 900
+    assert story.count() >= 1 and all(story.nth(at).bounding_box()["height"] > 150 for at in range(story.count()))
+    assert page.locator("#summary ol.next li").count() in (1, 2, 3)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1400
+
+
+@pytest.mark.chain
+def test_five_questions_are_answered(reports, new_page):
+    told = " ".join(visible_words(new_page(reports["both"], 1400, 900)))
+    part = read_results(reports["both"].parent).iso230
+    for answer in ("Mill 900", "4711", "J. Doe", "X axis", "± ", "a reversal error that changes", "ISO 230-2, not met:", "Next"):
+        assert answer in told, answer
+    decisions = {row.quantity: row.decision for row in part.tolerances}
+    assert set(decisions) == {"A", "B"}
+    for symbol, decision in decisions.items():
+        said = told.split("ISO 230-2, not met")[0].lower()
+        assert f"{symbol.lower()} ≤" in said and decision.split()[0] in said
+
+
+@pytest.mark.chain
+def test_a_phone_shows_identity_decision_and_cause_first(reports, new_page):
+    page = new_page(reports["both"], 390, 844)
+    told = " ".join(visible_words(page))
+    assert "Mill 900" in told and "≤ 20 µm" in told and "a reversal error that changes" in told
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.parametrize(
+    ("step", "line"),
+    [
+        ("Check the fan.", "Check the fan."),
+        ("Only if the clock is right: look up 10:08 (cycle 38).", "If so: look up 10:08."),
+        (
+            "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat it.",
+            "Inspect guideway, scale, screw and nut at this position for preload, wear …",
+        ),
+    ],
+)
+def test_an_action_is_cut_at_a_clause(step, line):
+    assert in_brief(step) == line
+
+
+@pytest.mark.chain
+def test_the_sharper_uncertainty_is_what_the_statement_gives(reports):
+    """The advice is computed from the budget; the run with the stated line gives the same uncertainty."""
+    folder = reports["both"].parent
+    advised = sharpen(read_results(folder).iso230)
+    assert advised.line.startswith('expansion_coefficient = "') and advised.sharper_um < 0.8 * advised.expanded_um
+    campaign = folder.parent / "campaign.toml"
+    stated = change(without(campaign, name="stated.toml"), 'expansion_coefficient = "11.7 ppm/K"', advised.line)
+    part = read_test(stated, None).part
+    assert 2 * part.settled.A_um.u == pytest.approx(advised.sharper_um, rel=1e-6)
+    assert part.settled.A_um.value == read_results(folder).iso230.settled.A_um.value
+    assert next(row.decision for row in part.tolerances if row.quantity == "A") == advised.decision
