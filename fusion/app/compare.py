@@ -160,7 +160,7 @@ class CompareScreen:
         """List the results that there are."""
         folders, whole = find_results(self._state.root)
         self._labels = {label_of(self._state.root, folder): folder for folder in folders}
-        self._reference.options = dict(self._labels)
+        self._reference.param.update(options=self._labels, value=next(iter(self._labels.values()), None))
         self._offer()
         self._compare.disabled = len(folders) < 2
         told = (

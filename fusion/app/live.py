@@ -15,7 +15,7 @@ from fusion.app import parts as ui
 from fusion.app.results.charts import draw_cells, shown_if
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
-from fusion.pipeline.check import BAD_INPUT
+from fusion.messages import BAD_INPUT
 from fusion.pipeline.watch import Enough, LiveState, follow
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, add_series, new_figure, palette, span_words
 from fusion.report.numbers import number
