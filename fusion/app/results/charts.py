@@ -492,10 +492,7 @@ def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.
         ui.paragraph(f"What to inspect: {evidence['check']}"),
         show,
     ]
-    around = _field_around(products, selection, anomaly.target)
-    told = pn.Column(*parts, min_width=300, styles={"flex": "3 1 340px"})
-    seen = pn.Column(*around, min_width=280, styles={"flex": "2 1 300px"})
-    return pn.FlexBox(told, seen, css_classes=["card-of-position"])
+    return ui.column(*parts, *_field_around(products, selection, anomaly.target))
 
 
 def _field_around(products: Products, selection: Selection, target: int) -> ui.Parts:
@@ -512,6 +509,7 @@ def _field_around(products: Products, selection: Selection, target: int) -> ui.P
     scale, _ = products.scale(layer)
     mapper = LinearColorMapper(palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
     drawn, cells = draw_cells(about.sel(cycle=selection.cycle), mapper, "rise", "K", height=300)
+    drawn.max_width = 420
     draw_ring(drawn, ColumnDataSource({"x": at[:1], "y": at[1:]}))
     told = ui.markup("")
 

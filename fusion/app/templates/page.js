@@ -23,6 +23,7 @@ const turned = (view) => {
     return;
   }
   const colours = dark.matches ? TURNED : BACK;
+  view.el.style.backgroundColor = dark.matches ? TURNED["#ffffff"] : "";
   [plot, ...plot.left, ...plot.right, ...plot.above, ...plot.below].forEach((part) => {
     for (const [name, value] of Object.entries(part.attributes)) {
       const other = /_color$/.test(name) && colours[String(value?.value ?? value).toLowerCase()];
