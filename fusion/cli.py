@@ -458,6 +458,17 @@ def simulate(
 
 
 @app.command()
+def demo(
+    out: Annotated[Path, Argument(metavar="FOLDER", help="Folder to write, which must be empty or absent.")] = Path(
+        "demo"
+    ),
+) -> None:
+    """Simulate a campaign of known truth and run it: the first report in a minute, without files of one's own."""
+    simulate(Path("demo"), out)
+    run([str(out / "campaign.toml")], out=out / "results")
+
+
+@app.command()
 def inspect(
     paths: Annotated[
         list[str],

@@ -18,7 +18,11 @@ def keep_scale(drawn: figure, x: Ends, y: Ends) -> figure:
     """Show these ranges to scale: the height follows the width that the page leaves to the drawing."""
     drawn.update(x_range=Range1d(*x), y_range=Range1d(*y), match_aspect=False)
     ratio = abs((y[1] - y[0]) / (x[1] - x[0]))
-    follow = "cb_obj.height = Math.round(cb_obj.inner_width * ratio + cb_obj.outer_height - cb_obj.inner_height)"
+    # A drawing that is hidden has no size.
+    follow = """
+        const around = cb_obj.outer_height - cb_obj.inner_height;
+        if (cb_obj.inner_width > 0 && around > 0) cb_obj.height = Math.round(cb_obj.inner_width * ratio + around);
+    """
     drawn.js_on_change("inner_width", CustomJS(args={"ratio": ratio}, code=follow))
     return drawn
 

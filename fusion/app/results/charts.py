@@ -171,12 +171,10 @@ def table_of(shown_table: Table, caption: str) -> pn.viewable.Viewable:
 
 
 def loop_steps(products: Products, linker: Linker) -> ui.Parts:
-    """Return the closed loop step by step, in the words of the report, or say why there is none."""
+    """Return the closed loop of a run that has one step by step, in the words of the report."""
     results = products.results
     loop = results.loop
-    if loop is None:
-        lacks = [warning.message for warning in results.warnings if warning.code.startswith("too_")]
-        return [ui.note(" ".join(["There is no model of the drift in this run.", *lacks]))]
+    assert loop is not None
     answers = [one for one in conclude(results) if one.question in ("How sure", "What remains")]
     parts = [
         *(ui.paragraph(f"{one.question}: {one.text}") for one in answers),
@@ -467,11 +465,8 @@ _AROUND_MM = 60.0
 
 
 def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
-    """Return one card for each position that stands out, or say that there is none."""
-    anomalies = products.results.anomalies
-    if anomalies is None:
-        lacks = "that needs readings with times, of several positions and cycles."
-        return [ui.note(f"Whether a position stands out was not examined: {lacks}")]
+    """Return one card for each position that stands out of those that were examined, or say that there is none."""
+    anomalies = products.results.anomalies or ()
     if not anomalies:
         return [ui.paragraph("No position stands out from the others, at a family-wise error of 5 %.")]
     return [_card(products, selection, anomaly) for anomaly in anomalies]
