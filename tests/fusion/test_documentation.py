@@ -94,7 +94,9 @@ def test_every_line_of_the_readme_that_installs_nothing_runs(tmp_path: Path) -> 
     (tmp_path / ".venv/bin").mkdir(parents=True)
     (tmp_path / COMMAND).write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fusion.cli "$@"\n', encoding="utf-8")
     (tmp_path / COMMAND).chmod(0o755)
-    run_lines([line for line in readme_lines() if "pip install" not in line and "make " not in line], tmp_path, sys.executable)
+    run_lines(
+        [line for line in readme_lines() if "pip install" not in line and "make " not in line], tmp_path, sys.executable
+    )
 
 
 @pytest.mark.slow
