@@ -2,6 +2,9 @@
 const named = (view) => {
   const root = view.shadow_el ?? view.el?.shadowRoot;
   const title = view.model?.title;
+  // A search field is one without being told so.
+  root?.querySelectorAll("input.choices__input[role]").forEach((input) => input.removeAttribute("role"));
+  root?.querySelectorAll("input[type=range]:not([aria-label])").forEach((input) => input.setAttribute("aria-label", title || "Cycle"));
   if (root && title) {
     root.querySelectorAll(".noUi-handle:not([aria-label])").forEach((handle) => handle.setAttribute("aria-label", title));
     root.querySelectorAll(".bk-spin-btn:not([aria-label])").forEach((button) => {
