@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[app]"
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.run
@@ -23,8 +23,7 @@ $(VENV)/.docs: $(VENV)/.run
 # The main job on a campaign of the twin: simulate, run, print the summary and the path of report.html.
 demo: $(VENV)/.run
 	rm -rf build/demo
-	$(BIN)/thermofuse simulate demo --out build/demo/campaign
-	$(BIN)/thermofuse run build/demo/campaign/campaign.toml --out build/demo/results
+	$(BIN)/thermofuse demo build/demo
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
@@ -47,7 +46,7 @@ docs: $(VENV)/.docs $(VENV)/.test
 
 # The pictures of README and documentation, from the demo's report in a headless Chromium.
 screenshots: $(VENV)/.test demo
-	$(BIN)/python docs/pictures/take.py build/demo/results build/demo/campaign docs/pictures
+	$(BIN)/python docs/pictures/take.py build/demo/results build/demo docs/pictures
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test

@@ -462,6 +462,17 @@ def simulate(
 
 
 @app.command()
+def demo(
+    out: Annotated[Path, Argument(metavar="FOLDER", help="Folder to write, which must be empty or absent.")] = Path(
+        "demo"
+    ),
+) -> None:
+    """Simulate a campaign of known truth and run it: the first report in a minute, without files of one's own."""
+    simulate(Path("demo"), out)
+    run([str(out / "campaign.toml")], out=out / "results")
+
+
+@app.command()
 def inspect(
     paths: Annotated[
         list[str],
@@ -673,6 +684,11 @@ def compare(
         list[Path],
         Argument(metavar="RESULTS RESULTS...", help="Results folders of one machine; the first is the reference."),
     ],
+    out: Annotated[Path | None, Option(help="Write the comparison as a document, page.html or page.pdf.")] = None,
+    same_setup: Annotated[
+        bool,
+        Option("--same-setup", help="Laser, its alignment and the sensors stood untouched: their errors are common."),
+    ] = False,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Compare campaigns of one machine: what changed by more than the uncertainties.
@@ -685,12 +701,17 @@ def compare(
         changes_table,
         comparison_json,
         conclude_comparison,
+        render_comparison,
         side_by_side,
     )
+    from fusion.report.page import write_iso230
     from fusion.report.wording import print_table
 
     with _answering():
-        pairs = compare_campaigns(results)
+        pairs = compare_campaigns(results, same_setup=same_setup)
+        if out is not None:
+            write_iso230(out, render_comparison(pairs))
+            errors.print(f"page: {out.resolve()}")
         if as_json:
             print_json(comparison_json(pairs))
             return

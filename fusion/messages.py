@@ -45,6 +45,10 @@ _LOST = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ENODEV,
 _FAILED_BASE, _MOST_FAILED = 100, 25
 
 
+#: What the readers raise for input that cannot be used.
+BAD_INPUT = (FusionError, ThermographyError, InterferometryError, OSError)
+
+
 class ExitCode(IntEnum):
     """What the process returns.
 

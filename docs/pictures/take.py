@@ -97,6 +97,30 @@ def take_thermograms(browser: Browser, folder: Path) -> None:
         take_report(browser, test / "results" / "report.html", folder, {"only-flir-files": ("body", 800)})
 
 
+#: Picture of the gallery -> the public files that it is made of, and what of their report is brought to the top of the window.
+_GALLERY = {
+    "spindle": ("CAIVIAC__FL_THERMAL", ("h2:has-text('What was recorded')", 640)),
+    "thermogram": ("FLIR_E40.jpg", ("body", 720)),
+}
+
+
+def take_gallery(browser: Browser, folder: Path) -> None:
+    """Write the pictures of reports of public files, and that of a test sheet."""
+    with tempfile.TemporaryDirectory() as name:
+        for picture, (sample, part) in _GALLERY.items():
+            test = Path(name) / picture
+            test.mkdir()
+            for one in (one for one in read_registry() if sample in one):
+                shutil.copy(fetch_sample(one), test)
+            subprocess.run([sys.executable, "-m", "thermofuse", "init", str(test), "--yes"], check=True)
+            run_campaign(test / "campaign.toml", test / "results")
+            take_report(browser, test / "results" / "report.html", folder, {picture: part})
+        readings = fetch_sample(next(one for one in read_registry() if one.endswith("target_x.md_ISO230.dat")))
+        sheet = Path(name) / "sheet.html"
+        subprocess.run([sys.executable, "-m", "thermofuse", "iso230", str(readings), "--out", str(sheet)], check=True)
+        take_report(browser, sheet, folder, {"iso230": ("body", 800)})
+
+
 def take_table(browser: Browser, folder: Path) -> None:
     """Write a picture of the application that asks for the columns of a table."""
     with tempfile.TemporaryDirectory() as name:
@@ -126,4 +150,5 @@ if __name__ == "__main__":
         take_app(browser, campaign, results, pictures)
         take_table(browser, pictures)
         take_thermograms(browser, pictures)
+        take_gallery(browser, pictures)
         browser.close()

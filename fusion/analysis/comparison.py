@@ -12,6 +12,7 @@ import xarray as xr
 from scipy import special
 
 from fusion.common import Array, FusionError
+from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
@@ -340,6 +341,7 @@ class PairComparison:
     profile : difference of the profiles; None where they cannot be compared
     not_compared : what cannot be compared, and why, one sentence each
     tests : tests of the family, over all campaigns
+    common : inputs of both budgets of ISO 230-2 whose error is the same in both tests
     """
 
     before: ComparedCampaign
@@ -348,6 +350,7 @@ class PairComparison:
     profile: ProfileChange | None
     not_compared: tuple[str, ...]
     tests: int
+    common: tuple[str, ...] = ()
 
 
 def read_campaign(folder: Path) -> ComparedCampaign:
@@ -356,18 +359,18 @@ def read_campaign(folder: Path) -> ComparedCampaign:
     return ComparedCampaign(folder, results, _axis(folder), _drift(folder / "deviations.nc"))
 
 
-def compare_campaigns(folders: Sequence[Path]) -> list[PairComparison]:
-    """Compare campaigns of one machine with the first of them."""
+def compare_campaigns(folders: Sequence[Path], *, same_setup: bool = False) -> list[PairComparison]:
+    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them."""
     unique = {folder.resolve() for folder in folders}
     if len(unique) < 2 or len(unique) < len(folders):
         raise ComparisonError(
             f"{len(folders)} results folders are named, {len(unique)} of them different: name at least two, each once"
         )
     reference, *others = [read_campaign(folder) for folder in folders]
-    return [_compare(reference, other, pairs=len(others)) for other in others]
+    return [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
 
 
-def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int) -> PairComparison:
+def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, same_setup: bool) -> PairComparison:
     """Compare one campaign with the reference; `pairs` campaigns share the family."""
     if before.axis != after.axis:
         reason = (
@@ -375,13 +378,15 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int) -
         )
         return PairComparison(before, after, (), None, (f"Everything: {reason}.",), 0)
     lacks: list[str] = []
-    changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *_standard(before, after, lacks)]
+    common = common_inputs(before, after, same_setup=same_setup)
+    standard = _standard(before, after, lacks, common)
+    changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *standard]
     profile = _profile(before, after, lacks, pairs=pairs, tests=len(changes) + 2)
     if profile is not None:
         changes = [*profile.shapes, *changes]
     tests = pairs * (len(changes) if profile is None else len(changes) - len(profile.shapes) + 2 + profile.tests)
     familywise = tuple(replace(change, p_value=min(1.0, change.p_value * tests)) for change in changes)
-    return PairComparison(before, after, familywise, profile, tuple(lacks), tests)
+    return PairComparison(before, after, familywise, profile, tuple(lacks), tests, common)
 
 
 def _axis(folder: Path) -> str:
@@ -473,7 +478,9 @@ def _per_kelvin(loop: AxisLoop) -> Iterator[tuple[str, Coefficient]]:
                 yield step.effect, coefficient
 
 
-def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str]) -> Iterator[Change]:
+def _standard(
+    before: ComparedCampaign, after: ComparedCampaign, lacks: list[str], common: Sequence[str]
+) -> Iterator[Change]:
     """The values by ISO 230-2 of the window that each campaign quotes."""
     parts = [campaign.results.iso230 for campaign in (before, after)]
     one, other = parts
@@ -499,12 +506,44 @@ def _standard(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str
         if None in (first.value, second.value, first.u, second.u):
             lacks.append(f"ISO 230-2, {symbol}: not measured with its uncertainty in both campaigns.")
             continue
-        yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False)
+        shared = sum(math.prod(_contributions((one, other), name, symbol)) for name in common)
+        yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False, covariance=shared)
 
 
-def _difference(quantity: str, kind: str, unit: str, before: Quantity, after: Quantity, *, machine: bool) -> Change:
-    """The difference of two quantities with independent uncertainties; without an uncertainty it is shown and never significant."""
+def _contributions(parts: Sequence[Iso230Part], name: str, symbol: str) -> list[float]:
+    """Return what an input of the budget contributes to the uncertainty of a quantity in every test, um."""
+    budgets = [
+        {row.contributor: row for row in window.contributions} if (window := part.settled or part.first) else {}
+        for part in parts
+    ]
+    return [float(getattr(budget.get(name), f"{symbol}_um", None) or 0.0) for budget in budgets]
+
+
+def common_inputs(before: ComparedCampaign, after: ComparedCampaign, *, same_setup: bool) -> tuple[str, ...]:
+    """Return the inputs of both budgets whose error is the same in both tests, so that it cancels as far as it contributes equally.
+
+    The coefficient of one machine where both state the same; the laser where both name the same instruments; and what was not touched
+    between the tests where the user says so.
+    """
+    stated = [
+        {} if one.results.iso230 is None else {row.name: row.text for row in one.results.iso230.conditions}
+        for one in (before, after)
+    ]
+
+    def same(beginning: str) -> bool:
+        texts = [{text for name, text in rows.items() if name.startswith(beginning) and text} for rows in stated]
+        return bool(texts[0]) and texts[0] == texts[1]
+
+    common = ["expansion_coefficient"] if same("Expansion coefficient") else []
+    common += ["device"] if same_setup or same("Instrument") else []
+    return (*common, *(("alignment", "material_temperature") if same_setup else ()))
+
+
+def _difference(
+    quantity: str, kind: str, unit: str, before: Quantity, after: Quantity, *, machine: bool, covariance: float = 0.0
+) -> Change:
+    """The difference of two quantities, whose errors may have a covariance; without an uncertainty it is shown and never significant."""
     change = float(after.value or 0.0) - float(before.value or 0.0)
-    u = math.hypot(before.u, after.u) if before.u and after.u else None
+    u = math.sqrt(before.u**2 + after.u**2 - 2.0 * covariance) if before.u and after.u else None
     p = 1.0 if u is None else float(2.0 * special.ndtr(-abs(change) / u))
     return Change(quantity, kind, None, unit, before, after, Quantity(value=change, u=u), p, machine)

@@ -4,108 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import panel as pn
-import xarray as xr
 
-from fusion.analysis.comparison import ComparedCampaign, PairComparison, compare_campaigns
+from fusion.analysis.comparison import PairComparison, compare_campaigns
 from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if, table_of
 from fusion.common import FusionError
-from fusion.report.charts.style import (
-    CATEGORIES,
-    Chart,
-    Courses,
-    add_band,
-    add_series,
-    new_figure,
-    of_rank,
-    span_words,
-)
+from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters, plot_trends
 from fusion.report.comparison import campaign_names, changes_table, conclude_comparison, side_by_side
 from fusion.results.results import read_results
-from interferometry.plots import ACCENT
-
-# Charts of a comparison: profiles over one another, what remains of their difference, scatter by position.
-
-_MARKS = ("circle", "square", "triangle", "diamond", "inverted_triangle", "x")
-#: Values of a campaign over position, and half their 95 % intervals, from its drift in order of position.
-_Values = Callable[[xr.Dataset], tuple[np.ndarray, np.ndarray]]
-
-
-def plot_profiles(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> Chart | None:
-    """Draw the profiles of all campaigns, mean of the approaches, each about its mean, with their 95 % bands."""
-
-    def profile(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-        value = drift["profile"].mean("direction").values
-        return value - np.nanmean(value), 2 * drift["profile_u"].mean("direction").values
-
-    seen = "Profiles about their means"
-    return _plot_campaigns(campaigns, names, profile, "deviation about its mean", seen, line=True)
-
-
-def plot_scatters(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -> Chart | None:
-    """Draw the scatter at every position of all campaigns."""
-
-    def scatter(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-        value, freedom = drift["scatter_position"].values, drift["scatter_freedom"].sum("direction").values
-        return value, 2 * value / np.sqrt(2 * np.maximum(freedom, 1.0))
-
-    return _plot_campaigns(campaigns, names, scatter, "scatter s", "Scatter of single readings by position", line=False)
-
-
-def _plot_campaigns(
-    campaigns: Sequence[ComparedCampaign],
-    names: Sequence[str],
-    values: _Values,
-    quantity: str,
-    seen: str,
-    *,
-    line: bool,
-) -> Chart | None:
-    """Draw one quantity of every campaign with readings over position: as lines with bands about zero, or as points from zero."""
-    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", legend_columns=1, zero=line)
-    courses = Courses(drawn)
-    for k, (campaign, name) in enumerate(zip(campaigns, names, strict=True)):
-        if campaign.drift is None:
-            continue
-        drift = campaign.drift.sortby("position")
-        x = drift["position"].values.astype(float)
-        value, half = values(drift)
-        looks = of_rank(k)
-        if line:
-            add_band(drawn, x, value - half, value + half, looks["colour"])
-        courses.columns[f"position, {name} / mm"] = x
-        heading, marker = f"{quantity.split()[0]}, {name} / µm", _MARKS[k % len(_MARKS)]
-        courses.add(x, value, name, heading=heading, half=half, marker=marker, line=line, **looks)
-    if not courses.told:
-        return None
-    if not line:
-        drawn.y_range.start = 0.0
-    return courses.chart(seen)
-
-
-def plot_remaining(pair: PairComparison) -> Chart | None:
-    """Draw the difference of two profiles beyond offset, slope and bow with its 95 % interval; positions that changed are marked."""
-    if pair.profile is None:
-        return None
-    x, value, half = pair.profile.position_mm, pair.profile.remaining_um, 2 * pair.profile.remaining_u_um
-    drawn = new_figure(x="position / mm", y="difference / µm", zero=True)
-    style: dict[str, Any] = {"colour": CATEGORIES[0], "line": False, "marker": "circle", "legend": False}
-    add_series(drawn, x, value, name="after − before", half=half, **style)
-    changed = [change.position_mm for change in pair.changes if change.group == "profile" and change.significant]
-    places = sorted({place for place in changed if place is not None})
-    at = np.isin(x, places)
-    if at.any():
-        drawn.scatter(x[at], value[at], marker="circle", size=17, fill_color=None, line_color=ACCENT, line_width=2.5)
-    marked = f"changed: {', '.join(f'{place:g} mm' for place in places)}" if places else "no position changed"
-    seen = f"Difference of the profiles beyond offset, slope and bow: {span_words(value, 'µm')}; {marked}."
-    return Chart(drawn, seen, {"position / mm": x, "difference / µm": value, "95 % interval ± / µm": half})
-
 
 #: Folders below the one of the application in which results are looked for, and most results that are listed.
 _DEPTH, _MOST = 4, 200
@@ -153,14 +62,21 @@ class CompareScreen:
         self._compare.on_click(self._show)
         self._reference.param.watch(lambda event: self._offer(), "value")
         self._list()
-        choice = (self._reference, ui.paragraph("Compared with it:"), self._others, pn.Row(self._compare, look))
+        self._same = pn.widgets.Checkbox(label="Laser, alignment and sensors stood untouched between the tests")
+        choice = (
+            self._reference,
+            ui.paragraph("Compared with it:"),
+            self._others,
+            self._same,
+            pn.Row(self._compare, look),
+        )
         self.view = ui.column(ui.heading("Compare"), *choice, self._told, self._found)
 
     def _list(self) -> None:
         """List the results that there are."""
         folders, whole = find_results(self._state.root)
         self._labels = {label_of(self._state.root, folder): folder for folder in folders}
-        self._reference.options = dict(self._labels)
+        self._reference.param.update(options=self._labels, value=next(iter(self._labels.values()), None))
         self._offer()
         self._compare.disabled = len(folders) < 2
         told = (
@@ -187,7 +103,8 @@ class CompareScreen:
             return
         with ui.disabled_during(self._compare):
             try:
-                pairs = await asyncio.to_thread(compare_campaigns, [self._reference.value, *others])
+                folders, same = [self._reference.value, *others], bool(self._same.value)
+                pairs = await asyncio.to_thread(lambda: compare_campaigns(folders, same_setup=same))
                 ui.schedule_parts(self._found, comparison_parts(pairs))
             except (FusionError, OSError) as error:
                 ui.schedule_parts(self._found, [ui.paragraph(str(error), kind="fault")])
@@ -209,6 +126,8 @@ def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
     profiles = "Drift-free profiles, mean of both approaches, each about its mean, with 95 % bands."
     parts += shown_if(plot_profiles(campaigns, names), profiles)
     parts += shown_if(plot_scatters(campaigns, names), "Scatter of single readings with 95 % intervals.")
+    for chart in plot_trends(campaigns).values():
+        parts += shown_if(chart, "Over the dates of the tests, with expanded uncertainties (k = 2).")
     for name, pair in compared:
         left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed: changed."
         parts += shown_if(plot_remaining(pair), left)

@@ -15,7 +15,7 @@ from fusion.app import parts as ui
 from fusion.app.results.charts import draw_cells, shown_if
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
-from fusion.pipeline.check import BAD_INPUT
+from fusion.messages import BAD_INPUT
 from fusion.pipeline.watch import Enough, LiveState, follow
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, add_series, new_figure, palette, span_words
 from fusion.report.numbers import number
@@ -163,7 +163,24 @@ def plot_standard(course: Course) -> Chart | None:
     return courses.chart(f"By ISO 230-2, {course.window}")
 
 
+def example_course() -> Course:
+    """Return the course of a test that was never made, to show what the screen draws: a warm-up of exponential form."""
+    course = Course(window="cycles 26 to 30")
+    for cycle in range(1, 31):
+        warm = 1.0 - np.exp(-cycle / 12.0)
+        course.cycle.append(cycle)
+        course.rise_K.append(3.0 * warm)
+        course.mean_drift_um.append(4.0 * warm)
+        course.far_drift_um.append(9.0 * warm)
+        if cycle >= 5:
+            course.iso230_cycle.append(cycle)
+            course.iso230_um.append({"A": 9.0 + 6.0 * warm, "R": 3.0, "B": 1.2})
+    return course
+
+
 _INTERVAL_MS = 1000
+_DRIFTS = "Drift of the readings and rise of the table since the first cycle."
+_STANDARD = "By ISO 230-2, the last five cycles after every cycle."
 
 
 class LiveScreen:
@@ -179,7 +196,10 @@ class LiveScreen:
         self._wanted = pn.widgets.FloatInput(**wanted, width=330)
         self._start = pn.widgets.Button(label="Follow", color="primary")
         self._end = pn.widgets.Button(label="Stop following", disabled=True)
-        self._told, self._charts = ui.markup(""), ui.column()
+        example = example_course()
+        told = "Example, not measured: the charts that are drawn here while a test runs, with the latest field of the camera above them."
+        charts = (*shown_if(plot_course(example), _DRIFTS), *shown_if(plot_standard(example), _STANDARD))
+        self._told, self._charts = ui.markup(""), ui.column(ui.paragraph(told, kind="warning"), *charts)
         self._start.on_click(self._on_start)
         self._end.on_click(lambda event: self.end())
         state.param.watch(lambda event: event.new and self._campaign.param.update(value=str(event.new)), "campaign")
@@ -222,8 +242,8 @@ class LiveScreen:
         drawn = [
             *([ui.paragraph(session.fault, kind="fault")] if session.fault else []),
             *shown_if(plot_field(course), "Latest field, on the scale of all fields so far."),
-            *shown_if(plot_course(course), "Drift of the readings and rise of the table since the first cycle."),
-            *shown_if(plot_standard(course), "By ISO 230-2, the last five cycles after every cycle."),
+            *shown_if(plot_course(course), _DRIFTS),
+            *shown_if(plot_standard(course), _STANDARD),
         ]
         if course.warnings:
             drawn += [ui.heading("Noticed", level=3), ui.bullets(dict.fromkeys(course.warnings))]
@@ -235,6 +255,9 @@ def standing(course: Course, wanted_u_um: float, *, runs: bool) -> str:
     seen = ((len(course.cycle), "finished cycle"), (course.frames, "frame"), (course.readings, "reading"))
     verb = "Following" if runs else "No longer followed"
     head = f"{verb}: {', '.join(counted(count, noun) for count, noun in seen)}."
+    if course.iso230_um:
+        values = ", ".join(f"{name} = {number(value, 3)} µm" for name, value in course.iso230_um[-1].items())
+        head += f" By ISO 230-2, {course.window}: {values}."
     return f'<p role="status">{ui.as_markup(head)} {ui.as_markup(enough_words(course, wanted_u_um))}</p>'
 
 

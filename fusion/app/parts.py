@@ -165,16 +165,17 @@ def file_name(written: str) -> str:
 
 # The report of a run, as a page of the application.
 
-_NAME = "report.html"
+#: Files of a results folder that the application sends, with their types.
+_SENT = {"report.html": "text/html; charset=utf-8", "report.pdf": "application/pdf", "sheet.pdf": "application/pdf"}
 
 
-def report_link(root: Path, results: Path) -> str:
+def report_link(root: Path, results: Path, name: str = "report.html") -> str:
     """Return the address of a report within the application."""
-    return f"/report/{quote((results.resolve() / _NAME).relative_to(root.resolve()).as_posix())}"
+    return f"/report/{quote((results.resolve() / name).relative_to(root.resolve()).as_posix())}"
 
 
 class ReportHandler(RequestHandler):
-    """Sends ``report.html`` of a results folder inside the folder of the application, and no other file."""
+    """Sends report and test sheet of a results folder inside the folder of the application, and no other file."""
 
     def initialize(self, root: Path) -> None:
         """Keep the folder."""
@@ -186,11 +187,13 @@ class ReportHandler(RequestHandler):
             path = allowed_path(self._root, written.lstrip("/"))
         except PathError:
             path = None
-        if path is None or path.name != _NAME or not path.is_file() or not (path.parent / "results.json").is_file():
+        if path is None or path.name not in _SENT or not path.is_file() or not (path.parent / "results.json").is_file():
             self.set_status(404)
             self.finish("404: there is no report in that folder\n")
             return
-        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.set_header("Content-Type", _SENT[path.name])
+        if path.suffix == ".pdf":
+            self.set_header("Content-Disposition", f'attachment; filename="{path.name}"')
         self.set_header("Cache-Control", "no-store")
         self.set_header(
             "Content-Security-Policy",

@@ -8,6 +8,7 @@ import secrets
 import webbrowser
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,13 +28,8 @@ from tornado.ioloop import IOLoop
 from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
-from fusion.app.compare import compare_screen
-from fusion.app.live import live_screen
 from fusion.app.parts import PathError, ReportHandler, State, note, state_of, switched
-from fusion.app.results.screen import results_screen
-from fusion.app.run import run_screen
 from fusion.app.runs import RUNS
-from fusion.app.setup.screen import set_up
 from fusion.common import FusionError
 
 # Authentication: every request is checked here before any page, file or connection answers it.
@@ -170,10 +166,21 @@ class AuthenticatedApplication(BokehTornado):
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
-#: Screens in the order of the work; each shows the state of the page, and changes it.
-SCREENS: dict[str, Callable[[State], Viewable]] = {
-    "Set up": set_up, "Run": run_screen, "Results": results_screen, "Compare": compare_screen, "Live": live_screen,
-}  # fmt: skip
+#: Screens in the order of the work, with the module and the function that builds them: what a screen needs is imported when it is opened.
+SCREENS = {
+    "Set up": ("setup.screen", "set_up"),
+    "Run": ("run", "run_screen"),
+    "Results": ("results.screen", "results_screen"),
+    "Compare": ("compare", "compare_screen"),
+    "Live": ("live", "live_screen"),
+}
+
+
+def _screen(name: str, state: State) -> Viewable:
+    """Build a screen, which shows the state of the page, and changes it."""
+    module, function = SCREENS[name]
+    screen: Viewable = getattr(import_module(f"fusion.app.{module}"), function)(state)
+    return screen
 
 
 class Look(Design):
@@ -186,13 +193,13 @@ def build_page(root: Path) -> Any:
     """Build the page for one tab of a browser."""
     pn.extension("filedropper")
     state = state_of(root)
-    builders = {name: partial(screen, state) for name, screen in SCREENS.items()}
+    builders = {name: partial(_screen, name, state) for name in SCREENS}
     bar, content = switched("Screens", builders, next(iter(SCREENS)))
     bar.param.watch(lambda event: state.param.update(screen=event.new), "value")
     state.param.watch(lambda event: bar.param.update(value=event.new), "screen")
     page = pn.Template((_TEMPLATES / "page.html.j2").read_text(encoding="utf-8"), design=Look)
     page.add_variable("style", (_TEMPLATES / "page.css").read_text(encoding="utf-8"))
-    page.add_variable("names", (_TEMPLATES / "names.js").read_text(encoding="utf-8"))
+    page.add_variable("watched", (_TEMPLATES / "page.js").read_text(encoding="utf-8"))
     page.add_panel("bar", bar)
     page.add_panel("place", note(f"Folder {state.root}"))
     page.add_panel("content", content)

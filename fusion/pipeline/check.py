@@ -18,23 +18,19 @@ from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
 from fusion.campaign.logs import NO_START, read_drivers
-from fusion.common import FusionError
+from fusion.messages import BAD_INPUT
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import check_source
 from fusion.pipeline.inspect import Recording, time_bars
 from fusion.results.progress import counted
 from fusion.results.results import Notice
-from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations, read_environment
-from thermography.common import ThermographyError
 from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 from thermography.registration.projection import read_lens
 
 #: Bars of runs that are drawn.
 _MOST_BARS = 10
-#: What the readers raise for input that cannot be used.
-BAD_INPUT = (FusionError, ThermographyError, InterferometryError, OSError)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
+import numpy as np
 import psutil
 import rich.table
 
@@ -25,20 +26,23 @@ from fusion.common import FusionError
 from fusion.messages import cell
 from fusion.pipeline.stages import kept_results
 from fusion.pipeline.workers import start_module
+from fusion.report.charts.comparison import plot_trend
+from fusion.report.charts.style import Chart, embed
 from fusion.report.conclusions import headline
+from fusion.report.exports.tables import write_table_book
 from fusion.report.numbers import measured, number
 from fusion.report.page import render_page
 from fusion.results.folder import MANIFEST, claim, open_folder
 from fusion.results.progress import Report, silent
 from fusion.results.results import read_results
-from fusion.results.store import write_json, write_text
+from fusion.results.store import write_atomically, write_json, write_text
 from thermography.common import usable_processors
 
 # Campaigns of a fleet: found in folders, each with a name of its own; and whether the results of one are still those
 # of its files.
 
 #: Names in the folder of a fleet that are its own, in lower case: not every file system tells case apart.
-RESERVED = frozenset({"logs", "fleet.json", "fleet.csv", "fleet.html", MANIFEST, ".stages"})
+RESERVED = frozenset({"logs", "fleet.json", "fleet.csv", "fleet.xlsx", "fleet.html", MANIFEST, ".stages"})
 #: Campaign files that are looked for in a folder and in all folders in it.
 CAMPAIGN_FILE = "campaign.toml"
 
@@ -128,6 +132,14 @@ class Row:
         As the campaign file names it.
     A_um, A_u_um and so on : float or None, um
         Values by ISO 230-2 of the most settled window, each with its standard uncertainty.
+    machine, date : str
+        As the campaign file names it, and the day of the first reading.
+    decision : str
+        The least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated.
+    maximum_degC, maximum_u_degC : float or None, degC
+        Highest temperature in any picture of a camera that measured alone, and its standard uncertainty.
+    held_out_um : float or None, um
+        Root mean square error of the final model on what was held out.
     anomalies, warnings : int or None
         Positions that stand out, and warnings.
     seconds, peak_MB : float
@@ -155,6 +167,12 @@ class Row:
     M_u_um: float | None = None
     B_um: float | None = None
     B_u_um: float | None = None
+    machine: str = ""
+    date: str = ""
+    decision: str = ""
+    maximum_degC: float | None = None
+    maximum_u_degC: float | None = None
+    held_out_um: float | None = None
     anomalies: int | None = None
     warnings: int | None = None
     inputs: str = ""
@@ -195,14 +213,24 @@ def with_findings(row: Row, folder: Path) -> Row:
         if test is None or test.unit != "um"
         else {name: getattr(test.settled or test, f"{name}_um") for name in _SYMBOLS}
     )
+    stated = {} if test is None else {one.name: one.text for one in test.conditions}
+    decided = [one.decision for one in test.tolerances] if test else []
+    highest = [one.maximum_degC for one in results.regions or () if one.maximum_degC.value is not None]
+    hottest = max(highest, key=lambda one: one.value or 0.0, default=None)
     return replace(
         row,
         title=results.campaign,
+        machine=stated.get("Machine", ""),
+        date=results.time.first[:10] if results.time else "",
+        decision=next((one for one in _DECISIONS if one in decided), ""),
+        maximum_degC=hottest.value if hottest else None,
+        maximum_u_degC=hottest.u if hottest else None,
+        held_out_um=None if results.loop is None else results.loop.rmse_final_um,
         verdict="" if results.loop is None else results.loop.verdict,
         headline="" if results.loop is None else headline(results),
         drift_um=most,
         drift_u_um=most_u,
-        axis=next((one.text for one in test.conditions if one.name == "Axis"), "") if test else "",
+        axis=stated.get("Axis", ""),
         **{f"{name}_um": one.value for name, one in values.items()},
         **{f"{name}_u_um": one.u for name, one in values.items()},
         anomalies=None if results.anomalies is None else len(results.anomalies),
@@ -238,6 +266,13 @@ def as_csv(rows: Sequence[Row]) -> str:
     return written.getvalue()
 
 
+def write_book(path: Path, rows: Sequence[Row]) -> None:
+    """Write the workbook of a fleet: one line per campaign that can be sorted and filtered, without columns in which nothing is."""
+    whole = [{**asdict(row), "report": row.report} for row in rows]
+    kept = [name for name in (*_COLUMNS, "report") if any(line[name] not in (None, "") for line in whole)]
+    write_table_book(path, "Campaigns", kept, [[line[name] for name in kept] for line in whole], chart="A_um")
+
+
 def _no_formula(text: str) -> str:
     """Return a text with an apostrophe before a sign with which formulas begin."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
@@ -247,9 +282,14 @@ def cells(row: Row) -> list[str]:
     """Return a row as page and terminal show it, in the order of `HEADINGS`; a dash where there is nothing."""
     return [
         row.name,
+        row.machine or "–",
         row.axis or "–",
+        row.date or "–",
+        row.decision or "–",
         row.verdict.replace("_", " ") or ("not modelled" if row.is_whole else row.state),
         *(measured(getattr(row, f"{name}_um"), getattr(row, f"{name}_u_um")) for name in ("drift", *_SYMBOLS)),
+        measured(row.maximum_degC, row.maximum_u_degC),
+        "–" if row.held_out_um is None else number(row.held_out_um, 3),
         *("–" if count is None else str(count) for count in (row.anomalies, row.warnings)),
         row.inputs or "–",
         "–" if row.exit_code is None else str(row.exit_code),
@@ -259,15 +299,27 @@ def cells(row: Row) -> list[str]:
 
 
 _SYMBOLS = ("A", "R", "E", "M", "B")
+#: Decisions by ISO 14253-1, the least favourable first.
+_DECISIONS = ("fail", "not measured", "not decided within the uncertainty", "pass")
 #: Headings of `cells`.
 HEADINGS = (
-    *("campaign", "axis", "verdict", "drift / µm", *(f"{name} / µm" for name in _SYMBOLS)),
+    *(
+        "campaign",
+        "machine",
+        "axis",
+        "date",
+        "decision",
+        "verdict",
+        "drift / µm",
+        *(f"{name} / µm" for name in _SYMBOLS),
+    ),
+    *("maximum / °C", "held-out error / µm"),
     *("anomalies", "warnings", "inputs", "exit code", "time / s", "memory / MB"),
 )
 #: Those of text; the others head numbers.
-TEXT = ("campaign", "axis", "verdict", "inputs")
+TEXT = ("campaign", "machine", "axis", "date", "decision", "verdict", "inputs")
 #: What the page alone shows.
-_COST = ("time / s", "memory / MB")
+_COST = ("machine", "date", "time / s", "memory / MB")
 
 
 def columns(rows: Sequence[Row]) -> dict[str, list[str]]:
@@ -307,9 +359,12 @@ def count_line(rows: Sequence[Row]) -> str:
 def render_fleet(rows: Sequence[Row], *, started: str) -> str:
     """Return the page of a fleet as HTML text."""
     shown = columns(rows)
+    trends = draw_trends(rows)
     return render_page(
         "fleet.html.j2",
-        {},
+        embed({f"trend_{k}": chart for k, chart in enumerate(trends.values())}),
+        ("fleet.js",),
+        trends=[(f"trend_{k}", f"{name}. {_TREND}") for k, name in enumerate(trends)],
         counts=count_line(rows),
         started=f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M} UTC",
         headings=[(heading[0].upper() + heading[1:], heading not in TEXT) for heading in shown],
@@ -322,6 +377,25 @@ def render_fleet(rows: Sequence[Row], *, started: str) -> str:
     )
 
 
+_TREND = "With expanded uncertainties (k = 2); dashed: control limits of a chart of individuals, from eight tests on."
+
+
+def draw_trends(rows: Sequence[Row]) -> dict[str, Chart]:
+    """Draw A, R and B over the dates of every axis that was tested three times or more; tests of a machine state it, or share a folder."""
+    tests: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.date and row.A_um is not None:
+            tests.setdefault((row.machine or row.name.rpartition("/")[0], row.axis), []).append(row)
+    charts = {}
+    for (machine, axis), dated in tests.items():
+        dates = np.array([row.date for row in dated], "datetime64[D]")
+        for name in "ARB":
+            values, u = (np.array([getattr(row, f"{name}_{key}") for row in dated], float) for key in ("um", "u_um"))
+            if (chart := plot_trend(dates, values, u, name)) is not None:
+                charts[", ".join(word for word in (machine, axis and f"axis {axis}", name) if word)] = chart
+    return charts
+
+
 #: Memory that a run is taken to need until one has been seen, bytes.
 _USUAL_BYTES = 1e9
 _POLL_S = 0.1
@@ -329,7 +403,7 @@ _POLL_S = 0.1
 _STOP_S = 0.7
 #: Beside its own threads, libraries start one per processor in every process unless these say otherwise.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-_PAGE, _TABLE, _LOGS = "fleet.html", "fleet.csv", "logs"
+_PAGE, _TABLE, _BOOK, _LOGS = "fleet.html", "fleet.csv", "fleet.xlsx", "logs"
 
 
 @dataclass
@@ -370,7 +444,7 @@ def run_fleet(
 
     others = psutil.Process().children()
     with open_folder(out, resume=resume):
-        claim(out, SUMMARY, _TABLE, _PAGE)
+        claim(out, SUMMARY, _TABLE, _BOOK, _PAGE)
         for name, row in read_rows(out).items() if resume else ():
             # Rows of finished campaigns whose files and products are as an earlier fleet left them.
             if name in campaigns and row.is_whole and is_unchanged(campaigns[name], out / name):
@@ -402,6 +476,7 @@ def run_fleet(
                 rows[name] = replace(rows[name], seconds=round(time.monotonic() - one.begun, 1))
             write_summary()
             write_text(out / _TABLE, as_csv([*rows.values()]))
+            write_atomically(out / _BOOK, lambda path: write_book(path, [*rows.values()]))
             write_text(out / _PAGE, render_fleet([*rows.values()], started=started))
     return list(rows.values())
 

@@ -6,8 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from fusion.analysis.comparison import LEVEL, Change, ComparedCampaign, PairComparison
+from fusion.common import versions
+from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters, plot_trends
+from fusion.report.charts.style import embed
 from fusion.report.conclusions import position_words
 from fusion.report.numbers import join, measured, number, p_cell, print_unit
+from fusion.report.page import render_page
 from fusion.report.wording import (
     Row,
     Table,
@@ -32,6 +36,13 @@ _WORDS = {
     "position": "deviation",
     "reversal at a position": "reversal error",
     "scatter": "scatter",
+}
+#: Inputs of the budget of ISO 230-2 that two tests may have in common.
+_INPUTS = {
+    "expansion_coefficient": "the error of the expansion coefficient (material on the same side of 20 °C in both)",
+    "device": "that of the laser",
+    "alignment": "that of its alignment",
+    "material_temperature": "that of the material sensor",
 }
 #: Verdict on a difference that a thermal state alone can cause.
 _STATE = "differs; the thermal state of a test alone can cause that"
@@ -60,8 +71,14 @@ def conclude_comparison(pair: PairComparison) -> list[str]:
     text = " ".join(sentences)
     for campaign in (pair.before, pair.after):
         text = conditional(text, campaign.results.inputs, "positions")
+    shared = [_INPUTS[name] for name in pair.common]
     return [
         text,
+        *(
+            [f"Common to both tests, and therefore not counted twice in the differences by ISO 230-2: {join(shared)}."]
+            if shared
+            else []
+        ),
         f"Each counts at {100 * LEVEL:.0f} % over all {pair.tests} tests together. Positions are compared beyond offset, slope and bow of "
         "the profile; that presumes that the laser measured along the same line.",
     ]
@@ -139,10 +156,40 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
         window = quoted_window(results.iso230)
         figures["ISO 230-2 window"] = window.window
         figures |= {f"{symbol} by ISO 230-2": value for symbol, value in iso230_values(window).items()}
+        for one in results.iso230.tolerances:
+            limit = f"at most {number(one.limit_um)} {print_unit(results.iso230.unit)}"
+            figures[f"{one.quantity} {limit}"] = one.decision
     if results.anomalies is not None:
         named = [f"{position_words(one.target, one.position_mm)}: {anomaly_cause(one)}" for one in results.anomalies]
         figures["positions that stand out"] = join(named) or "none"
     return figures
+
+
+def render_comparison(pairs: Sequence[PairComparison]) -> str:
+    """Return a comparison as a document: what changed and the figures first, then charts, trend and everything that was compared."""
+    names, campaigns = campaign_names(pairs), [pairs[0].before, *(pair.after for pair in pairs)]
+    trends = plot_trends(campaigns)
+    remaining = {f"remaining_{k}": plot_remaining(pair) for k, pair in enumerate(pairs, start=1)}
+    charts = {
+        "profiles": plot_profiles(campaigns, names),
+        "scatters": plot_scatters(campaigns, names),
+        **remaining,
+        **trends,
+    }
+    compared = [
+        (name, conclude_comparison(pair), pair.not_compared, changes_table(pair))
+        for name, pair in zip(names[1:], pairs, strict=True)
+    ]
+    return render_page(
+        "comparison.html.j2",
+        embed({name: chart for name, chart in charts.items() if chart is not None}),
+        names=names,
+        compared=compared,
+        figures_table=side_by_side(pairs),
+        trends=list(trends),
+        versions=versions(),
+        summary={"assumptions": {}},
+    )
 
 
 def comparison_json(pairs: Sequence[PairComparison]) -> dict[str, Any]:

@@ -34,10 +34,12 @@ from fusion.results.store import is_file_list, read_fusion, read_product, write_
 # network.
 
 
-def render_page(template: str, charts: Mapping[str, EmbeddedChart], **context: Any) -> str:
-    """Return a page as HTML text."""
-    own = Markup((TEMPLATES / "page.js").read_text(encoding="utf-8"))
-    scripts = (*chart_scripts(), own) if charts else (own,)
+def render_page(
+    template: str, charts: Mapping[str, EmbeddedChart], also: tuple[str, ...] = (), /, **context: Any
+) -> str:
+    """Return a page as HTML text; `also` names scripts of its own."""
+    own = tuple(Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in ("page.js", *also))
+    scripts = (*chart_scripts(), *own) if charts else own
     shared = {"figures": dict(charts), "scripts": scripts, "policy": content_security_policy(scripts)}
     return environment(html=True).get_template(template).render(**shared, css_string=_css_string, **context)
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from typer.main import get_command
 
 import thermofuse
@@ -36,24 +39,19 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
-def test_the_campaign_files_of_readme_and_reference_load(tmp_path: Path) -> None:
-    (short,) = blocks(README, "toml")
+def test_the_campaign_files_of_the_reference_load(tmp_path: Path) -> None:
     campaign, record = blocks(CAMPAIGN_FILE, "toml")
     (tmp_path / "thermal").mkdir()
     for name in ("thermal/a.jpg", "fiducials.csv", "laser.csv", "environment.csv", "drivers.csv", "spindle.xlsx"):
         (tmp_path / name).touch()
     (tmp_path / "campaign.toml").write_text(campaign, encoding="utf-8")
     assert load_campaign(tmp_path / "campaign.toml").model.declared == ("axis_expansion", "table_offset")
-    (tmp_path / "short.toml").write_text(short, encoding="utf-8")
-    assert load_campaign(tmp_path / "short.toml").interferometry is not None
     (tmp_path / "record.toml").write_text('[campaign]\ntitle = "Spindle"\n' + record, encoding="utf-8")
     assert load_campaign(tmp_path / "record.toml").record is not None
 
 
 def test_the_demo_of_the_start_page_has_the_rows_that_a_run_prints() -> None:
     (shown,) = re.findall(r"^Demo: (.*?)^```", START, flags=re.DOTALL | re.MULTILINE)
-    (begun,) = re.findall(r"^Demo: .*?\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
-    assert begun and all(line in shown for line in begun.splitlines())
     names = [name.strip() for name in re.findall(r"^│(.*?)│", shown, flags=re.MULTILINE) if name.strip()]
     source = SourcePart.model_construct(kind="cell", name="", part="common", x_mm=355.0, y_mm=95.0, p_value=0.002)
     correlation = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
@@ -66,12 +64,50 @@ def test_the_demo_of_the_start_page_has_the_rows_that_a_run_prints() -> None:
 
 def test_every_command_of_the_readme_exists() -> None:
     known = set(get_command(cli.app).commands)  # type: ignore[attr-defined]
-    shown = {line.split()[1] for line in "\n".join(blocks(README, "sh")).splitlines() if line.startswith("thermofuse ")}
-    assert shown == known
+    typed = {line.split()[1] for line in readme_lines() if line.startswith(COMMAND)}
+    named = {words.split()[0] for words in re.findall(r"`([a-z0-9]+[^`\n/.]*)", README)}
+    assert typed <= known and known <= typed | named
+
+
+#: The program as the README calls it.
+COMMAND = ".venv/bin/thermofuse"
+
+
+def readme_lines() -> list[str]:
+    """Return what the README tells a reader to type, without remarks."""
+    return [line.partition("   #")[0].strip() for line in "\n".join(blocks(README, "sh")).splitlines()]
+
+
+def run_lines(lines: list[str], folder: Path, python: str) -> None:
+    """Type lines in a folder, one after another; of the application only the address is waited for."""
+    for line in lines:
+        command = line if " app " not in line else f"timeout -s TERM 60 {line} | grep -m 1 http://127.0.0.1"
+        done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True)
+        assert done.returncode == 0, (line, done.stdout[-2000:], done.stderr[-2000:])
+    (chain,) = blocks(README, "python")
+    done = subprocess.run([python, "-c", chain], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.chain
+def test_every_line_of_the_readme_that_installs_nothing_runs(tmp_path: Path) -> None:
+    (tmp_path / ".venv/bin").mkdir(parents=True)
+    (tmp_path / COMMAND).write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fusion.cli "$@"\n', encoding="utf-8")
+    (tmp_path / COMMAND).chmod(0o755)
+    run_lines(
+        [line for line in readme_lines() if "pip install" not in line and "make " not in line], tmp_path, sys.executable
+    )
+
+
+@pytest.mark.slow
+def test_every_line_of_the_readme_runs_in_a_bare_environment(tmp_path: Path) -> None:
+    """On a copy of what is under version control; `make test` would run this test again."""
+    subprocess.run(["git", "checkout-index", "--all", f"--prefix={tmp_path}/"], cwd=ROOT, check=True)
+    run_lines([line for line in readme_lines() if line != "make test"], tmp_path, f"{tmp_path}/.venv/bin/python")
 
 
 def test_the_readme_is_short_and_its_pictures_are_small() -> None:
-    assert len(README.splitlines()) < 150
+    assert len(README.split()) <= 700
     for name in re.findall(r"!\[.*?\]\((.*?)\)", README):
         assert (ROOT / name).stat().st_size < 150_000, name
 

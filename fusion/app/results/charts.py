@@ -9,10 +9,11 @@ import numpy as np
 import panel as pn
 import xarray as xr
 from bokeh.events import Tap
-from bokeh.models import ColorBar, ColumnDataSource, DataRange1d, GlyphRenderer, HoverTool, LinearColorMapper
+from bokeh.models import ColorBar, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper
 from bokeh.plotting import figure
 
 from fusion.app import parts as ui
+from fusion.app.drawings import keep_scale, shown_drawing
 from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
 from fusion.campaign.inputs import lacks_course
 from fusion.report.campaign import (
@@ -25,6 +26,7 @@ from fusion.report.campaign import (
 )
 from fusion.report.charts import readings
 from fusion.report.charts.plan import (
+    Extent,
     Layer,
     add_cells,
     draw_map,
@@ -58,9 +60,7 @@ from interferometry.plots import ACCENT, INK, hours_since_start
 
 def shown(chart: Chart, caption: str) -> pn.viewable.Viewable:
     """Return a chart of the report with its caption and what is seen, in words."""
-    return ui.column(
-        ui.paragraph(caption), pn.pane.Bokeh(chart.figure, sizing_mode="stretch_width"), ui.note(chart.seen)
-    )
+    return ui.column(ui.paragraph(caption), shown_drawing(chart.figure), ui.note(chart.seen))
 
 
 def shown_if(chart: Chart | None, caption: str) -> ui.Parts:
@@ -171,12 +171,10 @@ def table_of(shown_table: Table, caption: str) -> pn.viewable.Viewable:
 
 
 def loop_steps(products: Products, linker: Linker) -> ui.Parts:
-    """Return the closed loop step by step, in the words of the report, or say why there is none."""
+    """Return the closed loop of a run that has one step by step, in the words of the report."""
     results = products.results
     loop = results.loop
-    if loop is None:
-        lacks = [warning.message for warning in results.warnings if warning.code.startswith("too_")]
-        return [ui.note(" ".join(["There is no model of the drift in this run.", *lacks]))]
+    assert loop is not None
     answers = [one for one in conclude(results) if one.question in ("How sure", "What remains")]
     parts = [
         *(ui.paragraph(f"{one.question}: {one.text}") for one in answers),
@@ -259,6 +257,8 @@ def effects_left(stored: xr.Dataset, loop: AxisLoop, entered: int) -> xr.DataArr
 
 #: Milliseconds from cycle to cycle while it plays.
 _PLAY_MS = 400
+#: Free margin around a plan, as a share of its longer side.
+_MARGIN = 0.02
 #: Most places whose temperature is shown over time.
 _MOST_PLACES = 8
 
@@ -302,7 +302,7 @@ class ThermalView:
             "A click on the map adds a place to the chart below. White line: the measured axis; ring: the chosen position; one colour "
             "scale for all cycles."
         )
-        chart = pn.pane.Bokeh(self._map, sizing_mode="stretch_width")
+        chart = shown_drawing(self._map)
         controls = pn.FlexBox(self._x, self._y, self._size, self._add)
         quantity = pn.FlexBox(self._quantity, self._cycle)
         return ui.column(
@@ -334,7 +334,7 @@ class ThermalView:
         read = self._products.deviations
         position = None if read is None else read["position"]
         draw_places(drawn, fields, position, results.hotspots or (), results.sensors or ())
-        to_scale(drawn, drawn.select_one("cells"))
+        to_scale(drawn, extent_of(fields))
         draw_ring(drawn, self._chosen)
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
         drawn.scatter("x", "y", source=self._marks, **square)
@@ -422,13 +422,14 @@ class ThermalView:
         self._unlink()
         self._unlink = self._linker.link(drawn, x=HOURS)
         seen = ui.note(f"{quantity[:1].upper()}{quantity[1:]} over time. {'; '.join(told)}.")
-        self._history[:] = [pn.pane.Bokeh(drawn, sizing_mode="stretch_width"), seen]
+        self._history[:] = [shown_drawing(drawn), seen]
 
 
-def to_scale(drawn: figure, cells: GlyphRenderer) -> None:
-    """Show a millimetre of the plan as long in both directions, whatever the width of the screen."""
-    drawn.x_range = DataRange1d(renderers=[cells], range_padding=0.03)
-    drawn.y_range = DataRange1d(renderers=[cells], range_padding=0.03)
+def to_scale(drawn: figure, extent: Extent) -> None:
+    """Show the plan to scale with a margin, y downwards as the camera sees it."""
+    left, right, bottom, top = extent
+    margin = _MARGIN * max(right - left, top - bottom)
+    keep_scale(drawn, (left - margin, right + margin), (top + margin, bottom - margin))
 
 
 def draw_cells(
@@ -438,7 +439,7 @@ def draw_cells(
     extent = extent_of(field.to_dataset(name=name))
     drawn = new_plan(extent, height=height)
     cells = add_cells(drawn, field.values, extent, mapper, [(name, f"@image{{0.00}} {unit}")])
-    to_scale(drawn, cells)
+    to_scale(drawn, extent)
     add_colour_bar(drawn, mapper, f"{name} / {unit}")
     return drawn, cells
 
@@ -464,11 +465,8 @@ _AROUND_MM = 60.0
 
 
 def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
-    """Return one card for each position that stands out, or say that there is none."""
-    anomalies = products.results.anomalies
-    if anomalies is None:
-        lacks = "that needs readings with times, of several positions and cycles."
-        return [ui.note(f"Whether a position stands out was not examined: {lacks}")]
+    """Return one card for each position that stands out of those that were examined, or say that there is none."""
+    anomalies = products.results.anomalies or ()
     if not anomalies:
         return [ui.paragraph("No position stands out from the others, at a family-wise error of 5 %.")]
     return [_card(products, selection, anomaly) for anomaly in anomalies]
@@ -489,10 +487,7 @@ def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.
         ui.paragraph(f"What to inspect: {evidence['check']}"),
         show,
     ]
-    around = _field_around(products, selection, anomaly.target)
-    told = pn.Column(*parts, min_width=300, styles={"flex": "3 1 340px"})
-    seen = pn.Column(*around, min_width=280, styles={"flex": "2 1 300px"})
-    return pn.FlexBox(told, seen, css_classes=["card-of-position"])
+    return ui.column(*parts, *_field_around(products, selection, anomaly.target))
 
 
 def _field_around(products: Products, selection: Selection, target: int) -> ui.Parts:
@@ -509,6 +504,7 @@ def _field_around(products: Products, selection: Selection, target: int) -> ui.P
     scale, _ = products.scale(layer)
     mapper = LinearColorMapper(palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
     drawn, cells = draw_cells(about.sel(cycle=selection.cycle), mapper, "rise", "K", height=300)
+    drawn.max_width = 420
     draw_ring(drawn, ColumnDataSource({"x": at[:1], "y": at[1:]}))
     told = ui.markup("")
 
@@ -522,4 +518,4 @@ def _field_around(products: Products, selection: Selection, target: int) -> ui.P
 
     selection.watch(show, "cycle")
     show()
-    return [pn.pane.Bokeh(drawn, sizing_mode="stretch_width"), told]
+    return [shown_drawing(drawn), told]

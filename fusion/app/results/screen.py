@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,9 +13,12 @@ from fusion.app import parts as ui
 from fusion.app.results.again import RunAgain
 from fusion.app.results.charts import ThermalView, anomaly_cards, laser_charts, loop_steps, reading_hours
 from fusion.app.results.data import Linker, Products, Selection
-from fusion.common import FusionError
+from fusion.common import FusionError, versions
+from fusion.messages import BAD_INPUT
+from fusion.pipeline.iso230 import read_test
 from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.conclusions import headline, position_words
+from fusion.report.page import print_pdf, render_iso230, report_of
 
 
 def results_screen(state: ui.State) -> pn.viewable.Viewable:
@@ -59,13 +63,13 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
     if hours is None and products.fields is not None:
         hours = products.field_hours
     linker = Linker(selection, targets, cycles, hours)
-    read, loop = products.deviations is not None, products.results.loop is not None
+    read = products.deviations is not None
     builders: dict[str, tuple[bool, Callable[[], ui.Parts]]] = {
         "Pictures": (products.thermograms is not None, lambda: _pictures(products)),
         "Map": (products.fields is not None, lambda: [ThermalView(products, selection, linker).view]),
         "Laser": (read, lambda: laser_charts(products, selection, linker)),
-        "Positions": (read, lambda: anomaly_cards(products, selection)),
-        "Loop": (read or loop, lambda: loop_steps(products, linker)),
+        "Positions": (products.results.anomalies is not None, lambda: anomaly_cards(products, selection)),
+        "Loop": (products.results.loop is not None, lambda: loop_steps(products, linker)),
         "Run again": (True, lambda: [RunAgain(state, products).view]),
     }
     shown = {name: build for name, (there, build) in builders.items() if there}
@@ -74,7 +78,39 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
     lead = [ui.paragraph(products.results.campaign), ui.paragraph(headline(products.results))]
     if (products.folder / "report.html").is_file():
         lead.append(ui.link("Open the report", ui.report_link(state.root, products.folder)))
+        lead.append(_printing(state, products))
     return [*lead, *_chosen(selection, targets), chooser, part]
+
+
+def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
+    """Buttons that print the test sheet, which is signed, and the report; then a link to the file."""
+    told = ui.column()
+
+    def button(label: str, name: str, page: Callable[[Path], str]) -> pn.widgets.Button:
+        made = pn.widgets.Button(label=label)
+
+        async def make(event: object) -> None:
+            with ui.disabled_during(made):
+                ui.schedule_parts(told, [ui.note("Printing, which takes half a minute ...")])
+                try:
+                    await asyncio.to_thread(lambda: print_pdf(page(products.folder), products.folder / name))
+                    link = ui.link(f"Save {name}", ui.report_link(state.root, products.folder, name))
+                    ui.schedule_parts(told, [link])
+                except BAD_INPUT as error:
+                    ui.schedule_parts(told, ui.faults(error))
+
+        made.on_click(make)
+        return made
+
+    report = button("Report as PDF", "report.pdf", report_of)
+    sheet = [button("Test sheet to sign (PDF)", "sheet.pdf", _sheet)] if products.results.iso230 is not None else []
+    return ui.column(pn.FlexBox(*sheet, report), told)
+
+
+def _sheet(results: Path) -> str:
+    """Return the test sheet of a run by ISO 230-2 as a page."""
+    test = read_test(results, None)
+    return render_iso230(test.title, test.part, test.dataset, remarks=test.remarks, versions=versions())
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:

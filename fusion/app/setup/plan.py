@@ -15,13 +15,15 @@ import numpy as np
 import panel as pn
 from bokeh.events import Pan, PanEnd, PanStart, Tap
 from bokeh.models import Arrow, ColumnDataSource, LinearColorMapper, NormalHead
+from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
+from fusion.app.drawings import scaled_drawing, shown_drawing
 from fusion.app.parts import column, heading, markup, note, paragraph_markup, table
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.common import FusionError
-from fusion.report.charts.style import new_figure
+from fusion.report.charts.style import add_colour_bar, add_hover
 from fusion.results.store import write_text
 from interferometry.plots import ACCENT, COLOURS, INK
 from thermography.common import Array, ThermographyError
@@ -31,19 +33,23 @@ from thermography.registration.discs import detect_discs
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.register import Registration, register, register_points
 
-# Drawings of the screen *Set up*, in the style of the report: white on every page.
+# Drawings of the screen *Set up*, in the style of the report.
 
 TEAL = COLOURS["positive"]
 _LABEL = {"text_font_size": "12px", "background_fill_color": "#ffffff"}
+#: The darkest fifth is left out: lines are drawn over the picture.
+_GREYS = Greys256[56:]
 
 
-def drawing(
-    x_range: tuple[float, float], y_range: tuple[float, float], *, x: str, y: str, size_px: tuple[int, int]
-) -> figure:
-    """Return an empty drawing of at most `size_px`, which shrinks with the page."""
-    drawn = new_figure(x=x, y=y, x_range=x_range, y_range=y_range, height=size_px[1])
-    drawn.update(width=size_px[0], max_width=size_px[0], sizing_mode="scale_width")
-    return drawn
+def add_thermogram(drawn: figure, seen: Array, corner: tuple[float, float], size: tuple[float, float]) -> None:
+    """Draw temperatures (row, column; degC) in light greys, on which lines are seen, with their scale and the value under the pointer."""
+    low, high = (float(limit) for limit in np.nanpercentile(seen, (0.5, 99.5)))
+    high = max(high, low + 0.1)
+    greys = LinearColorMapper(_GREYS, low=low, high=high, nan_color="#ffffff")
+    (x, y), (width, height) = corner, size
+    cells = drawn.image([seen.astype(np.float32)], x=x, y=y, dw=width, dh=height, color_mapper=greys)
+    add_hover(drawn, [("x, y", "$x{0}, $y{0}"), ("temperature", "@image{0.00} °C")], [cells])
+    add_colour_bar(drawn, greys, "temperature / °C")
 
 
 # Fiducials in a thermogram: found by the registration, or placed by hand with the residual of every place.
@@ -260,12 +266,10 @@ class FrameView:
         """Show a frame with fiducials."""
         self._frame, self._grid = frame, grid
         rows, columns = frame.shape
-        size = (820, round(770 * rows / columns) + 50)
-        drawn = drawing((-0.5, columns - 0.5), (rows - 0.5, -0.5), x="column (px)", y="row (px)", size_px=size)
+        ends = (-0.5, columns - 0.5), (rows - 0.5, -0.5)
+        drawn = scaled_drawing(*ends, x_name="column / px", y_name="row / px", width_px=820)
         smooth = cv2.GaussianBlur(frame, (0, 0), _SMOOTHED_PX)
-        low, high = np.nanpercentile(smooth, (0.5, 99.5))
-        shades = np.clip((smooth - low) * (255 / max(high - low, 1e-6)), 0, 255).astype(np.uint8)
-        drawn.image([shades], x=-0.5, y=-0.5, dw=columns, dh=rows, palette="Greys256")
+        add_thermogram(drawn, smooth, (-0.5, -0.5), (columns, rows))
         ring = {"marker": "circle_cross", "size": 18, "line_color": "colour", "fill_alpha": 0.0, "line_width": 2}
         drawn.scatter("x", "y", source=self._points, **ring)
         label = {"text_color": "colour", **_LABEL, "background_fill_alpha": 0.75}
@@ -273,7 +277,7 @@ class FrameView:
         on_event = {PanStart: self._on_start, Pan: self._on_drag, PanEnd: self._on_end, Tap: self._on_tap}
         for kind, answer in on_event.items():
             drawn.on_event(kind, answer)
-        self._picture[:] = [pn.pane.Bokeh(drawn, sizing_mode="scale_width")]
+        self._picture[:] = [shown_drawing(drawn)]
         self._take(placed)
 
     def _take(self, placed: Placed, *, choose: str | None = None) -> None:
@@ -445,7 +449,6 @@ class PlanView:
     def show(self, plan: Plan, placed: Placed, frame: NDArray[np.float64] | None) -> None:
         """Show a plan."""
         self._plan = plan
-        size = (1100, min(round(1040 * plan.height_mm / plan.width_mm) + 60, 1100))
         in_px = plan.unit == "px"
         self._axis.visible = not in_px
         if in_px:
@@ -453,16 +456,13 @@ class PlanView:
         # The centre of the first pixel is (0, 0), the corner of a plan in mm too.
         left = -0.5 if in_px else 0.0
         ranges = (left, plan.width_mm + left), (plan.height_mm + left, left)
-        drawn = drawing(*ranges, x=f"x ({plan.unit})", y=f"y ({plan.unit})", size_px=size)
+        # A tall plan stays as high as a screen.
+        width_px = round(min(1100, 900 * plan.width_mm / plan.height_mm + 60))
+        drawn = scaled_drawing(*ranges, x_name=f"x / {plan.unit}", y_name=f"y / {plan.unit}", width_px=width_px)
         if frame is not None and (in_px or placed.registration is not None):
             seen = frame if placed.registration is None else on_plan(frame, placed.registration, plan)
             if np.isfinite(seen).any():
-                low, high = np.nanpercentile(seen, (1, 99))
-                # Light greys, on which the lines are seen.
-                dark = low - 0.275 * max(high - low, 1e-6)
-                greys = LinearColorMapper("Greys256", low=dark, high=max(high, low + 1e-6), nan_color="#ffffff")
-                shown = seen.astype(np.float32)
-                drawn.image([shown], x=left, y=left, dw=plan.width_mm, dh=plan.height_mm, color_mapper=greys)
+                add_thermogram(drawn, seen, (left, left), (plan.width_mm, plan.height_mm))
         x, y = [one.x_mm for one in placed.fiducials], [one.y_mm for one in placed.fiducials]
         drawn.scatter(x, y, marker="circle", size=9, line_color=TEAL, fill_alpha=0, line_width=2)
         for name, corners in plan.regions:
@@ -472,7 +472,7 @@ class PlanView:
         drawn.on_event(Tap, self._on_tap)
         drawn.on_event(PanStart, self._on_drag)
         drawn.on_event(PanEnd, self._on_drop)
-        self._picture[:] = [pn.pane.Bokeh(drawn, sizing_mode="scale_width")]
+        self._picture[:] = [shown_drawing(drawn)]
 
     def _on_tap(self, event: Any) -> None:
         if self._mode.value == _ORIGIN:

@@ -1,108 +1,19 @@
-"""The screen *Set up*."""
+"""The screen *Set up*: a folder, what was recognised in it, and below that the editor of its campaign file."""
 
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import panel as pn
-from numpy.typing import NDArray
 
 from fusion.app import parts as ui
-from fusion.app.setup import plan as places
-from fusion.app.setup.campaign import (
-    LARGEST_MB,
-    CampaignText,
-    FieldError,
-    Form,
-    direction_text,
-    found_in_folder,
-    is_picture,
-    missing,
-    open_campaign,
-    read_direction,
-    store_upload,
-    write_fields,
-)
-from fusion.app.setup.columns import ColumnsView
-from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView, corners_of
-from fusion.app.setup.times import TimesView, recordings_of
-from fusion.campaign.values import QuantityError, read_quantity
-from fusion.pipeline.check import BAD_INPUT, CampaignCheck, check_campaign
-from fusion.pipeline.columns import TableProposal, propose_table
-from fusion.pipeline.draft import separate_tests
-from fusion.pipeline.inspect import FolderContent, Kind, Recording, scan_folder
-from interferometry.common import InterferometryError
-from interferometry.io.readings import read_deviations
-from thermography.common import ThermographyError
-from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
+from fusion.app.setup.folder import LARGEST_MB, found_in_folder, store_upload
+from fusion.messages import BAD_INPUT
 
-
-@dataclass(frozen=True)
-class Opened:
-    """What was read from a folder: its campaign file or the draft of one, the first thermogram (row, column; degC) with the fiducials
-    found in it, what was recorded when, the axis positions of the targets, the table of a record, and what could not be shown.
-    """
-
-    folder: Path
-    campaign: CampaignText
-    frame: NDArray[np.float64] | None
-    placed: Placed
-    recordings: list[Recording]
-    positions_mm: tuple[float, ...]
-    table: TableProposal | None
-    remarks: list[str]
-
-
-def open_folder(root: Path, folder: Path) -> Opened:
-    """Read what the screen shows of a folder."""
-    content, campaign = scan_folder(folder), open_campaign(folder)
-    remarks: list[str] = []
-    if campaign.saved is None and (tests := separate_tests(content)):
-        remarks.append(
-            f"{len(tests)} tests of an axis are in this folder, each a campaign of its own: thermofuse init {folder} writes one for each, "
-            f"in a folder of its own that can be looked into here, and thermofuse fleet runs them all. Shown is {tests[0].path.name} alone."
-        )
-    frame, placed = None, Placed()
-    if content.frames:
-        try:
-            frame = places.first_thermogram(content.frame_files, of_temperatures=content.of_temperatures)
-            listed = listed_fiducials(root, campaign)
-            placed = places.find(frame, listed, grid_of(campaign)) if listed else places.place([], frame.shape)
-        except BAD_INPUT as error:
-            remarks.append(str(error))
-    table = None
-    if campaign.value("record", "columns") is not None and content.of(Kind.RECORD):
-        table = propose_table(content.of(Kind.RECORD)[0].path)
-    return Opened(folder, campaign, frame, placed, recordings_of(content), positions_of(content), table, remarks)
-
-
-def listed_fiducials(root: Path, campaign: CampaignText) -> list[Fiducial]:
-    """Return the fiducials that a campaign file names; none where it names no list."""
-    name = campaign.value("plan", "fiducials")
-    return read_fiducials(ui.allowed_path(root, campaign.path.parent / name)) if isinstance(name, str) else []
-
-
-def grid_of(campaign: CampaignText) -> PlanGrid | None:
-    """Return the plan that a campaign file states, None where its sides are missing."""
-    try:
-        width, height = (read_quantity(side, "mm") for side in campaign.value("plan", "size") or [None, None])
-        cell = campaign.value("plan", "cell_size")
-        return PlanGrid(width, height, read_quantity(cell, "mm") if cell else width)
-    except (QuantityError, ThermographyError, ValueError, TypeError):
-        return None
-
-
-def positions_of(content: FolderContent) -> tuple[float, ...]:
-    """Return the axis positions of the targets in a folder, mm; none where its deviations cannot be read."""
-    for one in content.of(Kind.DEVIATIONS)[:1]:
-        with suppress(InterferometryError):
-            return tuple(np.unique(read_deviations(one.path, rotary=True)["position"].values).tolist())
-    return ()
+if TYPE_CHECKING:
+    from fusion.app.setup.editor import CampaignEditor, Opened
 
 
 class SetUpScreen:
@@ -110,36 +21,19 @@ class SetUpScreen:
 
     def __init__(self, state: ui.State) -> None:
         self._state = state
-        self._opened: Opened | None = None
         self._folder = ui.text_field("Folder of the measurement", state.folder or state.root)
         self._look = pn.widgets.Button(label="Look into it", align="end")
         self._drop = pn.widgets.FileDropper(
             multiple=True, previews=[], max_file_size=f"{LARGEST_MB}MB", sizing_mode="stretch_width"
         )
         self._taken: set[str] = set()
-        self._form = Form(self._on_field)
-        self._frame = FrameView(self._draw_plan)
-        self._regions = RegionsView(self._draw_plan)
-        self._columns = ColumnsView()
-        self._plan = PlanView(
-            lambda x, y: self._form.write({"origin_x": f"{round(x):g} mm", "origin_y": f"{round(y):g} mm"}),
-            lambda dx, dy: self._form.write({"direction": direction_text(dx, dy)}),
-            self._regions.take_corners,
-        )
-        self._times = TimesView(lambda offset: self._form.write({"clock_offset": f"{offset:g} s"}))
-        self._save = pn.widgets.Button(label="Save campaign.toml and check it", color="primary")
-        self._go = pn.widgets.Button(label="Go to Run", visible=False)
-        self._dropped, self._found, self._checked = ui.column(), ui.column(), ui.column()
-        pictures = (self._times.view, self._frame.view, self._plan.view, self._regions.view)
-        buttons = pn.FlexBox(self._save, self._go)
-        self._work = ui.column(*pictures, self._columns.view, self._form.view, buttons, self._checked, visible=False)
+        self._dropped, self._found, self._below = ui.column(), ui.column(), ui.column()
+        self.editor: CampaignEditor | None = None
         self._look.on_click(self.look)
-        self._save.on_click(self._on_save)
-        self._go.on_click(lambda event: setattr(state, "screen", "Run"))
         self._drop.param.watch(self._on_drop, "value")
         row = pn.Row(self._folder, self._look, sizing_mode="stretch_width")
         how = ui.note(f"Files can be dropped here; they go into this folder, up to {LARGEST_MB} MB each.")
-        self.view = ui.column(ui.heading("Set up"), row, how, self._drop, self._dropped, self._found, self._work)
+        self.view = ui.column(ui.heading("Set up"), row, how, self._drop, self._dropped, self._found, self._below)
 
     async def look(self, event: object = None) -> None:
         """Look into the folder that is typed, and show what is in it."""
@@ -150,73 +44,25 @@ class SetUpScreen:
             return
         with ui.disabled_during(self._look):
             ui.schedule_parts(self._dropped, [])
-            ui.schedule_update(lambda: self._work.param.update(visible=False))
+            ui.schedule_parts(self._below, [])
             ui.schedule_parts(self._found, [ui.note("Looking into the files ...")])
             found: list[Any] = []
             try:
                 found = await asyncio.to_thread(found_in_folder, folder)
+                ui.schedule_parts(self._found, [*found, ui.note("Reading the first frame and the recordings ...")])
+                opened = await asyncio.to_thread(_open, self._state.root, folder)
                 ui.schedule_parts(self._found, found)
-                opened = await asyncio.to_thread(open_folder, self._state.root, folder)
                 ui.schedule_update(lambda: self._show(opened))
             except BAD_INPUT as error:
                 ui.schedule_parts(self._found, [*found, ui.paragraph(str(error), kind="fault")])
 
     def _show(self, opened: Opened) -> None:
-        """Show what was read."""
-        self._opened = opened
-        self._found.extend(ui.paragraph(remark, kind="warning") for remark in opened.remarks)
-        self._form.show(opened.campaign)
-        self._columns.show(opened.table, opened.campaign.value("record", "columns") or {})
-        regions = opened.campaign.value("thermography", "region")
-        picture = is_picture(opened.campaign)
-        self._regions.show(list(regions) if isinstance(regions, list) else [], "px" if picture else "mm")
-        for view in (self._frame, self._plan, self._regions):
-            view.view.visible = opened.frame is not None and not (picture and view is self._frame)
-        self._times.show(opened.recordings, self._offset_s())
-        if opened.frame is not None:
-            self._frame.show(opened.frame, opened.placed, grid_of(opened.campaign))
-        self._checked[:] = []
-        self._go.visible = False
-        self._work.visible = True
-        if self._state.folder != opened.folder:
-            # Looking again into the same folder leaves what was chosen on another screen meanwhile.
-            self._state.folder = opened.folder
-            self._state.campaign = None if opened.campaign.saved is None else opened.campaign.path
+        """Show the editor with what was read."""
+        from fusion.app.setup.editor import CampaignEditor
 
-    def _quantity(self, name: str, unit: str) -> float | None:
-        """Return the quantity in a field; None where there is none."""
-        try:
-            return read_quantity(self._form.texts.get(name, ""), unit)
-        except QuantityError:
-            return None
-
-    def _offset_s(self) -> float:
-        return self._quantity("clock_offset", "s") or 0.0
-
-    def _on_field(self, name: str) -> None:
-        if name == "clock_offset":
-            self._times.move(self._offset_s())
-        elif name in ("width", "height", "origin_x", "origin_y", "direction"):
-            self._draw_plan()
-
-    def _draw_plan(self) -> None:
-        """Draw the plan from the fields, the fiducials and the regions; nothing where its sides are missing."""
-        width, height, x, y = (self._quantity(name, "mm") for name in ("width", "height", "origin_x", "origin_y"))
-        opened = self._opened
-        if opened is not None and opened.frame is not None and is_picture(opened.campaign):
-            height, width = (float(size) for size in opened.frame.shape)
-        if opened is None or not width or not height or width <= 0 or height <= 0:
-            return
-        try:
-            direction = read_direction(self._form.texts.get("direction", ""))
-        except FieldError:
-            direction = None
-        outlines = ((str(one.get("name", "")), corners_of(one)) for one in self._regions.regions)
-        regions = tuple((name, corners) for name, corners in outlines if corners is not None)
-        origin = None if x is None or y is None else (x, y)
-        unit = "px" if is_picture(opened.campaign) else "mm"
-        plan = Plan(width, height, origin, direction, opened.positions_mm, regions, unit)
-        self._plan.show(plan, self._frame.placed, opened.frame)
+        self.editor = self.editor or CampaignEditor(self._state)
+        self.editor.show(opened)
+        self._below[:] = [self.editor.view]
 
     def _on_drop(self, event: Any) -> None:
         """Write what was dropped into the folder; its content is not kept in memory, its line in the list of the page stays."""
@@ -232,58 +78,12 @@ class SetUpScreen:
             dropped[name] = b""
             self._dropped.append(told)
 
-    async def _on_save(self, event: object) -> None:
-        """Write the campaign file and the list of fiducials, and check both."""
-        if self._opened is None:
-            return
-        with ui.disabled_during(self._save):
-            ui.schedule_parts(self._checked, [])
-            try:
-                campaign = self._write(self._opened)
-                lacking = missing(campaign)
-                if lacking:
-                    told = ui.paragraph("Saved. Before it can run, fill in:", kind="warning")
-                    ui.schedule_parts(self._checked, [told, ui.bullets(lacking)])
-                    return
-                ui.schedule_parts(self._checked, [ui.note("Checking ...")])
-                checked = await asyncio.to_thread(check_campaign, campaign.path)
-                ui.schedule_update(lambda: self._ready(campaign.path, checked))
-            except BAD_INPUT as error:
-                ui.schedule_parts(self._checked, ui.faults(error))
 
-    def _ready(self, campaign: Path, checked: CampaignCheck) -> None:
-        """Show the check of the saved file, and lead on to the run."""
-        self._checked[:] = told_of_check(checked)
-        self._go.visible = not checked.faults
-        self._state.campaign = campaign
+def _open(root: Path, folder: Path) -> Opened:
+    """Read a folder; what that imports is ready only after the page has shown what was recognised."""
+    from fusion.app.setup.editor import open_folder
 
-    def _write(self, opened: Opened) -> CampaignText:
-        """Write what the screen shows; the list of fiducials where it was changed here."""
-        campaign = write_fields(opened.campaign, self._form.texts)
-        regions = self._regions.regions
-        stated = campaign.value("thermography", "region")
-        if regions != (stated or []) and (regions or isinstance(stated, list)):
-            campaign = campaign.with_values({("thermography", "region"): regions or None})
-        if opened.table is not None and self._columns.stated != campaign.value("record", "columns"):
-            campaign = campaign.with_values({("record", "columns"): self._columns.stated})
-        placed = self._frame.placed
-        if opened.frame is not None and placed.fiducials != opened.placed.fiducials:
-            written = places.write_picked(opened.folder, placed)
-            campaign = campaign.with_values({("plan", "fiducials"): written.name})
-        saved = campaign.save()
-        self._opened = replace(opened, campaign=saved, placed=placed)
-        return saved
-
-
-def told_of_check(checked: CampaignCheck) -> ui.Parts:
-    """Return a check of a campaign as parts of a screen."""
-    doubts = [ui.paragraph(f"{one.evidence} {one.remedy}", kind="warning") for one in checked.doubts]
-    if checked.faults:
-        told = ("Saved, but not ready to run:", *checked.faults)
-        return [*(ui.paragraph(one, kind="fault") for one in told), *doubts]
-    notices = [ui.paragraph(f"{one.message} {one.remedy}".strip(), kind="warning") for one in checked.notices]
-    ready = f"Saved and ready to run: {len(checked.checks) - len(checked.doubts)} checks passed."
-    return [ui.paragraph(ready, kind="done"), ui.bullets(checked.content), *doubts, *notices]
+    return open_folder(root, folder)
 
 
 def set_up(state: ui.State) -> pn.viewable.Viewable:

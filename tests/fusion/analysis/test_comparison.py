@@ -244,3 +244,37 @@ def test_a_position_without_scatter_is_left_out(rng: np.random.Generator) -> Non
     one[0], other[1] = 0.0, np.nan
     found = compare_scatters(PLACE, one, other, np.full(16, 50.0), np.full(16, 50.0))
     assert len(found) == 14
+
+
+def test_an_error_that_both_tests_have_in_common_cancels_as_far_as_it_is_equal(tmp_path: Path) -> None:
+    """u² = 3² + 5² - 2 · 2.4 · 4.5 with the coefficient alone in common, and 1 · 1 less twice for each input of one set-up."""
+
+    def part(u: float, share: float, coefficient: str) -> dict[str, Any]:
+        row = {
+            "u": 1.0,
+            "unit": "ppm",
+            "origin": "assumed",
+            **dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0),
+        }
+        shares = {"expansion_coefficient": share, "device": 1.0, "alignment": 1.0, "material_temperature": 1.0}
+        rows = [{**row, "contributor": name, "A_um": value} for name, value in shares.items()]
+        stated = {**PARTS["iso230"], "conditions": [{"name": "Expansion coefficient", "text": coefficient}]}
+        stated["settled"] = {**stated["settled"], "A_um": {"value": 2 * u, "u": u}, "contributions": rows}
+        return stated
+
+    def u_of(folders: list[Path], *, same_setup: bool = False) -> float:
+        (pair,) = compare_campaigns(folders, same_setup=same_setup)
+        return next(one.change.u for one in pair.changes if one.group == "ISO 230-2" and one.quantity == "A")
+
+    readings = readings_of(31)
+    one, other, steel = (
+        write_results(tmp_path / name, readings, iso230=part(u, share, text))
+        for name, u, share, text in (
+            ("a", 3.0, 2.4, "11.7 ppm/K"),
+            ("b", 5.0, 4.5, "11.7 ppm/K"),
+            ("c", 5.0, 4.5, "10 ppm/K"),
+        )
+    )
+    assert u_of([one, other]) == pytest.approx((34.0 - 21.6) ** 0.5)
+    assert u_of([one, other], same_setup=True) == pytest.approx((34.0 - 21.6 - 6.0) ** 0.5)
+    assert u_of([one, steel]) == pytest.approx(34.0**0.5)

@@ -14,11 +14,9 @@ from fusion.app.compare import (
     comparison_parts,
     find_results,
     label_of,
-    plot_profiles,
-    plot_remaining,
-    plot_scatters,
 )
 from fusion.app.parts import State
+from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters
 from fusion.results.store import write_json
 from tests.fusion.app.texts import texts
 from tests.fusion.compared_tests import readings_of, repaired, write_results
@@ -88,7 +86,7 @@ def two_results(folder):
 
 
 def raising(error):
-    def fail(*args):
+    def fail(*args, **options):
         raise error
 
     return fail

@@ -151,14 +151,15 @@ def test_a_phone_shows_it_without_scrolling_sideways(app, new_page):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_no_screen_breaks_a_serious_rule_of_accessibility(app, new_page, scheme):
+def test_no_screen_breaks_a_rule_of_accessibility(app, new_page, scheme):
     from axe_playwright_python.sync_playwright import Axe
 
     page = new_page(app[0], width=390, bypass_csp=True, color_scheme=scheme)
     page.get_by_text("12 fiducials agree").wait_for()
     page.get_by_role("slider", name="Camera clock minus laser clock (s)").wait_for()
-    for name in ("Set up", "Run"):
+    for name in ("Set up", "Run", "Results", "Compare", "Live"):
         page.get_by_role("button", name=name, exact=True).first.press("Enter")
         page.get_by_role("heading", name=name, exact=True).wait_for()
+        page.wait_for_timeout(1000)
         found = Axe().run(page).response["violations"]
-        assert not [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
+        assert not [(name, one["id"], one["nodes"][0]["html"]) for one in found]

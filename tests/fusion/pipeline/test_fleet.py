@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+import openpyxl
 import psutil
 import pytest
 from rich.console import Console
@@ -26,6 +27,7 @@ from fusion.pipeline.fleet import (
     cells,
     columns,
     count_line,
+    draw_trends,
     find_members,
     has_room,
     read_rows,
@@ -33,6 +35,7 @@ from fusion.pipeline.fleet import (
     run_fleet,
     summary_table,
     with_findings,
+    write_book,
 )
 from fusion.results.results import read_results
 from fusion.results.store import OutputError, write_json
@@ -196,8 +199,27 @@ def test_a_row_says_what_the_results_say(whole, results_folder):
     assert (shown["campaign"], shown["axis"]) == ("a", "X")
     assert "±" in shown["drift / µm"] and "±" in shown["A / µm"]
     assert cells(whole)[-3:] == ["0", "61.2", "412"]
-    assert cells(FAILED)[2:5] == ["failed", "–", "–"]
+    assert cells(FAILED)[4:7] == ["–", "failed", "–"]
+    assert (whole.date, whole.held_out_um) == (results.time.first[:10], results.loop.rmse_final_um)
     assert list(columns([FAILED])) == ["campaign", "verdict", "exit code", "time / s"]
+
+
+def test_tests_of_one_axis_over_the_dates_have_a_trend_and_the_least_favourable_decision_is_shown(whole, tmp_path):
+    months = [f"2026-{month:02d}-01" for month in range(1, 10)]
+    rows = [
+        replace(whole, name=f"m/{date}", date=date, A_um=5.0 + 0.1 * (k % 2), decision="pass")
+        for k, date in enumerate(months)
+    ]
+    assert list(draw_trends(rows)) == ["m, axis X, A", "m, axis X, R", "m, axis X, B"]
+    assert draw_trends(rows[:2]) == {}
+    page = render_fleet(rows, started=STARTED)
+    assert page.count("<figure") == 3 and 'id="filter"' in page
+    write_book(tmp_path / "fleet.xlsx", [*rows, FAILED])
+    sheet = openpyxl.load_workbook(tmp_path / "fleet.xlsx")["Campaigns"]
+    names = [cell.value for cell in sheet[1]]
+    assert sheet["A2"].value == "m/2026-01-01" and "maximum_degC" not in names
+    message = sheet.cell(11, 1 + names.index("message"))
+    assert (message.data_type, message.value) == ("s", '=HYPERLINK("x")')
 
 
 def test_results_that_cannot_be_read_are_a_failure(tmp_path):

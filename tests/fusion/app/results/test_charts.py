@@ -83,10 +83,7 @@ def test_before_a_step_its_effect_is_put_back():
     assert float(effects_left(stored, loop, 2)[0, 0, 0]) == 0.5
 
 
-def test_a_missing_model_is_said_and_steps_of_another_run_are_refused(products):
-    bare = Products(products.folder)
-    bare.results = products.results.model_copy(update={"loop": None})
-    assert "There is no model of the drift in this run." in parts_of(bare)
+def test_steps_of_another_run_are_refused(products):
     loop = products.results.loop
     assert isinstance(loop, AxisLoop) and loop.steps
     other = Products(products.folder)
@@ -128,12 +125,10 @@ def test_a_card_says_why_shows_the_field_and_chooses_the_position(marked):
     assert selection.target == 3
 
 
-def test_positions_that_do_not_stand_out_or_were_not_examined_are_told_apart(marked, tmp_path):
+def test_positions_that_do_not_stand_out_and_that_the_camera_did_not_see_are_told(marked, tmp_path):
     seen = marked.results
     marked.results = seen.model_copy(update={"anomalies": ()})
     assert "No position stands out" in texts(anomaly_cards(marked, Selection()))
-    marked.results = seen.model_copy(update={"anomalies": None})
-    assert "was not examined" in texts(anomaly_cards(marked, Selection()))
     marked.results, marked.fields = seen, None
     assert "The camera did not see this position." in texts(anomaly_cards(marked, Selection()))
 

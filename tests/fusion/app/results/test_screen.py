@@ -57,7 +57,8 @@ def test_places_are_added_by_keyboard_and_by_click(page):
     page.get_by_role("textbox", name="x / mm").press("Enter")
     page.get_by_role("button", name="Add place").press("Enter")
     page.get_by_text("over time. x 300 mm").wait_for()
-    page.locator(".bk-Figure:visible").first.click(position={"x": 220, "y": 130})
+    page.wait_for_timeout(1000)
+    page.locator(".bk-Figure:visible").first.click(position={"x": 220, "y": 45})
     page.get_by_text("over time. x 300 mm").filter(has_text=";").wait_for()
 
 

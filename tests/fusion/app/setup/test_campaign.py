@@ -3,25 +3,25 @@
 import tomllib
 from pathlib import Path
 
+import panel as pn
 import pytest
 
 from fusion.app.parts import PathError
-from fusion.app.setup import campaign as upload
-from fusion.app.setup.campaign import (
-    CampaignTextError,
+from fusion.app.setup import folder as upload
+from fusion.app.setup.campaign import CampaignTextError, open_campaign
+from fusion.app.setup.folder import UploadError, found_in_folder, store_upload
+from fusion.app.setup.form import (
     FieldError,
     Form,
-    UploadError,
     direction_text,
-    found_in_folder,
+    form_fields,
+    known_fields,
     missing,
-    open_campaign,
     read_direction,
     read_fields,
-    store_upload,
     write_fields,
 )
-from fusion.campaign.config import load_campaign
+from fusion.campaign.config import campaign_schema, load_campaign
 from fusion.pipeline.draft import DraftError
 
 
@@ -95,19 +95,20 @@ def test_nothing_that_somebody_wrote_is_lost(tmp_path):
 
 def test_fields_are_read_back_and_every_fault_is_named_with_its_field(copied):
     texts = read_fields(open_campaign(copied))
-    named = [texts[name] for name in ("title", "width", "direction", "table")]
-    assert named == ["Small campaign", "700 mm", "left", "still"]
-    assert texts["machine"] == "", "a table that can be added is shown"
+    names = ("campaign.title", "plan.size.0", "plan.axis.direction", "thermography.table")
+    assert [texts[name] for name in names] == ["Small campaign", "700 mm", "left", "still"]
+    assert texts["report.machine"] == "", "a table that can be added is shown"
     told = r"(?s)Width of the plan \(x\): .*unit.*It moves, as the position grows: .* no direction"
     with pytest.raises(FieldError, match=told):
-        write_fields(open_campaign(copied), {"width": "700", "direction": "0, 0"})
+        write_fields(open_campaign(copied), {"plan.size.0": "700", "plan.axis.direction": "0, 0"})
 
 
 def test_changed_fields_are_written_and_all_others_stay(copied):
     campaign = open_campaign(copied)
     assert write_fields(campaign, read_fields(campaign)).text == campaign.text
-    texts = {"width": "720 mm", "emissivity": "0.9 +- 0.02", "direction": "0.8, 0.6", "reflected": ""}
-    write_fields(campaign, {**texts, "machine": "Mill 3"}).save()
+    texts = {"plan.size.0": "720 mm", "plan.axis.direction": "0.8, 0.6", "report.machine": "Mill 3"}
+    camera = {"emissivity": "0.9 +- 0.02", "reflected_temperature": ""}
+    write_fields(campaign, texts | {f"thermography.{key}": text for key, text in camera.items()}).save()
     loaded = load_campaign(copied / "campaign.toml")
     assert loaded.plan.size_mm == (720.0, 180.0)
     assert loaded.thermography.emissivity_u == 0.02 and loaded.thermography.reflected_temperature_degC is None
@@ -115,7 +116,7 @@ def test_changed_fields_are_written_and_all_others_stay(copied):
 
 
 def test_a_needed_field_may_be_left_for_later(copied):
-    campaign = write_fields(open_campaign(copied), {"origin_x": ""})
+    campaign = write_fields(open_campaign(copied), {"plan.axis.origin.0": ""})
     assert campaign.value("plan", "axis", "origin")[0] is None and campaign.value("plan", "axis", "origin")[1]
     assert missing(campaign) == ["Spindle at axis position 0, x"] and missing(open_campaign(copied)) == []
     (copied / "campaign.toml").unlink()
@@ -143,9 +144,57 @@ def test_the_form_reads_back_what_it_shows(campaign_folder):
     form = Form(changes.append)
     campaign = open_campaign(campaign_folder)
     form.show(campaign)
-    assert form.texts == read_fields(campaign) and not changes
-    form.write({"width": "710 mm", "no such field": "x"})
-    assert form.texts["width"] == "710 mm" and changes == ["width"]
+    shown = read_fields(campaign)
+    assert form.texts == {name: shown[name] for name in form.texts} and not changes
+    form.write({"plan.size.0": "710 mm", "no such field": "x"})
+    assert form.texts["plan.size.0"] == "710 mm" and changes == ["plan.size.0"]
+    folded = next(card for card in form.view.select(pn.Card) if "[interferometry.uncertainty]" in card.title)
+    folded.collapsed = False
+    form.write({"interferometry.uncertainty.device": "0.5 ppm"})
+    assert form.texts["interferometry.uncertainty.device"] == "0.5 ppm"
+
+
+def test_every_key_of_the_schema_has_a_field_but_those_that_are_drawn_or_chosen_in_a_table():
+    """A key that the campaign file gains is in the form without a line of code."""
+
+    def keys(table, model):
+        for key, given in model["properties"].items():
+            found = [one for one in (given, *given.get("anyOf", ())) if "$ref" in one or "items" in one]
+            named = [one.get("$ref") or one["items"].get("$ref") for one in found]
+            inner = schema["$defs"].get((named[0] or "").rpartition("/")[2], {}) if named else {}
+            yield from keys((*table, key), inner) if "properties" in inner else [".".join((*table, key))]
+
+    schema = campaign_schema()
+    fields = {".".join((*field.table, field.key)) for field in known_fields().values()}
+    apart = set(keys((), schema)) - fields
+    assert {name for name in apart if not name.startswith("thermography.region.")} == {
+        "record.columns", "drivers.columns",
+    }  # fmt: skip
+
+
+def test_instruments_are_typed_one_after_another(copied):
+    name = "report.instrument.{}.{}".format
+    first = {name(0, "name"): "XL-80", name(0, "calibrated"): "2026-01-15", name(0, "certificate"): "K 17"}
+    write_fields(open_campaign(copied), first | {"acceptance.A": "20 um", "report.operator": "N. N."}).save()
+    campaign = open_campaign(copied)
+    assert name(1, "name") in form_fields(campaign)
+    write_fields(campaign, {name(1, "name"): "camera", name(0, "certificate"): ""}).save()
+    loaded = load_campaign(copied / "campaign.toml")
+    laser, camera = loaded.report.instrument
+    assert (laser.name, str(laser.calibrated), laser.certificate) == ("XL-80", "2026-01-15", "")
+    assert camera.name == "camera" and loaded.acceptance.A_um == 20.0
+    write_fields(open_campaign(copied), {name(1, "name"): ""}).save()
+    assert len(load_campaign(copied / "campaign.toml").report.instrument) == 1
+
+
+def test_lists_and_numbers_are_written_as_such_and_words_in_place_of_numbers_refused(copied):
+    texts = {"model.declared": "table_offset", "thermography.stack.scale": "0.5", "interferometry.compensation": "redo"}
+    campaign = write_fields(open_campaign(copied), texts)
+    assert campaign.value("model", "declared") == ["table_offset"]
+    assert campaign.value("thermography", "stack", "scale") == 0.5
+    assert campaign.value("interferometry", "compensation") == "redo"
+    with pytest.raises(FieldError, match=r"Scale: .*no number"):
+        write_fields(campaign, {"thermography.stack.scale": "half"})
 
 
 def test_every_file_of_a_campaign_has_a_row(campaign_folder):

@@ -8,7 +8,8 @@ import pytest
 
 from fusion.app.parts import State
 from fusion.app.setup.campaign import open_campaign
-from fusion.app.setup.screen import SetUpScreen, grid_of, listed_fiducials, open_folder, told_of_check
+from fusion.app.setup.editor import grid_of, listed_fiducials, open_folder, told_of_check
+from fusion.app.setup.screen import SetUpScreen
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.check import check_campaign
 from tests.fusion.app.texts import texts
@@ -40,16 +41,17 @@ def test_roles_and_units_of_a_record_are_chosen_on_the_screen(tmp_path):
     (tmp_path / "log.csv").write_text("\n".join(["T1,Z,speed,sample", *rows]) + "\n")
     screen = SetUpScreen(State(root=tmp_path))
     asyncio.run(screen.look())
-    assert {name: column["role"] for name, column in screen._columns.stated.items()} == {
+    editor = screen.editor
+    assert {name: column["role"] for name, column in editor._columns.stated.items()} == {
         "T1": "temperature", "Z": "displacement", "speed": "driver",
     }  # fmt: skip
-    asyncio.run(screen._on_save(None))
+    asyncio.run(editor._on_save(None))
     assert 'every = "FILL IN"' in texts([screen.view])
-    screen._form.write({"every": "10 s"})
-    _, unit = screen._columns._widgets["Z"]
+    editor._form.write({"record.every": "10 s"})
+    _, unit = editor._columns._widgets["Z"]
     unit.value = "0.5 mm"
-    screen._columns._widgets["speed"][0].value = "out"
-    asyncio.run(screen._on_save(None))
+    editor._columns._widgets["speed"][0].value = "out"
+    asyncio.run(editor._on_save(None))
     record = load_campaign(tmp_path / "campaign.toml").record
     assert record.every_s == 10.0 and record.columns["Z"].unit == "0.5 mm" and set(record.columns) == {"T1", "Z"}
     assert "ready to run" in texts([screen.view])
@@ -68,20 +70,20 @@ def test_saving_is_off_while_it_works_and_comes_back_whatever_fails(copied, monk
 
     def failing(error):
         def check(path):
-            seen.append(screen._save.disabled)
+            seen.append(screen.editor._save.disabled)
             raise error
 
-        monkeypatch.setattr("fusion.app.setup.screen.check_campaign", check)
+        monkeypatch.setattr("fusion.app.setup.editor.check_campaign", check)
 
     failing(PermissionError("laser.csv: permission denied"))
-    asyncio.run(screen._on_save(None))
+    asyncio.run(screen.editor._on_save(None))
     assert "laser.csv: permission denied" in texts([screen.view])
-    assert not screen._save.disabled
+    assert not screen.editor._save.disabled
     failing(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
-        asyncio.run(screen._on_save(None))
+        asyncio.run(screen.editor._on_save(None))
     assert seen == [True, True]
-    assert not screen._save.disabled
+    assert not screen.editor._save.disabled
 
 
 @pytest.fixture
@@ -115,10 +117,10 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
         ("Spindle at axis position 0, x", "500 mm"),
         ("Spindle at axis position 0, y", "90 mm"),
         ("It moves, as the position grows", "left"),
-        ("Machine, as the report names it", "<b>Mill</b>"),
+        ("Machine", "<b>Mill</b>"),
     ):
-        page.get_by_label(label).fill(text)
-        page.get_by_label(label).press("Tab")
+        page.get_by_label(label, exact=True).fill(text)
+        page.get_by_label(label, exact=True).press("Tab")
     column = page.get_by_role("textbox", name="Column in the frame (px)")
     column.fill("90")
     column.press("Tab")
@@ -134,7 +136,7 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
     assert page.get_by_label("Campaign file").input_value() == str(new_folder / "campaign.toml")
     again = new_page(app[0])
     look_into(again, ".new")
-    again.get_by_label("Machine, as the report names it").wait_for()
+    again.get_by_label("Machine", exact=True).wait_for()
     assert again.get_by_label("Spindle at axis position 0, x").input_value() == "500 mm"
 
 

@@ -261,7 +261,8 @@ def test_the_workbook_reads_back(small_run, tmp_path):
     results = read_results(small_run)
     write_workbook(tmp_path / "results.xlsx", results, deviations)
     book = openpyxl.load_workbook(tmp_path / "results.xlsx")
-    assert book.sheetnames == ["Summary", "ISO 230-2 axis", "ISO 230-2 positions", "Profile", "Readings"]
+    first = ["Summary", "A R E M B", "Conditions"]
+    assert book.sheetnames == [*first, "ISO 230-2 axis", "ISO 230-2 positions", "Profile", "Readings"]
     # The campaign is called =1+1.
     cell = book["Summary"]["B2"]
     assert (cell.data_type, cell.value.startswith("=1+1")) == ("s", True)
@@ -271,3 +272,10 @@ def test_the_workbook_reads_back(small_run, tmp_path):
     assert first["time_utc"].isoformat() == "2026-03-09T06:30:00"
     assert first["deviation_um"] == pytest.approx(float(deviations["deviation"][0, 0, 0]))
     assert book["Readings"].max_row == 1 + 192
+    quantity = next(row for row in book["A R E M B"].iter_rows(min_row=2) if row[0].value == "A")
+    window = results.iso230.settled
+    assert [cell.value for cell in quantity[1:3]] == pytest.approx([window.A_um.value, 2 * window.A_um.u])
+    assert quantity[1].number_format == "0.000" and quantity[4].value == results.iso230.tolerances[0].decision
+    assert book["Conditions"].max_row == 1 + len(results.iso230.conditions)
+    lines = book["Profile"]._charts[0].series
+    assert [len(line.xVal.numRef.f) > 0 for line in lines] == [True, True], "one line for each approach"

@@ -1,0 +1,39 @@
+"""Drawings to scale: a millimetre, or a pixel, is as long in both directions whatever the width of the screen."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import panel as pn
+from bokeh.models import CustomJS, Range1d
+from bokeh.plotting import figure
+
+from fusion.report.charts.style import new_figure
+
+#: First and last value of an axis as it is drawn; a descending pair turns it round.
+Ends: TypeAlias = tuple[float, float]
+
+
+def keep_scale(drawn: figure, x: Ends, y: Ends) -> figure:
+    """Show these ranges to scale: the height follows the width that the page leaves to the drawing."""
+    drawn.update(x_range=Range1d(*x), y_range=Range1d(*y), match_aspect=False)
+    ratio = abs((y[1] - y[0]) / (x[1] - x[0]))
+    # A drawing that is hidden has no size.
+    follow = """
+        const around = cb_obj.outer_height - cb_obj.inner_height;
+        if (cb_obj.inner_width > 0 && around > 0) cb_obj.height = Math.round(cb_obj.inner_width * ratio + around);
+    """
+    drawn.js_on_change("inner_width", CustomJS(args={"ratio": ratio}, code=follow))
+    return drawn
+
+
+def scaled_drawing(x: Ends, y: Ends, *, x_name: str, y_name: str, width_px: int) -> figure:
+    """Return an empty drawing to scale, at most `width_px` wide."""
+    drawn = keep_scale(new_figure(x=x_name, y=y_name), x, y)
+    drawn.update(max_width=width_px)
+    return drawn
+
+
+def shown_drawing(drawn: figure) -> pn.pane.Bokeh:
+    """Return a drawing as wide as the page leaves to it."""
+    return pn.pane.Bokeh(drawn, sizing_mode="stretch_width")

@@ -1,0 +1,93 @@
+"""Every chart of the application has ink where it should, on a light and a dark page, on a desktop and on a phone: by its pixels."""
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fusion.results.store import file_sha256
+from tests.fusion.results_sample import PARTS
+
+
+@pytest.fixture(scope="module")
+def flagged(app):
+    """Results in which a position stands out, so that every part of the screen has something to show."""
+    folder = shutil.copytree(app[1] / "results", app[1] / "flagged")
+    results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    results["anomalies"] = PARTS["anomalies"]
+    (folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    provenance["products"]["results.json"]["sha256"] = file_sha256(folder / "results.json")
+    (folder / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
+    return folder
+
+
+def ink(picture: Image.Image) -> tuple[int, np.ndarray]:
+    """Return the brightness of the paper, 0 to 255, and the share of pixels of every quarter of a picture that differ from it."""
+    grey = np.asarray(picture.convert("L"), int)[2:-2, 2:-2]
+    paper = int(np.bincount(grey[:, -8:].ravel(), minlength=256).argmax())
+    other = np.abs(grey - paper) > 12
+    rows, columns = (np.array_split(np.arange(size), 2) for size in other.shape)
+    return paper, np.array([other[np.ix_(down, across)].mean() for down in rows for across in columns])
+
+
+def test_a_blank_chart_with_its_labels_in_a_corner_has_no_ink():
+    blank = Image.new("L", (400, 300), 255)
+    blank.paste(0, (0, 0, 30, 30))
+    paper, quarters = ink(blank)
+    assert paper == 255 and (quarters > 0).sum() == 1
+
+
+#: Left, upper, right and lower edge of elements on the whole page, px.
+PLACES = """all => all.map((one) => {
+    const box = one.getBoundingClientRect();
+    return [box.left + scrollX, box.top + scrollY, box.right + scrollX, box.bottom + scrollY];
+})"""
+
+
+@pytest.mark.browser
+def test_every_chart_has_ink_in_both_themes_and_sizes(app, flagged, new_page):
+    page = new_page(app[0], width=1400, color_scheme="light")
+    page.get_by_text("12 fiducials agree").wait_for()
+
+    def charts_have_ink(least: int) -> None:
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            for width in (1400, 390):
+                page.set_viewport_size({"width": width, "height": 900})
+                page.wait_for_timeout(900)
+                boxes = [box for box in page.locator(".bk-Figure").evaluate_all(PLACES) if box[2] > box[0]]
+                assert len(boxes) >= least, page.get_by_role("heading").all_inner_texts()
+                whole = Image.open(io.BytesIO(page.screenshot(full_page=True)))
+                for box in boxes:
+                    paper, quarters = ink(whole.crop(box))
+                    # Axis labels alone are ink in three quarters; lines and points take at least a thousandth of the area.
+                    assert (quarters > 0.001).sum() >= 3, (scheme, width, box, quarters)
+                    assert (paper < 100) == (scheme == "dark"), (scheme, width, box, paper)
+
+    def open_part(name: str) -> None:
+        page.get_by_role("button", name=name, exact=True).first.press("Enter")
+
+    page.get_by_role("button", name="Save campaign.toml and check it").wait_for()
+    charts_have_ink(3)
+    open_part("Live")
+    page.get_by_text("Example, not measured").wait_for()
+    charts_have_ink(2)
+    open_part("Results")
+    page.get_by_label("Results folder").fill(str(flagged))
+    page.get_by_label("Results folder").press("Enter")
+    open_part("Open")
+    for part, least, shown in (
+        ("Map", 1, "Cycle 24 ("), ("Laser", 5, "Readings at"), ("Positions", 1, "Rise within"), ("Loop", 1, "Round 1"),
+    ):  # fmt: skip
+        open_part(part)
+        page.get_by_text(shown).first.wait_for()
+        charts_have_ink(least)
+    open_part("Compare")
+    reference = page.get_by_label("Reference (before a repair, or the oldest)")
+    reference.wait_for()
+    assert reference.input_value()
+    assert reference.evaluate("menu => menu.selectedOptions[0].innerText"), "the menu shows what is chosen"
