@@ -577,7 +577,8 @@ def iso230_3(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230_3 import read_thermal_tests
-    from fusion.report.sheet import write_thermal_tests
+    from fusion.report.page import write_page
+    from fusion.report.sheet import render_thermal_tests
     from fusion.report.thermal_test import thermal_test_tables
 
     with _answering():
@@ -589,7 +590,7 @@ def iso230_3(
                 _wide().print(table)
             _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
         if out is not None:
-            write_thermal_tests(out, title, tests, versions=versions())
+            write_page(out, render_thermal_tests(title, tests, versions=versions()))
             errors.print(f"page: {out.resolve()}")
 
 
@@ -704,13 +705,13 @@ def compare(
         render_comparison,
         side_by_side,
     )
-    from fusion.report.page import write_iso230
+    from fusion.report.page import write_page
     from fusion.report.wording import print_table
 
     with _answering():
         pairs = compare_campaigns(results, same_setup=same_setup)
         if out is not None:
-            write_iso230(out, render_comparison(pairs))
+            write_page(out, render_comparison(pairs))
             errors.print(f"page: {out.resolve()}")
         if as_json:
             print_json(comparison_json(pairs))

@@ -28,7 +28,7 @@ from fusion.report.thermal_test import draw_thermal_tests
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
-from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically
+from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically, write_text
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -194,6 +194,30 @@ def find_browser(named: str | None = None) -> str:
         "no browser that can print was found (looked for Chromium, Chrome, Edge and Brave); install one, name it with --browser FILE, or "
         "open report.html and press its button Print"
     )
+
+
+class PageFileError(FusionError):
+    """A page that cannot be written to the file that was named; the message says why."""
+
+
+def page_format(path: Path, *formats: str) -> str:
+    """Return the format that a file's name asks for, one of those given; the file must not exist."""
+    if path.exists():
+        raise PageFileError(f"{path} exists already; name another file with --out, or remove it")
+    asked = ".html" if path.suffix.lower() == ".htm" else path.suffix.lower()
+    if asked not in formats:
+        raise PageFileError(
+            f"{path}: it is written as {', '.join(formats[:-1])} or {formats[-1]}; name such a file with --out"
+        )
+    return asked
+
+
+def write_page(path: Path, page: str) -> None:
+    """Write a page as HTML or PDF; nothing is replaced."""
+    if page_format(path, ".html", ".pdf") == ".pdf":
+        print_pdf(page, path)
+    else:
+        write_text(path, page)
 
 
 def print_pdf(page: str, out: Path, *, browser: str | None = None) -> Path:

@@ -12,15 +12,14 @@ import pandas as pd
 import rich.table
 import xarray as xr
 
-from fusion.common import FusionError
 from fusion.report.campaign import describe_iso230, values_to_sign
 from fusion.report.charts.readings import plot_test, plot_windows
 from fusion.report.charts.style import Chart, embed
-from fusion.report.page import print_pdf, render_page
+from fusion.report.page import page_format, render_page, write_page
 from fusion.report.thermal_test import describe_thermal_tests, draw_thermal_tests
 from fusion.report.wording import Table, Words, print_table, table
 from fusion.results.axis import Iso230Part
-from fusion.results.store import group, write_atomically, write_text
+from fusion.results.store import group, write_atomically
 from fusion.results.thermal_test import ThermalTest
 from interferometry.plots import plot_iso230
 
@@ -34,10 +33,6 @@ _SIGNED = {"Measured by": "Operator", "Approved by": "Approved by"}
 #: What the standard means by a deviation, where a laboratory states no convention.
 _CONVENTION = "not stated; taken as actual minus target position (ISO 230-2)"
 _MET = {True: "yes", False: "no", None: "not known"}
-
-
-class Iso230PageError(FusionError):
-    """A test whose page or values cannot be written; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -91,37 +86,17 @@ def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remark
 
 def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> None:
     """Write the sheet of a test in the format of the file's name; nothing is replaced."""
-    if _kind(path, ".html", ".pdf", ".docx") == ".docx":
+    if page_format(path, ".html", ".pdf", ".docx") == ".docx":
         write_atomically(path, lambda temporary: _write_word(temporary, sheet, dataset))
     else:
-        _write_page(path, render_iso230(sheet, part, dataset, remarks=remarks))
+        write_page(path, render_iso230(sheet, part, dataset, remarks=remarks))
 
 
-def write_thermal_tests(path: Path, title: str, tests: Sequence[ThermalTest], *, versions: Mapping[str, str]) -> None:
-    """Write the page of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
-    _kind(path, ".html", ".pdf")
+def render_thermal_tests(title: str, tests: Sequence[ThermalTest], *, versions: Mapping[str, str]) -> str:
+    """Return the page of tests by ISO 230-3 as HTML text."""
     summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
     shown = {"summary": summary, "title": title, "versions": versions}
-    _write_page(path, render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), **shown))
-
-
-def _kind(path: Path, *kinds: str) -> str:
-    """Return the format that a file's name asks for, one of the kinds; the file must not exist."""
-    if path.exists():
-        raise Iso230PageError(f"{path} exists already; name another file with --out, or remove it")
-    kind = ".html" if path.suffix.lower() == ".htm" else path.suffix.lower()
-    if kind not in kinds:
-        raise Iso230PageError(
-            f"{path}: the sheet is written as {', '.join(kinds[:-1])} or {kinds[-1]}; name such a file with --out"
-        )
-    return kind
-
-
-def _write_page(path: Path, page: str) -> None:
-    if path.suffix.lower() == ".pdf":
-        print_pdf(page, path)
-    else:
-        write_text(path, page)
+    return render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), **shown)
 
 
 def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
@@ -147,9 +122,10 @@ def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
 
     document.add_heading(f"Test of positioning by ISO 230-2:2014: {sheet.title}", level=1)
     put(in_pairs(sheet.identity))
-    axes = plot_iso230(group(dataset, "settled"), dataset["position"])
+    figure = plot_iso230(group(dataset, "settled"), dataset["position"]).get_figure(root=True)
+    assert figure is not None
     picture = io.BytesIO()
-    axes.figure.savefig(picture, format="png", dpi=200, transparent=False)
+    figure.savefig(picture, format="png", dpi=200, transparent=False)
     document.add_picture(picture, width=Mm(150))
     put([row.cells for row in sheet.values.rows], sheet.values.titles)
     if sheet.requirements.rows:

@@ -18,7 +18,8 @@ from fusion.messages import BAD_INPUT
 from fusion.pipeline.iso230 import read_test
 from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.conclusions import headline, position_words
-from fusion.report.page import print_pdf, render_iso230, report_of
+from fusion.report.page import print_pdf, report_of
+from fusion.report.sheet import describe_sheet, render_iso230
 
 
 def results_screen(state: ui.State) -> pn.viewable.Viewable:
@@ -110,7 +111,8 @@ def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
 def _sheet(results: Path) -> str:
     """Return the test sheet of a run by ISO 230-2 as a page."""
     test = read_test(results, None)
-    return render_iso230(test.title, test.part, test.dataset, remarks=test.remarks, versions=versions())
+    sheet = describe_sheet(test.title, test.part, files=test.files, version=versions()["thermofuse"])
+    return render_iso230(sheet, test.part, test.dataset, remarks=test.remarks)
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:

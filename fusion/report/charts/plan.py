@@ -340,7 +340,12 @@ def plot_thermal_map(
     drawn = draw_map(last, extent_of(kept), shown[0], scales[0])
     draw_places(drawn, fields, position, hotspots, sensors)
     if followed is not None:
-        sides = {"left": followed.x_low_mm, "right": followed.x_high_mm, "bottom": followed.y_low_mm, "top": followed.y_high_mm}
+        sides = {
+            "left": followed.x_low_mm,
+            "right": followed.x_high_mm,
+            "bottom": followed.y_low_mm,
+            "top": followed.y_high_mm,
+        }
         for colour, width in ((INK, 4), ("#ffffff", 2)):
             drawn.quad(**sides, fill_color=None, line_color=colour, line_width=width)
         middle = (followed.x_low_mm + followed.x_high_mm) / 2

@@ -12,8 +12,8 @@ import xarray as xr
 from fusion.campaign.recompensation import ROTARY_BUDGET
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard
 from fusion.report.campaign import describe_iso230
+from fusion.report.page import PageFileError
 from fusion.report.sheet import (
-    Iso230PageError,
     describe_sheet,
     iso230_csv,
     iso230_json,
@@ -144,10 +144,10 @@ def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_pa
     page = page_of("<i>A</i>", *test_sheet, "<script>")
     assert "<i>A</i>" not in page and "<li>&lt;script&gt;</li>" in page
     sheet = sheet_of("A", test_sheet[0])
-    with pytest.raises(Iso230PageError, match=r"page\.odt: the sheet is written as \.html, \.pdf or \.docx"):
+    with pytest.raises(PageFileError, match=r"page\.odt: it is written as \.html, \.pdf or \.docx"):
         write_iso230(tmp_path / "page.odt", sheet, *test_sheet, remarks=())
     write_iso230(tmp_path / "page.html", sheet, *test_sheet, remarks=())
-    with pytest.raises(Iso230PageError, match="exists already"):
+    with pytest.raises(PageFileError, match="exists already"):
         write_iso230(tmp_path / "page.html", sheet, *test_sheet, remarks=())
     assert iso230_tables(*test_sheet, title="A")[0].title == "A, cycles 1 to 5"
 
