@@ -13,6 +13,7 @@ from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, interpol
 from fusion.campaign.config import CampaignError, InterferometryTable
 from fusion.results.results import Notice
 from interferometry.compensation import SensorUncertainty, air_index, compensate, dead_path_error_um, followed_factor_um
+from interferometry.io.readings import AIR_AND_MATERIAL
 from interferometry.iso230 import Iso230Budget
 from interferometry.iso230.uncertainty import SCATTER_ALONE
 
@@ -119,7 +120,7 @@ def compensate_readings(
         return Compensated(corrected, state_budget(table), notices)
     if environment is None:
         raise RecompensationError(f'[interferometry] compensation = "redo" needs the air: {_NO_LOG}')
-    log, coefficient = environment.dropna("time"), table.expansion_coefficient_ppm_per_K
+    log, coefficient = environment.dropna("time", subset=AIR_AND_MATERIAL), table.expansion_coefficient_ppm_per_K
     stated = _stated_factor_um(deviations, table)
     applied = stated or followed_factor_um(deviations, log, expansion_coefficient_ppm_per_K=coefficient)
     stated_budget = state_budget(table, camera_u_K=None if material is None else material.u_K)
@@ -193,7 +194,7 @@ def _correct_dead_path(
     if environment is None:
         message = f"The dead path of {dead_path_mm:g} mm is not corrected: the air was not logged."
         return deviations, [Notice("dead_path_uncorrected", message, _NO_LOG)]
-    log = environment.dropna("time")
+    log = environment.dropna("time", subset=AIR_AND_MATERIAL)
     start = log["time"].values[0]
     readings_s, log_s = (
         (times.astype("datetime64[ns]") - start) / np.timedelta64(1, "s")

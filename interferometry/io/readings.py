@@ -6,7 +6,7 @@ import itertools
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -825,6 +825,8 @@ DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "dev
 _AVERAGES = b"Bidirectional Avg Error"
 #: The header of a log stands within so many rows.
 _HEADER_WITHIN = 40
+#: Heading of a further column of the environment file, ``"name [unit]"``; a name begins with a letter, as a variable of NetCDF does.
+_WITH_UNIT = re.compile(r"\s*([^\W\d_][^/\[\]()]{0,99}?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*")
 #: Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value. Below 1 % of humidity lies a
 #: fraction of 1, and no workshop.
 ENVIRONMENT_COLUMNS = (
@@ -833,6 +835,7 @@ ENVIRONMENT_COLUMNS = (
     ("relative_humidity_percent", "relative_humidity", "percent", "humidity", 1.0, 100.0),
     ("material_temperature_degC", "material_temperature", "degC", "temperature", -9.0, 80.0),
 )
+AIR_AND_MATERIAL = tuple(name for _, name, *_ in ENVIRONMENT_COLUMNS)
 
 
 def read_deviations(
@@ -962,13 +965,15 @@ def read_environment(path: str | Path) -> xr.Dataset:
     ----------
     path : str or pathlib.Path
         With the columns time, air_temperature_degC, air_pressure_hPa, relative_humidity_percent and material_temperature_degC, or
-        headings in another language or unit (docs/formats.md).
+        headings in another language or unit (docs/formats.md). Further columns with a unit in their heading, such as
+        ``room [degC]``, are read as they are.
 
     Returns
     -------
     xarray.Dataset
         Dim time (UTC, increasing): ``air_temperature`` and ``material_temperature`` (degC), ``air_pressure`` (hPa),
-        ``relative_humidity`` (percent); ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason).
+        ``relative_humidity`` (percent); further columns by their names in their own units, NaN where there is no number;
+        ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason).
 
     Raises
     ------
@@ -997,6 +1002,8 @@ def read_environment(path: str | Path) -> xr.Dataset:
     variables = {
         name: {"units": unit, **(on_scale if unit == "degC" else {})} for _, name, unit, *_ in ENVIRONMENT_COLUMNS
     }
+    beside = _further_columns(table, {time, *(text for text, _ in columns.values())} | variables.keys())
+    variables |= {name: {"units": unit, "long_name": name} for name, unit in beside.values()}
 
     def parse(fields: dict[str, str]) -> list[float]:
         values = []
@@ -1005,9 +1012,28 @@ def read_environment(path: str | Path) -> xr.Dataset:
             if not low <= value <= high:
                 raise BadReading(fields[text], f"is outside {low:g} .. {high:g}, the range of {column} in its unit")
             values.append(value)
-        return values
+        return [*values, *(_number_or_nan(table, fields[text]) for text in beside)]
 
     return read_timed_rows(table, variables, parse, time=time)
+
+
+def _further_columns(table: DelimitedTable, taken: Collection[str]) -> dict[str, tuple[str, str]]:
+    """Name and unit of the columns of other quantities by heading; those without a unit, or with a role of their own, are none."""
+    found: dict[str, tuple[str, str]] = {}
+    for text in table.columns:
+        match = _WITH_UNIT.fullmatch(text)
+        if match is None or text in taken or read_heading(match[1]).role is not None:
+            continue
+        if match[1] not in taken and match[1] not in {name for name, _ in found.values()}:
+            found[text] = match[1], match[2]
+    return found
+
+
+def _number_or_nan(table: DelimitedTable, text: str) -> float:
+    try:
+        return table.numerals.reading(text)
+    except BadReading:
+        return np.nan
 
 
 def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple[str, str]]]:

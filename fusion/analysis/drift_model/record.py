@@ -71,7 +71,7 @@ from fusion.analysis.drift_model.search import (
     withdraw,
 )
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
-from fusion.analysis.effects.events import detect_jumps, periods_min
+from fusion.analysis.effects.events import periods_min
 from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.common import Array
@@ -481,10 +481,6 @@ _EVENT_MARGIN = 0.05
 _EVENT_INSTANTS = 200
 #: Shares of a block that a closer look tries as the part of it that lies after an event; coarser, and one event needs two steps.
 _SHARES = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
-#: A sensor's jump belongs to the sensor alone where it exceeds that of the others' mean so many times.
-_OWN_JUMP = 5.0
-#: A sensor that jumps alone more often is a quick one close to a source, not a faulty one.
-_MOST_FAULTS = 2
 #: Fewer periods than this are no rhythm: any slow drift looks like them.
 _LEAST_PERIODS = 6.0
 
@@ -558,34 +554,6 @@ def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Ca
         yield Candidate(np.column_stack([np.cos(phase), np.sin(phase)]), {"period_min": float(period)}, ("um", "um"))
 
 
-def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
-    """Detect sensors that jump alone."""
-    faults = []
-    switched = record.switched()
-    for k in range(len(record.sensors)):
-        others = np.delete(record.rise, k, axis=1)
-        common = others.mean(axis=1) if others.shape[1] else np.zeros(record.seconds.size)
-        own = []
-        runs = record.series(record.rise[:, k], "K").runs()
-        for before, after, size in (jump for run in runs for jump in detect_jumps(run)):
-            at = np.searchsorted(record.seconds, (before, after))
-            alone = abs(size) > _OWN_JUMP * abs(common[at[1]] - common[at[0]])
-            if alone and not switched[at[0] : at[1] + 1].any():
-                own.append((k, after, size))
-        if len(own) <= _MOST_FAULTS:
-            faults += own
-    return faults
-
-
-def _sensor_fault(record: Record, near: Candidate | None) -> Iterator[Candidate]:
-    """What the jump of a sensor does to the prediction: a step, since the displacement does not follow it."""
-    for k, instant, size in sensor_faults(record):
-        if near is None or near.event_s == instant:
-            late = (record.seconds >= instant).astype(float)
-            parameters: dict[str, float | str] = {"sensor": record.sensors[k], "time_s": instant, "jump_K": size}
-            yield Candidate(late[:, None], parameters, ("um",), instant)
-
-
 def _around(near: Candidate | None, grid: tuple[float, ...]) -> tuple[float, ...]:
     if near is None:
         return grid
@@ -598,7 +566,6 @@ _CANDIDATES = {
     "unseen_heat_source": _unseen_heat_source,
     "step_event": _step_event,
     "periodic_disturbance": _periodic_disturbance,
-    "sensor_fault": _sensor_fault,
 }
 
 
@@ -615,8 +582,6 @@ def needs_of(effect: Effect, record: Record) -> str | None:
         return effect.needs(record.view())
     if effect.name == "unseen_heat_source" and not record.drivers:
         return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
-    if effect.name == "sensor_fault" and not sensor_faults(record):
-        return "no sensor jumps alone"
     if effect.name == "periodic_disturbance" and record.runs:
         return (
             "of several runs, what restarts with each of them cannot be told from a rhythm; name one run as record.file"
@@ -628,6 +593,8 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     """Effects that can act in a record, and why the others of the library are not tried."""
     offered = library() if effects is None else effects
     not_tried = {name: "a record has no positions" for name in offered if name in BUILT_IN - _CANDIDATES.keys()}
+    # A sensor that jumps is left out before.
+    not_tried |= {name: "the sensors are examined before the search" for name in not_tried if name == "sensor_fault"}
     return {name: effect for name, effect in offered.items() if name not in not_tried}, not_tried
 
 

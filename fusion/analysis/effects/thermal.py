@@ -238,6 +238,8 @@ def _logged_influence(readings: Readings, _: Mapping[str, float], near: Candidat
         unit = um_per(readings.series[name].units)
         for lagged, response in first_order_responses(readings.series[name], near, LAGS_MIN, ratio=1.5):
             late = readings.at(lagged)
+            # Beside a level of 20 degC or 1000 hPa, which the static profile holds, what changes would count as rounding.
+            late = late - late.mean()
             for shape, along in _SHAPES.items():
                 parameters: Parameters = {"follows": name, **response, "shape": shape}
                 columns = np.column_stack([late * readings.share**power for power in along])

@@ -222,6 +222,24 @@ def test_environment_is_sorted_and_its_faults_are_listed(tmp_path):
     assert "is outside -9 .. 80" in str(reasons[6])
 
 
+def test_further_columns_of_the_environment_are_read_in_their_own_units(tmp_path):
+    """What is no number there leaves the line its air; a heading without a unit, or of a column that has a role, is no quantity."""
+    path = tmp_path / "environment.csv"
+    lines = [
+        "2026-03-09T06:30:00Z,23.5,1000.2,42,23.9,19.5,3.25,door open,1",
+        "2026-03-09T06:31:00Z,23.6,1000.2,42,23.9,,3.5,,2",
+    ]
+    path.write_text(
+        "\n".join([f"{ENVIRONMENT},room [degC],coolant flow (l/min),remark,cycle [1]", *lines]), encoding="utf-8"
+    )
+    environment = read_environment(path)
+    np.testing.assert_array_equal(environment["room"], [19.5, np.nan])
+    np.testing.assert_array_equal(environment["coolant flow"], [3.25, 3.5])
+    assert [environment[name].attrs["units"] for name in ("room", "coolant flow")] == ["degC", "l/min"]
+    assert environment.sizes["time"] == 2 and not left_out(environment)
+    assert not {"remark", "cycle"} & {str(name) for name in environment.data_vars}
+
+
 OTHER_UNITS = "time,air_temperature_degF,pressure (kPa),humidity (%),sample temperature [K]"
 
 

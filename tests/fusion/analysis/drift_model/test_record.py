@@ -32,7 +32,6 @@ from fusion.analysis.drift_model.record import (
     predict,
     record_library,
     search_record,
-    sensor_faults,
 )
 from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
 from fusion.analysis.drift_model.search import Confirmed, Decision, Reason, Round, Score
@@ -133,7 +132,7 @@ def test_the_start_says_what_this_record_cannot_show():
     told = problem_of(small()).start([]).not_tried()
     assert told["dead_path"] == "a record has no positions"
     assert told["unseen_heat_source"].startswith("nothing that drives a heat source was logged")
-    assert told["sensor_fault"] == "no sensor jumps alone"
+    assert told["sensor_fault"] == "the sensors are examined before the search"
     assert {effect.name for effect in LIBRARY} - set(told) == {"thermal_lag", "step_event", "periodic_disturbance"}
     assert "unseen_heat_source" not in problem_of(small(drivers=True)).start([]).not_tried()
 
@@ -397,45 +396,6 @@ def test_of_several_runs_no_rhythm_is_tried():
     several = replace(one, runs=runs, first=(0, 200))
     assert candidates("periodic_disturbance", several) == []
     assert "restarts with each of them" in needs_of(library()["periodic_disturbance"], several)
-
-
-def jumping(*, others: float = 0.0, load: bool = False, jumps: int = 1) -> Record:
-    """A quiet sensor t1 that jumps by 5 K; t2 jumps with it by a share of that, and the load may be switched there."""
-    quiet = 20.0 + 0.01 * (-1.0) ** np.arange(MANY)[:, None] * [1.0, 1.0]
-    for k in range(jumps):
-        first = 60 + 30 * k
-        quiet[first:] += [5.0 * (-1.0) ** k, 5.0 * others]
-    level = np.where(np.arange(MANY) < 60, 0.0, 1.0)
-    return record_of(np.zeros((MANY, 1)), quiet, drivers={"speed": level} if load else None)
-
-
-def test_a_sensor_that_jumps_alone_is_faulty():
-    of = jumping()
-    ((place, instant, size),) = sensor_faults(of)
-    assert (place, instant) == (0, of.seconds[60]) and size == pytest.approx(5.0, abs=0.05)
-    (candidate,) = candidates("sensor_fault", of)
-    np.testing.assert_array_equal(candidate.columns[:, 0], np.where(np.arange(MANY) < 60, 0.0, 1.0))
-    assert candidate.parameters == {"sensor": "t1", "time_s": instant, "jump_K": size}
-    assert candidate.event_s == instant
-    assert len(candidates("sensor_fault", of, near(instant))) == 1 and candidates("sensor_fault", of, near(0.0)) == []
-
-
-def test_a_jump_that_the_others_share_or_a_switching_explains_is_no_fault():
-    # More than five times the jump of the others is its own; t2 does not jump alone either.
-    assert [place for place, _, _ in sensor_faults(jumping(others=0.19))] == [0]
-    assert sensor_faults(jumping(others=0.22)) == []
-    assert sensor_faults(jumping(load=True)) == []
-
-
-@pytest.mark.parametrize(("jumps", "faults"), [(2, 2), (3, 0)])
-def test_a_sensor_that_jumps_three_times_is_a_quick_one(jumps, faults):
-    assert len(sensor_faults(jumping(jumps=jumps))) == faults
-
-
-def test_a_single_sensor_has_no_others():
-    of = jumping()
-    alone = record_of(np.zeros((MANY, 1)), of.temperature[:, :1])
-    assert len(sensor_faults(alone)) == 1
 
 
 def test_a_users_effect_sees_the_record_as_readings_of_one_place():

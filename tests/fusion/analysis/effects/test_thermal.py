@@ -276,6 +276,12 @@ def test_every_log_beside_field_and_loads_may_be_followed_late():
     assert {one.parameters["shape"] for one in offered} == {"flat", "linear", "flat and linear"}
     late = readings.at(series["relative_humidity"].lagged(300.0))
     linear = next(one for one in offered if one.parameters["shape"] == "linear")
-    np.testing.assert_allclose(linear.columns[:, 0], late * readings.share)
+    np.testing.assert_allclose(linear.columns[:, 0], (late - late.mean()) * readings.share)
+    # At 1000 hPa and 20 degC as at 0: a level is no change.
+    lifted = replace(
+        readings, series={**series, "relative_humidity": replace(series["relative_humidity"], values=1e3 + wave)}
+    )
+    for one, other in zip(offered, LOGGED_INFLUENCE.candidates(lifted, {}, None), strict=True):
+        np.testing.assert_allclose(one.columns, other.columns, atol=1e-9)
     bare = replace(readings, series={name: one for name, one in series.items() if name != "relative_humidity"})
     assert LOGGED_INFLUENCE.needs(bare) == "no room, coolant or humidity was logged"
