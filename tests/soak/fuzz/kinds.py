@@ -16,9 +16,11 @@ import tifffile
 import xarray as xr
 
 from fusion.analysis.attribution.modes import read_regions
+from fusion.analysis.comparison import compare_campaigns
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_record
 from fusion.campaign.logs import read_drivers
+from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import export_results
 from fusion.report.page import report_of
@@ -222,23 +224,29 @@ def read_damaged_record(path: Path) -> None:
     )
 
 
-def read_damaged_results(path: Path, results: Path) -> None:
-    """Print, export and report damaged results beside the intact products of their run; the report of some, which takes long."""
+def read_damaged_product(path: Path, *, results: Path, name: str) -> None:
+    """Print a results folder with one damaged file, and export, compare, reproduce or report it."""
 
     def use(folder: Path) -> None:
-        for name in ("deviations.nc", "fusion.nc"):
-            (folder / name).symlink_to(results / name)
-        # Without the hashes, as of an older run, by which what is damaged would be told before it is read.
-        provenance = json.loads((results / "provenance.json").read_text(encoding="utf-8"))
-        (folder / "provenance.json").write_text(json.dumps({**provenance, "products": {}}), encoding="utf-8")
-        found = read_results(folder)
-        summary_rows(found)
-        export_results(folder, "csv", folder / "csv")
-        if len(path.read_bytes()) % 40 == 0:
-            report_of(folder)
-        export_results(folder, "siemens840d", folder / "control", force=True)
+        for other in {"results.json", "deviations.nc", "fusion.nc"} - {name}:
+            (folder / other).symlink_to(results / other)
+        if name != "provenance.json":
+            # Without the hashes, as of an older run, by which what is damaged would be told before it is read.
+            provenance = json.loads((results / "provenance.json").read_text(encoding="utf-8"))
+            (folder / "provenance.json").write_text(json.dumps({**provenance, "products": {}}), encoding="utf-8")
+        summary_rows(read_results(folder))
+        commands: tuple[Callable[[], object], ...] = (
+            lambda: export_results(folder, "csv", folder / "csv"),
+            lambda: export_results(folder, "siemens840d", folder / "control", force=True),
+            lambda: compare_campaigns([results, folder]),
+            # The provenance is read before the campaign file is missed.
+            lambda: reproduce(folder, campaign=folder / "absent.toml"),
+        )
+        # One of them, as one that refuses the folder would hide what another meets; a report of some, which takes long.
+        size = len(path.read_bytes())
+        report_of(folder) if size % 40 == 0 else commands[size % len(commands)]()
 
-    _named(path, "results.json", use, {})
+    _named(path, name, use, {})
 
 
 def run_of_the_laser(folder: Path) -> Path:
@@ -285,10 +293,19 @@ def _files(folder: Path) -> dict[str, list[bytes]]:
 
 
 def kinds_of_products(folder: Path) -> list[Kind]:
-    """Return the kinds of files that come from the program itself: results.json for the terminal, `export` and `report`."""
+    """Return the kinds of files that come from the program itself: for the terminal, `export`, `compare`, `reproduce` and `report`."""
     results = run_of_the_laser(folder)
-    read = partial(read_damaged_results, results=results)
-    return [Kind("results.json", [(results / "results.json").read_bytes()], damaged_json, read, 0.05)]
+    damaged = {"results.json": damaged_json, "provenance.json": damaged_json, "deviations.nc": flir.mutate}
+    return [
+        Kind(
+            name,
+            [(results / name).read_bytes()],
+            damage,
+            partial(read_damaged_product, results=results, name=name),
+            0.05,
+        )
+        for name, damage in damaged.items()
+    ]
 
 
 def kinds_of_inputs(folder: Path) -> list[Kind]:
