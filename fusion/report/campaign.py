@@ -278,7 +278,9 @@ def values_to_sign(part: Iso230Part) -> Table:
         value = getattr(values, f"{symbol[0]}_um")
         if value.value is not None:
             limit, decision = judged.get(symbol, ("–", "no tolerance stated"))
-            rows.append(Row([term, quantity(value), limit, decision], marked=decision not in ("pass", "no tolerance stated")))
+            rows.append(
+                Row([term, quantity(value), limit, decision], marked=decision not in ("pass", "no tolerance stated"))
+            )
     titles = (f"Value ± U (k = 2) / {unit}", f"Tolerance / {unit}", Words("Decision (ISO 14253-1)"))
     return table([Words("Quantity of the axis"), *titles], rows)
 
@@ -473,6 +475,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
 
 #: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
 _SECTIONS = (
+    ("next", "", "What to do"),
     ("pictures", "regions", "Pictures"),
     ("iso230", "iso230", "ISO 230-2"),
     ("drift", "drift", "Drift"),

@@ -46,7 +46,9 @@ def headline(results: Results) -> str:
 #: Most actions on the first screen, and words of each.
 _FIRST_STEPS, _WORDS = 3, 12
 _BRACKETS = re.compile(r" \([^()]*\)")
-_DANGLING = re.compile(r"(?: (?:a|an|and|as|at|does|for|from|in|is|it|not|of|on|or|that|the|this|to|was|where|whether|which|with))+$")
+_DANGLING = re.compile(
+    r"(?: (?:a|an|and|as|at|does|for|from|in|is|it|not|of|on|or|that|the|this|to|was|where|whether|which|with))+$"
+)
 _CONDITION = re.compile(r"^Only if [^:]+: ")
 
 
@@ -57,7 +59,7 @@ def in_brief(step: str) -> str:
         return " ".join(words).rstrip(".") + "."
     line = _DANGLING.sub("", " ".join(words[:_WORDS]))
     end = max(line.rfind(sign) for sign in ",;:")
-    return (line[:end] if end > len(line) // 2 else line) + " …"
+    return (line[:end] if end > 2 * len(line) // 3 else line) + " …"
 
 
 def _if_so(statement: str) -> str:
@@ -151,7 +153,10 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
             continue
         expanded = 2 * (found.u**2 - term**2 + (term * stated_u / one.u) ** 2) ** 0.5
         if expanded < _WORTH * min(told.sharper_um, told.expanded_um):
-            value = next((row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text), _ASSUMED)
+            value = next(
+                (row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text),
+                _ASSUMED,
+            )
             limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)
             decision = "" if limit is None or found.value is None else decide(found.value, expanded, limit)
             told = told._replace(line=line.format(value=value), sharper_um=expanded, decision=decision)

@@ -335,9 +335,7 @@ def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
     side, unit = approach_of(iso), print_unit(iso.unit)
     of_side = getattr(iso, side) if side else iso
     once = of_side.A_um.value is None and of_side.E_um.value is not None
-    symbols, arrow = (
-        ("E" if once else "AR", ARROWS[side]) if side else ("EMB" if once else "ARB", "")
-    )
+    symbols, arrow = ("E" if once else "AR", ARROWS[side]) if side else ("EMB" if once else "ARB", "")
     return {f"{symbol}{arrow}": quantity(getattr(of_side, f"{symbol}_um"), unit) for symbol in symbols}
 
 

@@ -197,7 +197,12 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
     left = x[0] - 0.04 * room
     unit, along = (print_unit(str(values.attrs.get("units", "um"))) for values in (settled["A"], position))
     drawn = new_figure(
-        x=f"position / {along}", y=f"deviation / {unit}", height=360, x_range=(left, x[-1] + room), zero=True, legend_columns=3
+        x=f"position / {along}",
+        y=f"deviation / {unit}",
+        height=360,
+        x_range=(left, x[-1] + room),
+        zero=True,
+        legend_columns=3,
     )
     drawn.min_border_right = 52  # the label of E, whatever the width
     columns: dict[str, np.ndarray] = {"target": settled["target"].values, f"position / {along}": x}

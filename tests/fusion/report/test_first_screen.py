@@ -42,7 +42,9 @@ def reports(campaign_folder, tmp_path_factory):
         "both": path,
         "laser": without(path, "thermography", "plan", "model", name="laser.toml"),
         "camera": camera,
-        "pictures": without(path, "plan", "plan.axis", "interferometry", "model", "drivers", "acceptance", name="pictures.toml"),
+        "pictures": without(
+            path, "plan", "plan.axis", "interferometry", "model", "drivers", "acceptance", name="pictures.toml"
+        ),
     }
     pages = {}
     for name, campaign in parts.items():
@@ -91,7 +93,16 @@ def test_the_first_screen_is_a_picture_and_few_words(reports, new_page, kind):
 def test_five_questions_are_answered(reports, new_page):
     told = " ".join(visible_words(new_page(reports["both"], 1400, 900)))
     part = read_results(reports["both"].parent).iso230
-    for answer in ("Mill 900", "4711", "J. Doe", "X axis", "± ", "a reversal error that changes", "ISO 230-2, not met:", "Next"):
+    for answer in (
+        "Mill 900",
+        "4711",
+        "J. Doe",
+        "X axis",
+        "± ",
+        "a reversal error that changes",
+        "ISO 230-2, not met:",
+        "Next",
+    ):
         assert answer in told, answer
     decisions = {row.quantity: row.decision for row in part.tolerances}
     assert set(decisions) == {"A", "B"}
