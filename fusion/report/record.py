@@ -24,8 +24,8 @@ from fusion.results.results import Results
 _MOST_CHANNELS = 6
 #: Sections of the report with their titles in the contents.
 _SECTIONS = (
-    ("next", "What to do"), ("record", "Record"), ("loop", "Cause"), ("chained", "Forward chaining"), ("data", "Data"), ("uncertainty", "Uncertainty"),
-    ("glossary", "Glossary"), ("provenance", "Provenance"),
+    ("next", "What to do"), ("record", "Record"), ("loop", "Cause"), ("chained", "Forward chaining"), ("data", "Data"),
+    ("uncertainty", "Uncertainty"), ("glossary", "Glossary"), ("provenance", "Provenance"),
 )  # fmt: skip
 _ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 
