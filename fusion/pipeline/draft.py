@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,23 @@ _AXIS = re.compile(r"(?<![^\W_])([XYZABC]\d?|[UVW])(?:[-_ ]?ax[ei]s?|[-_ ]?achse
 _AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE | re.MULTILINE)
 #: Bytes of a file in which a header is looked for.
 _HEADER = 4096
+
+
+#: What a sheet to sign states beside the machine, by its key under [report], as it is asked for; the same of an instrument.
+_SHEET = {
+    "machine_serial_number": "Serial number of the machine",
+    "control": "Control",
+    "customer": "Customer",
+    "location": "Location of the machine",
+    "operator": "Operator",
+    "approved_by": "Who approves the report",
+    "report_number": "Number of the report",
+    "sign_convention": "Sign convention of the deviations",
+    "warm_up": "Warm-up before the test",
+    "machine_compensation": "Compensation that was active in the machine",
+    "sensor_places": "Places of the sensors",
+}
+_INSTRUMENT = {"serial_number": "Serial number of the instrument", "certificate": "Certificate of its calibration"}
 
 
 class DraftError(FusionError):
@@ -419,14 +437,52 @@ def _attributes(path: Path) -> dict[str, str]:
 
 def _report(asker: Asker) -> Iterator[str]:
     """Yield the conditions that the ISO 230-2 page and compensation tables print."""
-    machine = asker.text("Machine, as the report names it; empty: not stated", "")
-    if machine:
-        yield from ("", "[report]", f"machine = {_quoted(machine)}")
-    else:
-        yield ""
-        yield "# [report]                               # conditions of the test, printed with the ISO 230-2 values"
-        yield '# machine = "name of the machine"'
-    yield '# machine_compensation = "none"           # what was active during the test'
+    machine = asker.text("Machine, as the report names it; empty: nothing is stated for the sheet to sign", "").strip()
+    mark = "" if machine else "# "
+    tolerance = _tolerance(asker) if machine else ""
+    judged = "" if tolerance else "# "
+    yield from (
+        "",
+        f"{judged}[acceptance]                           # tolerances: A, R, E, M, B",
+        f'{judged}A = "{tolerance or "20 um"}"',
+    )
+    yield from (
+        "",
+        f"{mark}[report]                               # identity and conditions of the test, for the sheet to sign",
+    )
+    yield f"{mark}machine = {_quoted(machine or 'name of the machine')}"
+    for key, question in _SHEET.items():
+        answer = asker.text(f"{question}; empty: not stated", "").strip() if machine else ""
+        yield f"{key} = {_quoted(answer)}" if answer else f'# {key} = ""'
+    name = asker.text("Instrument; empty: not stated", "").strip() if machine else ""
+    mark = "" if name else "# "
+    yield from ("", f"{mark}[[report.instrument]]", f"{mark}name = {_quoted(name or 'laser interferometer')}")
+    for key, question in _INSTRUMENT.items():
+        answer = asker.text(f"{question}; empty: not stated", "").strip() if name else ""
+        yield f"{key} = {_quoted(answer)}" if answer else f'# {key} = ""'
+    yield _calibrated(asker) if name else "# calibrated = 2026-01-15"
+
+
+def _tolerance(asker: Asker) -> str:
+    """Return the tolerance of A with its unit, empty where there is none."""
+    while answer := asker.text("Tolerance of the bidirectional accuracy A, such as 20 um; empty: none", "").strip():
+        try:
+            read_quantity(answer, "um")
+        except QuantityError as error:
+            asker.say(str(error))
+            continue
+        return answer
+    return ""
+
+
+def _calibrated(asker: Asker) -> str:
+    """Return the line with the day of the last calibration."""
+    while answer := asker.text("Day of its calibration, such as 2026-01-15; empty: not stated", "").strip():
+        try:
+            return f"calibrated = {date.fromisoformat(answer)}"
+        except ValueError:
+            asker.say(f'"{answer}" is no day; write year-month-day')
+    return "# calibrated = 2026-01-15"
 
 
 def _drivers(content: FolderContent) -> Iterator[str]:

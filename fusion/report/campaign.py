@@ -476,6 +476,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
 
 #: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
 _SECTIONS = (
+    ("next", "", "What to do"),
     ("pictures", "regions", "Pictures"),
     ("iso230", "iso230", "ISO 230-2"),
     ("iso230-3", "iso230_3", "ISO 230-3"),

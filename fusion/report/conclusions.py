@@ -59,7 +59,7 @@ def in_brief(step: str) -> str:
         return " ".join(words).rstrip(".") + "."
     line = _DANGLING.sub("", " ".join(words[:_WORDS]))
     end = max(line.rfind(sign) for sign in ",;:")
-    return (line[:end] if end > len(line) // 2 else line) + " …"
+    return (line[:end] if end > 2 * len(line) // 3 else line) + " …"
 
 
 def _if_so(statement: str) -> str:
@@ -72,13 +72,14 @@ def first_screen(results: Results, report: Mapping[str, Any], axis: str) -> dict
     iso, inputs = results.iso230, results.inputs
     serial = report.get("machine_serial_number", "")
     named = [report.get("machine") or "machine not stated", f"no. {serial}" if serial else ""]
+    still_open = "" if inputs is None else say("open_inputs", inputs)
     return {
         "identity": [*named, f"{axis} axis" if axis else "", report.get("operator", "")],
         "decision": "" if iso is None else _if_so(conditional(say("decision", iso), inputs, "positions")),
         "unmet": "" if iso is None else say("unmet", iso),
         "cause": _if_so(say("headline", results, False)),
-        "open": "" if inputs is None else say("open_inputs", inputs),
-        "next": [in_brief(step) for step in next_steps(results)[:_FIRST_STEPS]],
+        "open": still_open,
+        "next": [in_brief(step) for step in next_steps(results)[: _FIRST_STEPS - bool(still_open)]],
     }
 
 

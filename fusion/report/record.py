@@ -25,7 +25,8 @@ from fusion.results.results import Results
 _MOST_CHANNELS = 6
 #: Sections of the report with their titles in the contents.
 _SECTIONS = (
-    ("record", "Record"), ("iso230-3", "ISO 230-3"), ("loop", "Cause"), ("chained", "Forward chaining"), ("data", "Data"),
+    ("next", "What to do"), ("record", "Record"), ("iso230-3", "ISO 230-3"), ("loop", "Cause"),
+    ("chained", "Forward chaining"), ("data", "Data"),
     ("uncertainty", "Uncertainty"), ("glossary", "Glossary"), ("provenance", "Provenance"),
 )  # fmt: skip
 _ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")

@@ -122,10 +122,10 @@ def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
 
     document.add_heading(f"Test of positioning by ISO 230-2:2014: {sheet.title}", level=1)
     put(in_pairs(sheet.identity))
-    figure = plot_iso230(group(dataset, "settled"), dataset["position"]).get_figure(root=True)
-    assert figure is not None
+    drawn = plot_iso230(group(dataset, "settled"), dataset["position"]).get_figure(root=True)
+    assert drawn is not None
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=200, transparent=False)
+    drawn.savefig(picture, format="png", dpi=200, transparent=False)
     document.add_picture(picture, width=Mm(150))
     put([row.cells for row in sheet.values.rows], sheet.values.titles)
     if sheet.requirements.rows:

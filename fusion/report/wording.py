@@ -35,7 +35,7 @@ from fusion.report.numbers import (
     small,
     upper_first,
 )
-from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, HotspotPart, Iso230Part, Iso230Window
+from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Iso230Window
 from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop, StepPart
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.results import Results
@@ -287,8 +287,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, quoted_window, randomised_causes,
-        spot_places, worse_channels,
+        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, quoted_window, randomised_causes, worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
     return made
@@ -407,19 +406,6 @@ def edges(area: AreaPart | None) -> str:
     if area is None:
         return "–"
     return f"x {area.x_low_mm:.0f} to {area.x_high_mm:.0f} mm, y {area.y_low_mm:.0f} to {area.y_high_mm:.0f} mm"
-
-
-class SpotPlaces(NamedTuple):
-    """Edges, peak and middle of the area of a hotspot in words, on the plan in mm."""
-
-    area: str
-    peak: str
-    middle: str
-
-
-def spot_places(spot: HotspotPart) -> SpotPlaces:
-    """Return the places of a hotspot in words."""
-    return SpotPlaces(edges(spot.area), place(spot.x_mm, spot.y_mm), place(spot.centroid_x_mm, spot.centroid_y_mm))
 
 
 def figures_of(results: Results) -> list[Figures]:

@@ -63,8 +63,6 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fuse
     charts: dict[str, Chart] = {}
     if fields is not None:
         charts["rise_history"] = plan.plot_rise_history(fields)
-        if "fiducial" in fields.sizes:
-            charts["registration"] = plan.plot_registration(fields)
     if deviations is not None:
         charts |= _reading_charts(deviations)
         charts |= _drift_charts(deviations) if has(deviations, "drift") else {}
@@ -107,6 +105,8 @@ def draw_placed(
     if fields is not None:
         correlation = results.correlation
         followed = correlation.source.area if correlation and correlation.verdict == "attributable" else None
+        if "fiducial" in fields.sizes:
+            charts["registration"] = plan.plot_registration(fields, results.hotspots or (), followed)
         charts["thermal_map"], controls = plot_thermal_map(
             fields, results.hotspots or (), position, sensors=results.sensors or (), followed=followed
         )

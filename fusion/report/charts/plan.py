@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -113,8 +113,10 @@ def draw_picture(
     return drawn
 
 
-def plot_registration(fields: xr.Dataset) -> Chart:
-    """Draw the reference frame, in sensor pixels, with every located fiducial."""
+def plot_registration(
+    fields: xr.Dataset, hotspots: Sequence[HotspotPart] = (), followed: AreaPart | None = None
+) -> Chart:
+    """Draw the reference frame, in sensor pixels, with every located fiducial and the places that matter on the plan."""
     frame = fields["reference_frame"].values
     rows, columns = frame.shape
     low, high = np.nanpercentile(frame[_on_plan(fields, frame.shape)], [1, 99])
@@ -126,12 +128,51 @@ def plot_registration(fields: xr.Dataset) -> Chart:
     looks = {"marker": "circle", "size": 13, "fill_alpha": 0.0, "line_color": "#7fe3ff", "line_width": 2}
     rings = drawn.scatter("column", "row", source=source, **looks)
     add_names(drawn, "column", "row", "name", source=source, x_offset=9, y_offset=-4)
+    if "target_x" in fields:
+        _draw_both(drawn.line, *_to_frame(fields, fields["target_x"].values, fields["target_y"].values))
+    if followed is not None:
+        _draw_both(drawn.line, *_to_frame(fields, *_rim(followed)))
+    for spot in hotspots:
+        at = _to_frame(fields, np.array([spot.x_mm]), np.array([spot.y_mm]))
+        add_marks(drawn, *at, "circle", 19)
+        add_names(drawn, *at, [spot.name], y_offset=-13, text_align="right" if at[0] > columns / 2 else "left")
     add_hover(drawn, [("fiducial", "@name"), ("residual", "@residual{0.000} mm")], [rings])
     seen = (
         f"Frame of {columns} by {rows} pixels with {len(names)} located fiducials; their residuals are up to "
         f"{number(float(np.nanmax(residual)), 2)} mm."
     )
     return Chart(drawn, seen, {"fiducial": names, "column / px": column, "row / px": row, "residual / mm": residual})
+
+
+def _to_frame(fields: xr.Dataset, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return column and row of plan points; the lens distortion is one radial term through the fiducials, as drawing needs it."""
+    to_sensor, half = np.linalg.inv(fields["homography"].values), np.array(fields["reference_frame"].shape[::-1]) / 2
+
+    def ideal(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        column, row, scale = to_sensor @ np.stack([x, y, np.ones_like(x)]).astype(float)
+        return np.stack([column / scale, row / scale], axis=-1) - half
+
+    seen = np.stack([fields["fiducial_column"].values, fields["fiducial_row"].values], axis=-1) - half
+    plain = ideal(fields["fiducial_x"].values, fields["fiducial_y"].values)
+    radial, known = plain * (plain**2).sum(-1, keepdims=True), np.isfinite(seen).all(-1)
+    share = float((radial * (seen - plain))[known].sum() / ((radial**2)[known].sum() or 1.0))
+    found = ideal(x, y)
+    found = found * (1 + share * (found**2).sum(-1, keepdims=True)) + half
+    return found[:, 0], found[:, 1]
+
+
+def _rim(area: AreaPart) -> tuple[np.ndarray, np.ndarray]:
+    """Return points around a rectangle on the plan, mm."""
+    x = np.array([area.x_low_mm, area.x_high_mm, area.x_high_mm, area.x_low_mm, area.x_low_mm])
+    y = np.array([area.y_low_mm, area.y_low_mm, area.y_high_mm, area.y_high_mm, area.y_low_mm])
+    share, corners = np.linspace(0, 4, 81), np.arange(5)
+    return np.interp(share, corners, x), np.interp(share, corners, y)
+
+
+def _draw_both(draw: Callable[..., Any], x: np.ndarray, y: np.ndarray) -> None:
+    """Draw dark under light, which reads on every colour."""
+    for colour, width in ((INK, 4), ("#ffffff", 1.6)):
+        draw(x, y, line_color=colour, line_width=width)
 
 
 def _on_plan(fields: xr.Dataset, shape: tuple[int, ...]) -> np.ndarray:
@@ -340,14 +381,7 @@ def plot_thermal_map(
     drawn = draw_map(last, extent_of(kept), shown[0], scales[0])
     draw_places(drawn, fields, position, hotspots, sensors)
     if followed is not None:
-        sides = {
-            "left": followed.x_low_mm,
-            "right": followed.x_high_mm,
-            "bottom": followed.y_low_mm,
-            "top": followed.y_high_mm,
-        }
-        for colour, width in ((INK, 4), ("#ffffff", 2)):
-            drawn.quad(**sides, fill_color=None, line_color=colour, line_width=width)
+        _draw_both(drawn.line, *_rim(followed))
         middle = (followed.x_low_mm + followed.x_high_mm) / 2
         add_names(drawn, [middle], [followed.y_high_mm], ["the drift follows this"], y_offset=-4, text_align="center")
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
@@ -472,7 +506,9 @@ def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
         add_names(drawn, x, y, names, y_offset=16, text_align="center", text_baseline="middle")
 
 
-def add_marks(drawn: figure, x: Sequence[float], y: Sequence[float], marker: str, size: int) -> None:
+def add_marks(
+    drawn: figure, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray, marker: str, size: int
+) -> None:
     """Draw hollow marks, light on dark, which reads on every colour."""
     for colour, width in ((INK, 4), ("#ffffff", 2)):
         drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width)

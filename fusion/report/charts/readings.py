@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -204,7 +205,6 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
         zero=True,
         legend_columns=3,
     )
-    drawn.min_border_right = 52  # the label of E, whatever the width
     columns: dict[str, np.ndarray] = {"target": settled["target"].values, f"position / {along}": x}
     for direction in settled["direction"].values:
         row = settled.sel(direction=direction)
@@ -247,7 +247,9 @@ def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> 
         drawn.segment([at], [bottom], [at], [top], line_color=INK, line_width=1.4)
         for level in (bottom, top):
             drawn.segment([end], [level], [at], [level], line_color=MUTED, line_dash="dashed", line_width=0.8)
-        add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {top - bottom:.2f}", offset=(4, -8))
+        # That of the outer span stands on its left: what leaves the frame is cut in a narrow chart.
+        looks: dict[str, Any] = {"offset": (-4, -8), "align": "right"} if symbol == "E" else {"offset": (4, -8)}
+        add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {top - bottom:.2f}", **looks)
 
 
 def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:

@@ -196,11 +196,23 @@ def of_rank(rank: int) -> dict[str, Any]:
 
 
 def add_label(
-    drawn: figure, x: float, y: float, text: str, *, offset: tuple[int, int], colour: str = INK, size: str = "12px"
+    drawn: figure,
+    x: float,
+    y: float,
+    text: str,
+    *,
+    offset: tuple[int, int],
+    colour: str = INK,
+    size: str = "12px",
+    align: str = "left",
 ) -> None:
     """Write a text at a point, moved by an offset in px."""
     across, up = offset
-    drawn.add_layout(Label(x=x, y=y, text=text, text_color=colour, text_font_size=size, x_offset=across, y_offset=up))
+    drawn.add_layout(
+        Label(
+            x=x, y=y, text=text, text_color=colour, text_font_size=size, text_align=align, x_offset=across, y_offset=up
+        )
+    )
 
 
 def _parts(label: str) -> tuple[str, str]:

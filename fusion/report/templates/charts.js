@@ -23,6 +23,7 @@
   function fit(figure, view) {
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");
+    figure.querySelector(".drawing").style.minHeight = 0;
     if (!view.frame.bbox.width) return;
     const { x_range, y_range } = view.model, ratio = Math.abs((y_range.end - y_range.start) / (x_range.end - x_range.start));
     view.model.frame_height = Math.round(Math.min(tallest, view.frame.bbox.width * ratio));

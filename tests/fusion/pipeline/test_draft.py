@@ -286,3 +286,42 @@ def test_nothing_is_asked_without_a_terminal_and_a_useless_answer_is_asked_again
     assert asker.choice("Which", ("a", "b")) == "b"
     assert len(told) == 3 and "needs its unit" in told[0] and told[2] == '"c" is not one of the choices'
     assert Asker(lambda question, default: "").quantity("Width", "mm") == '"FILL IN"'
+
+
+def test_whoever_names_the_machine_is_asked_for_the_sheet_to_sign_and_enter_skips(tmp_path):
+    write_laser(tmp_path / "test", 6, 5)
+    folder = tmp_path / "test"
+    (folder / "campaign.toml").unlink()
+    given = {
+        "Machine": "Mill 900",
+        "Tolerance": ["20", "20 um"],
+        "Operator": "J. Doe",
+        "Number of the report": "17",
+        "Instrument": "laser",
+        "Day of its": ["15.1.2026", "2026-01-15"],
+        "Certificate": "C-17",
+    }
+    said = []
+
+    def ask(question: str, default: str) -> str:
+        found = next((key for key in given if question.startswith(key)), None)
+        answer = default if found is None else given[found]
+        return answer.pop(0) if isinstance(answer, list) else answer
+
+    path, missing = write_campaign(folder, Asker(ask, said.append))
+    campaign = load_campaign(path)
+    report, (instrument,) = campaign.report, campaign.report.instrument
+    assert missing == [] and campaign.acceptance.limits() == {"A": 20.0}
+    assert (report.machine, report.operator, report.report_number, report.customer) == ("Mill 900", "J. Doe", "17", "")
+    assert (instrument.name, instrument.certificate, instrument.calibrated.isoformat()) == (
+        "laser",
+        "C-17",
+        "2026-01-15",
+    )
+    assert len(said) == 2  # a tolerance without unit, a day in another order
+
+    path.unlink()
+    asked = []
+    write_campaign(folder, Asker(lambda question, default: asked.append(question) or default))
+    assert not [question for question in asked if question.startswith(("Tolerance", "Operator", "Instrument"))]
+    assert load_campaign(path).report.machine == ""

@@ -12,7 +12,7 @@ from fusion.report import campaign as model_section
 from fusion.report.campaign import describe_campaign, describe_correlation
 from fusion.report.charts.plan import MapControls
 from fusion.report.page import render_page
-from fusion.report.wording import drift_u_note, environment, region_words
+from fusion.report.wording import environment, region_words
 from fusion.results.results import AxisLoop, CorrelationPart, Results, assemble, read_results
 from fusion.results.store import group, read_dataset, read_tree
 from tests.fusion.report.page_tables import tables_of
@@ -58,15 +58,15 @@ def test_results_without_products_still_make_a_page():
         for name in ("fields", "loop")
     )
     tables = tables_of(page)
-    assert tables["Hotspots"][1][5:] == ["3", "–", "–"]
+    assert tables["Hotspots"][1][4:] == ["3", "–", "–"]
     limit = tables["Detection limit of every effect"][1]
     assert limit[:5] == ["dead path of the laser", "never", "–", "10 %", "refractive index of the air"]
 
 
-def test_what_the_uncertainty_of_the_drift_leaves_out_stands_at_the_tile_and_under_the_table(results_folder):
+def test_what_the_uncertainty_of_the_drift_leaves_out_is_said_once_and_marked_at_its_figure(results_folder):
     page = (results_folder / "report.html").read_text(encoding="utf-8")
-    told = drift_u_note(read_results(results_folder).iso230)
-    assert f"during the test; {told}</div>" in page and f"± is the expanded uncertainty (k = 2): {told}." in page
+    assert "± scatter alone</div>" in page
+    assert page.count("It does not contain errors of the laser, its alignment, the temperature of the material") == 1
 
 
 ORIGIN = {

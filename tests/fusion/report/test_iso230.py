@@ -4,13 +4,16 @@ import csv
 import io
 import math
 import re
+import shutil
 
+import docx
 import numpy as np
 import pytest
 import xarray as xr
+from playwright.sync_api import sync_playwright
 
 from fusion.campaign.recompensation import ROTARY_BUDGET
-from fusion.pipeline.iso230 import complete_sheet, evaluate_standard
+from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test
 from fusion.report.campaign import describe_iso230
 from fusion.report.page import PageFileError
 from fusion.report.sheet import (
@@ -24,7 +27,10 @@ from fusion.report.sheet import (
 from fusion.report.wording import say
 from fusion.results.axis import Iso230Part
 from fusion.results.store import joined, plain
+from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from interferometry.drift.estimate import estimate_drift
+from tests.browser import CHROMIUM
+from tests.fusion.campaign_parts import without
 from tests.fusion.pipeline.test_iso230 import ASSUMED
 from tests.fusion.report.page_tables import tables_of
 from tests.interferometry.iso230.made_tests import by_hand, test_made
@@ -230,3 +236,56 @@ def test_results_of_an_older_run_show_their_only_window(part):
     told = describe_iso230(part.model_copy(update={"settled": None}))
     assert told["budget"] is None and told["quoted"].window == "cycles 1 to 5"
     assert len(told["axis"].rows) == 5
+
+
+@pytest.fixture(scope="module")
+def stated(campaign_folder, tmp_path_factory):
+    """The small campaign with everything that the demo states of its test."""
+    path = tmp_path_factory.mktemp("stated") / "campaign" / "campaign.toml"
+    shutil.copytree(campaign_folder, path.parent)
+    further = read_recipe(packaged_recipe("demo")).campaign.further
+    return read_test(without(path, "thermography", "plan", "model", "drivers", added=f"\n{further}"), None)
+
+
+@pytest.mark.chain
+def test_the_demo_states_everything_that_a_sheet_asks_for(stated):
+    sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
+    every = dict([*sheet.identity, *sheet.conditions])
+    assert len(every) >= 24 and [name for name, text in every.items() if "not stated" in text] == []
+    assert every["Instrument 1"].endswith("calibrated 2026-01-15, certificate C-2026-015")
+    assert sheet.signatures == [("Measured by", "R. Meyer"), ("Approved by", "S. Lind")]
+    assert set(sheet.files) >= {"laser.csv", "environment.csv"} and all(len(sha) == 64 for sha in sheet.files.values())
+    decisions = {row.cells[0]: row.cells[2:] for row in sheet.values.rows}
+    assert decisions["Bidirectional positioning accuracy A"][0] == "20"
+    assert decisions["Reversal error B"] == ["–", "no tolerance stated"]
+
+
+@pytest.mark.chain
+def test_the_document_of_word_says_what_the_page_says(stated, tmp_path):
+    sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
+    write_iso230(tmp_path / "sheet.docx", sheet, stated.part, stated.dataset, remarks=())
+    written = docx.Document(str(tmp_path / "sheet.docx"))
+    cells = [cell.text for grid in written.tables for row in grid.rows for cell in row.cells]
+    shown = [text for row in sheet.values.rows for text in row.cells]
+    shown += [text for pair in (*sheet.identity, *sheet.conditions) for text in pair]
+    assert [text for text in shown if text not in cells] == []
+    assert len(written.inline_shapes) == 1 and cells.count("Date, signature:") == 2
+    assert all(sha in written.paragraphs[-1].text for sha in sheet.files.values())
+
+
+@pytest.mark.chain
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed (Debian: apt-get install chromium)")
+def test_the_sheet_is_one_page_of_a4(stated, tmp_path):
+    sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
+    write_iso230(tmp_path / "sheet.html", sheet, stated.part, stated.dataset, remarks=())
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 688, "height": 998}, bypass_csp=True)
+        page.goto((tmp_path / "sheet.html").as_uri() + "#on-a4")
+        page.wait_for_function("document.documentElement.dataset.paper == 'ready'")
+        page.emulate_media(media="print")
+        bottom = page.evaluate("document.querySelector('#sheet .hashes').getBoundingClientRect().bottom + scrollY")
+        browser.close()
+    # The text of A4 with margins of 17 mm and 16 mm: 264 mm of 96 px to the inch.
+    assert 700 < bottom < 264 / 25.4 * 96

@@ -138,10 +138,10 @@ def test_each_chart_is_drawn_once_and_together_they_are_all(results_folder):
     ]
     measured, attributed, modelled, placed = (set(part.charts) for part in parts)
     assert len(measured | attributed | modelled | placed) == sum(len(part.charts) for part in parts)
-    assert {"rise_history", "registration", "drift_map", "iso230", "timeline", "drift_temperature"} <= measured
+    assert {"rise_history", "drift_map", "iso230", "timeline", "drift_temperature"} <= measured
     assert {"clusters", "region_targets"} <= attributed
     assert {"history", "anomalies", "contributions"} <= modelled
-    assert placed == {"thermal_map"}
+    assert placed == {"registration", "thermal_map"}
     both = draw_campaign(results, datasets)
     assert list(both.charts) == [name for part in parts for name in part.charts]
     assert both.thermal_map == parts[-1].thermal_map and both.thermal_map is not None

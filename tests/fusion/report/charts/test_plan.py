@@ -12,12 +12,13 @@ from fusion.report.charts.plan import plot_sensors
 from fusion.report.charts.readings import plot_timeline, recorded_spans
 from fusion.report.charts.style import Chart
 from fusion.results.axis import HotspotPart
+from fusion.results.parts import AreaPart
 from fusion.results.store import group
 
 
 def test_the_frame_lies_under_its_fiducials(fields):
     chart = plan.plot_registration(fields)
-    picture, rings, _ = chart.figure.renderers
+    picture, rings = chart.figure.renderers[:2]
     assert (picture.glyph.x, picture.glyph.y, picture.glyph.dh) == (-0.5, -0.5, fields.sizes["row"])
     np.testing.assert_allclose(picture.data_source.data["image"][0], fields["reference_frame"], atol=1 / 64)
     np.testing.assert_array_equal(rings.data_source.data["row"], fields["fiducial_row"])
@@ -222,3 +223,19 @@ def test_a_recording_without_readings_has_a_map_without_a_line(fields):
     alone = fields.drop_vars(["target", "target_x", "target_y"])
     chart, found = thermal_map.plot_thermal_map(alone)
     assert found.quantities and not chart.figure.select(type=Arrow)
+
+
+def test_a_place_of_the_plan_is_drawn_where_the_frame_shows_it(fields):
+    """The fiducials, taken for places of the plan, fall on the pixels at which they were located."""
+    known = fields["fiducial_x"].values, fields["fiducial_y"].values
+    column, row = plan._to_frame(fields, *known)
+    np.testing.assert_allclose(column, fields["fiducial_column"], atol=1.0)
+    np.testing.assert_allclose(row, fields["fiducial_row"], atol=1.0)
+    area = AreaPart(x_low_mm=100.0, x_high_mm=200.0, y_low_mm=40.0, y_high_mm=90.0)
+    x, y = plan._rim(area)
+    assert (x[0], y[0]) == (x[-1], y[-1]) == (100.0, 40.0) and {x.max(), y.max()} == {200.0, 90.0}
+    lines = [
+        one for one in plan.plot_registration(fields, (), area).figure.renderers if type(one.glyph).__name__ == "Line"
+    ]
+    drawn = lines[-1].data_source.data
+    assert drawn["x"].size == 81 and 0 < drawn["x"].min() < drawn["x"].max() < fields.sizes["column"]
