@@ -62,7 +62,8 @@ class CompareScreen:
         self._compare.on_click(self._show)
         self._reference.param.watch(lambda event: self._offer(), "value")
         self._list()
-        self._same = pn.widgets.Checkbox(label="Laser, alignment and sensors stood untouched between the tests")
+        same = "Laser, alignment and sensors stood untouched between the tests"
+        self._same = pn.widgets.CheckBoxGroup(label="Set-up", options=[same])
         choice = (
             self._reference,
             ui.paragraph("Compared with it:"),

@@ -78,32 +78,37 @@ def readme_lines() -> list[str]:
     return [line.partition("   #")[0].strip() for line in "\n".join(blocks(README, "sh")).splitlines()]
 
 
-def run_lines(lines: list[str], folder: Path, python: str) -> None:
-    """Type lines in a folder, one after another; of the application only the address is waited for."""
+def run_lines(lines: list[str], folder: Path) -> None:
+    """Type lines in a folder, one after another, and run the Python of the page; of the application only the address is waited for."""
     for line in lines:
-        command = line if " app " not in line else f"timeout -s TERM 60 {line} | grep -m 1 http://127.0.0.1"
-        done = subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True)
+        if " app " in line:
+            with subprocess.Popen(line.split(), cwd=folder, stdout=subprocess.PIPE, text=True) as app:
+                assert app.stdout is not None
+                assert "http://127.0.0.1:" in app.stdout.readline()
+                app.terminate()
+            continue
+        done = subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True)
         assert done.returncode == 0, (line, done.stdout[-2000:], done.stderr[-2000:])
     (chain,) = blocks(README, "python")
-    done = subprocess.run([python, "-c", chain], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run([folder / ".venv/bin/python", "-c", chain], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
 @pytest.mark.chain
 def test_every_line_of_the_readme_that_installs_nothing_runs(tmp_path: Path) -> None:
     (tmp_path / ".venv/bin").mkdir(parents=True)
-    (tmp_path / COMMAND).write_text(f'#!/bin/sh\nexec "{sys.executable}" -m fusion.cli "$@"\n', encoding="utf-8")
-    (tmp_path / COMMAND).chmod(0o755)
-    run_lines(
-        [line for line in readme_lines() if "pip install" not in line and "make " not in line], tmp_path, sys.executable
-    )
+    for name, module in (("thermofuse", " -m fusion.cli"), ("python", "")):
+        script = f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}"{module} "$@"\n'
+        (tmp_path / ".venv/bin" / name).write_text(script, encoding="utf-8")
+        (tmp_path / ".venv/bin" / name).chmod(0o755)
+    run_lines([line for line in readme_lines() if "pip install" not in line and "make " not in line], tmp_path)
 
 
 @pytest.mark.slow
 def test_every_line_of_the_readme_runs_in_a_bare_environment(tmp_path: Path) -> None:
     """On a copy of what is under version control; `make test` would run this test again."""
     subprocess.run(["git", "checkout-index", "--all", f"--prefix={tmp_path}/"], cwd=ROOT, check=True)
-    run_lines([line for line in readme_lines() if line != "make test"], tmp_path, f"{tmp_path}/.venv/bin/python")
+    run_lines([line for line in readme_lines() if line != "make test"], tmp_path)
 
 
 def test_the_readme_is_short_and_its_pictures_are_small() -> None:

@@ -134,15 +134,22 @@ def is_picture(campaign: CampaignText) -> bool:
     return campaign.value("plan", "registration") == "pixels" or campaign.value("plan") is None
 
 
+#: Tables that only hold together with keys that the file does not have yet.
+_WITH_OTHERS = ("plan.axis", "record.header_rows", "record.long", "drivers.header_rows")
+
+
 def _is_there(table: tuple[str, ...], campaign: CampaignText) -> bool:
     """Whether a campaign file has a table, or may be given it without more."""
-    if table[:1] == ("plan",) and is_picture(campaign):
+    top = table[0]
+    if top == "plan" and is_picture(campaign):
         return False
-    required = {"plan.axis", "record.header_rows", "record.long", "drivers.header_rows"}
-    return campaign.value(*table) is not None or (
-        ".".join(table) not in required
-        and (table[0] in _WHOLE or (campaign.value(table[0]) is not None and len(table) > 1))
-    )
+    if top == "acceptance":
+        return campaign.value("interferometry") is not None
+    if top in ("report", "accept") or campaign.value(*table) is not None:
+        return True
+    if top == "model":
+        return campaign.value("interferometry") is not None
+    return len(table) > 1 and ".".join(table) not in _WITH_OTHERS and campaign.value(top) is not None
 
 
 def form_fields(campaign: CampaignText) -> dict[str, Field]:

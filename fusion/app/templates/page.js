@@ -5,6 +5,9 @@ const named = (view) => {
   // A search field is one without being told so.
   root?.querySelectorAll("input.choices__input[role]").forEach((input) => input.removeAttribute("role"));
   root?.querySelectorAll("input[type=range]:not([aria-label])").forEach((input) => input.setAttribute("aria-label", title || "Cycle"));
+  root?.querySelectorAll("button[class]:not([aria-label])").forEach((button) => {
+    if (!button.innerText.trim()) button.setAttribute("aria-label", button.classList[0]);
+  });
   if (root && title) {
     root.querySelectorAll(".noUi-handle:not([aria-label])").forEach((handle) => handle.setAttribute("aria-label", title));
     root.querySelectorAll(".bk-spin-btn:not([aria-label])").forEach((button) => {
