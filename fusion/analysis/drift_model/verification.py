@@ -206,8 +206,8 @@ def _explain(
         return "wrong scale", told
     if by_states >= _EXPLAINS:
         return "stale table", (
-            f"the states of the model explain {100 * by_states:.0f} % of what is left, in other proportions than its coefficients ({told}): the "
-            "control runs other coefficients than the stated ones, or the machine has changed since"
+            f"the states of the model explain {100 * by_states:.0f} % of what is left, in other proportions than its coefficients "
+            f"({told}): the control runs other coefficients than the stated ones, or the machine has changed since"
         )
     return "not explained", f"{told}; the states of the model explain {100 * max(by_states, 0.0):.0f} %"
 
