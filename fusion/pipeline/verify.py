@@ -55,8 +55,7 @@ def verify_compensation(before: Path, after: Path, applied: Path) -> Verificatio
     health = examine_record(table, [QUASI_STATIC])
     record = reduce_record(health.table)
     faulty = {one.sensor: describe_fault(one) for one in health.findings if one.state == "left_out"}
-    duration_s = float(record.seconds[-1] - record.seconds[0]) + record.block_s
-    ranges = predicted_ranges(read_product(before, "record"), results.loop, duration_s=duration_s)
+    ranges = predicted_ranges(read_product(before, "record"), results.loop, record)
     remarks = []
     if model.results_sha256 != file_sha256(before / "results.json"):
         remarks.append(

@@ -22,8 +22,7 @@ from tests.fusion.record_tables import table_of
 
 pytestmark = pytest.mark.slow
 #: A spindle without a sensor; nothing else is undeclared.
-SOURCE = EffectRecipe("unseen_heat_source", 6.0, parameters={"time_constant_min": 20.0})
-DAY = 24.0 * 3600.0
+SOURCE = EffectRecipe("unseen_heat_source", parameters={"um": 15.0, "time_constant_min": 20.0})
 
 
 def logged(seed: int, **record) -> xr.Dataset:
@@ -59,8 +58,9 @@ def second_test(
     table = logged(seed, duty_seed=1000 + seed, applied=str(file), **record)
     health = examine_record(table, ["quasi_static"])
     faulty = {one.sensor: describe_fault(one) for one in health.findings if one.state == "left_out"}
-    ranges = predicted_ranges(product, loop, duration_s=DAY)
-    return verify(reduce_record(health.table), says or model, ranges, faulty_sensors=faulty), table
+    after = reduce_record(health.table)
+    ranges = predicted_ranges(product, loop, after)
+    return verify(after, says or model, ranges, faulty_sensors=faulty), table
 
 
 def test_what_a_compensation_leaves_is_what_was_predicted(tmp_path):

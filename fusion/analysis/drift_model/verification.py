@@ -29,8 +29,10 @@ _DRAWS = 1000
 _COVERAGE = 0.95
 #: Share of what is left that an explanation must take away, in pieces that it was not fitted to.
 _EXPLAINS = 0.5
-#: Gains that have a name; another one is a scale.
+#: Gains that have a name, half a unit apart at least; what is nearer to one than half of that is it, another one is a scale.
+_SAME_GAIN = 0.25
 _NAMED_GAINS = {"wrong sign": -1.0, "half the gain": 0.5, "not active": 0.0}
+_OF_GAIN = (*_NAMED_GAINS, "wrong scale")
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class ChannelVerdict:
     Attributes
     ----------
     name : displacement
-    before_um : range that the test would have shown without a correction, by the stated model
+    before_um : range that the test would have shown without the correction, taken with the gain that was found where that is the fault
     predicted_um, predicted_low_um, predicted_high_um : range that the compensation was predicted to leave, median and 95 % interval
     achieved_um : range that was measured
     gain, gain_u : with which the correction acted, by regression; 1 where all is well
@@ -62,25 +64,43 @@ class ChannelVerdict:
     reason: str
 
 
-def predicted_ranges(product: xr.Dataset, loop: RecordLoop, *, duration_s: float, seed: int = 1) -> dict[str, Array]:
-    """Return draws of the range (draws,), um, that a compensation by the model of a run leaves in a test of some length, by channel.
+def predicted_ranges(product: xr.Dataset, loop: RecordLoop, after: Record, *, seed: int = 1) -> dict[str, Array]:
+    """Return draws of the range (draws,), um, that a compensation by the model of a run leaves in another test, by channel.
 
-    Every part of the record is predicted from all others; what is missed is cut into pieces, which are put together again at random.
+    Two things are left. What the model misses: every part of the record is predicted from all others, and the errors are put together
+    again at random in pieces. And what its coefficients are wrong by, at the readings of the other test, which may go where the record
+    did not: the model is fitted without each part (jackknife), and the differences of its predictions there are added with random signs
+    and sizes.
     """
     record = record_of_product(product)
     columns, events, _ = columns_of_loop(loop, record, record.sensors)
     matrix = np.column_stack([evaluate_columns(record, columns), events])
-    train = ~product["sealed"].values.astype(bool)
-    missed = record.displacement - predict_left_out(record, matrix, predict(record, matrix, train).penalty)
-    pieces = np.array_split(np.arange(record.seconds.size), _PIECES)
-    blocks = max(1, round(duration_s / (record.block_s * record.seconds.size / _PIECES)))
+    there = evaluate_columns(_with_sensors(after, record.sensors), columns)
+    every = np.ones(record.seconds.size, bool)
+    missed = record.displacement - predict_left_out(record, matrix, predict(record, matrix, every).penalty)
+    parts = np.unique(record.chained)
+    fits = [predict(record, matrix, record.chained != part).coefficients[: len(columns)] for part in parts]
+    without = there @ np.array(fits)
+    apart = (without - without.mean(axis=0)) * np.sqrt((parts.size - 1) / parts.size)
+    length = max(1, record.seconds.size // _PIECES)
+    pieces = -(-after.seconds.size // length)
     rng = np.random.default_rng(seed)
-    chosen = rng.integers(0, len(pieces), (_DRAWS, blocks))
-    lowest, highest = (
-        np.array([extreme(missed[rows], axis=0) for rows in pieces]) for extreme in (np.nanmin, np.nanmax)
-    )
-    ranges = np.nanmax(highest[chosen], axis=1) - np.nanmin(lowest[chosen], axis=1)
+    ranges = np.empty((_DRAWS, len(record.channels)))
+    for draw in range(_DRAWS):
+        starts = rng.integers(0, record.seconds.size - length + 1, pieces)
+        rows = (starts[:, None] + np.arange(length)).ravel()[: after.seconds.size]
+        left = missed[rows] + np.tensordot(rng.standard_normal(parts.size), apart, axes=1)
+        ranges[draw] = np.nanmax(left, axis=0) - np.nanmin(left, axis=0)
     return dict(zip(record.channels, ranges.T, strict=True))
+
+
+def _with_sensors(after: Record, sensors: tuple[str, ...]) -> Record:
+    """Return a record with the sensors of another one in its order; one that does not measure stays at its first value."""
+    rows = [
+        after.temperature[:, after.sensors.index(name)] if name in after.sensors else np.zeros(after.seconds.size)
+        for name in sensors
+    ]
+    return replace(after, temperature=np.column_stack(rows), sensors=sensors)
 
 
 def verify(
@@ -127,14 +147,21 @@ def verify(
         is_kept = achieved <= high
         fault, reason = "", ""
         if dead or failed:
-            names = ", ".join(f"{name} ({faulty_sensors[name]})" for name in sorted(dead)) or "a reading"
+            names = ", ".join(f"{name} ({faulty_sensors[name]})" for name in sorted(dead))
             fault, reason = "dead sensor", f"{names} does not measure in this test, and the model reads it"
+            if not dead:
+                fault, reason = (
+                    "outside its range",
+                    "a reading was so far outside that the control took its sensor for failed",
+                )
         elif not is_kept:
-            fault, reason = _explain(after, model, readings, course, known, (gain, gain_u, explained))
+            rest = float(np.ptp(course - (gain - 1.0) * correction))
+            found = gain, gain_u, explained
+            fault, reason = _explain(after, model, readings, course, known, found, is_gain=rest <= high)
         verdicts.append(
             ChannelVerdict(
                 output.name,
-                before_um=float(np.ptp(course - correction)),
+                before_um=float(np.ptp(course - (gain if fault in _OF_GAIN else 1.0) * correction)),
                 predicted_um=float(np.median(draws)),
                 predicted_low_um=float(low),
                 predicted_high_um=float(high),
@@ -192,16 +219,18 @@ def _explain(
     course: Array,
     known: NDArray[np.bool_],
     gain: tuple[float, float, float],
+    *,
+    is_gain: bool,
 ) -> tuple[str, str]:
-    """Return what explains that more is left than was predicted, and the evidence."""
+    """Return what explains that more is left than was predicted, and the evidence; `is_gain`: but for the gain all is as predicted."""
     value, u, explained = gain
     by_states = _explained_by_states(after, model, readings, course, known)
     told = f"the correction acted with a gain of {value:.2f} ± {2.0 * u:.2f} (k = 2) and explains {100 * max(explained, 0.0):.0f} %"
     limit = float(special.stdtrit(_PIECES - 1, 0.5 + _COVERAGE / 2.0))
     # What the gain leaves may not be explained better by other coefficients: half of what is left beside it, again.
-    if explained >= _EXPLAINS and 1.0 - by_states > (1.0 - explained) * (1.0 - _EXPLAINS):
+    if is_gain or (explained >= _EXPLAINS and 1.0 - by_states > (1.0 - explained) * (1.0 - _EXPLAINS)):
         nearest = min(_NAMED_GAINS, key=lambda name: abs(_NAMED_GAINS[name] - value))
-        if abs(_NAMED_GAINS[nearest] - value) <= max(limit * u, 0.1):
+        if abs(_NAMED_GAINS[nearest] - value) <= max(limit * u, _SAME_GAIN):
             return nearest, told
         return "wrong scale", told
     if by_states >= _EXPLAINS:

@@ -4,6 +4,7 @@
 import json
 import subprocess
 import time
+from pathlib import Path
 
 import linuxcnc
 
@@ -45,7 +46,7 @@ def homed() -> bool:
 wait(homed)
 command.mode(linuxcnc.MODE_MDI)
 command.wait_complete(5)
-asked = json.load(open("moves.json"))
+asked = json.loads(Path("moves.json").read_text())
 moved = []
 for x in asked["moves"]:
     command.mdi(f"G0 X{x}")
@@ -62,4 +63,4 @@ if asked["readings"]:
         followed.append(
             [pin("thermofuse.correction-0"), pin("axis.x.eoffset"), pin("joint.0.pos-cmd"), pin("thermofuse.status")]
         )
-json.dump({"moved": moved, "followed": followed}, open("moved.json", "w"))
+Path("moved.json").write_text(json.dumps({"moved": moved, "followed": followed}))
