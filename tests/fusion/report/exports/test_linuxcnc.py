@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.skipif(
         shutil.which("linuxcnc") is None, reason="needs Debian's linuxcnc-uspace, which .ci/run installs"
     ),
-    pytest.mark.slow,
+    pytest.mark.long,
 ]
 
 
