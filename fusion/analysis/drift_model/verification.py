@@ -69,19 +69,22 @@ def predicted_ranges(product: xr.Dataset, loop: RecordLoop, after: Record, *, se
 
     Two things are left. What the model misses: every part of the record is predicted from all others, and the errors are put together
     again at random in pieces. And what its coefficients are wrong by, at the readings of the other test, which may go where the record
-    did not: the model is fitted without each part (jackknife), and the differences of its predictions there are added with random signs
-    and sizes.
+    did not: they are drawn from their distribution given the record, in which shrinkage is the prior of ridge regression.
     """
     record = record_of_product(product)
     columns, events, _ = columns_of_loop(loop, record, record.sensors)
     matrix = np.column_stack([evaluate_columns(record, columns), events])
     there = evaluate_columns(_with_sensors(after, record.sensors), columns)
     every = np.ones(record.seconds.size, bool)
-    missed = record.displacement - predict_left_out(record, matrix, predict(record, matrix, every).penalty)
-    parts = np.unique(record.chained)
-    fits = [predict(record, matrix, record.chained != part).coefficients[: len(columns)] for part in parts]
-    without = there @ np.array(fits)
-    apart = (without - without.mean(axis=0)) * np.sqrt((parts.size - 1) / parts.size)
+    fit = predict(record, matrix, every)
+    missed = record.displacement - predict_left_out(record, matrix, fit.penalty)
+    scale = np.where(matrix.std(axis=0) > 0.0, matrix.std(axis=0), np.inf)
+    standard = (matrix - matrix.mean(axis=0)) / scale
+    spread = standard.T @ standard / record.seconds.size + fit.penalty * np.eye(scale.size)
+    # Blocks follow each other closely: so many pieces are independent, not so many blocks.
+    root = np.linalg.cholesky(np.linalg.inv(spread) / _PIECES)
+    apart = ((there - there[0]) / scale[: len(columns)]) @ root[: len(columns)]
+    size = np.sqrt(np.nanmean(missed**2, axis=0))
     length = max(1, record.seconds.size // _PIECES)
     pieces = -(-after.seconds.size // length)
     rng = np.random.default_rng(seed)
@@ -89,7 +92,7 @@ def predicted_ranges(product: xr.Dataset, loop: RecordLoop, after: Record, *, se
     for draw in range(_DRAWS):
         starts = rng.integers(0, record.seconds.size - length + 1, pieces)
         rows = (starts[:, None] + np.arange(length)).ravel()[: after.seconds.size]
-        left = missed[rows] + np.tensordot(rng.standard_normal(parts.size), apart, axes=1)
+        left = missed[rows] + apart @ rng.standard_normal((scale.size, size.size)) * size
         ranges[draw] = np.nanmax(left, axis=0) - np.nanmin(left, axis=0)
     return dict(zip(record.channels, ranges.T, strict=True))
 
