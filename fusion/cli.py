@@ -559,6 +559,37 @@ def iso230(
             errors.print(f"page: {out.resolve()}")
 
 
+@app.command()
+def verify(
+    before: Annotated[
+        Path, Argument(metavar="BEFORE", help="Results folder of the test that the model was made from.")
+    ],
+    after: Annotated[Path, Argument(metavar="AFTER.toml", help="Campaign file of the test with the compensation.")],
+    applied: Annotated[Path, Option(metavar="MODEL.json", help="The model that the control runs.")],
+    as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Compare the test after a compensation with what was predicted.
+
+    What was predicted with its interval, what was achieved, and why not: wrong sign or scale, other coefficients, a dead sensor.
+    """
+    from dataclasses import asdict
+
+    from fusion.pipeline.verify import verify_compensation
+    from fusion.report.thermal_test import verification_table
+
+    with _answering():
+        found = verify_compensation(before, after, applied)
+        if as_json:
+            print_json(asdict(found))
+        else:
+            _wide().print(
+                verification_table(found.channels, title=f"{found.before}, then {found.after}: range of the drift")
+            )
+            _print_lines(
+                [*(f"{one.name}: {one.fault}: {one.reason}" for one in found.channels if one.fault), *found.remarks]
+            )
+
+
 @app.command("iso230-3")
 def iso230_3(
     test: Annotated[

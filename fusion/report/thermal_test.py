@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import rich.table
 
+from fusion.analysis.drift_model.verification import ChannelVerdict
 from fusion.report.charts.style import Chart, Courses, new_figure, of_rank, span_words
-from fusion.report.numbers import number, print_unit, small
+from fusion.report.numbers import measured, number, print_unit, small
 from fusion.report.wording import Table, Words, print_table, quantity, table
 from fusion.results.thermal_test import ThermalDistortion, ThermalTest
 
@@ -93,3 +94,20 @@ def thermal_test_tables(tests: Sequence[ThermalTest], *, title: str) -> list[ric
         for name in ("distortions", "temperatures", "budget")
         if (shown := described[name]) is not None
     ]
+
+
+def verification_table(verdicts: Sequence[ChannelVerdict], *, title: str) -> rich.table.Table:
+    """Return what was predicted and achieved for the terminal."""
+    rows = [
+        [
+            one.name,
+            number(one.before_um),
+            f"{number(one.predicted_um)} [{number(one.predicted_low_um)} to {number(one.predicted_high_um)}]",
+            number(one.achieved_um),
+            measured(one.gain, one.gain_u),
+            one.fault or "as predicted",
+        ]
+        for one in verdicts
+    ]
+    titles = ["without / µm", "predicted [95 %] / µm", "achieved / µm", "gain (k = 2)"]
+    return print_table(table([Words("Displacement"), *titles, Words("Verdict")], rows), title)

@@ -70,7 +70,7 @@ class RecursionOutput(ResultPart):
     coefficients: tuple[float, ...]
     """Predicted displacement per state."""
     limit: float
-    """Largest correction of the test; a larger one is held here."""
+    """Range of the correction in the test; a larger correction is held here."""
     max_step: float
     """Largest change of the correction in one step."""
     before: float

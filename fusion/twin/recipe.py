@@ -416,6 +416,12 @@ class Record(_TomlTable):
         Range of the sensors' time constants.
     walk_um_per_sqrt_h : float
         Standard deviation after one hour of the random walk of each channel.
+    duty_seed : int
+        Seed of what the same machine does on another day: duty, room, noise; 0: that of the campaign.
+    applied, applied_gain : str and float
+        Model description that the control runs as its compensation, and the factor with which it acts; empty: none.
+    dead_sensor : int
+        Sensor that reads 0 degC after a quarter of the test; 0: none.
     """
 
     hours: PositiveFloat = 24.0
@@ -431,6 +437,10 @@ class Record(_TomlTable):
     sensor_lag_min: Pair = (0.5, 2.0)
     noise_um: float = 0.3
     walk_um_per_sqrt_h: float = 0.2
+    duty_seed: int = 0
+    applied: str = ""
+    applied_gain: float = 1.0
+    dead_sensor: int = 0
 
 
 @dataclass(frozen=True)

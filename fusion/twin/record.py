@@ -83,29 +83,36 @@ def simulate_record(recipe: Recipe) -> RecordTruth:
         raise RecipeError("anomaly: a record has no targets; remove the [[anomaly]] tables or the [record]")
     seed = recipe.campaign.seed
     time_s = np.arange(0.0, 3600.0 * record.hours, record.step_s, dtype=float)
-    duty = random_levels(time_s, 0.0, 1.0, record.mean_hold_min, stream(seed, "duty"))
+    # The same machine under another duty.
+    duty_seed = record.duty_seed or seed
+    duty = random_levels(time_s, 0.0, 1.0, record.mean_hold_min, stream(duty_seed, "duty"))
     duty[duty < record.rest_share] = 0.0
-    axes = random_levels(time_s, 0.0, 1.0, 0.7 * record.mean_hold_min, stream(seed, "load of the axes"))
-    rises = solve_parts(duty, axes, _room_rise(record, time_s, seed), record.step_s)
+    axes = random_levels(time_s, 0.0, 1.0, 0.7 * record.mean_hold_min, stream(duty_seed, "load of the axes"))
+    rises = solve_parts(duty, axes, _room_rise(record, time_s, duty_seed), record.step_s)
     with_sensor = rises[:, 1:]
 
     size = (time_s.size, record.channels)
     sensitivities = (with_sensor.shape[1], record.channels)
     per_K = stream(seed, "sensitivities").normal(0.0, record.sensitivity_um_per_K, sensitivities)
-    walks = stream(seed, "walks").standard_normal(size) * np.sqrt(record.step_s / 3600.0)
+    walks = stream(duty_seed, "walks").standard_normal(size) * np.sqrt(record.step_s / 3600.0)
     series: dict[str, Array] = {
         "quasi_static": with_sensor @ per_K,
         "nuisance": record.walk_um_per_sqrt_h * np.cumsum(walks, axis=0),
-        "noise": record.noise_um * stream(seed, "noise").standard_normal(size),
+        "noise": record.noise_um * stream(duty_seed, "noise").standard_normal(size),
     }
     session = _session(recipe, record, time_s, duty, with_sensor.mean(axis=1))
     for effect in recipe.effect:
         series[effect.name] = series.get(effect.name, np.zeros(size)) + _effect(effect, session, record, seed)
-    dims, logged = ("time", "channel"), _logged_temperatures(record, with_sensor, seed)
+    dims, logged = ("time", "channel"), np.round(_logged_temperatures(record, with_sensor, seed), 3)
+    if record.dead_sensor:
+        logged[time_s >= 0.25 * time_s[-1], record.dead_sensor - 1] = 0.0
+    if record.applied:
+        speed = np.round(duty * record.top_speed_rpm)
+        series["compensation"] = record.applied_gain * _correction(record, logged, speed)
     start = np.datetime64(recipe.campaign.start.removesuffix("Z"), "ns")
     table = xr.Dataset(
         {
-            "temperature": (("time", "sensor"), np.round(logged, 3), {"units": "degC"}),
+            "temperature": (("time", "sensor"), logged, {"units": "degC"}),
             "displacement": (dims, np.round(np.sum(list(series.values()), axis=0), 3), {"units": "um"}),
             "speed": ("time", np.round(duty * record.top_speed_rpm), {"units": "1/min"}),
             **{name: (dims, part, {"units": "um"}) for name, part in series.items()},
@@ -117,6 +124,29 @@ def simulate_record(recipe: Recipe) -> RecordTruth:
         },
     )
     return RecordTruth(recipe, table, tuple(series))
+
+
+def _correction(record: Record, logged: Array, speed: Array) -> Array:
+    """Return what a control with the model of ``applied`` adds (time, channel), um, zero at the start; nothing after a failed reading."""
+    model = json.loads(Path(record.applied).read_text(encoding="utf-8"))
+    readings = {f"T{number}": column for number, column in enumerate(logged.T, start=1)} | {"spindle speed": speed}
+    states: list[Array] = []
+    failed = np.zeros(speed.size, bool)
+    for one in model["inputs"]:
+        values = readings[one["name"]]
+        failed |= (values < one["failed_below"]) | (values > one["failed_above"])
+    for one in model["states"]:
+        origin = model["inputs"][one["input"]]
+        held = np.clip(readings[origin["name"]], origin["low"], origin["high"])
+        signal = ((held - origin["reference"]) / one["size"]) ** one["exponent"]
+        tau_s = one["time_constant_s"]
+        states.append(signal if tau_s == 0.0 else first_order(signal - signal[0], record.step_s, tau_s) + signal[0])
+    correction = np.zeros((speed.size, record.channels))
+    for one in model["outputs"]:
+        wanted = -np.asarray(one["coefficients"]) @ np.array(states)
+        held = np.clip(wanted - wanted[0], -one["limit"], one["limit"])
+        correction[:, CHANNELS.index(one["name"])] = np.where(np.maximum.accumulate(failed), 0.0, held)
+    return correction
 
 
 def _room_rise(record: Record, time_s: Array, seed: int) -> Array:

@@ -244,7 +244,8 @@ def make_recursion(
     for column, weights in zip(columns, whole, strict=True):
         for one in column:
             coefficients[place[one.input, one.exponent, one.time_constant_s]] += one.share * weights
-    limit = np.abs(follow).max(axis=0)
+    # Counted from any state of the test that is made the zero.
+    limit = np.ptp(follow, axis=0)
     outputs = [
         RecursionOutput(
             name=record.channels[k],
