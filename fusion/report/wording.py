@@ -287,7 +287,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, quoted_window, randomised_causes, worse_channels,
+        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, quoted_window, randomised_causes,
+        worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
     return made
