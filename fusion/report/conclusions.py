@@ -44,7 +44,7 @@ def headline(results: Results) -> str:
 
 
 #: Most actions on the first screen, and words of each.
-_FIRST_STEPS, _WORDS = 3, 12
+_FIRST_STEPS, _WORDS = 3, 14
 _BRACKETS = re.compile(r" \([^()]*\)")
 _DANGLING = re.compile(
     r"(?: (?:a|an|and|as|at|does|for|from|in|is|it|not|of|on|or|that|the|this|to|was|where|whether|which|with))+$"
