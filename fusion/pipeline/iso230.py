@@ -24,6 +24,7 @@ from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
+from fusion.results.parts import decide
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
 from fusion.results.store import file_sha256, group, has, joined, plain, read_product
@@ -43,7 +44,7 @@ from interferometry.iso230 import (
     evaluate_windows,
     settled_window,
 )
-from interferometry.iso230.conditions import check_conditions, decide
+from interferometry.iso230.conditions import check_conditions
 from interferometry.plots import time_span
 
 _RULE = f"of the windows of {STANDARD_CYCLES} cycles in the second half of the test, the one with the least drift by the joint estimate"

@@ -10,10 +10,8 @@ from typing import Any, NamedTuple
 from fusion.report.wording import ARROWS, approach_of, conditional, randomised_causes, say
 from fusion.results.axis import AnomalyPart, Iso230Part
 from fusion.results.loop import StepPart
-from fusion.results.parts import TimePart
+from fusion.results.parts import TimePart, decide
 from fusion.results.results import Results
-from interferometry.iso230 import Iso230Budget
-from interferometry.iso230.conditions import decide
 
 #: Question of a reader, and the statement that answers it.
 _QUESTIONS = {
@@ -108,8 +106,6 @@ def action(step: StepPart, time: TimePart | None, *, record: bool) -> str:
 
 # What would make the uncertainty of the axis values smaller.
 
-#: Coefficient of which the budget of a file without a campaign is, ppm/K.
-_ASSUMED = f"{Iso230Budget().nominal_expansion_ppm_per_K:g}"
 #: An uncertainty that becomes no smaller than this share of itself is not worth a line.
 _WORTH = 0.8
 #: Line of the campaign file and standard uncertainty of an input that is stated in place of an assumption: a coefficient that was measured
@@ -156,7 +152,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
         if expanded < _WORTH * min(told.sharper_um, told.expanded_um):
             value = next(
                 (row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text),
-                _ASSUMED,
+                "...",
             )
             limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)
             decision = "" if limit is None or found.value is None else decide(found.value, expanded, limit)

@@ -178,6 +178,16 @@ class InputsPart(ResultPart):
 # other standards.
 
 
+Decision = Literal["pass", "fail", "not decided within the uncertainty"]
+
+
+def decide(value: float, expanded_u: float, limit: float) -> Decision:
+    """Judge a quantity with its expanded uncertainty (k = 2) against its upper limit (ISO 14253-1)."""
+    if value + expanded_u <= limit:
+        return "pass"
+    return "fail" if value - expanded_u > limit else "not decided within the uncertainty"
+
+
 class Iso230Tolerance(ResultPart):
     """A quantity judged against its tolerance."""
 
@@ -189,7 +199,7 @@ class Iso230Tolerance(ResultPart):
     """Value in the settled window, um."""
     expanded_u_um: Number
     """Its expanded uncertainty (k = 2), um."""
-    decision: Literal["pass", "fail", "not decided within the uncertainty", "not measured"]
+    decision: Decision | Literal["not measured"]
     """By ISO 14253-1."""
 
 

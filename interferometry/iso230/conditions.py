@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -12,18 +11,6 @@ from scipy.special import fdtrc
 
 from interferometry.drift.planning import Settling, spacing_warnings
 from interferometry.iso230.evaluation import STANDARD_CYCLES
-
-# Whether a quantity keeps its tolerance, with its uncertainty.
-
-Decision = Literal["pass", "fail", "not decided within the uncertainty"]
-
-
-def decide(value: float, expanded_u: float, limit: float) -> Decision:
-    """Judge a quantity with its expanded uncertainty (k = 2) against its upper limit (ISO 14253-1)."""
-    if value + expanded_u <= limit:
-        return "pass"
-    return "fail" if value - expanded_u > limit else "not decided within the uncertainty"
-
 
 #: Least number of target positions, and per metre of travel; travel in mm above which the standard has another test.
 LEAST_TARGETS, TARGETS_PER_METRE, LONGEST_TRAVEL_MM = 5, 5, 2000.0

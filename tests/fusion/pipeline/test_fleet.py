@@ -243,7 +243,7 @@ def test_no_text_is_a_formula_for_a_spreadsheet_or_a_style_for_the_terminal(whol
     assert float(lines[0]["drift_um"]) == whole.drift_um
     assert "key" not in lines[0]
     told = io.StringIO()
-    Console(file=told, width=160).print(summary_table([replace(whole, name="[red]a[/red]"), FAILED], "2 [b]campaigns"))
+    Console(file=told, width=240).print(summary_table([replace(whole, name="[red]a[/red]"), FAILED], "2 [b]campaigns"))
     assert "[red]a[/red]" in told.getvalue()
     assert "2 [b]campaigns" in told.getvalue()
 

@@ -12,6 +12,7 @@ from fusion.campaign.recompensation import StatedBudget
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test, read_window
 from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
+from fusion.results.parts import decide
 from fusion.results.results import ResultsError
 from fusion.results.store import joined, plain
 from interferometry.deviations import build_deviations
@@ -160,3 +161,17 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(pipe)
     with pytest.raises(CampaignError, match=r"laser\.csv: is a pipe, a socket or a device; name a file"):
         read_test(pipe, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "u", "decision"),
+    [
+        (8.0, 2.0, "pass"),
+        (8.01, 2.0, "not decided within the uncertainty"),
+        (12.0, 2.0, "not decided within the uncertainty"),
+        (12.01, 2.0, "fail"),
+        (10.0, 0.0, "pass"),
+    ],
+)
+def test_the_uncertainty_counts_against_whoever_claims_the_result(value, u, decision):
+    assert decide(value, u, 10.0) == decision

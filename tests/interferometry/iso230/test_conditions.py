@@ -6,7 +6,7 @@ import xarray as xr
 
 from interferometry.deviations import build_deviations
 from interferometry.drift.planning import Settling
-from interferometry.iso230.conditions import ConditionCheck, check_conditions, decide
+from interferometry.iso230.conditions import ConditionCheck, check_conditions
 
 CYCLES = [1, 2, 3, 4, 5]
 
@@ -82,17 +82,3 @@ def test_scatter_alone_is_seldom_called_a_trend():
         called += not found(scattered, settling=[])["settled"].met
     # 1 % of 200 is 2; seven or more would have a probability of 0.5 %.
     assert called < 7
-
-
-@pytest.mark.parametrize(
-    ("value", "u", "decision"),
-    [
-        (8.0, 2.0, "pass"),
-        (8.01, 2.0, "not decided within the uncertainty"),
-        (12.0, 2.0, "not decided within the uncertainty"),
-        (12.01, 2.0, "fail"),
-        (10.0, 0.0, "pass"),
-    ],
-)
-def test_the_uncertainty_counts_against_whoever_claims_the_result(value, u, decision):
-    assert decide(value, u, 10.0) == decision

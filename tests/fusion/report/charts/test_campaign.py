@@ -15,6 +15,7 @@ from fusion.report.charts.campaign import draw_attributed, draw_campaign, draw_m
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import Chart, chart_scripts, embed, new_figure
 from fusion.report.numbers import alike, number
+from fusion.report.thermal_test import draw_thermal_tests
 from fusion.results.results import read_results
 from fusion.results.store import group, read_fusion, read_product
 from tests.browser import CHROMIUM, record_faults
@@ -141,7 +142,7 @@ def test_each_chart_is_drawn_once_and_together_they_are_all(results_folder):
     assert {"rise_history", "drift_map", "iso230", "timeline", "drift_temperature"} <= measured
     assert {"clusters", "region_targets"} <= attributed
     assert {"history", "anomalies", "contributions"} <= modelled
-    assert placed == {"registration", "thermal_map"}
+    assert placed == {"registration", "thermal_map", *draw_thermal_tests(results.iso230_3)}
     both = draw_campaign(results, datasets)
     assert list(both.charts) == [name for part in parts for name in part.charts]
     assert both.thermal_map == parts[-1].thermal_map and both.thermal_map is not None
