@@ -256,7 +256,8 @@ def standing(course: Course, wanted_u_um: float, *, runs: bool) -> str:
     verb = "Following" if runs else "No longer followed"
     head = f"{verb}: {', '.join(counted(count, noun) for count, noun in seen)}."
     if course.iso230_um:
-        values = ", ".join(f"{name} = {number(value, 3)} µm" for name, value in course.iso230_um[-1].items())
+        latest = course.iso230_um[-1]
+        values = ", ".join(f"{name} = {number(latest[name], 3)} µm" for name in sorted(latest, key="AREMB".find))
         head += f" By ISO 230-2, {course.window}: {values}."
     return f'<p role="status">{ui.as_markup(head)} {ui.as_markup(enough_words(course, wanted_u_um))}</p>'
 
