@@ -73,7 +73,7 @@ def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> N
     """Write a picture of the application that shows the results of a campaign."""
     copy = Path(tempfile.mkdtemp()) / "measurement"
     shutil.copytree(campaign, copy)
-    shutil.copytree(results, copy / "results")
+    shutil.copytree(results, copy / "results", dirs_exist_ok=True)
     try:
         with open_app(copy) as address, open_page(browser, address, 900) as page:
             page.set_default_timeout(_LOADING_MS)
