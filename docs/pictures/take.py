@@ -99,7 +99,7 @@ def take_thermograms(browser: Browser, folder: Path) -> None:
 
 #: Picture of the gallery -> the public files that it is made of, and what of their report is brought to the top of the window.
 _GALLERY = {
-    "spindle": ("CAIVIAC__FL_THERMAL", ("h2:has-text('What was recorded')", 640)),
+    "spindle": ("CAIVIAC__FL_THERMAL", ("body", 800)),
     "thermogram": ("FLIR_E40.jpg", ("body", 720)),
 }
 

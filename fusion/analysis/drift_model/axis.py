@@ -1003,7 +1003,7 @@ class LoopResult:
     @property
     def verdict(self) -> schema.Verdict:
         """Word for the outcome."""
-        kept = [step.keeps_name for step in self.steps]
+        kept = [step.keeps_name and not step.withheld for step in self.steps]
         return verdict(
             named=any(kept),
             left=bool(self.remainder.shape) or not all(kept) or self._falls_short,
@@ -1141,6 +1141,8 @@ def _added_effect(
         answer = replace(answer, against=wrong.sentence)
     size_um, smooth_um = _size(model, term), wandering_um(model.fit) if model.fit.system.order == 2 else 0.0
     withheld = withheld_for(step, size_um=size_um, smooth_drift_um=smooth_um, beside=beside)
+    if not withheld and answer.is_of_other_size:
+        withheld = answer.other_size(where)
     return AddedEffect(
         **step.described(term.candidate, answer, where, size=model.size(term), withheld=withheld),
         coefficients=coefficients_of(averaged, term),

@@ -400,7 +400,7 @@ class Step:
             "parameter_ranges": self.score.ranges,
             "p_value": self.score.family_wise_p,
             "tied": tied,
-            "withheld": withheld or (answer.other_size(where) if answer.is_of_other_size else ""),
+            "withheld": withheld,
             "runner_up": runner_up,
             **answer.described(where),
             "confirmed_by": str(self.confirmed),

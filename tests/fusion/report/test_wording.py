@@ -374,6 +374,9 @@ def test_effects_that_are_not_separated_are_told_as_one_of_these():
     open_end = axis_step("thermal_lag", withheld="its time constant is not determined (130 min and more fits)")
     words = step_phrase(open_end, None, record=False)
     assert words.startswith("something that moves like a part") and words.endswith("130 min and more fits)")
+    told = say("verdict", loop("unexplained", open_end), None, False)
+    assert f"can be identified as its cause; it holds {words}." in told
+    assert action(open_end, None, record=False).startswith("Not confirmed, check this only where nothing else is found")
 
 
 def test_an_event_is_told_with_its_size_and_its_local_time():
