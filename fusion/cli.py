@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from enum import StrEnum
 from functools import reduce
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -172,14 +172,17 @@ def run(
         from fusion.analysis.effects.effect import leave_plugins_out
 
         leave_plugins_out()
-    second = second_process(wanted=processes > 1 and not (resume or watch))
-    with _answering([folder for _, folder in folders]), second as worker:
-        # The libraries may take seconds to load: something is seen before that.
-        with _progress(quiet=quiet) as report:
-            report("start", 0, 1)
-            from fusion.report.terminal import summary_table
+    two = processes > 1 and not (resume or watch)
+    written = [folder for _, folder in folders]
+    # The libraries may take seconds to load: something is seen before that.
+    with _answering(written), _progress(quiet=quiet) as report:
+        report("start", 0, 1)
+        from fusion.report.terminal import summary_table
 
-            report("start", 1, 1)
+        if two:
+            import_module("fusion.pipeline.run")
+        report("start", 1, 1)
+    with second_process(wanted=two) as worker, _answering(written):
         if watch:
             _watch(_here(places[0], "--watch follows"), until_idle_s=until_idle, wanted=wanted, quiet=quiet)
         join = _joining([_here(place, "two are joined from") for place in places]) if len(folders) == 2 else None
@@ -190,7 +193,7 @@ def run(
                 console.print(summary_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
         if join is not None:
-            for name, text in join([folder for _, folder in folders], folders[0][1].parent):
+            for name, text in join(written, folders[0][1].parent):
                 if not quiet:
                     console.print(f"both campaigns, {name}: {text}", soft_wrap=True)
 
@@ -758,9 +761,13 @@ def compare(
 
 @app.command()
 def plan(
+    results: Annotated[
+        Path | None,
+        Argument(metavar="[RESULTS]", help="Results of a record: what it left open asks for the next test."),
+    ] = None,
     source: Annotated[
         list[str], Option(metavar="NAME=TIME", help="A heat source that can be switched, with its time constant.")
-    ],
+    ] = [],  # noqa: B006
     effect: Annotated[str, Option(help="Smallest drift of one source to be detected.")] = "1 um",
     drift: Annotated[
         str, Option(help="Random walk of the axis in one hour (the report's unexplained drift).")
@@ -774,11 +781,15 @@ def plan(
 ) -> None:
     """Propose a random duty schedule for a new test.
 
-    It separates heat sources that are collinear when they are switched together.
+    It separates what is collinear when it is switched together: heat sources that are named, or what the results of a record left open,
+    with the uncertainty of a prediction that is expected after it.
     """
-    from fusion.pipeline.plan import duty_lines
+    from fusion.pipeline.plan import duty_lines, next_test_lines
 
     with _answering():
+        if results is not None:
+            _print_lines(next_test_lines(results, seed=seed))
+            return
         _print_lines(duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed))
 
 

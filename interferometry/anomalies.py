@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from interferometry.common import Array, InterferometryError, check_dataset
-from interferometry.drift.gls import typical_memory, von_neumann_p_value
+from interferometry.drift.gls import memory_of_each, typical_memory, von_neumann_p_value
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
 WEIGHTS = {"scatter": 0.7, "slow": 0.1, "step": 0.1, "periodic": 0.1}
@@ -157,7 +157,7 @@ def _scatter_anomalies(
     estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator
 ) -> list[Anomaly]:
     """Return positions with excess scatter, step down: each leaves the pool before the others are tested again."""
-    z = estimated["standardised"].values
+    z = _without_memory(estimated["standardised"].values)
     scatter = estimated["scatter_position"].values
     usable = np.flatnonzero(np.isfinite(scatter) & (scatter > 0))
     stands_out = _stands_out(estimated, usable)
@@ -188,6 +188,16 @@ def _scatter_anomalies(
         )
         pool = others
     return anomalies
+
+
+def _without_memory(z: Array) -> Array:
+    """Standardised residuals (cycle, direction, target) whose noise has no memory over the cycles: the scatter of fewer independent values
+    differs more between positions.
+    """
+    series = z.reshape(z.shape[0], -1).T
+    memory = memory_of_each(np.nan_to_num(series))
+    white = memory.innovations(np.nan_to_num(series)) / np.sqrt(memory.innovation_share)
+    return np.where(np.isfinite(z), white.T.reshape(z.shape), np.nan)
 
 
 def _stands_out(estimated: xr.Dataset, usable: NDArray[np.int64]) -> NDArray[np.bool_]:

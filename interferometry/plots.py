@@ -291,7 +291,7 @@ def plot_iso230(settled: xr.Dataset, position: xr.DataArray, ax: Axes | None = N
         one = settled.sel(direction=direction).isel(target=order)
         mean, spread = one["mean_unidirectional"].values, 2 * one["standard_deviation"].values
         if np.isfinite(mean).any():
-            label = f"mean {ARROWS[direction]} ± 2 s"
+            label = f"mean {ARROWS[direction]}{' ± 2 s' if np.isfinite(spread).any() else ''}"
             axes.errorbar(position.values[order], mean, spread, color=COLOURS[direction], capsize=3, label=label)
     unit = str(settled["A"].attrs.get("units", "um")).replace("um", "µm")
     axes.set(xlabel=f"position / {position.attrs.get('units', 'mm')}", ylabel=f"deviation / {unit}")

@@ -14,12 +14,14 @@ from fusion.pipeline.workers import second_process
 
 def main(campaign: str, results: str, *more: str) -> int:
     """Run a campaign as `thermofuse run` does."""
+    console = Terminal(stderr=True, soft_wrap=True)
     try:
-        with answering(Terminal(stderr=True, soft_wrap=True)), second_process() as worker:
+        with answering(console):
             write_progress("start", 0, 1)
             from fusion.pipeline.run import run_campaign
 
             write_progress("start", 1, 1)
+        with second_process() as worker, answering(console):
             run_campaign(Path(campaign), Path(results), resume="--resume" in more, report=write_progress, worker=worker)
     except typer.Exit as ended:
         return ended.exit_code

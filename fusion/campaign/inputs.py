@@ -586,7 +586,9 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
             f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
             "that stand out and causes need the time of every reading, and no log can be set beside them."
         )
-        notices.append(Notice("no_times", message, "Export one reading per line with its time."))
+        notices.append(
+            Notice("no_times", message, "To see drift and its causes, export one reading per line with its time.")
+        )
     elif source.environment is None:
         message = "No environment was logged, so effects of the air and of the material compensation cannot be separated from the drift."
         remedy = "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -38,7 +39,6 @@ from fusion.analysis.consistency.logs import (
     check_contact_sensors,
     check_log,
     check_material,
-    check_sensors,
     compare_sensors,
 )
 from fusion.analysis.consistency.model import check_coefficients
@@ -59,10 +59,6 @@ def check_source(source: Inputs) -> list[Check]:
     checks: list[Check] = []
     if isinstance(source, LaserInputs):
         checks += _check_readings_and_logs(source)
-    if source.sensors is not None:
-        sensors = source.sensors
-        left_out = [f"{sensors.logged['sensor'].values[fault.sensor]} {fault.words}" for fault in sensors.faults]
-        checks += check_sensors(sensors.temperature, file=sensors.file, left_out=left_out)
     if isinstance(source, CameraInputs) and source.frames:
         checks += check_order(source.frames)
         if isinstance(source, Source) and source.thermography.table == "still":
@@ -144,56 +140,34 @@ def _check_readings_and_logs(source: LaserInputs) -> list[Check]:
     return [*checks, *check_contact_sensors(source.environment, source.drivers, file=environment_file)]
 
 
-def _compare_sensors(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
-    """The camera's rise against that of contact sensors, where there are any."""
-    sensors = source.sensors
-    if sensors is None:
-        return []
-    return compare_sensors(fields, sensors.temperature, sensors.x_mm, sensors.y_mm, u_K=sensors.u_K)
-
-
-def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[Check]:
-    """Check the fields in themselves, and against logs and drift."""
-    try:
-        compared = compare_drift(read_fused(fused))
-    except ReadingsError:
+def check_fields(source: CameraInputs, fields: xr.Dataset, fused: xr.Dataset | None = None) -> list[Check]:
+    """Check the fields in themselves and against logs and contact sensors; with a laser against material temperature and drift too."""
+    field, (environment_file, drivers_file) = thin_fields(fields), _log_files(source.campaign)
+    compared, material, gaps = list[Evidence](), list[Check](), list[Check]()
+    if isinstance(source, Source) and fused is not None:
         # It takes three cycles at three targets with readings among the frames.
-        compared = []
-    field, place_mm = thin_fields(fields), source.interferometry.material_sensor_mm
-    near = field if place_mm is None else field_at(fields, place_mm)
-    environment_file, drivers_file = _log_files(source.campaign)
-    compared += [
-        *_of_stamps(source, fields),
-        *compare_material(near, source.environment),
-        *compare_load(field, source.drivers),
-    ]
-    material = check_material(near, source.environment, stated=place_mm is not None, file=environment_file)
-    sensors = _compare_sensors(source, fields)
+        with suppress(ReadingsError):
+            compared += compare_drift(read_fused(fused))
+        place_mm = source.interferometry.material_sensor_mm
+        near = field if place_mm is None else field_at(fields, place_mm)
+        compared += [*_of_stamps(source, fields), *compare_material(near, source.environment)]
+        material = check_material(near, source.environment, stated=place_mm is not None, file=environment_file)
+        gaps = check_gaps(fields["time"].values, source.deviations["time"])
+    sensors, on_plan = list[Check](), source.sensors
+    if on_plan is not None:
+        sensors = compare_sensors(fields, on_plan.temperature, on_plan.x_mm, on_plan.y_mm, u_K=on_plan.u_K)
     if sensors:
         # Contact sensors on the plan have shown the scale, or contradict it.
         material = [check if check.verified else replace(check, verified=True, remedy="") for check in material]
     return [
-        *check_clocks(_recordings(source, fields), compared),
+        *check_clocks(_recordings(source, fields), [*compared, *compare_load(field, source.drivers)]),
         *check_load_scale(field, source.drivers, file=drivers_file),
-        *check_load_course(field, source.drivers, file=drivers_file),
+        *check_load_course(field, source.drivers, file=drivers_file, environment=source.environment),
         *material,
         *sensors,
         *check_place(fields),
         *check_picture(fields),
-        *check_gaps(fields["time"].values, source.deviations["time"]),
-    ]
-
-
-def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
-    """Check the fields in themselves, and against the logged loads, where there is no laser."""
-    field, (_, drivers_file) = thin_fields(fields), _log_files(source.campaign)
-    return [
-        *check_clocks(_recordings(source, fields), compare_load(field, source.drivers)),
-        *check_load_scale(field, source.drivers, file=drivers_file),
-        *check_load_course(field, source.drivers, file=drivers_file),
-        *_compare_sensors(source, fields),
-        *check_place(fields),
-        *check_picture(fields),
+        *gaps,
     ]
 
 

@@ -85,12 +85,12 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
             "mounting": _mounting(stated, temperature),
         }
         courses.append(_Course(channel, "um", displacement[:, k], sources, share))
-    courses += list(_tilts(courses, stated))
     missing = [one for tilted in stated.tilts.values() for one in tilted.channels if one not in channels]
     if missing:
         raise CampaignError(
             f"[thermal_test.tilts] names {', '.join(missing)}; the displacements of the record are {', '.join(channels)}"
         )
+    courses += list(_tilts(courses, stated))
     if not stated.tilts:
         remarks.append(
             'No tilt: write [thermal_test.tilts], for example A = {channels = ["Y1", "Y2"], distance = "150 mm"}.'
@@ -118,8 +118,6 @@ def _tilts(courses: Sequence[_Course], stated: ThermalTestTable) -> Iterator[_Co
     """Yield the tilts that two displacements show."""
     by_name = {one.name: one for one in courses}
     for name, tilted in stated.tilts.items():
-        if not set(tilted.channels) <= set(by_name):
-            continue
         first, second = (by_name[one] for one in tilted.channels)
         per_um = 1e3 / tilted.distance_mm
         sources = {

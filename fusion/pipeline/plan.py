@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from fusion.analysis.attribution.duty import DutyPlanError, Machine, plan_duty, switchings
+from fusion.analysis.drift_model.next_test import propose_tests
 from fusion.campaign.values import read_option
 from fusion.report.numbers import duration
+from fusion.results.loop import RecordLoop
+from fusion.results.results import read_results
+from fusion.results.store import read_product
+
+#: Inputs that are named as known worst.
+_NAMED = 4
 
 
 def duty_lines(
@@ -31,6 +39,36 @@ def duty_lines(
         "minute  source  state",
     ]
     return lines + [f"{minute:6.0f}  {name}  {state}" for minute, name, state in switchings(proposed)]
+
+
+def next_test_lines(folder: Path, *, seed: int) -> list[str]:
+    """Propose the next test of a record's machine from what the last one left open."""
+    results = read_results(folder)
+    if not isinstance(results.loop, RecordLoop):
+        raise DutyPlanError(
+            f"{folder}: the results of a [record] are needed; for a positioning test name its heat sources by --source"
+        )
+    product = read_product(folder, "record")
+    tests = list(propose_tests(product, results.loop, seed=seed))
+    now = tests[0].width_now_um
+    # The shortest that halves what is open, else the one that leaves least.
+    best = next((one for one in tests if one.width_um <= now / 2.0), min(tests, key=lambda one: one.width_um))
+    worst = ", ".join(f"{name} {um:.2g} um" for name, um in list(tests[0].open_um.items())[:_NAMED])
+    names = [str(name) for name in product["driver_name"].values]
+    units = [str(unit) for unit in product["driver_units"].values]
+    return [
+        f"standard uncertainty of a prediction under another duty: {now:.2g} um now; least known by itself: {worst}",
+        *(
+            f"after {one.hours:g} h, mean time at one level {one.hold_min:g} min: {one.width_um:.2g} um"
+            for one in tests
+        ),
+        f"proposed: {best.hours:g} h",
+        "minute  " + "  ".join(f"{name} / {unit}" for name, unit in zip(names, units, strict=True)),
+        *(
+            f"{minute:6.0f}  " + "  ".join(f"{level:g}" for level in row)
+            for minute, row in zip(best.minutes, best.levels, strict=True)
+        ),
+    ]
 
 
 def _source(text: str) -> tuple[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry, add_sensor_line, align, align_logs
 from fusion.analysis.consistency.camera import find_gaps, gap_words, in_gaps
 from fusion.analysis.consistency.readings import find_gross_readings
-from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose, undetermined_check
+from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose
 from fusion.campaign.inputs import LaserInputs, Source, lacks_course
 from fusion.campaign.recompensation import material_by_cycle
 from fusion.campaign.time_zones import utc
@@ -230,8 +230,9 @@ def _outside_notices(fused: xr.Dataset) -> Iterator[Notice]:
 
 # Positions that stand out from what the model explains, and their cause.
 
-#: Largest family-wise p-value of an anomaly for which a cause is named.
-_CAUSE_LEVEL = 0.02
+#: Probability of any false anomaly in a whole test: a run states effects and a remainder as well, and all together may be false in 0.05.
+#: A rare kind reaches it with so many permutations.
+_LEVEL, _PERMUTATIONS = 0.02, 999
 
 
 @dataclass(frozen=True)
@@ -268,21 +269,10 @@ def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.
     left = (fused["deviation"] - explained).values
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=left))
     # Scatter that is only unequal, as it naturally is, makes no position an anomaly; one that stands out does.
-    anomalies = [anomaly for anomaly in detect_anomalies(cleaned, estimate_drift(cleaned)) if anomaly.stands_out]
+    found = detect_anomalies(cleaned, estimate_drift(cleaned), level=_LEVEL, permutations=_PERMUTATIONS)
+    anomalies = [anomaly for anomaly in found if anomaly.stands_out]
     diagnoses = diagnose(fused.assign(deviation=fused["deviation"].copy(data=left)), anomalies)
-    return [
-        DiagnosedPosition(anomaly, withhold_doubtful_cause(anomaly, diagnosis))
-        for anomaly, diagnosis in zip(anomalies, diagnoses, strict=True)
-    ]
-
-
-def withhold_doubtful_cause(anomaly: Anomaly, diagnosis: Diagnosis) -> Diagnosis:
-    """Name no cause for a position that is itself flagged only near the limit."""
-    if diagnosis.cause == "undetermined" or anomaly.p_value <= _CAUSE_LEVEL:
-        return diagnosis
-    doubt = f"the position itself is flagged only near the limit (p = {anomaly.p_value:.2g}); before a cause, it needs more cycles"
-    check = undetermined_check(diagnosis.cause)
-    return replace(diagnosis, cause="undetermined", check=check, against_it=(doubt, *diagnosis.against_it))
+    return [DiagnosedPosition(*both) for both in zip(anomalies, diagnoses, strict=True)]
 
 
 def sites_of(positions: Sequence[DiagnosedPosition], targets: int) -> list[tuple[int, str]]:

@@ -31,7 +31,7 @@ from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, thermal
 from fusion.pipeline import positioning as interferometry
 from fusion.pipeline import record as record_stage
-from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
+from fusion.pipeline.consistency import check_fields, check_loop, check_plan, check_source
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.iso230_3 import evaluate_axis_test, evaluate_record_test
 from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
@@ -58,7 +58,7 @@ from fusion.results.store import StageStamps, is_large, open_dataset, write_data
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
-    from fusion.report.charts.campaign import Drawn
+    from fusion.report.charts.embedded import Drawn
 
 #: A product that a campaign may not have.
 Maybe: TypeAlias = xr.Dataset | None
@@ -311,7 +311,7 @@ def _begin_checks(run: Run, camera: CameraInputs, fields: xr.Dataset, fused: May
     """Begin to check the fields."""
     if isinstance(camera, Source) and fused is not None:
         return run.worker.submit(partial(check_fields, _without_frames(camera), fields, fused))
-    return partial(check_fields_alone, camera, fields)
+    return partial(check_fields, camera, fields)
 
 
 def _begin_maps(run: Run, fields: xr.Dataset) -> Callable[[], object]:

@@ -40,7 +40,7 @@ from fusion.results.store import (
 from thermography.io.other_cameras import ENTRY_POINT_GROUP
 
 if TYPE_CHECKING:
-    from fusion.report.charts.campaign import Drawn
+    from fusion.report.charts.embedded import Drawn
 
 
 # Provenance of a run: versions, inputs with their SHA-256, parameters, times, and the command; and whether a run is

@@ -10,7 +10,7 @@ import numpy as np
 from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.drift_model.record import examine_record
 from fusion.analysis.drift_model.record_data import reduce_record
-from fusion.analysis.drift_model.verification import ChannelVerdict, predicted_ranges, verify
+from fusion.analysis.drift_model.verification import ChannelVerdict, verify
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_record
@@ -55,7 +55,6 @@ def verify_compensation(before: Path, after: Path, applied: Path) -> Verificatio
     health = examine_record(table, [QUASI_STATIC])
     record = reduce_record(health.table)
     faulty = {one.sensor: describe_fault(one) for one in health.findings if one.state == "left_out"}
-    ranges = predicted_ranges(read_product(before, "record"), results.loop, record)
     remarks = []
     if model.results_sha256 != file_sha256(before / "results.json"):
         remarks.append(
@@ -74,6 +73,6 @@ def verify_compensation(before: Path, after: Path, applied: Path) -> Verificatio
     return Verification(
         results.campaign,
         campaign.campaign.title,
-        tuple(verify(record, model, ranges, faulty_sensors=faulty)),
+        tuple(verify(read_product(before, "record"), results.loop, record, model, faulty_sensors=faulty)),
         tuple(remarks),
     )

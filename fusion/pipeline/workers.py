@@ -13,13 +13,13 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from multiprocessing.connection import Connection
-from threading import Thread
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer")
-#: What the second process loads while the first reads the campaign.
-_LIBRARIES = ("fusion.pipeline.run", "fusion.report.page")
+#: What the second process loads while the first reads the campaign, where it is not a copy of a process that has it.
+_LIBRARIES = ("fusion.pipeline.run", "fusion.report.charts.campaign")
 #: No file of the working folder is imported as a module; and a process that is killed leaves no warning of its semaphores.
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1", "PYTHONWARNINGS": "ignore::UserWarning:multiprocessing.resource_tracker"}
 #: In the second process: where it sends its progress.
@@ -65,7 +65,9 @@ class _SecondProcess(Worker):
 
     def __init__(self, libraries: Sequence[str]) -> None:
         super().__init__()
-        context = multiprocessing.get_context("spawn")
+        # A copy has what is loaded; it would wait for ever for a lock that another thread held at that moment.
+        alone = sys.platform == "linux" and threading.active_count() == 1
+        context = multiprocessing.get_context("fork" if alone else "spawn")
         progress, sender = context.Pipe(duplex=False)
         self._reports: list[Report | None] = []
         self._ended = False
@@ -80,7 +82,7 @@ class _SecondProcess(Worker):
             set_mask(getattr(signal, "SIG_SETMASK", 0), before)
         self._processes = [process for process in multiprocessing.active_children() if process not in others]
         sender.close()
-        Thread(target=self._receive_progress, args=(progress,), daemon=True).start()
+        threading.Thread(target=self._receive_progress, args=(progress,), daemon=True).start()
 
     def submit(self, work: Callable[..., Answer], report: Report | None = None) -> Callable[[], Answer]:
         """Send the work, see `Worker.submit`."""
@@ -161,7 +163,8 @@ def _prepare(progress: Connection, libraries: Sequence[str]) -> None:
     global _progress
     _progress = progress
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     collect_garbage_less()
     for name in libraries:
         import_module(name)

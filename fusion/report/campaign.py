@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.attribution.significance import CHECKS, LEVEL
 from fusion.analysis.diagnosis.residual import LEVEL as REMAINDER_LEVEL
 from fusion.analysis.drift_model.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
-from fusion.report.charts.model import rate_text
-from fusion.report.conclusions import describe_anomaly, first_screen, headline, next_steps, sharpen
+from fusion.report.conclusions import first_screen, headline, next_steps, sharpen
 from fusion.report.numbers import (
     alike,
     decimals_of,
@@ -20,6 +19,7 @@ from fusion.report.numbers import (
     gain,
     join,
     measured,
+    moment,
     number,
     p_cell,
     p_words,
@@ -56,7 +56,7 @@ from fusion.report.wording import (
     untouched,
 )
 from fusion.results.axis import CorrelationPart, Evidence, Iso230Part, Iso230Window, PlacePart
-from fusion.results.loop import AxisLoop, AxisStep, Coefficient, HoldOutQuestion, Loop, Nothing, RunnerUp, StepPart
+from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RunnerUp, StepPart
 from fusion.results.parts import Figures
 from fusion.results.results import Results
 from fusion.results.store import by_approach, group, has
@@ -264,7 +264,7 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
 def values_to_sign(part: Iso230Part) -> Table:
     """Return the axis values of the settled window, and of each direction what has a tolerance, with their decisions."""
     shown, unit = quoted_window(part), print_unit(part.unit)
-    judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
+    judged = {one.quantity: [f"{one.limit_um:g}", one.decision] for one in part.tolerances}
     found = [(f"{term}", symbol, shown) for symbol, term in ISO230_TERMS.items()]
     if isinstance(shown, Iso230Window):
         one_way = bool(approach_of(shown))
@@ -278,12 +278,10 @@ def values_to_sign(part: Iso230Part) -> Table:
     for term, symbol, values in found:
         value = getattr(values, f"{symbol[0]}_um")
         if value.value is not None:
-            limit, decision = judged.get(symbol, ("–", "no tolerance stated"))
-            rows.append(
-                Row([term, quantity(value), limit, decision], marked=decision not in ("pass", "no tolerance stated"))
-            )
-    titles = (f"Value ± U (k = 2) / {unit}", f"Tolerance / {unit}", Words("Decision (ISO 14253-1)"))
-    return table([Words("Quantity of the axis"), *titles], rows)
+            verdict = judged.get(symbol, ["–", "no tolerance stated"]) if judged else []
+            rows.append(Row([term, quantity(value), *verdict], symbol in judged and verdict[1] != "pass"))
+    titles = [f"Tolerance / {unit}", Words("Decision (ISO 14253-1)")] if judged else []
+    return table([Words("Quantity of the axis"), f"Value ± U (k = 2) / {unit}", *titles], rows)
 
 
 def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
@@ -410,8 +408,6 @@ def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
     common, stretch = small(left.common_rms_um), small(left.stretch_rms_um)
     size = f"{common} µm rms common to all positions, {stretch} µm rms of stretch along the axis"
     rows.append(("unexplained drift", f"{left.kind}: {size}"))
-    if isinstance(loop.held_out_test, HoldOutQuestion):
-        rows.append(("extra test on the held-out cycles", say("hold_out_question", loop.held_out_test)))
     return rows + refused_effects(loop)
 
 
@@ -528,9 +524,12 @@ def describe_campaign(
         }
         loop = {name: describe(results.loop) for name, describe in tables.items()}
     axis = provenance["parameters"]["campaign"].get("axis", "") if deviations is not None else ""
+    camera = None if fields is None else _camera(fields)
+    zone = results.time.zone if results.time else None
+    begun = [part["first"] for part in (laser, camera) if part and part["first"] is not None]
+    begun += [one.first for one in (results.thermograms.cameras if results.thermograms else ()) if one.first]
     return {
-        "first": laser["first"] if laser else None,
-        "zone": results.time.zone if results.time else None,
+        "zone": zone,
         "figures": figures,
         "verdict": results.loop.verdict if results.loop else "",
         "headline": headline(results),
@@ -539,13 +538,16 @@ def describe_campaign(
         "unverified": results.inputs.unverified if results.inputs else (),
         "untouched": untouched(results.inputs, figures),
         "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
-        "first_screen": first_screen(results, provenance["parameters"].get("report", {}), axis),
+        "first_screen": first_screen(
+            results, provenance["parameters"].get("report", {}), axis, moment(begun[0], zone) if begun else ""
+        ),
         "next": next_steps(results)[:MOST_STEPS],
         "contents": [
             (at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) not in (None, ())
         ],
         "laser": laser,
-        "camera": None if fields is None else _camera(fields),
+        "moved": None,
+        "camera": camera,
         "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
         "drift_stated": (provenance["parameters"].get("thermography") or {}).get("camera_drift_u_K") is not None,
         "field_of": "cycle" if "positions" in figures else "window",
@@ -556,7 +558,7 @@ def describe_campaign(
         "anomalies": [
             {
                 "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",
-                "sentence": describe_anomaly(anomaly),
+                "sentence": say("anomaly_sentence", anomaly),
                 **describe_evidence(anomaly.evidence),
             }
             for anomaly in results.anomalies or ()
@@ -642,3 +644,9 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
         [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
     ]
     return table(["Position", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
+
+
+def rate_text(rate: float) -> str:
+    """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
+    u = np.sqrt(max(rate, 1.0 / CHECKS) * (1.0 - rate) / CHECKS)
+    return f"{100 * rate:.1f} ± {200 * u:.1f} %"

@@ -9,7 +9,6 @@ from fusion.analysis.comparison import LEVEL, Change, ComparedCampaign, PairComp
 from fusion.common import versions
 from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters, plot_trends
 from fusion.report.charts.style import embed
-from fusion.report.conclusions import position_words
 from fusion.report.numbers import join, measured, number, p_cell, print_unit
 from fusion.report.page import render_page
 from fusion.report.wording import (
@@ -22,6 +21,7 @@ from fusion.report.wording import (
     iso230_values,
     quantity,
     quoted_window,
+    say,
     table,
 )
 from fusion.results.loop import AxisLoop
@@ -160,7 +160,9 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
             limit = f"at most {number(one.limit_um)} {print_unit(results.iso230.unit)}"
             figures[f"{one.quantity} {limit}"] = one.decision
     if results.anomalies is not None:
-        named = [f"{position_words(one.target, one.position_mm)}: {anomaly_cause(one)}" for one in results.anomalies]
+        named = [
+            f"{say('position_words', one.target, one.position_mm)}: {anomaly_cause(one)}" for one in results.anomalies
+        ]
         figures["positions that stand out"] = join(named) or "none"
     return figures
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from fusion.report.wording import ARROWS, approach_of, conditional, randomised_causes, say
-from fusion.results.axis import AnomalyPart, Iso230Part
+from fusion.results.axis import Iso230Part
 from fusion.results.loop import StepPart
 from fusion.results.parts import TimePart, decide
 from fusion.results.results import Results
@@ -44,20 +44,20 @@ def headline(results: Results) -> str:
 #: Most actions on the first screen, and words of each.
 _FIRST_STEPS, _WORDS = 3, 14
 _BRACKETS = re.compile(r" \([^()]*\)")
-_DANGLING = re.compile(
-    r"(?: (?:a|an|and|as|at|does|for|from|in|is|it|not|of|on|or|that|the|this|to|was|where|whether|which|with))+$"
-)
+#: Where a sentence may end before its end.
+_CLAUSE = re.compile(r"[;:] |, and | for ")
 _CONDITION = re.compile(r"^Only if [^:]+: ")
 
 
 def in_brief(step: str) -> str:
     """Return the beginning of an action: its clauses as far as a line holds them, without what stands in brackets."""
-    words = _BRACKETS.sub("", _if_so(step)).split(". ")[0].split()
+    sentence = _BRACKETS.sub("", _if_so(step)).split(". ")[0].rstrip(".")
+    words = sentence.split()
+    line = " ".join(words[:_WORDS])
     if len(words) <= _WORDS:
-        return " ".join(words).rstrip(".") + "."
-    line = _DANGLING.sub("", " ".join(words[:_WORDS]))
-    end = max(line.rfind(sign) for sign in ",;:")
-    return (line[:end] if end > 2 * len(line) // 3 else line) + " …"
+        return line + "."
+    ends = [found.start() for found in _CLAUSE.finditer(sentence) if len(line) / 3 < found.start() <= len(line)]
+    return sentence[: ends[-1]] + "." if ends else line + " …"
 
 
 def _if_so(statement: str) -> str:
@@ -65,30 +65,27 @@ def _if_so(statement: str) -> str:
     return _CONDITION.sub("If so: ", statement)
 
 
-def first_screen(results: Results, report: Mapping[str, Any], axis: str) -> dict[str, Any]:
+def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: str) -> dict[str, Any]:
     """Return what a reader learns before anything else: which machine, whether it passes, why, what to doubt, what to do."""
     iso, inputs = results.iso230, results.inputs
     serial = report.get("machine_serial_number", "")
     named = [report.get("machine") or "machine not stated", f"no. {serial}" if serial else ""]
     still_open = "" if inputs is None else say("open_inputs", inputs)
     return {
-        "identity": [*named, f"{axis} axis" if axis else "", report.get("operator", "")],
-        "decision": "" if iso is None else _if_so(conditional(say("decision", iso), inputs, "positions")),
+        "identity": [
+            *named,
+            f"{axis} axis" if axis and f"{axis} axis" not in results.campaign else "",
+            report.get("operator", ""),
+            begun[:10] or "date not stated",
+        ],
+        "decision": "Not an acceptance test: no tolerance applies."
+        if iso is None
+        else _if_so(conditional(say("decision", iso), inputs, "positions")),
         "unmet": "" if iso is None else say("unmet", iso),
-        "cause": _if_so(say("headline", results, False)),
+        "cause": _if_so(say("why", results)),
         "open": still_open,
         "next": [in_brief(step) for step in next_steps(results)[: _FIRST_STEPS - bool(still_open)]],
     }
-
-
-def describe_anomaly(anomaly: AnomalyPart) -> str:
-    """Return one sentence on a position that stands out: what it does, by how much, and what that speaks for."""
-    return say("anomaly_sentence", anomaly)
-
-
-def position_words(target: int, position_mm: float | None) -> str:
-    """Return the name of a target position with its place."""
-    return say("position_words", target, position_mm)
 
 
 # Added effects in words: what each is, and what to check.
@@ -182,7 +179,7 @@ def next_steps(results: Results) -> list[str]:
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
     steps += [
-        f"{position_words(anomaly.target, anomaly.position_mm)}: {anomaly.evidence.check}"
+        f"{say('position_words', anomaly.target, anomaly.position_mm)}: {anomaly.evidence.check}"
         for anomaly in results.anomalies or ()
     ]
     if correlation is not None and correlation.verdict == "attributable" and not randomised_causes(correlation):

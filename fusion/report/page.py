@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,12 +20,10 @@ from fusion.analysis.attribution.significance import LEVEL
 from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
 from fusion.common import FusionError
 from fusion.report.campaign import describe_campaign
-from fusion.report.charts.campaign import Drawn, draw_campaign
-from fusion.report.charts.style import EmbeddedChart, chart_scripts, embed
+from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
 from fusion.report.conclusions import headline
 from fusion.report.numbers import moment, number, place
-from fusion.report.record import describe_record, draw_record
-from fusion.report.thermal_test import draw_thermal_tests
+from fusion.report.record import describe_record
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
@@ -118,6 +117,9 @@ def render_report(
     """
     context: dict[str, Any] = {"results": results, "provenance": provenance, "thermal_map": None}
     if "record" in datasets:
+        from fusion.report.charts.record import draw_record, draw_thermal_tests
+        from fusion.report.charts.style import embed
+
         context["summary"] = describe_record(results, datasets["record"], provenance)
         return render_page(
             "record.html.j2",
@@ -125,7 +127,12 @@ def render_report(
             **context,
         )
     context["summary"] = describe_campaign(results, provenance, datasets, joint)
-    charts, context["thermal_map"] = draw_campaign(results, datasets) if drawn is None else drawn()
+    if drawn is None:
+        # Its library is loaded where charts are made.
+        from fusion.report.charts.campaign import draw_campaign
+
+        drawn = partial(draw_campaign, results, datasets)
+    charts, context["thermal_map"] = drawn()
     return render_page("report.html.j2", charts, **context)
 
 

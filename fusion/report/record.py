@@ -1,4 +1,4 @@
-"""The report of a record: the facts that its templates state, and its charts."""
+"""The report of a record: the facts that its templates state."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ import xarray as xr
 from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.drift_model.record import ENTRY_LEVEL
 from fusion.report.campaign import DECIDED_BEFORE, MOST_STEPS, errors_table, refused_effects, steps_table
-from fusion.report.charts import record as charts
-from fusion.report.charts.model import plot_block_errors
-from fusion.report.charts.style import Chart
 from fusion.report.conclusions import first_screen, headline, next_steps
 from fusion.report.numbers import duration, join, moment
 from fusion.report.thermal_test import describe_thermal_tests
@@ -32,23 +29,7 @@ _SECTIONS = (
 _ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 
 
-def draw_record(record: xr.Dataset) -> dict[str, Chart]:
-    """Return the charts of a record by name."""
-    drawn = {"temperatures": charts.plot_temperatures(record)}
-    if record.sizes["driver_name"]:
-        drawn["drivers"] = charts.plot_drivers(record)
-    for k, name in enumerate(_shown_channels(record)):
-        drawn[f"prediction_{k}"] = charts.plot_prediction(record, name)
-        drawn[f"residual_{k}"] = charts.plot_residuals(record, name)
-        if record.sizes["effect"]:
-            drawn[f"contribution_{k}"] = charts.plot_contributions(record, name)
-    for step in range(record.sizes.get("step", 0)):
-        errors = xr.Dataset({name: record[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})
-        drawn[f"block_errors_{step}"] = plot_block_errors(errors, charts.hours_of(record), "time")
-    return drawn
-
-
-def _shown_channels(record: xr.Dataset) -> list[str]:
+def shown_channels(record: xr.Dataset) -> list[str]:
     """Return the channels that get charts."""
     return [str(name) for name in record["channel"].values[:_MOST_CHANNELS]]
 
@@ -65,8 +46,9 @@ def describe_record(results: Results, record: xr.Dataset, provenance: Mapping[st
     channels, drivers = (join([str(name) for name in record[dim].values]) for dim in ("channel", "driver_name"))
     zone = "" if any(notice.code == "record_no_zone" for notice in results.warnings) else None
     begun = "start not stated" if start is None else moment(start, zone)
+    tested = results.iso230_3[0].distortions if results.iso230_3 else ()
+    distances = [one for one in tested if one.name in shown_channels(record)]
     return {
-        "first": start,
         "zone": zone,
         "figures": (),
         "verdict": loop.verdict,
@@ -78,7 +60,9 @@ def describe_record(results: Results, record: xr.Dataset, provenance: Mapping[st
             f"{counted(record.sizes['channel'], 'displacement')} and {counted(record.sizes['sensor'], 'temperature')} over "
             f"{_measured_time(loop, span)}" + (f", with {drivers} as driver" if drivers else "")
         ),
-        "first_screen": first_screen(results, provenance["parameters"].get("report", {}), ""),
+        "first_screen": first_screen(
+            results, provenance["parameters"].get("report", {}), "", "" if start is None else begun
+        ),
         "next": next_steps(results)[:MOST_STEPS],
         "contents": [one for one in _SECTIONS if one[0] != "iso230-3" or results.iso230_3],
         "thermal_tests": describe_thermal_tests(results.iso230_3 or ()),
@@ -91,7 +75,8 @@ def describe_record(results: Results, record: xr.Dataset, provenance: Mapping[st
             ("Sensors", join([str(name) for name in record["sensor"].values])),
             ("Time", f"{begun}, {span}; averaged over {record.sizes['time']} blocks of {duration(block_s)}"),
         ],
-        "shown": list(enumerate(_shown_channels(record))),
+        "shown": list(enumerate(shown_channels(record))),
+        "moved": max(distances, key=lambda one: one.whole.value or 0.0, default=None),
         "omitted": max(0, record.sizes["channel"] - _MOST_CHANNELS),
         "faults": [(one, describe_fault(one)) for one in loop.sensor_faults],
         "steps": steps_table(loop),

@@ -14,9 +14,10 @@ import xarray as xr
 
 from fusion.report.campaign import describe_iso230, values_to_sign
 from fusion.report.charts.readings import plot_test, plot_windows
+from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed
 from fusion.report.page import page_format, render_page, write_page
-from fusion.report.thermal_test import describe_thermal_tests, draw_thermal_tests
+from fusion.report.thermal_test import describe_thermal_tests
 from fusion.report.wording import Table, Words, print_table, table
 from fusion.results.axis import Iso230Part
 from fusion.results.store import group, write_atomically
@@ -110,29 +111,33 @@ def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
     page.left_margin = page.right_margin = Mm(16)
     page.top_margin = page.bottom_margin = Mm(12)
     normal = document.styles["Normal"]
-    normal.font.size, normal.paragraph_format.space_after = Pt(8), Pt(2)
+    normal.font.name, normal.font.size, normal.paragraph_format.space_after = "Arial", Pt(7), Pt(0)
 
-    def put(rows: Iterable[Sequence[str]], titles: Sequence[str] = ()) -> None:
+    def put(rows: Iterable[Sequence[str]], widths_mm: Sequence[int], titles: Sequence[str] = ()) -> None:
         every = [*([titles] if titles else []), *rows]
-        grid = document.add_table(rows=len(every), cols=len(every[0]), style="Light Grid")
+        grid = document.add_table(rows=len(every), cols=len(every[0]), style="Table Grid")
+        grid.autofit = False
+        for column, width in zip(grid.columns, widths_mm, strict=False):
+            column.width = Mm(width)
         for cells, texts in zip(grid.rows, every, strict=True):
-            for cell, text in zip(cells.cells, texts, strict=True):
-                cell.text = text
+            for cell, text, width in zip(cells.cells, texts, widths_mm, strict=False):
+                cell.text, cell.width = text, Mm(width)
         document.add_paragraph()
 
+    pairs = (32, 57, 32, 57)
     document.add_heading(f"Test of positioning by ISO 230-2:2014: {sheet.title}", level=1)
-    put(in_pairs(sheet.identity))
+    put(in_pairs(sheet.identity), pairs)
     drawn = plot_iso230(group(dataset, "settled"), dataset["position"]).get_figure(root=True)
     assert drawn is not None
     picture = io.BytesIO()
     drawn.savefig(picture, format="png", dpi=200, transparent=False)
-    document.add_picture(picture, width=Mm(150))
-    put([row.cells for row in sheet.values.rows], sheet.values.titles)
+    document.add_picture(picture, width=Mm(125))
+    put([row.cells for row in sheet.values.rows], (70, 38, 28, 42), sheet.values.titles)
     if sheet.requirements.rows:
-        put([row.cells for row in sheet.requirements.rows], sheet.requirements.titles)
+        put([row.cells for row in sheet.requirements.rows], (44, 18, 116), sheet.requirements.titles)
     if sheet.conditions:
-        put(in_pairs(sheet.conditions))
-    put([[f"{role}: {name}", "Date, signature:"] for role, name in sheet.signatures])
+        put(in_pairs(sheet.conditions), pairs)
+    put([[f"{role}: {name}\n", "Date, signature:"] for role, name in sheet.signatures], (89, 89))
     hashes = "; ".join(f"{name} {sha256}" for name, sha256 in sheet.files.items())
     document.add_paragraph(f"thermofuse {sheet.version}. SHA-256: {hashes}")
     document.save(str(path))

@@ -10,7 +10,7 @@ import rich.table
 from fusion.messages import cell
 from fusion.report.conclusions import conclude, headline, next_steps
 from fusion.report.numbers import alike, number, p_words
-from fusion.report.wording import baseline_words, condition, figures_of, say, step_errors, untouched
+from fusion.report.wording import baseline_words, condition, figures_of, say, untouched
 from fusion.results.axis import DriftPart, RegistrationPart
 from fusion.results.loop import Loop, RecordLoop
 from fusion.results.parts import Figures
@@ -84,7 +84,9 @@ def _loop_rows(loop: Loop) -> list[tuple[str, str, Figures]]:
         doubt = f", {say('doubt', step)}" if step.doubt else ""
         one_of = f"one of {', '.join((step.effect, *step.tied))}" if step.tied else step.effect
         without = f", without a name: {step.withheld}" if step.withheld else ""
-        rows.append(("added", f"{one_of} ({p_words(step.p_value)}), {step_errors(step)}{doubt}{without}", "causes"))
+        rows.append(
+            ("added", f"{one_of} ({p_words(step.p_value)}), {say('step_errors', step)}{doubt}{without}", "causes")
+        )
     stages = (loop.errors.declared, loop.errors.final) if loop.steps else (loop.errors.declared,)
     numbers = iter(alike([value for one in stages for value in (one.rmse_um, one.low_um, one.high_um)], distinct=False))
     errors = " -> ".join(

@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import rich.table
 
 from fusion.analysis.drift_model.verification import ChannelVerdict
-from fusion.report.charts.style import Chart, Courses, new_figure, of_rank, span_words
 from fusion.report.numbers import measured, number, print_unit, small
 from fusion.report.wording import Table, Words, print_table, quantity, table
 from fusion.results.thermal_test import ThermalDistortion, ThermalTest
 
 _PERIODS = ("first_hour", "whole", "last_hour", "change")
 _TITLES = ("first 60 min", "whole test", "last 60 min", "last − first")
-#: Curves of one chart; the others are in the table.
-_DRAWN = 8
 _KINDS = {
     "environment": "Environmental temperature variation (ETVE)",
     "spindle": "Distortion by the rotating spindle",
@@ -25,6 +21,9 @@ _KINDS = {
     "rotary axis": "Distortion by rotary motion",
     "not stated": "Kind of test not stated",
 }
+
+#: Curves of one chart of a test; the others are in the table.
+DRAWN = 8
 
 
 def describe_thermal_tests(tests: Sequence[ThermalTest]) -> list[dict[str, Any]]:
@@ -42,6 +41,7 @@ def describe_thermal_tests(tests: Sequence[ThermalTest]) -> list[dict[str, Any]]
                 ],
             ),
             "remarks": test.remarks,
+            "drawn": DRAWN,
         }
         for test in tests
     ]
@@ -60,32 +60,6 @@ def _distortions(found: Sequence[ThermalDistortion], title: str) -> Table:
     return table([Words(title), Words("Unit"), *_TITLES, "settled after / min"], rows)
 
 
-def draw_thermal_tests(tests: Sequence[ThermalTest]) -> dict[str, Chart]:
-    """Return the charts of every test: what has the same unit over time."""
-    charts = {}
-    for k, test in enumerate(tests):
-        for unit in dict.fromkeys(one.unit for one in test.courses):
-            shown = [one for one in test.courses if one.unit == unit][:_DRAWN]
-            printed = print_unit(unit)
-            drawn = new_figure(
-                x="time since start / h", y=f"{'temperature' if unit == 'degC' else 'drift'} / {printed}"
-            )
-            courses = Courses(drawn, {"time since start / h": np.array(shown[0].hours)})
-            for rank, one in enumerate(shown):
-                values = np.array([np.nan if value is None else value for value in one.values])
-                told = span_words(values, printed)
-                courses.add(
-                    np.array(one.hours),
-                    values,
-                    one.name,
-                    heading=f"{one.name} / {printed}",
-                    seen=f"{one.name} {told}",
-                    **of_rank(rank),
-                )
-            charts[f"thermal_{k}_{unit.replace('/', '_')}"] = courses.chart("Course of the test")
-    return charts
-
-
 def thermal_test_tables(tests: Sequence[ThermalTest], *, title: str) -> list[rich.table.Table]:
     """Return the tables of tests for the terminal."""
     return [
@@ -101,7 +75,7 @@ def verification_table(verdicts: Sequence[ChannelVerdict], *, title: str) -> ric
     rows = [
         [
             one.name,
-            number(one.before_um),
+            "–" if one.before_um is None else number(one.before_um),
             f"{number(one.predicted_um)} [{number(one.predicted_low_um)} to {number(one.predicted_high_um)}]",
             number(one.achieved_um),
             measured(one.gain, one.gain_u),

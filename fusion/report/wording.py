@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ from fusion.report.numbers import (
     upper_first,
 )
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Iso230Window
-from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop, StepPart
+from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.results import Results
 
@@ -259,12 +260,18 @@ CONTRIBUTORS = {
 _SHARE_OF_SCATTER = 0.01
 
 
+def _compiled(pattern: str) -> jinja2.BytecodeCache | None:
+    """Return where compiled templates are kept: beside the compiled modules, where that can be written."""
+    folder = Path(__file__).parent / "__pycache__"
+    return jinja2.FileSystemBytecodeCache(str(folder), pattern) if os.access(folder, os.W_OK) else None
+
+
 @cache
 def environment(*, html: bool) -> jinja2.Environment:
     """Return the templates with what formats values in them; text from files is escaped where a page is made."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=html, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
-        finalize=_without_control if html else None,
+        finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
         condition, conditional, duration, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
@@ -342,11 +349,6 @@ def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
 def quoted_term(symbol: str) -> str:
     """Return the term of the standard for the symbol of a quoted value, which ends with it."""
     return ISO230_TERMS.get(symbol) or f"{ONE_WAY_TERMS[symbol[0]]}{symbol[1:]}"
-
-
-def drift_u_note(iso: Iso230Part | None) -> str:
-    """Return what the ± of profile and drift contains, and where the rest stands."""
-    return say("drift_uncertainty", iso)
 
 
 class DriftExtreme(NamedTuple):
@@ -448,8 +450,3 @@ def baseline_words(loop: Loop) -> dict[str, str]:
         for name, words in BASELINES.items()
         if hasattr(loop.baselines, name)
     }
-
-
-def step_errors(step: StepPart) -> str:
-    """Return the errors before and after an effect entered: on the hold-out, and of blocks predicted from the others, µm."""
-    return say("step_errors", step)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import platform
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import filelock
 
-from fusion.results.store import OutputError, finished_stages, is_text, read_json_object, write_json
+from fusion.results.store import OutputError, is_text, read_json_object, write_json
 from thermography.io.files import PARTIAL, finished_path
 
 MANIFEST = "manifest.json"
@@ -166,39 +165,3 @@ def _remove_leftovers(folder: Path) -> None:
                 leftover.unlink()
     for leftover in (folder / _STAGES).rglob(f"*{PARTIAL}*"):
         leftover.unlink()
-
-
-# A second results folder that starts from what a first one has finished: for a campaign in which a little was
-# changed.
-
-#: What belongs to one run of one folder, and not to its products.
-_OWN = {"lock", "holder.json"}
-
-
-def branch_results(finished: Path, branch: Path) -> list[str]:
-    """Give a new results folder the products of a finished one, so that a run with ``resume`` computes only what changed."""
-    written = read_manifest(finished)
-    stages = finished / _STAGES
-    kept = [path for path in stages.glob("*") if path.is_file() and path.name not in _OWN]
-    files = [finished / MANIFEST, *kept, *(finished / name for name in written)]
-    try:
-        branch.mkdir(parents=True)
-        for path in files:
-            if path.is_file():
-                _share(path, branch / path.relative_to(finished))
-    except FileExistsError:
-        raise OutputError(f"{branch} exists; name another folder for the new results") from None
-    except OSError as error:
-        raise OutputError(
-            f"{branch}: cannot be written to ({error.strerror or error}); make room or allow it"
-        ) from error
-    return finished_stages(branch)
-
-
-def _share(path: Path, copy: Path) -> None:
-    """Make a second name for a file, or a copy of it where there can be no second name."""
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(path, copy)
-    except OSError:
-        shutil.copy2(path, copy)

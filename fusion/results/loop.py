@@ -389,6 +389,19 @@ class HoldOutErrors(ResultPart):
     """Of the final model, with the effects that the training part alone decided on, um."""
 
 
+class Tracking(ResultPart):
+    """Errors on the hold-out where all channels, or all targets, are read again from time to time."""
+
+    every_min: Number
+    """Time from one reading to the next, min."""
+    model: ErrorInterval
+    """Of the final model, its random drift carried on from the readings by the Kalman filter."""
+    last_reading: ErrorInterval
+    """Of repeating the last reading."""
+    ridge: ErrorInterval
+    """Of ridge regression started at the last reading."""
+
+
 class Loop(HoldOutErrors):
     """What the closed loop found, along an axis or on a record."""
 
@@ -415,6 +428,8 @@ class Loop(HoldOutErrors):
     and no effect deserves its name; no_skill: the model predicts no better than the last value or the mean, these data cannot tell."""
     unconfirmed_effects: Mapping[str, Number]
     """Effects that are significant and were not admitted or not confirmed, with their p-value."""
+    tracking: Tracking | None = None
+    """Errors with a reading from time to time; null for several runs, and in results of earlier versions."""
     left_out_of_forecast: tuple[str, ...] = ()
     """Added effects without which the final error is predicted: the hold-out contradicts them, or is predicted worse with them."""
     unexplained: Unexplained
@@ -443,8 +458,8 @@ class AxisLoop(Loop):
     """Drift without a cause in the final model."""
     noise: NoisePart | None = None
     """Noise of the final model; null in results of earlier versions."""
-    held_out_test: HoldOutQuestion | Nothing
-    """Hold-out test of the strongest undecided candidate."""
+    held_out_test: HoldOutQuestion | Nothing = Nothing()
+    """Hold-out test of the strongest undecided candidate, in results of earlier versions."""
     search: tuple[tuple[AxisScore, ...], ...]
     """Scores of every round of the search."""
     identifiability: tuple[DetectionLimit, ...]
@@ -533,19 +548,6 @@ class RunPart(HoldOutErrors):
     """Verdict by the errors in this run; empty where it is not held out."""
 
 
-class Tracking(ResultPart):
-    """Errors on the hold-out where the displacements are read again from time to time; means over the channels."""
-
-    every_min: Number
-    """Time from one reading to the next, min."""
-    model: ErrorInterval
-    """Of the final model, its random drift carried on from the readings by the Kalman filter."""
-    last_reading: ErrorInterval
-    """Of repeating the last reading."""
-    ridge: ErrorInterval
-    """Of ridge regression started at the last reading."""
-
-
 class RecordLoop(Loop):
     """What the closed loop found on a record; errors are means over the channels."""
 
@@ -555,8 +557,6 @@ class RecordLoop(Loop):
     """What is left."""
     channels: Mapping[str, ChannelErrors]
     """Errors by channel."""
-    tracking: Tracking | None = None
-    """Errors with a reading from time to time; null for several runs, and in results of earlier versions."""
     chained: tuple[ChainedPart, ...]
     """Forward-chained parts."""
     search: tuple[tuple[RecordScorePart, ...], ...]

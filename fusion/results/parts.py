@@ -22,6 +22,8 @@ class ResultPart(BaseModel):
         frozen=True,
         extra="forbid",
         use_attribute_docstrings=True,
+        # What nobody validates alone is built as a part of what holds it.
+        defer_build=True,
         serialize_by_alias=True,
         # A result of the analysis may add arrays to its part, which are not written.
         arbitrary_types_allowed=True,

@@ -67,8 +67,9 @@ def listed(names: Iterable[str]) -> str:
 Report = Callable[[str, int, int], None]
 
 _SECONDS_BETWEEN_LINES = 10.0
-#: A step is overdue after this multiple of its forecast, and after a minute.
+#: A step is overdue after this multiple of its forecast, of one without parts: of what the run took before it; and after a minute.
 _OVERDUE, _LEAST_OVERDUE_S = 10.0, 60.0
+_BY_PARTS, _BY_RUN = "{:.0f} s were expected from its first parts", "the whole run before it took {:.0f} s"
 
 
 def silent(label: str, done: int, total: int) -> None:
@@ -85,8 +86,10 @@ class Reporter(AbstractContextManager["Reporter"]):
         self._started: dict[str, float] = {}
         self._spoken: dict[str, float] = {}
         self._finished: set[str] = set()
-        self._running: dict[str, tuple[float, float | None]] = {}
+        self._running: dict[str, tuple[float, float, str]] = {}
+        self._begun = time.monotonic()
         self._ended = Event()
+        self._watching = Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Reporter:
         if self._console.is_terminal:
@@ -101,22 +104,26 @@ class Reporter(AbstractContextManager["Reporter"]):
             self._bars = Progress(*columns, console=self._console)
             self._bars.start()
         # A step that hangs reports nothing.
-        Thread(target=self._watch, daemon=True).start()
+        self._watching.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._ended.set()
+        self._watching.join()
         if self._bars is not None:
             self._bars.stop()
 
     def __call__(self, label: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the step `label` are finished."""
         now = time.monotonic()
-        started, forecast_s = self._running.pop(label, (now, None))
+        running = self._running.pop(label, (now, now - self._begun, _BY_RUN))
         if done < total:
-            self._running[label] = started, forecast_s or ((now - started) / done * total if done else None)
+            started, forecast_s, known = running
+            if done and known != _BY_PARTS:
+                forecast_s, known = (now - started) / done * total, _BY_PARTS
+            self._running[label] = started, forecast_s, known
         if self._bars is None:
             self._write(label, done, total, now)
             return
@@ -129,15 +136,15 @@ class Reporter(AbstractContextManager["Reporter"]):
             self._say_overdue(time.monotonic())
 
     def _say_overdue(self, now: float) -> None:
-        """Say once of every step that takes ten times what its first parts let expect."""
-        for label, (started, forecast_s) in list(self._running.items()):
-            if forecast_s is not None and now - started > max(_OVERDUE * forecast_s, _LEAST_OVERDUE_S):
+        """Say once of every step that takes ten times what its first parts, or the run before it, let expect."""
+        for label, (started, forecast_s, known) in list(self._running.items()):
+            if forecast_s > 0.0 and now - started > max(_OVERDUE * forecast_s, _LEAST_OVERDUE_S):
                 self._console.print(
-                    f"{label}: {now - started:.0f} s so far, {forecast_s:.0f} s were expected from its first parts; Ctrl-C stops the run, "
-                    "finished stages are kept, and --resume goes on from them",
+                    f"{label}: {now - started:.0f} s so far, {known.format(forecast_s)}; Ctrl-C stops the run, finished stages are "
+                    "kept, and --resume goes on from them",
                     highlight=False,
                 )
-                self._running[label] = started, float("inf")
+                self._running[label] = started, float("inf"), known
 
     def _write(self, label: str, done: int, total: int, now: float) -> None:
         if label in self._finished:

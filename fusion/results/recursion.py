@@ -32,9 +32,9 @@ class RecursionInput(ResultPart):
     reference: float
     """Reading at which it contributes nothing."""
     low: float
-    """Lowest reading of the test; a lower one is held here."""
+    """Lowest reading that is followed, half the range of the test below it; a lower one is held here."""
     high: float
-    """Highest reading of the test; a higher one is held here."""
+    """Highest reading that is followed; a higher one is held here."""
     failed_below: float
     """A reading below this value, or one that is no number, is that of a failed sensor."""
     failed_above: float
@@ -58,6 +58,8 @@ class RecursionState(ResultPart):
     """Weight of the signal of this step."""
     before: float
     """Weight of the signal of the step before."""
+    start: float
+    """Share of the first signal that the state starts with: 0 of a load that starts with the machine, 1 of what was there before."""
 
 
 class RecursionOutput(ResultPart):
@@ -70,7 +72,7 @@ class RecursionOutput(ResultPart):
     coefficients: tuple[float, ...]
     """Predicted displacement per state."""
     limit: float
-    """Range of the correction in the test; a larger correction is held here."""
+    """Largest correction, half as much again as its range in the test; a larger one is held here."""
     max_step: float
     """Largest change of the correction in one step."""
     before: float
@@ -93,7 +95,7 @@ class SensorCurvePoint(ResultPart):
 class Recursion(ResultPart):
     """A drift model as a discrete-time recursion."""
 
-    format: Literal["thermofuse recursion 1"] = "thermofuse recursion 1"
+    format: Literal["thermofuse recursion 2"] = "thermofuse recursion 2"
     """Version of this layout."""
     campaign: str
     """Title of the campaign that it was made from."""
@@ -183,8 +185,8 @@ def run_recursion(
     if readings.ndim != 2 or readings.shape[1] != len(model.inputs):
         raise RecursionError(f"readings of shape {readings.shape}; the model takes (steps, {len(model.inputs)})")
     of = np.array([one.input for one in model.states])
-    size, exponent, decay, now, before = (
-        np.array([getattr(one, name) for one in model.states]) for name in ("size", "exponent", *_WEIGHTS)
+    size, exponent, decay, now, before, start = (
+        np.array([getattr(one, name) for one in model.states]) for name in ("size", "exponent", *_WEIGHTS, "start")
     )
     coefficients = np.array([one.coefficients for one in model.outputs])
     limit, most = (np.array([getattr(one, name) for one in model.outputs]) for name in ("limit", "max_step"))
@@ -199,7 +201,7 @@ def run_recursion(
         last = signal
         signal = (held[of] - columns["reference"][of]) / size
         signal = np.where(exponent == 2, signal * signal, signal)
-        state = signal if step == 0 else decay * state + now * signal + before * last
+        state = start * signal if step == 0 else decay * state + now * signal + before * last
         wanted = -(coefficients @ state)
         if zero is not None and zero[step]:
             zeroed = wanted
@@ -213,7 +215,7 @@ def run_recursion(
 
 
 def read_recursion(path: str | Path) -> Recursion:
-    """Read a model description that `export --format json` wrote.
+    """Read a model description that `export --format model-json` wrote.
 
     Parameters
     ----------
@@ -235,5 +237,5 @@ def read_recursion(path: str | Path) -> Recursion:
     except (OSError, ValueError, ValidationError) as error:
         told = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise RecursionError(
-            f"{path}: no model description of thermofuse ({told}); write one with --format json"
+            f"{path}: no model description of thermofuse ({told}); write one with --format model-json"
         ) from None

@@ -88,7 +88,7 @@ def find_recipe(recipe: str | Path) -> Path:
     """Return the path of a recipe: the file itself, or the one with this name that comes with the package."""
     path = Path(recipe)
     is_name = path.name == str(recipe) and not path.suffix
-    return packaged_recipe(path.name) if is_name and not path.exists() else path
+    return packaged_recipe(path.name) if is_name and not path.is_file() else path
 
 
 def _with_parameters(content: dict[str, Any]) -> dict[str, Any]:

@@ -140,7 +140,8 @@ def _correction(record: Record, logged: Array, speed: Array) -> Array:
         held = np.clip(readings[origin["name"]], origin["low"], origin["high"])
         signal = ((held - origin["reference"]) / one["size"]) ** one["exponent"]
         tau_s = one["time_constant_s"]
-        states.append(signal if tau_s == 0.0 else first_order(signal - signal[0], record.step_s, tau_s) + signal[0])
+        origin = one["start"] * signal[0]
+        states.append(signal if tau_s == 0.0 else first_order(signal - origin, record.step_s, tau_s) + origin)
     correction = np.zeros((speed.size, record.channels))
     for one in model["outputs"]:
         wanted = -np.asarray(one["coefficients"]) @ np.array(states)

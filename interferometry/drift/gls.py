@@ -646,9 +646,9 @@ NO_MEMORY = Autoregression(np.empty(0), 1.0)
 #: Patterns of a motion in common that are taken from series before their own memory is estimated.
 _COMMON_PATTERNS = 2
 #: Memories from one cycle to the next that are simulated, so often, to learn what the patterns and the means take of them.
-_SIMULATED_MEMORY, _SIMULATIONS = np.linspace(0.0, 0.9, 10), 10
+_SIMULATED_MEMORY, _SIMULATIONS = np.linspace(0.0, 0.9, 10), 20
 #: Standard deviations by which an estimate must exceed what independent noise gives.
-_LEAST_MEMORY = 4.0
+_LEAST_MEMORY = 3.0
 
 
 def memory_of_each(values: Array) -> Autoregression:

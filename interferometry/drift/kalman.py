@@ -28,6 +28,9 @@ from numpy.typing import NDArray
 
 from interferometry.common import Array, InterferometryError
 
+#: Columns that are whitened together.
+_COLUMNS_AT_ONCE = 256
+
 
 @njit(cache=True)
 def predict_covariance(
@@ -176,22 +179,21 @@ def filter_covariance(
 
 @njit(cache=True)
 def filter_columns(
-    seconds: Array, loadings: Array, order: int, memory: Array, gains: Array, columns: Array, keep: bool
+    seconds: Array, loadings: Array, order: int, memory: Array, gains: Array, columns: Array
 ) -> tuple[Array, Array]:
-    """Run the state half of the filter: the innovations of every column under the same gains."""
+    """Run the state half of the filter: the innovations and predicted levels of every column under the same gains."""
     n, components = loadings.shape
     m = gains.shape[1]
     p = columns.shape[1]
     innovations = np.empty((n, p))
-    states = np.zeros((n if keep else 1, components, p))
+    states = np.empty((n, components, p))
     state = np.zeros((m, p))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
         predict_state(state, components, order, memory, step)
-        if keep:
-            for c in range(components):
-                for j in range(p):
-                    states[k, c, j] = state[c * order, j]
+        for c in range(components):
+            for j in range(p):
+                states[k, c, j] = state[c * order, j]
         # One loop over the columns for every term: the compiler then takes several columns at a time.
         innovation = innovations[k]
         for j in range(p):
@@ -222,56 +224,34 @@ def whiten_rows(
     rows: Array,
 ) -> None:
     """Standardise the innovations of some successive readings in place, going on from the state before them."""
-    p = rows.shape[1]
-    for row in range(rows.shape[0]):
-        k = first + row
-        step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        innovation = rows[row]
-        if loadings.shape[1] == 2 and order == 2 and not memory.size:
-            _whiten_under_two(
-                state[0], state[1], state[2], state[3], innovation, step, loadings[k], gains[k], 1.0 / roots[k]
-            )
-            continue
-        predict_state(state, loadings.shape[1], order, memory, step)
-        for c in range(loadings.shape[1]):
-            loading, level = loadings[k, c], state[c * order]
-            for j in range(p):
-                innovation[j] -= loading * level[j]
-        if memory.size:
-            shared = state[loadings.shape[1] * order]
-            for j in range(p):
-                innovation[j] -= shared[j]
-        for i in range(gains.shape[1]):
-            gain, expected = gains[k, i], state[i]
-            for j in range(p):
-                expected[j] += gain * innovation[j]
-        for j in range(p):
-            innovation[j] /= roots[k]
-
-
-@njit(cache=True)
-def _whiten_under_two(
-    level: Array,
-    rate: Array,
-    other_level: Array,
-    other_rate: Array,
-    reading: Array,
-    step: float,
-    loadings: Array,
-    gains: Array,
-    precision: float,
-) -> None:
-    """Prediction, update and standardised innovation of one reading under two integrated random walks, in one pass over the columns."""
-    loading, other_loading = loadings[0], loadings[1]
-    a, b, c, d = gains[0], gains[1], gains[2], gains[3]
-    for j in range(reading.size):
-        first, second = level[j] + step * rate[j], other_level[j] + step * other_rate[j]
-        innovation = reading[j] - loading * first - other_loading * second
-        level[j] = first + a * innovation
-        rate[j] += b * innovation
-        other_level[j] = second + c * innovation
-        other_rate[j] += d * innovation
-        reading[j] = innovation * precision
+    components = loadings.shape[1]
+    # Some columns at a time, whose state stays in the processor's nearest cache.
+    for low in range(0, rows.shape[1], _COLUMNS_AT_ONCE):
+        some = slice(low, min(low + _COLUMNS_AT_ONCE, rows.shape[1]))
+        for row in range(rows.shape[0]):
+            k = first + row
+            step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
+            innovation = rows[row, some]
+            for c in range(components):
+                loading, level = loadings[k, c], state[c * order, some]
+                if order == 2:
+                    rate = state[c * order + 1, some]
+                    for j in range(innovation.size):
+                        level[j] += step * rate[j]
+                for j in range(innovation.size):
+                    innovation[j] -= loading * level[j]
+            if memory.size:
+                shared, kept = state[components * order, some], np.exp(-step / memory[1])
+                for j in range(innovation.size):
+                    shared[j] *= kept
+                    innovation[j] -= shared[j]
+            for i in range(gains.shape[1]):
+                gain, expected = gains[k, i], state[i, some]
+                for j in range(innovation.size):
+                    expected[j] += gain * innovation[j]
+            precision = 1.0 / roots[k]
+            for j in range(innovation.size):
+                innovation[j] *= precision
 
 
 @njit(cache=True)
@@ -373,62 +353,6 @@ def _smooth_levels(order: int, covariance: Array, r: Array, N: Array, levels: Ar
 
 
 @njit(cache=True)
-def normal_equations(
-    seconds: Array,
-    loadings: Array,
-    order: int,
-    ratios: Array,
-    memory: Array,
-    process_noise_scale: Array,
-    variance: Array,
-    observed: NDArray[np.bool_],
-    columns: Array,
-) -> tuple[Array, float]:
-    """Gram matrix of the standardised innovations of the observed readings, in one pass over the readings."""
-    n, components = loadings.shape
-    p = columns.shape[1]
-    covariance = start_covariance(components * order, memory, 0)
-    cross_covariance = np.zeros(covariance.shape[0])
-    state = np.zeros((covariance.shape[0], p))
-    innovations, precision, held = np.zeros((4, p)), np.zeros(4), 0
-    gram = np.zeros((p, p))
-    log_determinant = 0.0
-    for k in range(n):
-        step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict_covariance(covariance, order, ratios, memory, process_noise_scale[k], step)
-        predict_state(state, components, order, memory, step)
-        if not observed[k]:
-            continue
-        total = innovation_variance(covariance, order, loadings, k, memory, variance[k], cross_covariance)
-        update_covariance(covariance, cross_covariance, total)
-        update_state(state, order, loadings, k, memory, columns[k], cross_covariance, total, innovations[held])
-        log_determinant += np.log(total)
-        precision[held] = 1.0 / total
-        held += 1
-        if held == 4:
-            _add_products(gram, innovations, precision)
-            held = 0
-    for unused in range(held, 4):
-        precision[unused] = 0.0
-    _add_products(gram, innovations, precision)
-    for i in range(p):
-        for j in range(i):
-            gram[j, i] = gram[i, j]
-    return gram, log_determinant
-
-
-@njit(cache=True)
-def _add_products(gram: Array, innovations: Array, precision: Array) -> None:
-    """Add the weighted outer products of four rows to the lower triangle; four at a time load and store it a quarter as often."""
-    a, b, c, d = innovations[0], innovations[1], innovations[2], innovations[3]
-    for i in range(a.size):
-        wa, wb, wc, wd = precision[0] * a[i], precision[1] * b[i], precision[2] * c[i], precision[3] * d[i]
-        row = gram[i]
-        for j in range(i + 1):
-            row[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-
-
-@njit(cache=True)
 def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
     """Sweep a Gram matrix on every design column: least squares, its inverse and its determinant in one go."""
     swept = matrix.copy()
@@ -456,10 +380,10 @@ def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
 
 Order = Literal[1, 2]
 
-#: From so many columns on their products are formed block by block, by products of whole matrices; fewer are multiplied on the way.
+#: Columns of which a Gram matrix is swept by its Cholesky factor, and which are smoothed at a time.
 MANY_COLUMNS = 64
-#: Readings of a block.
-_ROWS_AT_ONCE = 256
+#: Values that are whitened before they are multiplied, 512 kB.
+_VALUES_AT_ONCE = 2**16
 
 
 class DriftModelError(InterferometryError):
@@ -559,11 +483,8 @@ class DriftSystem:
 
     def innovations(self, columns: Array) -> tuple[Array, Array]:
         """One-step prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
-        gains, innovation_variances, _ = filter_covariance(*self.arrays, False)
-        innovations, _ = filter_columns(
-            self.seconds, self.loadings, self.order, self.memory_array, gains, np.ascontiguousarray(columns), False
-        )
-        return innovations, innovation_variances
+        whitening = self.whitening(columns.shape[1])
+        return whitening.whiten(columns.astype(float, order="C")) * whitening.roots[:, None], whitening.roots**2
 
     def whitening(self, columns: int) -> Whitening:
         """Start to whiten so many columns, some readings after others."""
@@ -572,21 +493,20 @@ class DriftSystem:
 
     def normal_equations(self, columns: Array) -> tuple[Array, float]:
         """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
-        if columns.shape[1] >= MANY_COLUMNS:
-            whitening = self.whitening(columns.shape[1])
-            gram = np.zeros((columns.shape[1], columns.shape[1]))
-            for start in range(0, columns.shape[0], _ROWS_AT_ONCE):
-                rows = slice(start, start + _ROWS_AT_ONCE)
-                whitened = whitening.whiten(columns[rows].copy())[self.observed[rows]]
-                gram += whitened.T @ whitened
-            return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
-        return normal_equations(*self.arrays, np.ascontiguousarray(columns))
+        n, p = columns.shape
+        whitening, gram, at_once = self.whitening(p), np.zeros((p, p)), max(1, _VALUES_AT_ONCE // p)
+        # A reading that is not observed weighs nothing.
+        whitening.roots[~self.observed] = np.inf
+        for start in range(0, n, at_once):
+            whitened = whitening.whiten(columns[start : start + at_once].copy())
+            gram += whitened.T @ whitened
+        return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
 
     def whiten(self, columns: Array) -> tuple[Array, float]:
         """Standardised innovations of the observed readings (n_observed, p), and the log-determinant of their covariance."""
-        innovations, innovation_variances = self.innovations(columns)
-        kept = innovation_variances[self.observed]
-        return innovations[self.observed] / np.sqrt(kept)[:, None], float(np.log(kept).sum())
+        whitening = self.whitening(columns.shape[1])
+        whitened, roots = whitening.whiten(columns.astype(float, order="C")), whitening.roots[self.observed]
+        return whitened[self.observed], 2.0 * float(np.log(roots).sum())
 
     def smooth(self, columns: Array) -> Smoothed:
         """Smooth the drift that columns (n, p) imply, and the noise of every reading."""
@@ -595,7 +515,7 @@ class DriftSystem:
         parts = []
         # The states of all columns at all readings are needed on the way back, not afterwards: some columns at a time.
         for some in np.array_split(columns, max(1, columns.shape[1] // MANY_COLUMNS), axis=1):
-            innovations, states = filter_columns(*filtered, np.ascontiguousarray(some), True)
+            innovations, states = filter_columns(*filtered, np.ascontiguousarray(some))
             parts.append(smooth(*filtered, innovation_variances, self.observed, innovations, states, covariances))
         if len(parts) == 1:
             return Smoothed(*parts[0])

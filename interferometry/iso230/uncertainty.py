@@ -47,7 +47,8 @@ class Iso230Budget:
     expansion_coefficient_ppm_per_K : float
         Of the expansion coefficient that the compensation used, ppm/K. Assumed: 2 ppm/K, a steel or cast iron of unknown grade.
     difference_from_20_degC_K : float
-        Difference of the material temperature from 20 degC, K (no uncertainty: it scales that of the coefficient). Assumed: 3 K.
+        Difference of the material temperature from 20 degC, K (no uncertainty: it scales that of the coefficient). Assumed: 10 K,
+        an axis that has warmed in a workshop of 15 to 25 degC: what is not measured must not make the uncertainty smaller.
     nominal_expansion_ppm_per_K : float
         The coefficient itself, ppm/K (no uncertainty: it scales that of the temperature). Assumed: 11.7 ppm/K, steel.
     environmental_variation_um : float or None
@@ -73,7 +74,7 @@ class Iso230Budget:
     alignment_ppm: float = 0.3
     material_temperature_K: float = 0.3
     expansion_coefficient_ppm_per_K: float = 2.0
-    difference_from_20_degC_K: float = 3.0
+    difference_from_20_degC_K: float = 10.0
     nominal_expansion_ppm_per_K: float = 11.7
     environmental_variation_um: float | None = None
 

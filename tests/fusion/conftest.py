@@ -59,7 +59,7 @@ def copied(campaign_folder: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs whose page nobody looks at draw no charts: they are half of the time of a small campaign."""
-    from fusion.report.charts.campaign import Drawn
+    from fusion.report.charts.embedded import Drawn
 
     for name in ("_draw", "_draw_attributed"):
         monkeypatch.setattr(f"fusion.pipeline.run.{name}", lambda *_: Drawn({}))

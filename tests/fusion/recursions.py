@@ -28,7 +28,14 @@ def some_model(*, sampling_s: float = 5.0, campaign: str = "Spindle", seed: int 
         size = 6000.0 if place == 2 else 1.0
         states.append(
             RecursionState(
-                input=place, size=size, exponent=exponent, time_constant_s=tau, decay=decay, now=now, before=before
+                input=place,
+                size=size,
+                exponent=exponent,
+                time_constant_s=tau,
+                decay=decay,
+                now=now,
+                before=before,
+                start=0.0 if place == 2 and tau else 1.0,
             )
         )
     outputs = [

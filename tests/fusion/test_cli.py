@@ -246,6 +246,27 @@ def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
         assert {"displacement", "predicted_final", "contribution", "sealed"} <= set(product.data_vars)
     assert invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out", "--resume").exit_code == 0
     assert json.loads((tmp_path / "out" / "results.json").read_text())["loop"] == written["loop"]
+    # The loop closes at the machine: a model for its control, the test after it, and the next test.
+    model = tmp_path / "model" / "model.json"
+    exported = invoke("export", tmp_path / "out", "--format", "model-json", "--out", model.parent)
+    assert exported.exit_code == 0, exported.output
+    second = recipe.read_text().replace(
+        "hours = 24\n", f'hours = 24\nduty_seed = 1044\napplied = "{model}"\napplied_gain = -1.0\n'
+    )
+    (tmp_path / "second.toml").write_text(second)
+    assert invoke("simulate", tmp_path / "second.toml", "--out", tmp_path / "after").exit_code == 0
+    after = tmp_path / "after" / "campaign.toml"
+    verified = invoke("verify", tmp_path / "out", after, "--applied", model, "--json")
+    assert verified.exit_code == 0, verified.output
+    faults = [one["fault"] for one in json.loads(verified.stdout)["channels"]]
+    assert faults == ["wrong sign"] * len(faults) and faults
+    planned = invoke("plan", tmp_path / "out")
+    assert planned.exit_code == 0, planned.output
+    head, *lines = planned.output.splitlines()
+    assert head.startswith("standard uncertainty of a prediction under another duty: ")
+    assert lines[-1].split()[0].isdigit()
+    refused = invoke("plan", tmp_path / "day")
+    assert refused.exit_code == 2 and "results.json" in refused.stderr
 
 
 def test_a_record_too_short_is_refused_before_anything_is_written(tmp_path: Path) -> None:

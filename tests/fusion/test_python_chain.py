@@ -41,6 +41,7 @@ def test_results_print_and_show_themselves(walked: Walk, results_folder: Path) -
 def test_everything_is_plotted(walked: Walk, results_folder: Path) -> None:
     import matplotlib.pyplot as plt
 
+    plt.close("all")  # what a test before this one in the same process left open is not counted
     show(walked)
     assert len(plt.get_fignums()) == 11
     plt.close("all")

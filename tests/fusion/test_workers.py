@@ -108,7 +108,7 @@ def test_where_no_process_can_be_started_the_work_is_done_here(monkeypatch: pyte
     def full(*_: object) -> None:
         raise BlockingIOError("no more processes")
 
-    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", full)
+    monkeypatch.setattr("multiprocessing.process.BaseProcess.start", full)
     with second_process() as none:
         assert none.submit(os.getpid)() == os.getpid()
         assert none.faults == ["could not be started: no more processes"]

@@ -15,6 +15,7 @@ from interferometry.anomalies import (
 )
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import estimate_drift
+from interferometry.drift.gls import Autoregression
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate, with_memory
 
 pytestmark = pytest.mark.long
@@ -304,3 +305,19 @@ def test_an_approach_whose_readings_are_all_left_out_has_no_course(rng):
         (2, "positive"),
     ]
     assert (values.std(axis=1) > 0.5).all()
+
+
+def test_noise_with_a_memory_over_the_cycles_makes_no_position_scatter():
+    """The scatter of fewer independent values differs more between positions than permuted readings do."""
+    memory, found = Autoregression(np.array([0.6]), 0.64), {True: 0, False: 0}
+    for seed in range(60):
+        z = memory.with_memory(np.random.default_rng(seed).normal(size=(40, 32))).reshape(40, 2, 16)
+        for freed, values in ((True, anomalies_module._without_memory(z)), (False, z)):
+            excess, largest = anomalies_module._scatter_test(values, 199, np.random.default_rng(seed))
+            found[freed] += (1 + np.count_nonzero(largest >= excess.max())) <= 0.05 * 200
+    # Three of 60 by chance, more than eight once in a hundred.
+    assert found[True] <= 8 < found[False]
+    # Readings that are missing stay missing, and noise without memory stays as it is.
+    white = np.random.default_rng(1).normal(size=(40, 2, 16))
+    white[3, 0, 2] = np.nan
+    np.testing.assert_array_equal(anomalies_module._without_memory(white), white)

@@ -12,7 +12,7 @@ from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.drift_model.record import close_record, examine_record, predict
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.drift_model.recursion import make_recursion, record_of_product
-from fusion.analysis.drift_model.verification import ChannelVerdict, predicted_ranges, verify
+from fusion.analysis.drift_model.verification import ChannelVerdict, verify
 from fusion.pipeline.record import record_variables
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import Recursion
@@ -21,6 +21,8 @@ from fusion.twin.record import simulate_record
 from tests.fusion.record_tables import table_of
 
 pytestmark = pytest.mark.slow
+#: Seeds of the machines: not those that the model was developed on.
+MACHINES = range(1, 21)
 #: A spindle without a sensor; nothing else is undeclared.
 SOURCE = EffectRecipe("unseen_heat_source", parameters={"um": 15.0, "time_constant_min": 20.0})
 
@@ -49,9 +51,9 @@ def first_test(seed: int) -> tuple[Record, xr.Dataset, RecordLoop, Recursion]:
 
 
 def second_test(
-    seed: int, folder: Path, *, runs: Recursion | None = None, says: Recursion | None = None, **record
+    seed: int, folder: Path, *, runs: Recursion | None = None, **record
 ) -> tuple[list[ChannelVerdict], xr.Dataset]:
-    """Verify the test after it: the control runs one model and is said to run another; the machine's own by default."""
+    """Verify the test after it: the control is said to run the machine's own model, and does so by default."""
     _, product, loop, model = first_test(seed)
     file = folder / "model.json"
     file.write_text((runs or model).model_dump_json(), encoding="utf-8")
@@ -59,17 +61,12 @@ def second_test(
     health = examine_record(table, ["quasi_static"])
     faulty = {one.sensor: describe_fault(one) for one in health.findings if one.state == "left_out"}
     after = reduce_record(health.table)
-    ranges = predicted_ranges(product, loop, after)
-    return verify(after, says or model, ranges, faulty_sensors=faulty), table
+    return verify(product, loop, after, model, faulty_sensors=faulty), table
 
 
-@pytest.mark.xfail(
-    reason="the interval holds 73 % of 60 axes instead of 90 %: a day of the room that the first test did not show",
-    strict=True,
-)
 def test_what_a_compensation_leaves_is_what_was_predicted(tmp_path):
-    rows, inside = [], []
-    for seed in range(1, 21):
+    rows, inside, named = [], [], []
+    for seed in MACHINES:
         verdicts, table = second_test(seed, tmp_path)
         bare = reduce_record(logged(seed, duty_seed=1000 + seed))
         ideal = json.loads(table.attrs["ideal"])
@@ -77,15 +74,19 @@ def test_what_a_compensation_leaves_is_what_was_predicted(tmp_path):
         for one in verdicts:
             k = ("X", "Y", "Z").index(one.name)
             inside.append(one.achieved_um <= one.predicted_high_um)
+            named.append(one.fault not in {"", "not explained"})
             before = float(np.ptp(bare.displacement[:, k]))
             rows.append([before, one.predicted_um, one.achieved_um, ridge[k], ideal[k]])
     before, predicted, achieved, ridge, ideal = np.median(rows, axis=0)
     print(
         f"{len(rows)} axes of 20 machines, median range: before {before:.2f}, predicted {predicted:.2f}, achieved {achieved:.2f}, ridge "
-        f"with lags {ridge:.2f}, best possible {ideal:.2f} um; achieved within the interval {np.mean(inside):.2f}"
+        f"with lags {ridge:.2f}, best possible {ideal:.2f} um; achieved within the interval {np.mean(inside):.2f}; "
+        f"axes with a fault named, where none is: {sum(named)}"
     )
     assert np.mean(inside) >= 0.9
-    assert achieved < 0.5 * before
+    assert sum(named) <= 2
+    # Of what a model may take away, nine tenths.
+    assert achieved - ideal < 0.1 * (before - ideal)
 
 
 def ridge_ranges(seed: int, bare: Record) -> np.ndarray:
@@ -93,11 +94,17 @@ def ridge_ranges(seed: int, bare: Record) -> np.ndarray:
     first = record_of_product(first_test(seed)[1])
     left = []
     for record in (first, bare):
-        now = np.column_stack(
-            [record.temperature, *(one for powers in record.drivers.values() for one in powers.values())]
+        share = {name: size / first.driver_sizes[name][0] for name, (size, _) in record.driver_sizes.items()}
+        loads = np.column_stack(
+            [one * share[name] ** k for name, powers in record.drivers.items() for k, one in powers.items()]
         )
-        late = [record.series(now, "1").lagged(60.0 * minutes).values for minutes in (5.0, 20.0, 80.0)]
-        left.append(np.column_stack([now, *late]))
+        # As the model does: what a load warms is cold at the start.
+        late = [
+            record.series(now, "1").lagged(60.0 * minutes, at_rest=start).values
+            for minutes in (5.0, 20.0, 80.0)
+            for now, start in ((record.temperature, None), (loads, 0.0))
+        ]
+        left.append(np.column_stack([record.temperature, loads, *late]))
     fitted = predict(first, left[0], np.ones(first.seconds.size, bool))
     return np.ptp(bare.displacement - left[1] @ fitted.coefficients, axis=0)
 
@@ -111,27 +118,16 @@ FAULTS = {
 }
 
 
-#: Faults that are not named often enough, with the machines of 10 on which they are.
-MISSED = {
-    "half the gain": "4 of 10: what half a correction leaves is within the predicted interval, and no fault is looked for",
-    "stale table": "5 of 10: a model of another machine may be nearly proportional to the machine's own",
-}
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        pytest.param(one, marks=pytest.mark.xfail(reason=MISSED[one], strict=True)) if one in MISSED else one
-        for one in FAULTS
-    ],
-)
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_planted_fault_is_named(fault, tmp_path):
     named = []
-    for seed in range(1, 11):
+    for seed in MACHINES[:10]:
         # A stale table is that of another machine: its sensors are the same, its coefficients are not.
         runs = first_test(seed + 10)[3] if fault == "stale table" else None
         verdicts, _ = second_test(seed, tmp_path, runs=runs, **FAULTS[fault])
         faults = [one.fault for one in verdicts if one.fault]
-        named.append(max(set(faults), key=faults.count) if faults else "")
-    print(f"{fault}: {named.count(fault)} of 10 machines; {named}")
-    assert named.count(fault) >= 9
+        named.append(max(sorted(set(faults)), key=faults.count) if faults else "")
+    # Of two that cannot be told apart, the right one is among them.
+    right = sum(fault in words and len(words) <= 2 for words in (one.split(" or ") for one in named))
+    print(f"{fault}: {right} of 10 machines; {named}")
+    assert right >= 9

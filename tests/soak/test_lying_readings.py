@@ -44,6 +44,19 @@ def missed_trigger(values: Array, rng: np.random.Generator) -> Array:
     return values
 
 
+def other_unit(values: Array, rng: np.random.Generator) -> Array:
+    """From the middle on the readings are in units of 10 µm."""
+    values[len(values) // 2 :] /= 10.0
+    return values
+
+
+def exchanged_approaches(values: Array, rng: np.random.Generator) -> Array:
+    """From the middle on each approach holds the readings of the other one."""
+    half = len(values) // 2
+    values[half:] = values[half:, ::-1].copy()
+    return values
+
+
 LIES: dict[str, tuple[str, Callable[[Array, np.random.Generator], Array]]] = {
     "as they are": ("", lambda values, rng: values),
     "rounded to 0.1 µm": ("", lambda values, rng: np.round(values, 1)),
@@ -51,6 +64,8 @@ LIES: dict[str, tuple[str, Callable[[Array, np.random.Generator], Array]]] = {
     "clipped at the 70th percentile": ("repeated_value", clipped),
     "zeros for a tenth": ("repeated_value", zeros),
     "a trigger missed in the middle": ("missed_trigger", missed_trigger),
+    "another unit from the middle on": ("deviation_unit", other_unit),
+    "approaches exchanged from the middle on": ("approach_labels", exchanged_approaches),
 }
 
 

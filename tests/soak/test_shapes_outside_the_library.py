@@ -12,7 +12,8 @@ import pytest
 from scipy.signal import lfilter
 
 from fusion.analysis.alignment.readings import Readings, Series
-from fusion.analysis.drift_model.axis import close_loop
+from fusion.analysis.drift_model.axis import _MISFIT_SHARE, close_loop
+from fusion.analysis.drift_model.search import DISCREPANCY
 from tests.fusion.loop_bench import DECLARED, readings_of
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 
@@ -26,8 +27,8 @@ def late(values: np.ndarray, minutes: float) -> np.ndarray:
     return lfilter([1.0 - keep], [1.0, -keep], values - values[0]) + values[0]
 
 
-def bar(power: np.ndarray, minutes: float, loss: float) -> np.ndarray:
-    """Mean temperature of the far half of a bar that is heated at one end; ``minutes`` is its length squared over its diffusivity."""
+def bar(power: np.ndarray, minutes: float, loss: float, part: slice = slice(12, 24)) -> np.ndarray:
+    """Mean temperature of a part of a bar heated at one end, of its far half; ``minutes`` is its length squared over its diffusivity."""
     cells = 24
     conduct = np.diag(np.full(cells - 1, 1.0), 1) + np.diag(np.full(cells - 1, 1.0), -1)
     matrix = (cells**2 * (conduct - np.diag(conduct.sum(axis=1))) - loss * np.eye(cells)) / (60.0 * minutes)
@@ -37,7 +38,7 @@ def bar(power: np.ndarray, minutes: float, loss: float) -> np.ndarray:
         first * lfilter([0.0, (1.0 - one) / -value], [1.0, -one], power)
         for one, value, first in zip(keep, values, vectors[0], strict=True)
     ]
-    return np.asarray((vectors @ np.array(modes))[cells // 2 :].mean(axis=0))
+    return np.asarray((vectors @ np.array(modes))[part].mean(axis=0))
 
 
 def play(values: np.ndarray, width: float) -> np.ndarray:
@@ -92,6 +93,40 @@ def course(readings: Readings, shape: str, rng: np.random.Generator) -> tuple[np
         ),
     }
     return np.zeros_like(share), replace(readings, series={**readings.series, **false})
+
+
+def missed(course: np.ndarray, response: np.ndarray, minutes: float) -> float:
+    """Share of a course's rms that a response leaves, its level and the state before the log free."""
+    seconds = GRID_S * np.arange(course.size)
+    columns = np.column_stack([np.ones(course.size), response, np.exp(-seconds / (60.0 * minutes))])
+    left = course - columns @ np.linalg.lstsq(columns, course, rcond=None)[0]
+    return float(left.std() / course.std())
+
+
+def test_what_lumped_bodies_miss_of_a_bar_that_conducts_heat() -> None:
+    """The discrepancy of a library shape: the best response of one body or two against 200 bars under loads switched at random."""
+    rng, shares = np.random.default_rng(5), []
+    for number in range(200):
+        grid = np.arange(0.0, 3600.0 * rng.uniform(3.0, 6.0), GRID_S)
+        holds = rng.exponential(25.0 * 60.0 / GRID_S, 200).astype(int) + 1
+        power = np.repeat(rng.uniform(0.0, 1.0, 200), holds)[: grid.size]
+        minutes, loss = np.exp(rng.uniform(np.log([15.0, 0.3]), np.log([200.0, 3.0])))
+        part = (slice(12, 24), slice(0, 24), slice(20, 24))[number % 3]
+        course = bar(power, minutes, loss, part)
+        one, two = [], []
+        for tau in np.geomspace(3.0, 400.0, 50):
+            first = late(power, tau)
+            one.append(missed(course, first, tau))
+            two += [missed(course, late(first, share * tau), tau) for share in (0.25, 0.5, 1.0)]
+        shares.append((min(one), min(one + two)))
+    of_one, of_two = np.transpose(shares)
+    for name, missing in (("one body", of_one), ("one or two", of_two)):
+        print(
+            f"\n{name}: median, 75 %, 95 % {np.quantile(missing, [0.5, 0.75, 0.95])}, rms {np.sqrt(np.mean(missing**2)):.3f}"
+        )
+    # What the closed loop assumes, to its digits.
+    assert np.sqrt(np.mean(of_two**2)) == pytest.approx(DISCREPANCY, abs=5e-4)
+    assert np.quantile(of_one, 0.95) < _MISFIT_SHARE
 
 
 #: Names that are right in substance, by shape.

@@ -24,6 +24,7 @@ from fusion.results.results import Results
 from fusion.twin.recipe import Recipe
 from interferometry.common import InterferometryError
 from tests.soak.lies.campaigns import write
+from tests.soak.lies.outcome import shares_within
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import on_any_machine
 from thermography.common import ThermographyError
@@ -43,12 +44,15 @@ class Run(NamedTuple):
         Codes of the doubts, or the refusal.
     statements : tuple of str
         What was stated of a campaign with nothing to be found.
+    within : dict of str to float
+        Share of each figure's values whose error is at most twice its printed uncertainty.
     """
 
     seed: int
     bare: bool
     doubts: tuple[str, ...]
     statements: tuple[str, ...]
+    within: dict[str, float]
 
 
 def recipe_of(seed: int) -> Recipe:
@@ -62,15 +66,16 @@ def run(seed: int) -> Run:
     bare = not recipe.effect and not recipe.anomaly
     with tempfile.TemporaryDirectory() as base, contextlib.ExitStack() as stack:
         folder = Path(base)
-        write(recipe, folder / "campaign")
+        truth = write(recipe, folder / "campaign")
         stack.enter_context(mock.patch("fusion.report.page.render_report", return_value=""))
         try:
             results = run_campaign(folder / "campaign" / "campaign.toml", folder / "out")
         except (FusionError, InterferometryError, ThermographyError) as error:
-            return Run(seed, bare, (f"refused: {error}".replace(base, ""),), ())
+            return Run(seed, bare, (f"refused: {error}".replace(base, ""),), (), {})
+        within = shares_within(truth, results, folder / "out")
     assert results.inputs is not None
     doubts = tuple(f"{check.code} {check.value:.3g}" for check in results.inputs.doubts)
-    return Run(seed, bare, doubts, statements_of(results) if bare else ())
+    return Run(seed, bare, doubts, statements_of(results) if bare else (), within)
 
 
 def statements_of(results: Results) -> tuple[str, ...]:
@@ -90,14 +95,18 @@ def test_reports_on_sound_campaigns(capsys: pytest.CaptureFixture[str]) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         for one in pool.map(run, range(first, first + runs)):
             done.append(one)
-            if one.doubts or one.statements:
+            short = {name: share for name, share in one.within.items() if share < 0.8}
+            if one.doubts or one.statements or short:
                 with capsys.disabled():
-                    print(f"\n{one.seed}: {'; '.join((*one.doubts, *one.statements))}", flush=True)
+                    print(f"\n{one.seed}: {'; '.join((*one.doubts, *one.statements))} {short or ''}", flush=True)
     doubted = sum(bool(one.doubts) for one in done)
     bare = [one for one in done if one.bare]
     false = sum(bool(one.statements) for one in bare)
     with capsys.disabled():
         print(f"\ndoubted or refused: {rate(doubted, runs)}; something false stated: {rate(false, len(bare))}")
+        for name in done[0].within:
+            shares = [one.within[name] for one in done if not one.doubts and np.isfinite(one.within.get(name, np.nan))]
+            print(f"{name}: {np.mean(shares):.3f} of the values within 2 u, {len(shares)} campaigns")
     assert wilson(doubted, runs)[0] <= 0.02
     assert wilson(false, len(bare))[0] <= 0.05
 

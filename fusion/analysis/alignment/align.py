@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import integrate, ndimage
+from scipy import ndimage
 
 from fusion.analysis.alignment.reflections import find_switching_patch, seen_throughout
 from fusion.analysis.alignment.sensor_health import SensorFault
@@ -327,7 +327,8 @@ class MeasuredLine:
 
 def _integral_from_zero(line: Array, places_mm: Array) -> Array:
     """Integral of values along a line (time, place) from its place 0 to every place, (time, place)."""
-    integral = integrate.cumulative_trapezoid(line, places_mm, axis=1, initial=0.0)
+    trapezia = np.diff(places_mm) * (line[:, 1:] + line[:, :-1]) / 2.0
+    integral = np.pad(np.cumsum(trapezia, axis=1), ((0, 0), (1, 0)))
     return np.asarray(integral - integral[:, [int(np.argmin(np.abs(places_mm)))]])
 
 

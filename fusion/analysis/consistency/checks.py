@@ -92,7 +92,6 @@ CONDITIONS = {
     "contact_sensors": Condition(
         "the contact sensors of the logs are sound", _LOG, "compensation by the log, and every cause that follows it"
     ),
-    "plan_sensors": Condition("the contact sensors on the table are sound", _CLOCK, _SENSORS),
     "sensors_coverage": Condition(
         "the sensors' log belongs to this test", _CLOCK, "every effect that follows the temperature of the table"
     ),

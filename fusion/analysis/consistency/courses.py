@@ -7,7 +7,7 @@ checked on the way.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -43,6 +43,8 @@ _MODES = 2
 #: Share of the variance of the field's rate that the load must explain, and the factor by which a shift must lessen what is left: half
 #: the standard deviation.
 _LEAST_EXPLAINED, _LEFT_RATIO = 0.6, 4.0
+#: The same of a load that was read backwards: a sound one leaves less than its reverse does.
+_BACKWARDS_RATIO = 2.0
 #: A load whose largest value grows or falls by this factor from one sample to the next may have changed its unit; ...
 _SCALE_JUMP = 20.0
 #: ... by one of these: minutes or seconds, per cent, thousands, hours or seconds.
@@ -57,6 +59,8 @@ _OTHER_TIMES, _MOST_OTHER_TIMES, _LEAST_VARIATION, _STRUCTURED, _LEAST_WARMED_K 
 #: Share of the rows with the largest value from which a load may have been clipped, where it is reached more than once; and the shortest
 #: time between changes, s, from which a load may be a mean: the frames resolve less.
 _CLIPPED_SHARE, _HELD_S = 0.2, 900.0
+#: Values from which on it is unlikely that a load which is switched among levels meets each of them but the largest once.
+_LEVELS = 4
 #: Rises in a row without a fall that chance makes less than once in a million: a counter.
 _COUNTED = 20
 #: Share of the variance of a load's response that may depend on whether it is held or interpolated between two rows.
@@ -118,12 +122,12 @@ def _as_evidence(misfit: Array, early_s: float, ratio: float, *, second: str, wh
 
 def compare_load(field: FieldSeries | None, log: xr.Dataset | None) -> list[Evidence]:
     """Compare the loads with the rate of the field: what the load that explains most of it says of the clock of the drivers' log."""
-    loads = [] if log is None else [column for column in log.data_vars.values() if _is_load(column)]
+    loads = _loads(log)
     if field is None or log is None or not loads:
         return []
     at, rate = field.since_start(log["time"].values), _Rate.of(field)
     columns, left = min(
-        ((one, rate.left(one)) for one in (rate.columns(at, load.values.astype(float)) for load in loads)),
+        ((one, rate.left(one)) for one in (rate.columns(at, load) for load in loads.values())),
         key=lambda of_load: float(of_load[1].min()),
     )
     if 1.0 - float(left.min()) < _LEAST_EXPLAINED:
@@ -140,15 +144,14 @@ def compare_load(field: FieldSeries | None, log: xr.Dataset | None) -> list[Evid
 
 def check_load_scale(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
     """Check that a load keeps its unit: a share does not become per cent, and where a size jumps, the field's rate must follow."""
-    loads = {} if log is None else {str(name): column for name, column in log.data_vars.items() if _is_load(column)}
+    loads = _loads(log)
     if field is None or log is None or not loads:
         return []
     at, rate = field.since_start(log["time"].values), _Rate.of(field)
     value, evidence = 1.0, f"No change of scale of the loads in {file} detected."
-    for name, column in loads.items():
-        load = column.values.astype(float)
+    for name, load in loads.items():
         for start, factor in _scale_jumps(load):
-            share = str(column.attrs.get("units", "")) == "1" and _share_and_per_cent(load, start)
+            share = str(log[name].attrs.get("units", "")) == "1" and _share_and_per_cent(load, start)
             reason = "a share and per cent" if share else _rate_against_jump(rate, at, load, start, factor)
             if reason:
                 value = 100.0 if share else max(factor, 1.0 / factor)
@@ -184,9 +187,11 @@ def check_load_kind(log: xr.Dataset | None, *, file: str) -> list[Check]:
 
 def _loads(log: xr.Dataset | None, *, constant: bool = False) -> dict[str, Array]:
     """The loads of a log by name; `constant`: also those that never change."""
-    columns = {} if log is None else {str(name): column for name, column in log.data_vars.items()}
+    columns = {} if log is None else log.data_vars
     return {
-        name: column.values.astype(float) for name, column in columns.items() if _is_load(column, constant=constant)
+        str(name): column.values.astype(float)
+        for name, column in columns.items()
+        if _is_load(column, constant=constant)
     }
 
 
@@ -201,8 +206,12 @@ def _between_rows(at: Array, load: Array) -> float:
     return float(np.var(responses[:, 1] - responses[:, 0]) / max(float(np.var(responses[:, 1])), 1e-30))
 
 
-def check_load_course(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
-    """Check that the field's rate follows a load: more than the same log at other times, and than backwards."""
+def check_load_course(
+    field: FieldSeries | None, log: xr.Dataset | None, *, file: str, environment: xr.Dataset | None = None
+) -> list[Check]:
+    """Check that the field's rate follows a load: more than the same log at other times, and than backwards; what other loads and the
+    logged air explain need not be explained by it.
+    """
     loads = _loads(log, constant=True)
     if field is None or log is None or not loads:
         return []
@@ -212,10 +221,15 @@ def check_load_course(field: FieldSeries | None, log: xr.Dataset | None, *, file
     lefts = {name: _load_left(rate, grid, course) for name, course in courses.items()}
     name = min(lefts, key=lambda one: lefts[one])
     course, left = courses[name], lefts[name]
-    structured, explains_little = _is_structured(field, rate), left > 1.0 - _LEAST_EXPLAINED
+    beside = [courses[other] for other in courses if other != name]
+    if environment is not None and "air_temperature" in environment:
+        air = environment["air_temperature"].dropna("time")
+        beside += [np.interp(grid, field.since_start(air["time"].values), air.values)] if air.size else []
+    together = _load_left(rate, grid, course, *beside)
+    structured, explains_little = _is_structured(field, rate), together > 1.0 - _LEAST_EXPLAINED
     told = structured and course.std() >= _LEAST_VARIATION * np.abs(course).max()
     left_backwards = _load_left(rate, grid, course[::-1])
-    is_backwards = told and left_backwards <= 1.0 - _LEAST_EXPLAINED and left > _LEFT_RATIO * left_backwards
+    is_backwards = told and left_backwards <= 1.0 - _LEAST_EXPLAINED and left > _BACKWARDS_RATIO * left_backwards
     at_other_times = 0.0
     if told and not is_backwards and explains_little:
         rolls = np.linspace(0, course.size, _OTHER_TIMES, endpoint=False, dtype=int)[1:]
@@ -223,6 +237,8 @@ def check_load_course(field: FieldSeries | None, log: xr.Dataset | None, *, file
     constant = float(np.ptp(course)) == 0.0
     coarse = _coarse_kind(at, loads[name]) if explains_little and (_bends(field) if constant else structured) else ""
     evidence = f"{name} in {file} explains {100.0 * (1.0 - left):.0f} % of the rate at which the field changes"
+    if beside:
+        evidence += f", with all that was logged {100.0 * (1.0 - together):.0f} %"
     if is_backwards:
         evidence += f", read backwards in time {100.0 * (1.0 - left_backwards):.0f} %"
     elif coarse:
@@ -253,8 +269,10 @@ def _coarse_kind(at: Array, load: Array) -> str:
     if values.size == 2:
         marks = bool((lengths[load[starts] == values[np.argmin(rows)]] == 1).all())
         return "holds marks, as of starts" if marks else "knows two states, as of a switch"
-    largest = load[starts] == values[-1]
-    if largest.sum() > 1 and rows[-1] >= _CLIPPED_SHARE * load.size:
+    # Where other values than the largest and that at rest come back as well, the load is switched from level to level.
+    _, times = np.unique(load[starts], return_counts=True)
+    is_cut_off = times[-1] > 1 and times.size > _LEVELS and (times[1:-1] == 1).all()
+    if is_cut_off and rows[-1] >= _CLIPPED_SHARE * load.size:
         return (
             f"is {values[-1]:g}, its largest value, in {100.0 * rows[-1] / load.size:.0f} % of the rows, as if clipped"
         )
@@ -318,10 +336,18 @@ def _rate_against_jump(rate: _Rate, at: Array, load: Array, start: int, factor: 
     return f"the load leaves {as_logged:.0f} % of the field's rate unexplained as it is logged, {without:.0f} % without that factor"
 
 
-def _load_left(rate: _Rate, at: Array, load: Array) -> float:
-    """Share of the variance of the field's rate that a load leaves, at the best delay of physics."""
+def _load_left(rate: _Rate, at: Array, *loads: Array) -> float:
+    """Share of the variance of the field's rate that loads leave, one taken out after the other at its best delay of physics."""
     delays_s = _LOG_SHIFTS_S[np.abs(_LOG_SHIFTS_S) <= _LOG_DELAY_S]
-    return float(rate.left(rate.columns(at, load, delays_s)).min())
+    share = 1.0
+    for load in loads:
+        columns = rate.columns(at, load, delays_s)
+        left = rate.left(columns)
+        best = int(left.argmin())
+        taken = columns.reshape(left.size, -1)[best]
+        share *= float(left[best])
+        rate = replace(rate, modes=rate.modes - np.outer(taken, taken @ rate.modes))
+    return share
 
 
 def _is_load(column: xr.DataArray, *, constant: bool = False) -> bool:

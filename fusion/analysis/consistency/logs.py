@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -132,25 +131,6 @@ def _covered(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64]) -
 _LIMIT = 3.0
 #: Standard uncertainty of the rise under a surface probe relative to that of the surface (contact, stem conduction), as a share of it.
 _CONTACT = 0.02
-
-
-def check_sensors(temperature: xr.DataArray, *, file: str, left_out: Sequence[str] = ()) -> list[Check]:
-    """Check that no contact sensor in use shows a step, ramp, stuck-at or drop-out fault."""
-    times = temperature["time"].values
-    seconds = np.asarray((times - times[0]) / np.timedelta64(1, "s"), float)
-    clear = [fault for fault in examine_sensors(seconds, temperature.values) if fault.is_clear]
-    named = "; ".join(f"{temperature['sensor'].values[fault.sensor]} {fault.words}" for fault in clear)
-    return [
-        judge(
-            "plan_sensors",
-            len(clear),
-            0.0,
-            f"{file}: {named}.",
-            f"Check contact and cable, and leave the column out of {file}.",
-            sound=f"No {'other ' if left_out else ''}contact sensor of {file} shows a step, ramp, stuck-at or drop-out fault"
-            + (f"; left out: {'; '.join(left_out)}." if left_out else "."),
-        )
-    ]
 
 
 def compare_sensors(

@@ -21,14 +21,18 @@ from thermography.common import scatter_by_median
 _LARGEST_SHARE, _LARGEST_MM = 0.01, 1.0
 #: Smallest random part of a reading, um, over a travel of this length, mm: refraction in still air makes more. Less over a shorter one.
 _LEAST_NOISE_UM, _NOISE_TRAVEL_MM = 0.002, 200.0
+#: Cycles on either side of a change of unit, the least factor, and from how many standard errors on their mean profile has a shape: no
+#: laser scatters five times as much from one cycle to the next while the profile grows with it.
+_UNIT_SIDE, _UNIT_FACTOR, _SHAPE_CLEAR = 5, 5.0, 2.0
 #: Smallest travel as a share of the plan's extent along the axis.
 _LEAST_TRAVEL_SHARE = 0.03
 #: Share of equal readings from which two cycles or targets are copies, and the share of one value that ordinary sites may have.
 _COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
 #: Probability that sound readings show it by chance, from which a coincidence over targets or cycles is doubted.
 _COINCIDENCE = 1e-6
-#: The same for a change of the profile that looks like a shift by one target, of the one largest change.
-_SHIFT_BY_CHANCE = 1e-4
+#: The same for a change of the profile that looks like a shift by one target, of the one largest change; it is an upper bound, which
+#: sound readings reach in far fewer tests.
+_SHIFT_BY_CHANCE = 1e-2
 #: Cycles that are compared with all others at once.
 _CYCLES_AT_ONCE = 256
 #: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
@@ -43,8 +47,9 @@ _COMMON_SHARE = 0.1
 _ZEROED_SHARE = 0.9
 #: Fewest cycles on either side of an exchange of the approaches.
 _LEAST_SIDE = 3
-#: Standard errors by which the reversal error must differ before and after, and the p-value for equal size and opposite sign.
-_EXCHANGE_SIGMAS, _OPPOSITE_P = 8.0, 1e-3
+#: Standard errors by which the reversal error must differ before and after, the p-value for equal size and opposite sign, and the share of
+#: it within which the sizes are equal beside a drift.
+_EXCHANGE_SIGMAS, _OPPOSITE_P, _SAME_SIZE = 8.0, 1e-3, 0.25
 
 
 def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> list[Check]:
@@ -55,7 +60,7 @@ def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> l
     noise_um = random_part_um(values)
     return [
         _largest_deviation(deviations),
-        _least_noise(deviations, max(noise_um, _rounding_um(values))),
+        _unit(deviations, max(noise_um, _rounding_um(values))),
         *([] if plan_extent_mm is None else [_travel(deviations, plan_extent_mm)]),
         _copied_cycles(deviations),
         _copied_targets(deviations),
@@ -109,18 +114,44 @@ def _largest_deviation(deviations: xr.Dataset) -> Check:
     )
 
 
-def _least_noise(deviations: xr.Dataset, noise_um: float) -> Check:
-    """Unit check: repeatability below that of air, not from rounding, suggests values in mm."""
+def _unit(deviations: xr.Dataset, noise_um: float) -> Check:
+    """Unit check: repeatability below that of air, not from rounding, or scatter and profile that change by one factor."""
     travel_mm = float(np.ptp(deviations["position"].values))
     limit_um = _LEAST_NOISE_UM * min(travel_mm / _NOISE_TRAVEL_MM, 1.0)
+    complete = np.isfinite(deviations["deviation"].values).all(axis=(1, 2))
+    first, factor = _unit_change(deviations["deviation"].values[complete])
+    evidence = f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (air makes {limit_um:.2g} µm over {travel_mm:.4g} mm)."
+    if first:
+        cycle = deviations["cycle"].values[complete][first]
+        evidence = (
+            f"From cycle {cycle} on scatter and profile are both some {factor:.2g} times those of the cycles before."
+        )
     return judge(
         "deviation_unit",
         noise_um,
         limit_um,
-        f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (air makes {limit_um:.2g} µm over {travel_mm:.4g} mm).",
-        "Check the unit of the deviations: they look like mm and are read as µm.",
-        passed=not noise_um < limit_um,
+        evidence,
+        f"Check the unit of the deviations{' from there on' if first else ': they look like mm and are read as µm'}.",
+        passed=not (noise_um < limit_um or first),
     )
+
+
+def _unit_change(values: Array) -> tuple[int, float]:
+    """First of the cycles (cycle, direction, target) from which on readings are on another scale, and its factor; (0, 1) where none is."""
+    if len(values) < 2 * _UNIT_SIDE or values.shape[2] < _LEAST_TARGETS:
+        return 0, 1.0
+    window = np.lib.stride_tricks.sliding_window_view(values, _UNIT_SIDE, axis=0)
+    noise = np.median(np.abs(np.diff(window, 2, axis=-1)), axis=(1, 2, 3)) / (special.ndtri(0.75) * np.sqrt(6.0))
+    shape = np.sqrt((_bent(window.mean(axis=-1)) ** 2).mean(axis=(1, 2)))
+    # A mean over the window shows a shape where that is large against its noise.
+    clear = shape > _SHAPE_CLEAR * noise / np.sqrt(_UNIT_SIDE)
+    before, after = slice(None, -_UNIT_SIDE), slice(_UNIT_SIDE, None)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_noise, of_shape = (np.log(size[after] / size[before]) for size in (noise, shape))
+    alike = (np.abs(of_noise - of_shape) < np.log(2.0)) & (np.abs(of_noise) > np.log(_UNIT_FACTOR))
+    size = np.where(alike & clear[before] & clear[after], np.abs(of_shape), 0.0)
+    place = int(np.argmax(size))
+    return (place + _UNIT_SIDE, float(np.exp(of_shape[place]))) if size[place] > np.log(_UNIT_FACTOR) else (0, 1.0)
 
 
 def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
@@ -267,10 +298,13 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
 
 def _without_line(profiles: Array) -> float:
     """Standard deviation of profiles (direction, target) about a straight line of each, um."""
-    design = np.vander(np.arange(profiles.shape[1], dtype=float), 2)
-    base, _ = np.linalg.qr(design)
-    left = profiles - (profiles @ base) @ base.T
-    return float(np.sqrt((left**2).sum() / (profiles.shape[0] * (profiles.shape[1] - 2))))
+    return float(np.sqrt((_bent(profiles) ** 2).sum() / (profiles.shape[0] * (profiles.shape[1] - 2))))
+
+
+def _bent(profiles: Array) -> Array:
+    """What a straight line leaves of each profile (..., target), um."""
+    base, _ = np.linalg.qr(np.vander(np.arange(profiles.shape[-1], dtype=float), 2))
+    return np.asarray(profiles - (profiles @ base) @ base.T)
 
 
 def _largest_shares(differences: Array) -> list[tuple[float, float]]:
@@ -306,15 +340,16 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     reversal = values[:, 0] - values[:, 1]
     known = np.isfinite(reversal).any(axis=1)
     reversal, cycles = reversal[known], deviations["cycle"].values[known]
-    best, place = 0.0, 0
-    for k in range(_LEAST_SIDE, reversal.shape[0] - _LEAST_SIDE + 1):
-        before, after = known_mean(reversal[:k], axis=0), known_mean(reversal[k:], axis=0)
-        sigma = noise_um * np.sqrt(2.0) * np.sqrt(1.0 / k + 1.0 / (reversal.shape[0] - k))
-        if not np.isfinite(after - before).any():
-            continue
-        shift = float(np.nanmean(after - before) / (sigma / np.sqrt(before.size)))
-        if abs(shift) > abs(best):
-            best, place = shift, k
+
+    def sigmas(k: int) -> float:
+        """Change of the reversal error at a cycle in standard errors."""
+        change = known_mean(reversal[k:], axis=0) - known_mean(reversal[:k], axis=0)
+        u = noise_um * np.sqrt(2.0 / k + 2.0 / (len(reversal) - k))
+        return float(np.nanmean(change) * np.sqrt(change.size) / u) if np.isfinite(change).any() else 0.0
+
+    changes = {k: sigmas(k) for k in range(_LEAST_SIDE, len(reversal) - _LEAST_SIDE + 1)}
+    place = max(changes, key=lambda k: abs(changes[k]), default=0)
+    best = changes.get(place, 0.0)
     if abs(best) <= _EXCHANGE_SIGMAS:
         return sound
     before, after = reversal[:place], reversal[place:]
@@ -322,12 +357,15 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
     early, late = before[:, both], after[:, both]
     spread = np.sqrt(np.nanvar(early, axis=0) / early.shape[0] + np.nanvar(late, axis=0) / late.shape[0])
-    total = (np.nanmean(early, axis=0) + np.nanmean(late, axis=0)) / np.maximum(spread, 1e-12)
-    opposite = float(special.chdtrc(total.size, float(total @ total)))
+    total = np.nanmean(early, axis=0) + np.nanmean(late, axis=0)
+    size = float(np.ptp([np.nanmean(early), np.nanmean(late)]))
+    standardised = total / np.maximum(spread, 1e-12)
+    opposite = special.chdtrc(total.size, standardised @ standardised) >= _OPPOSITE_P
+    # That drift fades over a test; no other change of the reversal error comes so near to its own opposite.
+    opposite |= np.sqrt(np.mean(total**2)) <= _SAME_SIZE * 0.5 * size
     # An exchange happens from one cycle to the next, a reversal that drifts does not.
     near = np.nanmean(reversal[max(0, place - _LEAST_SIDE) : place]), np.nanmean(reversal[place : place + _LEAST_SIDE])
-    sudden = abs(near[1] - near[0]) > 0.7 * abs(np.nanmean(after) - np.nanmean(before))
-    if opposite < _OPPOSITE_P or near[0] * near[1] >= 0.0 or not sudden:
+    if not opposite or near[0] * near[1] >= 0.0 or abs(near[1] - near[0]) <= 0.7 * size:
         return sound
     return judge(
         "approach_labels",

@@ -48,7 +48,6 @@ from fusion.analysis.effects.events import cycle_starts
 from fusion.common import Array
 from interferometry.drift.gls import DriftFit, fit_fixed_effects
 from interferometry.drift.kalman import DriftSystem
-from thermography.fields.large_arrays import copy_to_disk, give_back
 
 #: Largest share of a temperature's range that its noise may be for a lag to be identified: where the load is switched, and for a single
 #: warm-up.
@@ -328,8 +327,6 @@ _CONTRADICTED = 0.5
 _FIVE_SIGMA = 2.9e-7
 #: Share of the cycles from which the later ones are predicted.
 _EARLY_SHARE = 0.5
-#: Values of simulated campaigns that are filtered together, 8 MB.
-_VALUES_AT_ONCE = 2**20
 
 
 def prior_rows(model: ModelFit, rng: np.random.Generator | None = None, *, draws: int = DRAWS) -> PriorRows:
@@ -475,60 +472,6 @@ def _judged(score: Score, gain: float, p_value: float) -> Confirmation:
         return Confirmation(True, Confirmed.OTHER_TARGETS if score.is_event else Confirmed.LATER_CYCLES, gain, p_value)
     level = STRONG_LEVEL if p_value <= _CONTRADICTED else _FIVE_SIGMA
     return Confirmation(score.family_wise_p <= level, Confirmed.BY_EVIDENCE, gain, p_value)
-
-
-def evaluate_on_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Put one candidate to the hold-out readings, predicted in open loop."""
-    fit, whole, design = model.fit, model.whole_system(), model.whole_design()
-    priors = prior_rows(model, rng)
-    everywhere = replace(whole, observed=np.ones_like(whole.observed))
-    null = simulate_null(fit, rng, over=everywhere, memory=model.memory, site=model.readings.site)
-    columns = np.column_stack([design, candidate.columns])
-    # Some columns at a time, in files where there are many, so that one matrix is read without the others.
-    count = 1 + null.size // _VALUES_AT_ONCE
-    responses = [null] if count == 1 else copy_to_disk(np.array_split(null, count, axis=1))
-    del null
-    responses[0] = np.column_stack([model.readings.response, responses[0]])
-    likelihood: dict[bool, list[Array]] = {False: [], True: []}
-    error: dict[bool, list[Array]] = {False: [], True: []}
-    for system in scaled_systems(fit, SHIFT_AND_STRETCH, over=whole):
-        seen, x, ahead = _open_loop(system, columns, responses)
-        seen = priors.add_to(seen)
-        for with_candidate in (False, True):
-            moments = seen if with_candidate else seen.first(design.shape[1])
-            beta = solve(moments.design, moments.cross)
-            likelihood[with_candidate].append(profile_likelihood(moments))
-            each = np.split(beta, np.cumsum([some.shape[1] for some in ahead])[:-1], axis=1)
-            error[with_candidate].append(
-                np.concatenate(
-                    [((y - x[:, : beta.shape[0]] @ own) ** 2).mean(axis=0) for y, own in zip(ahead, each, strict=True)]
-                )
-            )
-    before, after = (
-        np.sqrt(np.take_along_axis(np.array(error[key]), np.argmax(likelihood[key], axis=0)[None, :], axis=0)[0])
-        for key in (False, True)
-    )
-    return float(before[0]), float(after[0]), rank_p_value(-after[0], -after[1:])
-
-
-def _open_loop(system: DriftSystem, design: Array, responses: Sequence[Array]) -> tuple[Moments, Array, list[Array]]:
-    """Products over the observed readings, and prediction errors of the others: of the design (m, p) and of all responses (m, some)."""
-    train = system.observed
-    errors, spread = system.innovations(design)
-    x, roots = errors[train], np.sqrt(spread[train])[:, None]
-    x /= roots
-    cross, squares, ahead = [], [], []
-    for some in responses:
-        y, _ = system.innovations(some)
-        ahead.append(y[~train])
-        seen = y[train]
-        seen /= roots
-        cross.append(x.T @ seen)
-        squares.append((seen**2).sum(axis=0))
-        give_back(some)
-    log_spread = float(np.log(spread[train]).sum())
-    moments = Moments(x.T @ x, np.hstack(cross), np.concatenate(squares), x.shape[0], log_spread)
-    return moments, errors[~train], ahead
 
 
 # An event against a heteroscedastic random walk: drift whose variance is larger about that instant, as in a warm-up.

@@ -48,13 +48,10 @@ SINGLE = ((-6.0,), (-2.5,), (-1.0,), (0.0,), (0.5,), (1.0,))
 _PLAUSIBLE = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0])
 
 
-def scaled_systems(
-    fit: DriftFit, exponents: Sequence[Sequence[float]], *, over: DriftSystem | None = None
-) -> list[DriftSystem]:
+def scaled_systems(fit: DriftFit, exponents: Sequence[Sequence[float]]) -> list[DriftSystem]:
     """Scale the estimated drift variances of a fit by every set of factors of a grid."""
-    system = fit.system if over is None else over
     centre = np.maximum(fit.system.ratios, least_ratio(fit.system))
-    return [replace(system, ratios=centre * np.resize(10.0 ** np.asarray(one), centre.size)) for one in exponents]
+    return [replace(fit.system, ratios=centre * np.resize(10.0 ** np.asarray(one), centre.size)) for one in exponents]
 
 
 def least_ratio(system: DriftSystem) -> float:

@@ -24,7 +24,6 @@ def simulate_null(
     rng: np.random.Generator,
     *,
     draws: int = DRAWS,
-    over: DriftSystem | None = None,
     memory: Autoregression = NO_MEMORY,
     site: NDArray[np.int64] | None = None,
 ) -> Array:
@@ -32,7 +31,7 @@ def simulate_null(
 
     ``memory`` is that of the noise of every site over the cycles, ``site`` (n,) that of every simulated reading.
     """
-    system = fit.system if over is None else over
+    system = fit.system
     relative = fit.white_noise() * fit.sigma
     # Some readings at a time, and those of a long test on disk: these are its largest numbers.
     drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.independent)[:, None]

@@ -69,6 +69,7 @@ from fusion.analysis.drift_model.search import (
     search,
     verdict,
     withdraw,
+    withheld_for,
 )
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.events import periods_min
@@ -1117,7 +1118,8 @@ class RecordResult:
     @property
     def _kept(self) -> list[bool]:
         """For every step whether its name stands."""
-        return [one.word != "no" for one in self.answers]
+        steps = zip(self.answers, self.state.steps, strict=True)
+        return [one.word != "no" and not withheld_for(step) for one, step in steps]
 
     @property
     def verdict(self) -> schema.Verdict:
@@ -1217,7 +1219,9 @@ class RecordResult:
         squares = self.contribution(term) ** 2
         where = "on the hold-out set" if term.candidate.event_s is None else "in parts that are left out"
         return schema.RecordStep(
-            **step.described(term.candidate, self.answers[place], where, size=step.score.gain, withheld=""),
+            **step.described(
+                term.candidate, self.answers[place], where, size=step.score.gain, withheld=withheld_for(step)
+            ),
             rmse_before_um=known_mean(self.errors[place]),
             rmse_after_um=known_mean(self.errors[place + 1]),
             rmse_without_um=self.state.errors_without_um[place],

@@ -24,7 +24,7 @@ from fusion.analysis.drift_model.gains import Gains
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
 from fusion.analysis.drift_model.record_data import independent
 from fusion.analysis.effects.effect import Candidate, Effect, Separable, Wave
-from fusion.analysis.effects.library import LIBRARY
+from fusion.analysis.effects.library import LIBRARY, describe_effect
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
 from interferometry.drift.gls import estimate
@@ -187,7 +187,9 @@ def parameter_ranges(tried: Sequence[Tried], best: Parameters, best_gain: float)
     """Values of the parameters that fit as well as the best, by profile likelihood (95 %)."""
     alike = [parameters for parameters, gain in tried if gain >= best_gain - _WITHIN]
     ranges: dict[str, Range] = {}
-    words = _words(best, DERIVED_WORDS)
+    # A sine and a course of harmonics have periods of their own.
+    derived = DERIVED_WORDS - {"course"}
+    words = _words(best, derived)
     for name, value in best.items():
         if name in DERIVED_WORDS:
             continue
@@ -198,7 +200,7 @@ def parameter_ranges(tried: Sequence[Tried], best: Parameters, best_gain: float)
             continue
         # A body that is not there has a time constant of zero.
         values, fitting = (
-            np.array([float(one.get(name, 0.0)) for one in some if _words(one, DERIVED_WORDS) == words])
+            np.array([float(one.get(name, 0.0)) for one in some if _words(one, derived) == words])
             for some in ([parameters for parameters, _ in tried], alike)
         )
         if np.unique(values).size > 1:
@@ -219,10 +221,10 @@ def _words(parameters: Parameters, left_out: Collection[str]) -> dict[str, str]:
 
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
-#: Share of an effect's rms by which its shape in the library may be wrong on a real machine: the upper quartile of what a bar that conducts
-#: heat leaves of the best response of one or two lumped bodies (60 bars; docs/method/closed-loop.md). A difference of this size between two
-#: effects is worth no more than a tie, however little noise there is.
-DISCREPANCY = 0.062
+#: Share of an effect's rms by which its shape in the library may be wrong on a real machine: root mean square of what 200 bars that conduct
+#: heat leave of the best response of one or two lumped bodies (docs/method/closed-loop.md). A difference of this size between two effects
+#: is worth no more than a tie, however little noise there is.
+DISCREPANCY = 0.066
 #: An effect that is not significant by itself is no rival.
 _RIVAL_LEVEL = 0.05
 
@@ -407,6 +409,38 @@ class Step:
         }
 
 
+#: A slow effect may be a part of a smooth drift without a name that is left beside it and has this share of its size.
+_SMOOTH_SHARE = 0.5
+
+
+def withheld_for(
+    step: Step, *, size_um: float = np.inf, drift_um: float = 0.0, is_smooth: bool = False, beside: str = ""
+) -> str:
+    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side, one
+    that is longer than physics allows, a drift of which it may be a part, or an effect without a name ``beside`` which it was found.
+    """
+    effect, parameters = describe_effect(step.effect), step.score.best.parameters
+    # What follows nothing that was logged is a trend since the first reading.
+    is_trend = parameters.get("follows", "warm_up") == "warm_up"
+    for name, words in (("time_constant_min", "time constant"), ("period_min", "period")):
+        # A value of which no other was tried is as open as one of which all fit.
+        low, high = step.score.ranges.get(name, [None, None] if name in parameters else [0.0, 0.0])
+        by_course = name == "period_min" or is_trend or (effect is not None and effect.excited_by)
+        if by_course and (low is None or high is None):
+            known = f"{low:.3g} min and more" if low else f"{high:.3g} min and less" if high else "any"
+            return f"its {words} is not determined ({known} fits)"
+    longest_min, minutes = effect.longest_min if effect else np.inf, float(parameters.get("time_constant_min", 0.0))
+    if minutes > longest_min:
+        return f"its time constant of {minutes:.3g} min is longer than its physics allows ({longest_min:g} min)"
+    # A walk may be mistaken for a trend as well, and only a smooth drift for what follows a load.
+    if "time_constant_min" in parameters and (is_smooth or is_trend) and drift_um >= _SMOOTH_SHARE * size_um:
+        kind = "smooth drift" if is_smooth else "drift"
+        return f"a {kind} of {drift_um:.2g} µm is left beside its {size_um:.2g} µm, of which it may be a part"
+    if beside and step.score.best.event_s is None and "period_min" not in parameters:
+        return f"it was found beside {beside.replace('_', ' ')}, which has no name itself"
+    return ""
+
+
 class Model(Protocol):
     """What the loop asks of a fitted model."""
 
@@ -431,7 +465,6 @@ class LoopState(Generic[M]):
     errors_um : hold-out error of the declared model and after each step that was decided on the training part, um; empty until the
         hold-out set is opened
     errors_without_um : hold-out error of the last of these models without each of these steps, um
-    question : what the hold-out set says of an undecided candidate
     held : the models that the search has held before this one
     """
 
@@ -441,7 +474,6 @@ class LoopState(Generic[M]):
     rounds: tuple[Round, ...] = ()
     errors_um: tuple[float, ...] = ()
     errors_without_um: tuple[float, ...] = ()
-    question: schema.HoldOutQuestion | None = None
     held: frozenset[tuple[str, ...]] = frozenset()
 
     @property

@@ -1,38 +1,47 @@
 """The test after a compensation: what was predicted, what was achieved, and where it was not, why.
 
-What a machine with a compensation shows is its own displacement plus the gain with which the correction acts, 1 where all is well. The
-correction itself is known from the readings that were logged. So what is left follows the correction where the gain is wrong, and follows
-the states of the model in other proportions where the control runs other coefficients.
+The first test says how a machine responds to its readings, with what it left open. What a second test shows is that response at its own
+readings plus what the control added, which the applied model replays. Every fault says what the control added instead: the same with
+another gain, or the same states in other proportions. The fault under which the second test is most probable is named; faults under which
+it is about as probable are named with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
-from scipy import special
 
-from fusion.analysis.drift_model.record import predict, predict_left_out
 from fusion.analysis.drift_model.record_data import Record
-from fusion.analysis.drift_model.recursion import columns_of_loop, evaluate_columns, record_of_product
+from fusion.analysis.drift_model.recursion import (
+    Marginal,
+    Response,
+    columns_of,
+    evaluate_columns,
+    events_of,
+    record_of_product,
+    respond,
+)
 from fusion.common import Array
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import FAILED, Recursion, RecursionError, run_recursion
 
-#: Pieces of which a course is put together for the predicted range, and of which a gain is estimated without each.
-_PIECES = 8
 _DRAWS = 1000
 #: Probability within the predicted interval.
 _COVERAGE = 0.95
-#: Share of what is left that an explanation must take away, in pieces that it was not fitted to.
+#: Difference of the gain from one that is a fault even where no more is left than predicted, beyond three standard uncertainties: between
+#: all and half of it.
+_OTHER_GAIN = 0.25
+#: Share of the variance of what is left that an explanation must take away.
 _EXPLAINS = 0.5
-#: Gains that have a name, half a unit apart at least; what is nearer to one than half of that is it, another one is a scale.
-_SAME_GAIN = 0.25
+#: Faults under which the test is less probable by more than this factor are told from the most probable one.
+_LESS_PROBABLE = 20.0
+#: Gains that have a name, with the standard deviation within which they have it; another one is a scale, of any size up to inches.
 _NAMED_GAINS = {"wrong sign": -1.0, "half the gain": 0.5, "not active": 0.0}
-_OF_GAIN = (*_NAMED_GAINS, "wrong scale")
+_NAMED_U, _SCALE_U = 0.1, 30.0
+_STALE, _UNKNOWN = "stale table", "not explained"
 
 
 @dataclass(frozen=True)
@@ -42,17 +51,19 @@ class ChannelVerdict:
     Attributes
     ----------
     name : displacement
-    before_um : range that the test would have shown without the correction, taken with the gain that was found where that is the fault
+    before_um : range that the test would have shown without the correction, taken with the gain that was found where that is the fault;
+        None where a sensor does not measure, because what the control made of it is not known
     predicted_um, predicted_low_um, predicted_high_um : range that the compensation was predicted to leave, median and 95 % interval
     achieved_um : range that was measured
-    gain, gain_u : with which the correction acted, by regression; 1 where all is well
+    gain, gain_u : with which the correction acted; 1 where all is well
     is_kept : whether what was achieved is not above the interval
-    fault : name of what is wrong; empty where nothing is, and "not explained" where nothing here explains it
+    fault : what is wrong, several names with "or" where they cannot be told apart; empty where nothing is, "not explained" where
+        nothing here explains it
     reason : the evidence, one sentence
     """
 
     name: str
-    before_um: float
+    before_um: float | None
     predicted_um: float
     predicted_low_um: float
     predicted_high_um: float
@@ -64,61 +75,19 @@ class ChannelVerdict:
     reason: str
 
 
-def predicted_ranges(product: xr.Dataset, loop: RecordLoop, after: Record, *, seed: int = 1) -> dict[str, Array]:
-    """Return draws of the range (draws,), um, that a compensation by the model of a run leaves in another test, by channel.
-
-    Two things are left. What the model misses: every part of the record is predicted from all others, and the errors are put together
-    again at random in pieces. And what its coefficients are wrong by, at the readings of the other test, which may go where the record
-    did not: they are drawn from their distribution given the record, in which shrinkage is the prior of ridge regression.
-    """
-    record = record_of_product(product)
-    columns, events, _ = columns_of_loop(loop, record, record.sensors)
-    matrix = np.column_stack([evaluate_columns(record, columns), events])
-    there = evaluate_columns(_with_sensors(after, record.sensors), columns)
-    every = np.ones(record.seconds.size, bool)
-    fit = predict(record, matrix, every)
-    missed = record.displacement - predict_left_out(record, matrix, fit.penalty)
-    scale = np.where(matrix.std(axis=0) > 0.0, matrix.std(axis=0), np.inf)
-    standard = (matrix - matrix.mean(axis=0)) / scale
-    spread = standard.T @ standard / record.seconds.size + fit.penalty * np.eye(scale.size)
-    # Blocks follow each other closely: so many pieces are independent, not so many blocks.
-    root = np.linalg.cholesky(np.linalg.inv(spread) / _PIECES)
-    apart = ((there - there[0]) / scale[: len(columns)]) @ root[: len(columns)]
-    size = np.sqrt(np.nanmean(missed**2, axis=0))
-    length = max(1, record.seconds.size // _PIECES)
-    pieces = -(-after.seconds.size // length)
-    rng = np.random.default_rng(seed)
-    ranges = np.empty((_DRAWS, len(record.channels)))
-    for draw in range(_DRAWS):
-        starts = rng.integers(0, record.seconds.size - length + 1, pieces)
-        rows = (starts[:, None] + np.arange(length)).ravel()[: after.seconds.size]
-        left = missed[rows] + apart @ rng.standard_normal((scale.size, size.size)) * size
-        ranges[draw] = np.nanmax(left, axis=0) - np.nanmin(left, axis=0)
-    return dict(zip(record.channels, ranges.T, strict=True))
-
-
-def _with_sensors(after: Record, sensors: tuple[str, ...]) -> Record:
-    """Return a record with the sensors of another one in its order; one that does not measure stays at its first value."""
-    rows = [
-        after.temperature[:, after.sensors.index(name)] if name in after.sensors else np.zeros(after.seconds.size)
-        for name in sensors
-    ]
-    return replace(after, temperature=np.column_stack(rows), sensors=sensors)
-
-
 def verify(
-    after: Record, applied: Recursion, ranges: Mapping[str, Array], *, faulty_sensors: Mapping[str, str]
+    product: xr.Dataset, loop: RecordLoop, after: Record, applied: Recursion, *, faulty_sensors: Mapping[str, str]
 ) -> list[ChannelVerdict]:
-    """Compare a test with an active compensation with what was predicted.
+    """Compare a test with an active compensation with what the test before it predicts.
 
     Parameters
     ----------
+    product, loop : Dataset and RecordLoop
+        ``fusion.nc`` of the test before it, and what the closed loop found there.
     after : Record
         The test with the compensation, on its blocks.
     applied : Recursion
         The model that is said to run in the control.
-    ranges : mapping of str to (draws,) ndarray
-        What `predicted_ranges` returns.
     faulty_sensors : mapping of str to str
         Sensors that do not measure in this test, with what they do.
 
@@ -130,44 +99,57 @@ def verify(
     missing = [one.name for one in applied.inputs if one.name not in (*after.sensors, *after.drivers, *faulty_sensors)]
     if missing:
         raise RecursionError(f"the test after it does not hold {', '.join(missing)}, which the applied model reads")
+    for one in applied.inputs:
+        unit = after.driver_sizes[one.name][1] if one.name in after.driver_sizes else one.unit
+        if unit != one.unit:
+            raise RecursionError(
+                f"{one.name} is logged in {unit} in the test after it, and the applied model reads {one.unit}: write it in {one.unit}"
+            )
+    before = record_of_product(product)
+    columns, every = columns_of(before, before.sensors), np.ones(before.seconds.size, bool)
+    responses = respond(before, evaluate_columns(before, columns), events_of(product, loop), every)
+    there = evaluate_columns(_with_readings(after, before), columns)
     model = applied.at_sampling(after.block_s)
-    readings = _readings(after, model, faulty_sensors)
     zero = np.arange(after.seconds.size) == 0
-    replayed = run_recursion(model, readings, zero=zero)
-    dead = {one.name for one in model.inputs} & set(faulty_sensors)
+    replayed = run_recursion(model, _readings(after, model, faulty_sensors), zero=zero)
+    dead = sorted({one.name for one in model.inputs} & set(faulty_sensors))
     failed = bool((replayed.status == FAILED).any())
     verdicts = []
     for k, output in enumerate(model.outputs):
-        if output.name not in after.channels or output.name not in ranges:
+        if output.name not in after.channels or output.name not in before.channels:
             continue
         measured = after.displacement[:, after.channels.index(output.name)]
         known = np.isfinite(measured)
-        course, correction = measured[known], replayed.correction[known, k]
-        draws = ranges[output.name]
-        low, high = np.quantile(draws, [(1.0 - _COVERAGE) / 2.0, (1.0 + _COVERAGE) / 2.0])
-        gain, gain_u, explained = _gain(course, correction)
-        achieved = float(np.ptp(course))
+        second = _Second(
+            after.seconds[known],
+            measured[known],
+            replayed.correction[known, k],
+            there[known],
+            responses[before.channels.index(output.name)],
+        )
+        draws = second.draw_ranges()
+        low, high = np.quantile(draws, [(1.0 - _COVERAGE) / 2.0, (1.0 + _COVERAGE) / 2.0]).tolist()
+        gain, gain_u = second.gain()
+        achieved = float(np.ptp(second.course))
         is_kept = achieved <= high
         fault, reason = "", ""
-        if dead or failed:
-            names = ", ".join(f"{name} ({faulty_sensors[name]})" for name in sorted(dead))
+        if dead:
+            names = ", ".join(f"{name} ({faulty_sensors[name]})" for name in dead)
             fault, reason = "dead sensor", f"{names} does not measure in this test, and the model reads it"
-            if not dead:
-                fault, reason = (
-                    "outside its range",
-                    "a reading was so far outside that the control took its sensor for failed",
-                )
-        elif not is_kept:
-            rest = float(np.ptp(course - (gain - 1.0) * correction))
-            found = gain, gain_u, explained
-            fault, reason = _explain(after, model, readings, course, known, found, is_gain=rest <= high)
+        elif failed:
+            fault = "outside its range"
+            reason = "a reading was so far outside that the control took its sensor for failed"
+        elif not is_kept or abs(gain - 1.0) > max(_OTHER_GAIN, 3.0 * gain_u):
+            fault, reason = second.explain(0.0 if is_kept else _EXPLAINS)
+            fault, reason = ("", "") if is_kept and fault == _UNKNOWN else (fault, reason)
+        acted = 1.0 if fault in {"", "outside its range", _UNKNOWN, _STALE} else gain
         verdicts.append(
             ChannelVerdict(
                 output.name,
-                before_um=float(np.ptp(course - (gain if fault in _OF_GAIN else 1.0) * correction)),
+                before_um=None if dead else float(np.ptp(second.course - acted * second.correction)),
                 predicted_um=float(np.median(draws)),
-                predicted_low_um=float(low),
-                predicted_high_um=float(high),
+                predicted_low_um=low,
+                predicted_high_um=high,
                 achieved_um=achieved,
                 gain=gain,
                 gain_u=gain_u,
@@ -177,6 +159,24 @@ def verify(
             )
         )
     return verdicts
+
+
+def _with_readings(after: Record, before: Record) -> Record:
+    """Return a test with sensors and drivers of the one before it, in its order and sizes; what does not measure stays where it was."""
+    still = np.zeros(after.seconds.size)
+    rows = [
+        after.temperature[:, after.sensors.index(name)] if name in after.sensors else still for name in before.sensors
+    ]
+    drivers = {
+        name: {
+            power: after.drivers[name][power] * (after.driver_sizes[name][0] / size) ** power
+            if name in after.drivers
+            else still
+            for power in before.drivers[name]
+        }
+        for name, (size, _) in before.driver_sizes.items()
+    }
+    return replace(after, temperature=np.column_stack(rows), sensors=before.sensors, drivers=drivers)
 
 
 def _readings(after: Record, model: Recursion, faulty: Mapping[str, str]) -> Array:
@@ -192,73 +192,78 @@ def _readings(after: Record, model: Recursion, faulty: Mapping[str, str]) -> Arr
     return np.column_stack(columns)
 
 
-def _gain(course: Array, correction: Array) -> tuple[float, float, float]:
-    """Return the gain with which a correction acted, its standard uncertainty, and the share of what is left that it takes away.
+@dataclass(frozen=True)
+class _Second:
+    """One displacement in the second test: its blocks (n,), what was measured and corrected, um, the columns (n, p), and their response."""
 
-    Without each piece of the test once: the uncertainty is that of the jackknife, the share is that in the pieces left out.
-    """
-    pieces = np.array_split(np.arange(course.size), _PIECES)
-    whole = _slope(course, correction)
-    slopes, left = [], np.empty(course.size)
-    for piece in pieces:
-        others = np.setdiff1d(np.arange(course.size), piece)
-        slope = _slope(course[others], correction[others])
-        slopes.append(slope)
-        middle = course[others].mean() - slope * correction[others].mean()
-        left[piece] = course[piece] - middle - slope * correction[piece]
-    u = float(np.sqrt((_PIECES - 1) / _PIECES * np.sum((np.array(slopes) - np.mean(slopes)) ** 2)))
-    return 1.0 + whole, u, 1.0 - float(np.mean(left**2)) / max(float(np.var(course)), 1e-12)
+    seconds: Array
+    course: Array
+    correction: Array
+    columns: Array
+    response: Response
 
+    @property
+    def _left_open(self) -> Array:
+        """What the first test left open of the response: columns (n, p) with independent coefficients of unit variance, um."""
+        values, vectors = np.linalg.eigh(self.response.covariance)
+        return self.columns @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
-def _slope(course: Array, correction: Array) -> float:
-    centred = correction - correction.mean()
-    return float(centred @ (course - course.mean()) / max(float(centred @ centred), 1e-12))
+    @property
+    def _bare(self) -> Array:
+        """What was measured less the predicted response: what the control added, beside what is not known, um."""
+        return self.course - self.columns @ self.response.coefficients
 
+    def draw_ranges(self, *, seed: int = 1) -> Array:
+        """Draw the range that the correction leaves (draws,), um: response, wandering and noise as the first test knows them."""
+        rng = np.random.default_rng(seed)
+        one, steps = self.response, np.diff(self.seconds, prepend=self.seconds[0])
+        size = (self.seconds.size, _DRAWS)
+        walk = np.cumsum(np.sqrt(one.ratio * steps)[:, None] * rng.standard_normal(size), axis=0)
+        left = self._left_open @ rng.standard_normal((one.coefficients.size, _DRAWS))
+        left += one.noise_um * (walk + rng.standard_normal(size))
+        return np.asarray(np.ptp(left + (self.course - self._bare + self.correction)[:, None], axis=0))
 
-def _explain(
-    after: Record,
-    model: Recursion,
-    readings: Array,
-    course: Array,
-    known: NDArray[np.bool_],
-    gain: tuple[float, float, float],
-    *,
-    is_gain: bool,
-) -> tuple[str, str]:
-    """Return what explains that more is left than was predicted, and the evidence; `is_gain`: but for the gain all is as predicted."""
-    value, u, explained = gain
-    by_states = _explained_by_states(after, model, readings, course, known)
-    told = f"the correction acted with a gain of {value:.2f} ± {2.0 * u:.2f} (k = 2) and explains {100 * max(explained, 0.0):.0f} %"
-    limit = float(special.stdtrit(_PIECES - 1, 0.5 + _COVERAGE / 2.0))
-    # What the gain leaves may not be explained better by other coefficients: half of what is left beside it, again.
-    if is_gain or (explained >= _EXPLAINS and 1.0 - by_states > (1.0 - explained) * (1.0 - _EXPLAINS)):
-        nearest = min(_NAMED_GAINS, key=lambda name: abs(_NAMED_GAINS[name] - value))
-        if abs(_NAMED_GAINS[nearest] - value) <= max(limit * u, _SAME_GAIN):
-            return nearest, told
-        return "wrong scale", told
-    if by_states >= _EXPLAINS:
-        return "stale table", (
-            f"the states of the model explain {100 * by_states:.0f} % of what is left, in other proportions than its coefficients "
-            f"({told}): the control runs other coefficients than the stated ones, or the machine has changed since"
+    def gain(self) -> tuple[float, float]:
+        """Return the gain with which the correction acted and its standard uncertainty."""
+        _, coefficients, covariance = self._judge(
+            self._bare, np.column_stack([self._left_open, _SCALE_U * self.correction])
         )
-    return "not explained", f"{told}; the states of the model explain {100 * max(by_states, 0.0):.0f} %"
+        return float(_SCALE_U * coefficients[-1]), float(_SCALE_U * np.sqrt(covariance[-1, -1]))
 
+    def _judge(self, left: Array, columns: Array) -> tuple[float, Array, Array]:
+        """Return the log-likelihood of a course that follows columns, and their coefficients with covariance."""
+        variance = self.response.noise_um**2
+        marginal = Marginal.of(self.seconds, left, np.ones((left.size, 1)), columns, ratio=self.response.ratio)
+        covariance = np.asarray(np.linalg.inv(np.eye(columns.shape[1]) + marginal.gram / variance), float)
+        return marginal.log_likelihood(variance), covariance @ marginal.moment / variance, covariance
 
-def _explained_by_states(
-    after: Record, model: Recursion, readings: Array, course: Array, known: NDArray[np.bool_]
-) -> float:
-    """Return the share of what is left that free coefficients of the model's states take away, in pieces that they were not fitted to."""
-    states = np.column_stack([_state(model, k, readings) for k in range(len(model.states))])
-    record_like = np.full(after.seconds.size, np.nan)
-    record_like[known] = course
-    alone = replace(after, displacement=record_like[:, None], channels=("left",))
-    penalty = predict(alone, states, np.ones(after.seconds.size, bool)).penalty
-    left = record_like - predict_left_out(alone, states, penalty)[:, 0]
-    return 1.0 - float(np.nanmean(left**2)) / max(float(np.nanvar(record_like)), 1e-12)
+    def _faults(self) -> Iterator[tuple[str, Array, Array]]:
+        """Yield every fault with what is left beside what the control added then, and the columns of what is not known."""
+        for name, gain in _NAMED_GAINS.items():
+            columns = np.column_stack([self._left_open, _NAMED_U * self.correction])
+            yield name, self._bare - gain * self.correction, columns
+        yield "wrong scale", self._bare, np.column_stack([self._left_open, _SCALE_U * self.correction])
+        # Any table of such states, which need not know the machine.
+        yield _STALE, self._bare, np.column_stack([self._left_open, self.columns * self.response.prior_u])
 
-
-def _state(model: Recursion, place: int, readings: Array) -> Array:
-    """Return one state of a model over readings, by an output that holds nothing else."""
-    weights = tuple(-1.0 if k == place else 0.0 for k in range(len(model.states)))
-    free = model.outputs[0].model_copy(update={"coefficients": weights, "limit": np.inf, "max_step": np.inf})
-    return run_recursion(model.model_copy(update={"outputs": (free,)}), readings).correction[:, 0]
+    def explain(self, least_share: float) -> tuple[str, str]:
+        """Return the fault that explains this share of what is left, and the evidence."""
+        well, _, _ = self._judge(self._bare - self.correction, self._left_open)
+        judged: dict[str, tuple[float, float]] = {}
+        for name, left, columns in self._faults():
+            likelihood, coefficients, _ = self._judge(left, columns)
+            share = 1.0 - float(np.var(left - columns @ coefficients)) / max(float(np.var(self.course)), 1e-12)
+            judged[name] = likelihood, share
+        best = max(judged, key=lambda name: judged[name][0])
+        alike = np.log(_LESS_PROBABLE)
+        gain, gain_u = self.gain()
+        told = f"by its course the correction acted with a gain of {gain:.2f} ± {2.0 * gain_u:.2f} (k = 2)"
+        if judged[best][1] < least_share or judged[best][0] < well + alike:
+            return _UNKNOWN, f"{told}; no fault of the compensation explains half of what is left"
+        named = sorted(
+            (name for name in judged if judged[name][0] > judged[best][0] - alike), key=lambda name: -judged[name][0]
+        )
+        words = f"{told}; {named[0]} explains {100 * judged[named[0]][1]:.0f} % of what is left"
+        if _STALE in named:
+            words += "; the control runs other coefficients than the stated ones, or the machine has changed since"
+        return " or ".join(named), words

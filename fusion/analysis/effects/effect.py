@@ -164,6 +164,8 @@ class Effect:
         Whether it is an error of the camera: it makes the field wrong, not the drift.
     follows_field : bool
         Whether its coefficients are per kelvin of the camera's rise, so that an error of the rise's scale is theirs.
+    longest_min : float
+        Longest time constant that its physics allows, min.
     limitation : callable
         ``limitation(readings)`` says what these readings hide of it, or returns an empty text.
     label : str
@@ -198,6 +200,7 @@ class Effect:
     patterned: bool = False
     errs_camera: bool = False
     follows_field: bool = False
+    longest_min: float = np.inf
     limitation: Callable[[Readings], str] = field(default=lambda readings: "")
     label: str = ""
     remedy: str = ""

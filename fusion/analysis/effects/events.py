@@ -150,7 +150,7 @@ def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Cand
     weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
     for period, harmonics in _rhythms(readings, near):
         orders = np.arange(harmonics) + 1
-        orders = orders[(period >= _SHORTEST_MIN * orders) & ((orders == 1) | _off(readings, orders / period))]
+        orders = orders[(orders == 1) | ((period >= _SHORTEST_MIN * orders) & _off(readings, orders / period))]
         waves: tuple[Array | Wave, ...] = tuple(
             Wave(shape, readings.seconds, 60.0 * period / order) for order in orders for shape in (np.cos, np.sin)
         )

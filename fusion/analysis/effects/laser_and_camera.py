@@ -80,6 +80,7 @@ REFLECTED_SOURCE = Effect(
 
 
 _AIR = ("air_temperature", "air_pressure", "relative_humidity")
+#: Time constants of a laser's warm-up; what settles more slowly is a part of machine or set-up.
 _WARM_UPS_MIN = (3.0, 6.0, 12.0, 24.0)
 
 
@@ -126,8 +127,9 @@ def _laser_warm_up(readings: Readings, _: Mapping[str, float], near: Candidate |
         settling = 1.0 - warm_up(readings, minutes)
         linear = settling * readings.position_mm * 1e-3
         yield Candidate(linear[:, None], {"time_constant_min": minutes, "shape": "linear"}, ("ppm",))
+        # A shift of all positions that dies away may come from any part of machine and set-up.
         both: Parameters = {"time_constant_min": minutes, "shape": "linear with dead path"}
-        yield Candidate(np.column_stack([linear, settling]), both, ("ppm", "um"))
+        yield Candidate(np.column_stack([linear, settling]), both, ("ppm", "um"), beside=1)
 
 
 def _sensor_fault(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
@@ -179,6 +181,7 @@ LASER_WARM_UP = Effect(
     source="frequency stabilisation of a He-Ne laser",
     candidates=_laser_warm_up,
     masked_by=unmeasured_expansion,
+    longest_min=_WARM_UPS_MIN[-1],
     label="warm-up of the laser",
     remedy="Let the laser warm up longer before the first cycle.",
 )

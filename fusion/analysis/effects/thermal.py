@@ -19,7 +19,6 @@ from fusion.analysis.effects.effect import (
     um_per,
     unit_of_state,
     unmeasured_expansion,
-    values_near,
 )
 from fusion.common import Array
 
@@ -185,18 +184,21 @@ def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Candidate | N
     """Delayed copies of the seen temperatures, flat and along the axis."""
     # Between two frames the field is a straight line; a shorter lag is not in the data.
     frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
-    for minutes in values_near(near, "time_constant_min", LAGS_MIN, ratio=1.5):
-        if minutes < 2.0 * frames_min:
+    late = (
+        first_order_responses(readings.series[name], near, LAGS_MIN, ratio=1.5, second=_SECOND_BODY_TRIED)
+        for name in ("mean_rise", "axis_integral")
+    )
+    for (mean, response), (integral, _) in zip(*late, strict=True):
+        if float(response["time_constant_min"]) < 2.0 * frames_min:
             continue
-        axis = readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) * 1e-3
-        offset = readings.at(readings.series["mean_rise"].lagged(60.0 * minutes))
-        yield Candidate(offset[:, None], {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
-        yield Candidate(axis[:, None], {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))
-        both: Parameters = {"time_constant_min": minutes, "shape": "flat and linear"}
+        offset, axis = readings.at(mean), readings.at(integral) * 1e-3
+        yield Candidate(offset[:, None], {**response, "shape": "flat"}, ("um/K",))
+        yield Candidate(axis[:, None], {**response, "shape": "linear"}, ("ppm/K",))
+        both: Parameters = {**response, "shape": "flat and linear"}
         yield Candidate(np.column_stack([offset, axis]), both, ("um/K", "ppm/K"))
         # A bed that is warmer above than below bends; with the Abbe offset its angle makes an error that grows along the axis.
         bending = (readings.at(readings.series["mean_rise"]) - offset) * readings.share
-        yield Candidate(bending[:, None], {"time_constant_min": minutes, "shape": "bending"}, ("um/K",))
+        yield Candidate(bending[:, None], {**response, "shape": "bending"}, ("um/K",))
 
 
 def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:

@@ -35,22 +35,20 @@ from fusion.report.charts.plan import (
     new_plan,
 )
 from fusion.report.charts.readings import cycle_map
+from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
-from fusion.report.conclusions import action, conclude, describe_anomaly, next_steps, step_phrase
+from fusion.report.conclusions import action, conclude, next_steps, step_phrase
 from fusion.report.numbers import join, moment, number, p_words, place
-from fusion.report.record import draw_record
 from fusion.report.wording import (
     Table,
     anomaly_cause,
     anomaly_figures,
     anomaly_place,
     conditional,
-    drift_u_note,
     effect_words,
     iso230_values,
     quoted_window,
     say,
-    step_errors,
 )
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
@@ -98,7 +96,7 @@ def _drift_charts(
     linker.link(course.figure, x=HOURS)
     linker.link(field.figure, x=CYCLE, y=POSITION)
     _highlight(read, joint, selection, course)
-    band = f"with its 95 % band ({drift_u_note(products.results.iso230)})"
+    band = f"with its 95 % band ({say('drift_uncertainty', products.results.iso230)})"
     return [
         ui.heading("Profile and drift", level=3),
         shown(profile, f"Deviation along the axis without drift, {band}. A click chooses the position."),
@@ -236,7 +234,7 @@ def _rounds(products: Products, loop: AxisLoop, linker: Linker) -> ui.Parts:
             parts.append(ui.paragraph("No further effect entered."))
             continue
         step = later[0]
-        phrase = f"{step_phrase(step, time, record=False)}, {p_words(step.p_value)}; {step_errors(step)}"
+        phrase = f"{step_phrase(step, time, record=False)}, {p_words(step.p_value)}; {say('step_errors', step)}"
         entry = f"Entered, {say('doubt', step)}" if step.doubt else "Entered"
         parts.append(ui.paragraph(f"{entry}: {phrase}. {action(step, time, record=False)}"))
         if stored is not None:
@@ -475,7 +473,7 @@ def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
 def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.viewable.Viewable:
     """Return what stands out, what it rests on, what to inspect, and the field around it."""
     evidence = describe_evidence(anomaly.evidence)
-    sentence = conditional(describe_anomaly(anomaly), products.results.inputs, *anomaly_figures(anomaly))
+    sentence = conditional(say("anomaly_sentence", anomaly), products.results.inputs, *anomaly_figures(anomaly))
     place = anomaly_place(anomaly)
     show = pn.widgets.Button(label=f"Show position {anomaly.target} everywhere")
     show.on_click(lambda event: selection.param.update(target=anomaly.target))

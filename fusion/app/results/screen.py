@@ -10,16 +10,16 @@ from pathlib import Path
 import panel as pn
 
 from fusion.app import parts as ui
-from fusion.app.results.again import RunAgain
 from fusion.app.results.charts import ThermalView, anomaly_cards, laser_charts, loop_steps, reading_hours
 from fusion.app.results.data import Linker, Products, Selection
 from fusion.common import FusionError, versions
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.iso230 import read_test
 from fusion.report.charts.thermograms import draw_thermograms
-from fusion.report.conclusions import headline, position_words
+from fusion.report.conclusions import headline
 from fusion.report.page import print_pdf, report_of
 from fusion.report.sheet import describe_sheet, render_iso230
+from fusion.report.wording import say
 
 
 def results_screen(state: ui.State) -> pn.viewable.Viewable:
@@ -71,12 +71,13 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
         "Laser": (read, lambda: laser_charts(products, selection, linker)),
         "Positions": (products.results.anomalies is not None, lambda: anomaly_cards(products, selection)),
         "Loop": (products.results.loop is not None, lambda: loop_steps(products, linker)),
-        "Run again": (True, lambda: [RunAgain(state, products).view]),
     }
     shown = {name: build for name, (there, build) in builders.items() if there}
     parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in shown.items()}
     chooser, part = ui.switched("Part", parts, next(iter(parts)))
-    lead = [ui.paragraph(products.results.campaign), ui.paragraph(headline(products.results))]
+    results, iso = products.results, products.results.iso230
+    lead = [ui.paragraph(results.campaign), *([ui.paragraph(say("decision", iso))] if iso else [])]
+    lead.append(ui.paragraph(headline(results)))
     if (products.folder / "report.html").is_file():
         lead.append(ui.link("Open the report", ui.report_link(state.root, products.folder)))
         lead.append(_printing(state, products))
@@ -127,7 +128,7 @@ def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> ui.Parts:
     """The menu of the position that is shown everywhere."""
     if not targets:
         return []
-    names = {position_words(number, place): number for number, place in targets}
+    names = {say("position_words", number, place): number for number, place in targets}
     menu = pn.widgets.Select(label="Position shown everywhere", options=names, value=selection.target, width=280)
     menu.link(selection, bidirectional=True, value="target")
     return [menu]

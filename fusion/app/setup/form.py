@@ -16,6 +16,7 @@ from fusion.campaign.config import campaign_schema
 from fusion.campaign.values import read_quantity
 from fusion.common import FusionError
 from fusion.pipeline.draft import TO_FILL
+from fusion.results.progress import counted
 
 #: Directions along the plan, as `thermofuse init` names them.
 DIRECTIONS = {"right": (1, 0), "left": (-1, 0), "down": (0, 1), "up": (0, -1)}
@@ -312,7 +313,9 @@ class Form:
                 group = [self._widget(name, fields[name], texts[name]) for name in first]
                 parts += [heading(_TITLES.get(table, table), level=3), pn.FlexBox(*group)]
             if others:
-                parts.append(self._folded(f"[{table}]: {len(others)} {'more ' if first else ''}keys", others, texts))
+                parts.append(
+                    self._folded(f"[{table}]: {counted(len(others), 'more key' if first else 'key')}", others, texts)
+                )
         self.view[:] = parts
 
     def _folded(self, title: str, fields: Mapping[str, Field], texts: Mapping[str, str]) -> pn.Card:

@@ -443,8 +443,8 @@ class PlanView:
             "Click the point under the spindle at axis position 0, then a point to which it moves as the position grows. A region is "
             "dragged from corner to corner. The fields below take the same as numbers."
         )
-        self._axis = column(note(how), self._mode)
-        self.view = column(heading("Axis and regions on the plan", level=3), self._axis, self._picture)
+        self._axis = column(heading("Axis and regions on the plan", level=3), note(how), self._mode)
+        self.view = column(self._axis, self._picture)
 
     def show(self, plan: Plan, placed: Placed, frame: NDArray[np.float64] | None) -> None:
         """Show a plan."""

@@ -6,39 +6,21 @@ What was measured, and where drift and field agree, wait for no model and can be
 from __future__ import annotations
 
 from collections.abc import Mapping, Set
-from typing import Any, NamedTuple
+from typing import Any
 
 import xarray as xr
 
 from fusion.analysis.attribution.significance import LEVEL
 from fusion.report.campaign import leading_region
 from fusion.report.charts import model, plan, readings
-from fusion.report.charts.plan import MapControls, plot_thermal_map
-from fusion.report.charts.style import Chart, EmbeddedChart, embed
+from fusion.report.charts.embedded import Drawn
+from fusion.report.charts.plan import plot_thermal_map
+from fusion.report.charts.record import draw_thermal_tests
+from fusion.report.charts.style import Chart, embed
 from fusion.report.charts.thermograms import draw_thermograms
-from fusion.report.thermal_test import draw_thermal_tests
 from fusion.results.results import Results
 from fusion.results.store import group, has
 from interferometry.plots import evaluate_common_start, hours_since_start
-
-
-class Drawn(NamedTuple):
-    """Charts as a page takes them in.
-
-    Attributes
-    ----------
-    charts : dict of str to EmbeddedChart
-        By name.
-    thermal_map : MapControls or None
-        What the reader can choose of the thermal map; None where it is not among the charts.
-    """
-
-    charts: dict[str, EmbeddedChart]
-    thermal_map: MapControls | None = None
-
-    def with_more(self, more: Drawn) -> Drawn:
-        """Return these charts and others."""
-        return Drawn(self.charts | more.charts, more.thermal_map or self.thermal_map)
 
 
 def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
@@ -134,7 +116,7 @@ def _reading_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     if not has(deviations, "comparison"):
         return standard
     shifted = evaluate_common_start(deviations)
-    from_start = "deviation from a common start"
+    from_start = "deviation from the start"
     return {
         **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in sides},
         **{f"common_start_{side}": readings.plot_cycles(shifted, side, quantity=from_start) for side in sides},
@@ -161,8 +143,6 @@ def _drift_charts(deviations: xr.Dataset) -> dict[str, Chart]:
         # The last window is the whole test.
         both |= {"windows": readings.plot_windows(windows)} if windows.sizes["window"] > 1 else {}
     return {
-        "deviation_map": readings.plot_deviation_map(deviations),
-        "drift_map": readings.plot_drift_map(joint, position),
         "drift": readings.plot_drift(joint, deviations),
         "profile": readings.plot_profile(joint, position),
         **both,

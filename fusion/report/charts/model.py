@@ -11,7 +11,7 @@ from bokeh.models import FixedTicker, LinearColorMapper
 from bokeh.plotting import figure
 from scipy import ndimage
 
-from fusion.analysis.attribution.significance import CHECKS, LEVEL
+from fusion.analysis.attribution.significance import LEVEL
 from fusion.report.charts.plan import Extent, add_cells, extent_of, new_plan
 from fusion.report.charts.style import (
     BEFORE,
@@ -194,12 +194,6 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
         "family-wise p": chosen["p_value"].values,
     }  # fmt: skip
     return Chart(drawn, seen, columns)
-
-
-def rate_text(rate: float, checks: int = CHECKS) -> str:
-    """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
-    u = np.sqrt(max(rate, 1.0 / checks) * (1.0 - rate) / checks)
-    return f"{100 * rate:.1f} ± {200 * u:.1f} %"
 
 
 _TIME = "time since first reading / h"

@@ -10,6 +10,7 @@ import xarray as xr
 from bokeh.models import Arrow, ColorMapper, ColumnDataSource, GlyphRenderer, HoverTool, LinearColorMapper, NormalHead
 from bokeh.plotting import figure
 
+from fusion.report.charts.embedded import MapControls
 from fusion.report.charts.style import (
     CATEGORIES,
     DIVERGING,
@@ -346,24 +347,6 @@ LAYERS = (
 )
 
 
-class MapControls(NamedTuple):
-    """What the reader can choose of the map, and what the page says of it.
-
-    Attributes
-    ----------
-    quantities : list of str
-        Entries of the menu.
-    cycles : list of int
-        Cycles that the slider goes through.
-    note : str
-        What was thinned or averaged; empty where nothing was.
-    """
-
-    quantities: list[str]
-    cycles: list[int]
-    note: str
-
-
 def plot_thermal_map(
     fields: xr.Dataset,
     hotspots: Sequence[HotspotPart] = (),
@@ -383,7 +366,15 @@ def plot_thermal_map(
     if followed is not None:
         _draw_both(drawn.line, *_rim(followed))
         middle = (followed.x_low_mm + followed.x_high_mm) / 2
-        add_names(drawn, [middle], [followed.y_high_mm], ["the drift follows this"], y_offset=-4, text_align="center")
+        add_names(
+            drawn,
+            [middle],
+            [followed.y_high_mm],
+            ["the drift follows this"],
+            y_offset=2,
+            text_baseline="top",
+            text_align="center",
+        )
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]

@@ -138,12 +138,6 @@ def plot_drift_map(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     return cycle_map(drift["drift"].mean("direction"), position, "drift / µm")
 
 
-def plot_deviation_map(deviations: xr.Dataset) -> Chart:
-    """Draw the readings as colours over cycle and position, mean of both approaches, each position about its mean over the cycles."""
-    read = deviations["deviation"].mean("direction")
-    return cycle_map(read - read.mean("cycle"), deviations["position"], "deviation from the mean of the position / µm")
-
-
 def cycle_map(values: xr.DataArray, position: xr.DataArray, label: str) -> Chart:
     """Draw values as colours over cycle and position; a value that is missing is left blank."""
     order = np.argsort(position.values, kind="stable")
@@ -203,7 +197,6 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
         height=360,
         x_range=(left, x[-1] + room),
         zero=True,
-        legend_columns=3,
     )
     columns: dict[str, np.ndarray] = {"target": settled["target"].values, f"position / {along}": x}
     for direction in settled["direction"].values:
@@ -214,13 +207,13 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
         name = ARROWS[direction]
         add_band(drawn, x, mean - 2 * s, mean + 2 * s, COLOURS[direction])
         source = ColumnDataSource({"x": x, "y": mean, "low": mean - 2 * s, "high": mean + 2 * s, "s": s})
-        drawn.line("x", "y", source=source, line_width=1.6, color=COLOURS[direction], legend_label=f"mean, {name}")
+        drawn.line("x", "y", source=source, line_width=1.6, color=COLOURS[direction], legend_label=name)
         whisker = Whisker(base="x", upper="high", lower="low", source=source, line_color=COLOURS[direction])
         for head in (whisker.upper_head, whisker.lower_head):
             head.update(line_color=COLOURS[direction], size=8)
         drawn.add_layout(whisker)
         looks = {"marker": MARKERS[direction], "size": 7, "color": COLOURS[direction]}
-        points = drawn.scatter("x", "y", source=source, legend_label=f"mean, {name}", **looks)
+        points = drawn.scatter("x", "y", source=source, legend_label=name, **looks)
         tips = [
             ("position", f"@x{{0.###}} {along}"),
             (f"mean {name}", f"@y{{0.00}} {unit}"),
@@ -239,7 +232,7 @@ def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> 
     """Draw the spans of A and E to the right of the data, where both approaches were measured, else those of the one approach."""
     mean, s = settled["mean_unidirectional"].values, settled["standard_deviation"].values
     # Labels are at two heights: at one height they would be written over each other.
-    spans = (("A", mean - 2 * s, mean + 2 * s, 0.15, 0.3), ("E", mean, mean, 0.62, 0.6))
+    spans = (("A", mean - 2 * s, mean + 2 * s, 0.1, 0.3), ("E", mean, mean, 0.9, 0.6))
     for symbol, low, high, share, height in spans:
         if not np.isfinite(low).any():
             continue
@@ -249,7 +242,7 @@ def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> 
             drawn.segment([end], [level], [at], [level], line_color=MUTED, line_dash="dashed", line_width=0.8)
         # That of the outer span stands on its left: what leaves the frame is cut in a narrow chart.
         looks: dict[str, Any] = {"offset": (-4, -8), "align": "right"} if symbol == "E" else {"offset": (4, -8)}
-        add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {top - bottom:.2f}", **looks)
+        add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {number(top - bottom)}", **looks)
 
 
 def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:
@@ -260,7 +253,7 @@ def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:
     drawn.segment([x[k]], [ends.min()], [x[k]], [ends.max()], line_color=INK, line_width=3)
     top = float((ends + 2 * s).max())
     at, offset = (top, (-16, 6)) if np.isfinite(top) else (float(ends.mean()), (6, -8))
-    add_label(drawn, float(x[k]), at, f"B {abs(reversal[k]):.2f}", offset=offset)
+    add_label(drawn, float(x[k]), at, f"B {number(abs(reversal[k]))}", offset=offset)
 
 
 def _seen(settled: xr.Dataset, x: np.ndarray, unit: str, along: str) -> str:
@@ -484,7 +477,7 @@ def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure
     """Draw one logged quantity below the bars, on the same time axis."""
     unit = print_unit(str(values.attrs.get("units", "1")))
     words = _words(str(values.name))
-    drawn = new_figure(x=_TIME, y=unit or "1", title=words, height=118)
+    drawn = new_figure(x=_TIME, y=unit, title=words, height=118)
     drawn.x_range = above.x_range
     drawn.yaxis.ticker.desired_num_ticks = 3
     low, high = shared_range(values.values)

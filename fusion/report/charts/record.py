@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 from bokeh.layouts import column
 from bokeh.models import Plot
 from bokeh.plotting import figure
 
+from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import (
     BEFORE,
     CATEGORIES,
@@ -24,7 +27,10 @@ from fusion.report.charts.style import (
     span_words,
 )
 from fusion.report.numbers import join, number, print_unit
+from fusion.report.record import shown_channels
+from fusion.report.thermal_test import DRAWN
 from fusion.report.wording import effect_words
+from fusion.results.thermal_test import ThermalTest
 from interferometry.plots import COLOURS, INK
 
 _TIME, _AFTER, _PALE = "time since start / h", COLOURS["positive"], "#b3bdc2"
@@ -117,7 +123,7 @@ def plot_drivers(record: xr.Dataset) -> Chart:
 def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
     """Draw what each term of the final model contributes to one channel, about its mean."""
     hours = hours_of(record)
-    drawn = new_figure(x=_TIME, y="contribution / µm", title=channel, zero=True)
+    drawn = new_figure(x=_TIME, y="contribution / µm", title=channel, legend_columns=1, zero=True)
     _shade_hold_out(record, drawn)
     courses = Courses(drawn, {_TIME: hours})
     for k, effect in enumerate(str(name) for name in record["effect"].values):
@@ -141,3 +147,45 @@ def hours_of(record: xr.Dataset) -> np.ndarray:
         return np.asarray(record["elapsed"].values / 3600.0)
     time = record["time"].values
     return np.asarray((time - time[0]) / np.timedelta64(1, "h"), float)
+
+
+def draw_record(record: xr.Dataset) -> dict[str, Chart]:
+    """Return the charts of a record by name."""
+    drawn = {"temperatures": plot_temperatures(record)}
+    if record.sizes["driver_name"]:
+        drawn["drivers"] = plot_drivers(record)
+    for k, name in enumerate(shown_channels(record)):
+        drawn[f"prediction_{k}"] = plot_prediction(record, name)
+        drawn[f"residual_{k}"] = plot_residuals(record, name)
+        if record.sizes["effect"]:
+            drawn[f"contribution_{k}"] = plot_contributions(record, name)
+    for step in range(record.sizes.get("step", 0)):
+        errors = xr.Dataset({name: record[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})
+        drawn[f"block_errors_{step}"] = plot_block_errors(errors, hours_of(record), "time")
+    return drawn
+
+
+def draw_thermal_tests(tests: Sequence[ThermalTest]) -> dict[str, Chart]:
+    """Return the charts of every test: what has the same unit over time."""
+    charts = {}
+    for k, test in enumerate(tests):
+        for unit in dict.fromkeys(one.unit for one in test.courses):
+            shown = [one for one in test.courses if one.unit == unit][:DRAWN]
+            printed = print_unit(unit)
+            drawn = new_figure(
+                x="time since start / h", y=f"{'temperature' if unit == 'degC' else 'drift'} / {printed}"
+            )
+            courses = Courses(drawn, {"time since start / h": np.array(shown[0].hours)})
+            for rank, one in enumerate(shown):
+                values = np.array([np.nan if value is None else value for value in one.values])
+                told = span_words(values, printed)
+                courses.add(
+                    np.array(one.hours),
+                    values,
+                    one.name,
+                    heading=f"{one.name} / {printed}",
+                    seen=f"{one.name} {told}",
+                    **of_rank(rank),
+                )
+            charts[f"thermal_{k}_{unit.replace('/', '_')}"] = courses.chart("Course of the test")
+    return charts

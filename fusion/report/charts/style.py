@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import bokeh
 import numpy as np
 import xarray as xr
 from bokeh import palettes
+from bokeh.core.serialization import Serializer
 from bokeh.document import Document
+from bokeh.model import Model
 from bokeh.models import (
     BoxAnnotation,
     ColorBar,
@@ -33,8 +32,8 @@ from bokeh.models import (
     WheelZoomTool,
 )
 from bokeh.plotting import figure
-from markupsafe import Markup
 
+from fusion.report.charts.embedded import EmbeddedChart, in_script
 from interferometry.plots import ACCENT, COLOURS, GRID, INK, MUTED
 
 #: Colours of named lines, each readable on white and distinguishable by colour-blind readers together with the dashes of `DASHES`.
@@ -303,29 +302,7 @@ def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
     return f"{low:.2f} to {high:.2f} {unit}".replace("-", "−")
 
 
-# Charts in a page: the scripts once, each chart with its caption, its text alternative and its data.
-
-
-@dataclass(frozen=True)
-class EmbeddedChart:
-    """A chart as the macro ``draw`` of ``templates/charts.html.j2`` reads it.
-
-    Attributes
-    ----------
-    name : str
-        Unique in its page; a word of letters, digits and underscores.
-    seen : str
-        Text alternative.
-    height : int
-        CSS px that are kept free until it is drawn.
-    item : Markup
-        Bokeh's document as JSON that may stand in a ``<script>``.
-    """
-
-    name: str
-    seen: str
-    height: int
-    item: Markup
+# Charts in a page: each with its text alternative and its data.
 
 
 def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
@@ -333,7 +310,7 @@ def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
     for chart in charts.values():
         _prepare(chart)
     return {
-        name: EmbeddedChart(name, chart.seen, _height(chart), _in_script(json.dumps(item, separators=(",", ":")), "</"))
+        name: EmbeddedChart(name, chart.seen, _height(chart), in_script(json.dumps(item, separators=(",", ":")), "</"))
         for (name, chart), item in zip(charts.items(), _items(charts), strict=True)
     }
 
@@ -350,16 +327,29 @@ def _prepare(chart: Chart) -> None:
 
 def _items(charts: Mapping[str, Chart]) -> list[dict[str, object]]:
     """Return what `bokeh.embed.json_item` returns of every chart; it also looks for mistakes in every drawing, for most of the time."""
-    document = Document(title="")
-    with document.models.freeze():
-        for chart in charts.values():
-            document.add_root(chart.figure)
-    content = document.to_json(deferred=False)
+    empty = Document(title="").to_json(deferred=False)
     items: list[dict[str, object]] = []
-    for (name, chart), root in zip(charts.items(), content["roots"], strict=True):
+    for name, chart in charts.items():
         names = {"target_id": f"drawing-{name}", "root_id": chart.figure.id}
-        items.append({**names, "doc": {**content, "roots": [root]}, "version": bokeh.__version__})
+        drawing = _Sparing(deferred=False).encode(chart.figure)
+        items.append({**names, "doc": {**empty, "roots": [drawing]}, "version": bokeh.__version__})
     return items
+
+
+class _Sparing(Serializer):
+    """Writes models as Bokeh does, which also makes the default of every property that it then leaves out, for most of the time."""
+
+    def _encode(self, obj: Any) -> Any:
+        if not isinstance(obj, Model):
+            return super()._encode(obj)
+        self.add_ref(obj, obj.ref)
+        known = obj._property_values.keys() | obj._unstable_default_values.keys()
+        values = obj.query_properties_with_values(
+            lambda one: one.serialized and one.name in known, include_defaults=False
+        )
+        attributes = {key: self.encode(value) for key, value in values.items()}
+        written = {"type": "object", "name": obj.__qualified_model__, "id": obj.id}
+        return {**written, "attributes": attributes} if attributes else written
 
 
 def _compact(values: np.ndarray) -> np.ndarray:
@@ -378,16 +368,3 @@ def _height(chart: Chart) -> int:
     """Return the height of a chart in CSS px: its own, or the sum of what a column of charts holds."""
     own = chart.figure.height
     return int(own) if own is not None else sum(int(plot.height or 0) for plot in _plots(chart))
-
-
-@cache
-def chart_scripts() -> tuple[Markup, ...]:
-    """Return BokehJS and what draws the charts, as texts for script elements; once per page, after the last chart."""
-    library = (Path(bokeh.__file__).parent / "server" / "static" / "js" / "bokeh.min.js").read_text(encoding="utf-8")
-    own = (resources.files("fusion.report") / "templates" / "charts.js").read_text(encoding="utf-8")
-    return tuple(_in_script(text, "</script") for text in (library, own))
-
-
-def _in_script(text: str, closing: str) -> Markup:
-    """Return a text that may stand in a script element: nothing in its strings closes the element."""
-    return Markup(text.replace(closing, closing.replace("</", "<\\/")))

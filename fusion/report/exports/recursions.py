@@ -50,7 +50,7 @@ def emit(model: Recursion, format: str) -> tuple[str, str]:
     made.filters["plain"] = _plain
     columns = {name: [getattr(one, name) for one in model.inputs] for name in RecursionInput.model_fields}
     arrays = {name: columns[name] for name in ("reference", "low", "high", "failed_below", "failed_above")}
-    for name in ("input", "size", "exponent", "decay", "now", "before"):
+    for name in ("input", "size", "exponent", "decay", "now", "before", "start"):
         arrays[name] = [getattr(one, name) for one in model.states]
     for name in ("limit", "max_step"):
         arrays[name] = [getattr(one, name) for one in model.outputs]
@@ -78,6 +78,7 @@ def header(model: Recursion) -> list[str]:
             f"{one.u:.3g} {one.unit}"
             for one in model.outputs
         ),
+        "Start it with the machine, which is cold then: what a load warms counts as cold at the first step.",
         "Do not add to a compensation that is active already, unless it was active during the test.",
         "How to try it: let the correction of one axis be 10 um and check with an indicator in which direction the axis moves.",
         f"source: results.json, SHA-256 {model.results_sha256}",

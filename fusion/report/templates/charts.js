@@ -21,9 +21,9 @@
   // A plan has millimetres of one length in both directions: its height follows the width that the page leaves it.
   const tallest = 340;
   function fit(figure, view) {
+    figure.querySelector(".drawing").style.minHeight = 0;
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");
-    figure.querySelector(".drawing").style.minHeight = 0;
     if (!view.frame.bbox.width) return;
     const { x_range, y_range } = view.model, ratio = Math.abs((y_range.end - y_range.start) / (x_range.end - x_range.start));
     view.model.frame_height = Math.round(Math.min(tallest, view.frame.bbox.width * ratio));
@@ -130,18 +130,17 @@
   }
 
   // Paper: charts in the width that they have on A4, so that their text keeps its size; then each becomes a drawing in SVG.
-  const flatter = 0.72, flattest = 0.62, tallestTable = 620, heights = new Map();
+  const flatter = 0.72, heights = new Map();
   const later = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
   async function toPaper() {
     document.documentElement.classList.add("paper");
     for (const figure of figures) if (figure.offsetParent) await draw(figure);
-    // A table that a part of the page holds is not split.
-    for (const part of document.querySelectorAll(".scroll")) part.classList.toggle("whole", part.offsetHeight < tallestTable);
     for (const view of roots.values()) for (const plot of plots(view)) {
       for (const axis of [...plot.model.left, ...plot.model.below]) if (axis.axis_label) axis.axis_label_text_font_size = "10px";
-      if (plot.model.height === null || plot.model.sizing_mode === "scale_width") continue;  // a plan or a picture keeps its proportions
+      // A plan or a picture keeps its proportions, a low chart below others its height.
+      if (plot.model.height === null || plot.model.sizing_mode === "scale_width" || plots(view).length > 2) continue;
       heights.set(plot.model, plot.model.height);
-      plot.model.height = Math.round((plots(view).length > 2 ? flattest : flatter) * plot.model.height);
+      plot.model.height = Math.round(flatter * plot.model.height);
     }
     await later(300);
     fitAll();

@@ -192,7 +192,7 @@ def test_contact_sensors_stand_for_the_camera(folder, results_folder, tmp_path):
     (notice,) = [warning for warning in results.warnings if warning.code == "sensors_for_the_camera"]
     assert "which enters the uncertainty of every coefficient per kelvin" in notice.message
     codes = {check.code: check.passed for check in results.inputs.checks}
-    assert codes["plan_sensors"] and codes["sensors_coverage"] and "sensors_rise" not in codes
+    assert codes["sensors_coverage"] and "sensors_rise" not in codes
 
 
 def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(folder, results_folder, tmp_path):

@@ -48,7 +48,7 @@ def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
             assert np.sqrt(squares) == pytest.approx(total.u)
             assert window.u_without_sampling_um[name] < total.u
     origins = {entry.contributor: entry.origin for entry in part.settled.contributions}
-    assert origins["expansion_coefficient"] == "assumed; material at an assumed 3 K from 20 \u00b0C"
+    assert origins["expansion_coefficient"] == "assumed; material at an assumed 10 K from 20 \u00b0C"
 
 
 def test_without_times_no_environmental_variation_is_claimed():

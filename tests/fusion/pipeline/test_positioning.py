@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from fusion.analysis.diagnosis.diagnose import CAUSES, Diagnosis
+from fusion.analysis.diagnosis.diagnose import Diagnosis
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import Source, read_source
 from fusion.pipeline import positioning as module
@@ -24,7 +24,6 @@ from fusion.pipeline.positioning import (
     insufficient_for_correlation,
     insufficient_for_model,
     sites_of,
-    withhold_doubtful_cause,
 )
 from fusion.results.results import Notice
 from fusion.results.store import read_dataset
@@ -163,22 +162,6 @@ def diagnosis(cause: str = "structural") -> Diagnosis:
     return Diagnosis(3, "positive", cause, 0.9, evidence, ("it scatters",), ("it is alone",), "Look at the guide.")
 
 
-def test_a_cause_is_named_up_to_a_p_value_of_two_percent():
-    at_the_limit = diagnosis()
-    assert withhold_doubtful_cause(anomaly(p_value=0.02), at_the_limit) is at_the_limit
-    doubted = withhold_doubtful_cause(anomaly(p_value=0.0201), at_the_limit)
-    assert doubted.cause == "undetermined"
-    near, alone = doubted.against_it
-    assert "flagged only near the limit (p = 0.02)" in near and alone == "it is alone"
-    undetermined = diagnosis("undetermined")
-    assert withhold_doubtful_cause(anomaly(p_value=0.04), undetermined) is undetermined
-    # What to check of the withdrawn cause is said as a condition; the evidence stays.
-    generic, condition = doubted.check.split(" If the cause is ")
-    assert generic == CAUSES["undetermined"].check
-    assert condition.startswith("scatter of the structure: inspect guideway, scale, screw and nut")
-    assert (doubted.probability, doubted.evidence, doubted.for_it) == (0.9, at_the_limit.evidence, ("it scatters",))
-
-
 def test_sites_are_set_aside_for_at_most_a_quarter_of_the_targets():
     def found(*places):
         return [DiagnosedPosition(anomaly(*place), diagnosis()) for place in places]
@@ -220,10 +203,12 @@ def test_what_the_model_explains_is_taken_out_before_positions_are_judged(monkey
     expected = deviation.values - explained.values
     judged = []
 
-    def detect(cleaned, drift):
+    def detect(cleaned, drift, *, level, permutations):
         judged.append(cleaned["deviation"])
         assert drift == "drift of what is left"
-        return [anomaly(1, p_value=0.04), anomaly(2, stands_out=False), anomaly(3)]
+        # The rarest kind has a tenth of the probability, and must reach it.
+        assert level == 0.02 and permutations + 1 >= 10 / level
+        return [anomaly(1), anomaly(2, stands_out=False), anomaly(3)]
 
     def diagnose(cleaned, anomalies):
         judged.append(cleaned["deviation"])
@@ -236,8 +221,8 @@ def test_what_the_model_explains_is_taken_out_before_positions_are_judged(monkey
     for values in judged:
         np.testing.assert_array_equal(values, expected)
         assert values.attrs == {"units": "um"}
-    # Scatter that is naturally unequal is no anomaly; a position near the limit gets no cause.
-    assert [(one.anomaly.target, one.diagnosis.cause) for one in told] == [(1, "undetermined"), (3, "structural")]
+    # Scatter that is naturally unequal is no anomaly.
+    assert [(one.anomaly.target, one.diagnosis.cause) for one in told] == [(1, "structural"), (3, "structural")]
     np.testing.assert_array_equal(fused["deviation"], np.arange(12.0).reshape(3, 2, 2))
 
 

@@ -27,7 +27,7 @@ from fusion.pipeline.stages import (
     refuse_other_campaign,
 )
 from fusion.pipeline.workers import Worker
-from fusion.report.charts.campaign import Drawn
+from fusion.report.charts.embedded import Drawn
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome
 from fusion.results.store import OutputError, StageStamps, write_json

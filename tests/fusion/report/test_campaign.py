@@ -9,8 +9,8 @@ import xarray as xr
 from markupsafe import Markup
 
 from fusion.report import campaign as model_section
-from fusion.report.campaign import describe_campaign, describe_correlation
-from fusion.report.charts.plan import MapControls
+from fusion.report.campaign import describe_campaign, describe_correlation, rate_text
+from fusion.report.charts.embedded import MapControls
 from fusion.report.page import render_page
 from fusion.report.wording import environment, region_words
 from fusion.results.results import AxisLoop, CorrelationPart, Results, assemble, read_results
@@ -212,3 +212,8 @@ def test_every_coefficient_has_a_name_of_its_own():
     assert named("thermal_lag", "flat and linear", 2) == ["shift", "stretch at the far end"]
     assert named("periodic_disturbance", "flat", 2) == ["sine part", "cosine part"]
     assert named("step_event", "flat", 1) == [""] and named("bed_bending", "", 2) == ["coefficient 1", "coefficient 2"]
+
+
+def test_a_rate_carries_its_own_uncertainty():
+    # Binomial: sqrt(0.05 * 0.95 / 199) = 1.54 %, and twice that is stated.
+    assert rate_text(0.05) == "5.0 ± 3.1 %"

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.report.charts.record import draw_record
 from fusion.report.page import render_page
-from fusion.report.record import describe_record, draw_record
+from fusion.report.record import describe_record
 from fusion.results.loop import RecordLoop
 from fusion.results.results import assemble
 from tests.fusion.report.page_tables import tables_of

@@ -121,9 +121,9 @@ def test_a_step_has_both_pairs_of_errors():
     step = StepPart.model_construct(
         rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
     )
-    told = wording.step_errors(step)
+    told = wording.say("step_errors", step)
     assert "held-out error 0.60 -> 0.70 \u00b5m" in told and told.endswith("from the others 0.50 -> 0.40 \u00b5m")
-    late = wording.step_errors(step.model_copy(update={"rmse_after_um": None}))
+    late = wording.say("step_errors", step.model_copy(update={"rmse_after_um": None}))
     assert late.startswith("found after the hold-out was opened") and "0.60" not in late
 
 
@@ -184,7 +184,7 @@ def results(found: Loop | None, **parts: Any) -> Results:
         ),
         (
             loop("unexplained", shape="a wave"),
-            ["predicted to 0.66 µm (last", "(0.20 µm rms)", "no effect of the library"],
+            ["predicted to 0.66 µm (last", "(0.20 µm rms)", "none of the known effects"],
         ),
         (
             loop("unexplained", step("dead_path"), separable=False, baselines=LAGGED),
@@ -306,12 +306,12 @@ def test_an_unseen_source_and_a_seen_place_are_reconciled(found, verdict, stated
 def test_a_position_that_stands_out_is_compared_with_the_others():
     (anomaly,) = assemble("A", PARTS, []).anomalies or ()
     placed = anomaly.model_copy(update={"position_mm": 40.0, "p_resolution": 0.01})
-    told = answers.describe_anomaly(placed)
+    told = answers.say("anomaly_sentence", placed)
     assert told.startswith("Position 3 (40 mm)") and "0.60 µm, that of the others 0.30 µm (p ≤ 0.01," in told
     # Of one approach its own scatter is stated, not that of both.
     evidence = anomaly.evidence.model_copy(update={"scatter_negative_um": 0.9})
     one = anomaly.model_copy(update={"direction": "negative", "evidence": evidence})
-    told = answers.describe_anomaly(one)
+    told = answers.say("anomaly_sentence", one)
     assert told.startswith("Position 3, negative approach,") and "0.90 µm" in told
 
 

@@ -34,7 +34,7 @@ def test_plain_lines_tell_start_and_end_once(done: Sequence[int], lines: list[st
 
 
 def test_plain_lines_speak_up_during_a_long_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([0.0, 4.0, 11.0, 12.0, 30.0])
+    clock = iter([0.0, 0.0, 4.0, 11.0, 12.0, 30.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     told = shown(*(("frames", done, 10) for done in (0, 1, 2, 3, 10)))
     assert told.splitlines() == ["frames ...", "frames: 2 of 10, about 44 s left", "frames: done in 30.0 s"]
@@ -43,17 +43,21 @@ def test_plain_lines_speak_up_during_a_long_step(monkeypatch: pytest.MonkeyPatch
 def test_a_step_that_takes_ten_times_its_forecast_says_so_once_and_how_to_stop_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    clock = iter([0.0, 4.0, 5.0, 6.0])
+    clock = iter([0.0, 0.0, 4.0, 9.0, 9.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     written = io.StringIO()
     with Reporter(Console(file=written, width=300)) as report:
         for label, done in (("closed loop", 0), ("closed loop", 2), ("correlation", 0), ("closed loop", 3)):
             report(label, done, 10)
-        # 4 s for two of ten parts: 20 s; of the correlation no part is done.
-        for now in (199.0, 201.0, 300.0):
+        # 4 s for two of ten parts: 20 s; of the correlation no part is done, and the run took 9 s before it.
+        for now in (98.0, 100.0, 199.0, 201.0, 300.0):
             report._say_overdue(now)
-    _, _, said = written.getvalue().splitlines()
-    assert said.startswith("closed loop: 201 s so far, 20 s were expected") and "Ctrl-C stops the run" in said
+    _, _, *said = written.getvalue().splitlines()
+    assert [one.split(";")[0] for one in said] == [
+        "correlation: 91 s so far, the whole run before it took 9 s",
+        "closed loop: 201 s so far, 20 s were expected from its first parts",
+    ]
+    assert all("Ctrl-C stops the run" in one for one in said)
 
 
 def test_a_terminal_gets_a_bar_per_step() -> None:

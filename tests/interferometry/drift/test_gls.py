@@ -385,8 +385,8 @@ def test_the_memory_of_each_site_is_estimated_beside_what_all_do_together(rng, w
     """32 sites over 50 cycles, and a motion of all that is no noise."""
     together = np.outer(rng.normal(size=32), np.sin(np.arange(50) / 5.0))
     found = memory_of_each(with_memory(rng.normal(size=(50, 32)), weight).T + together)
-    # 1600 values: a correlation is known to 0.025, less what the patterns take.
-    assert found.weights[0] == pytest.approx(weight, abs=0.1)
+    # Of 40 such series the standard deviation is 0.05; three of them.
+    assert found.weights[0] == pytest.approx(weight, abs=0.15)
 
 
 def test_independent_sites_have_no_memory_and_few_sites_are_not_asked(rng):

@@ -88,14 +88,15 @@ def test_readings_that_are_whitened_some_after_others_are_those_whitened_at_once
     assert whitening.done == n
 
 
-def test_products_of_many_columns_are_those_of_few(rng, monkeypatch):
+def test_normal_equations_are_the_products_of_what_is_whitened_at_once(rng, monkeypatch):
     n = 700
     system, columns = uneven(rng, n), rng.normal(size=(n, 5))
-    gram, log_determinant = system.normal_equations(columns)
-    monkeypatch.setattr("interferometry.drift.kalman.MANY_COLUMNS", 5)
-    by_blocks, determinant = system.normal_equations(columns)
-    np.testing.assert_allclose(by_blocks, gram, rtol=1e-11, atol=1e-11)
-    assert determinant == pytest.approx(log_determinant, rel=1e-12)
+    whitened, log_determinant = system.whiten(columns)
+    for at_once in (10**6, 1000):
+        monkeypatch.setattr("interferometry.drift.kalman._VALUES_AT_ONCE", at_once)
+        gram, determinant = system.normal_equations(columns)
+        np.testing.assert_allclose(gram, whitened.T @ whitened, rtol=1e-11, atol=1e-11)
+        assert determinant == pytest.approx(log_determinant, rel=1e-12)
 
 
 def test_many_columns_are_smoothed_as_few_are(rng, monkeypatch):

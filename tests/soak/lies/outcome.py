@@ -64,6 +64,33 @@ def judge(lie: Lie, truth: Truth, results: Results, folder: Path) -> tuple[Outco
     return (Outcome.CORRECTED if any(_names(lie, notice) for notice in notices) else Outcome.RIGHT), wrong
 
 
+def shares_within(truth: Truth, results: Results, folder: Path, *, renumbered: int = 0) -> dict[str, float]:
+    """Share of the values of each figure whose error is at most twice its printed standard uncertainty."""
+    shares = {}
+    loop = results.loop
+    if isinstance(loop, AxisLoop):
+        true_values = {"axis_expansion": EXPANSION_PPM_PER_K, "table_offset": truth.recipe.drift.offset_um_per_K}
+        for entry in loop.declared_coefficients:
+            if entry.effect in true_values and entry.value is not None and entry.u is not None:
+                shares[entry.effect] = float(abs(entry.value - true_values[entry.effect]) <= 2.0 * entry.u)
+        drift = results.drift
+        assert drift is not None
+        estimate, u = (
+            np.array([part.positive, part.negative], dtype=float) for part in (drift.profile_um, drift.profile_u_um)
+        )
+        true = truth.readings["mean_profile"].values
+        if estimate.shape == true.shape:
+            shares["profile"] = _share(_line_left_out(estimate - true), u)
+    for name, error, u in _field_errors(truth, folder / "fields.nc", renumbered):
+        shares[name] = _share(error, u)
+    return shares
+
+
+def _share(error: np.ndarray, u: np.ndarray) -> float:
+    known = np.isfinite(error) & (u > 0.0)
+    return float(np.mean(np.abs(error[known]) <= 2.0 * u[known])) if known.any() else float("nan")
+
+
 def _names(lie: Lie, words: str) -> bool:
     return re.search(lie.family, words, flags=re.IGNORECASE | re.DOTALL) is not None
 
@@ -134,36 +161,41 @@ def _wrong_profile(truth: Truth, results: Results) -> Iterator[str]:
     if estimate.shape != true.shape:
         # A target without readings has no place in the results.
         return
-    error = _without_line(estimate - true)
+    error = _line_left_out(estimate - true)
     ratio = _rms(error) / _rms(u)
     if not ratio <= _SIGMAS:
         yield f"profile off by {_rms(error):.3g} µm (u {_rms(u):.2g} µm)"
 
 
-def _without_line(error: np.ndarray) -> np.ndarray:
-    """Errors (direction, target) less the straight line through all of them; a direction without readings is left out."""
+def _line_left_out(error: np.ndarray) -> np.ndarray:
+    """Errors (direction, target) less the straight line through all of them; NaN in a direction without readings."""
     target = np.broadcast_to(np.arange(error.shape[1], dtype=float), error.shape)
     known = np.isfinite(error)
     if np.count_nonzero(known) < 3:
         return error
-    return error[known] - np.polyval(np.polyfit(target[known], error[known], 1), target[known])
+    return error - np.polyval(np.polyfit(target[known], error[known], 1), target)
 
 
 def _wrong_field(lie: Lie, truth: Truth, path: Path) -> Iterator[str]:
     """Temperature and rise of every cell on the table and every cycle against the true field."""
+    for name, error, u in _field_errors(truth, path, lie.renumbered):
+        # The rise of the reference cycle is zero by definition, with no uncertainty.
+        known = np.isfinite(error) & (u > 0.0)
+        if not known.any() or not _rms(error[known]) <= _SIGMAS * _rms(u[known]):
+            yield f"{name} off by {_rms(error[known]):.3g} K (u {_rms(u[known]):.2g} K)"
+
+
+def _field_errors(truth: Truth, path: Path, renumbered: int) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, error and standard uncertainty of temperature and rise, of every cell on the table and every cycle."""
     plan = truth.recipe.plan
     with xr.open_dataset(path, engine="h5netcdf") as whole:
         fields = whole.sel(x=slice(0.0, plan.width_mm), y=slice(0.0, plan.height_mm))
         true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=10.0)
-        rows = fields["cycle"].values + lie.renumbered - 1
+        rows = fields["cycle"].values + renumbered - 1
         # A cycle entered twice, as one more at the end, was measured in no time of its own.
         rows = np.minimum(rows, len(true) - 1)
         for name, expected in (("temperature", true[rows]), ("temperature_rise", true[rows] - true[rows[0]])):
-            error, u = fields[name].values - expected, fields[f"{name}_u"].values
-            # The rise of the reference cycle is zero by definition, with no uncertainty.
-            known = np.isfinite(error) & (u > 0.0)
-            if not known.any() or not _rms(error[known]) <= _SIGMAS * _rms(u[known]):
-                yield f"{name} off by {_rms(error[known]):.3g} K (u {_rms(u[known]):.2g} K)"
+            yield name, fields[name].values - expected, fields[f"{name}_u"].values
 
 
 def _rms(values: np.ndarray) -> float:

@@ -11,7 +11,7 @@ import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from unittest import mock
@@ -24,7 +24,7 @@ from fusion.results.results import Results
 from interferometry.common import InterferometryError
 from tests.soak.lies.campaigns import RECIPES, write
 from tests.soak.lies.catalogue import GROUPS, LIES
-from tests.soak.lies.outcome import Outcome, judge, refusal
+from tests.soak.lies.outcome import Outcome, judge, refusal, shares_within
 from thermography.common import ThermographyError
 
 #: Longest part of a message that a row keeps.
@@ -48,6 +48,8 @@ class Row:
         The refusal, the end of the traceback, or the verdict with its causes.
     seconds : float
         Time of the run, s.
+    within : dict of str to float
+        Share of each figure's values whose error is at most twice its printed uncertainty.
     """
 
     campaign: str
@@ -58,6 +60,7 @@ class Row:
     said: tuple[str, ...]
     message: str
     seconds: float
+    within: dict[str, float] = field(default_factory=dict)
 
 
 def run_one(campaign: str, group: str, name: str, figures: bool) -> Row:
@@ -71,16 +74,18 @@ def run_one(campaign: str, group: str, name: str, figures: bool) -> Row:
             stack.enter_context(mock.patch("fusion.report.page.render_report", return_value=""))
         wrong: list[str] = []
         said: tuple[str, ...] = ()
+        within: dict[str, float] = {}
         try:
             results = run_campaign(folder / "campaign.toml", out)
             outcome, wrong = judge(lie, truth, results, out)
             said, message = tuple(_said(results)), _verdict(results)
+            within = shares_within(truth, results, out, renumbered=lie.renumbered)
         except (FusionError, ThermographyError, InterferometryError) as error:
             message = f"{type(error).__name__}: {error}".replace(base, "")
             outcome = refusal(lie, message)
         except Exception:
             outcome, message = Outcome.TRACEBACK, traceback.format_exc()[-_MESSAGE:]
-    return Row(campaign, group, name, outcome, tuple(wrong), said, message[:_MESSAGE], time.monotonic() - begun)
+    return Row(campaign, group, name, outcome, tuple(wrong), said, message[:_MESSAGE], time.monotonic() - begun, within)
 
 
 def _said(results: Results) -> Iterator[str]:
@@ -188,4 +193,15 @@ def counts_table(rows: Sequence[Row]) -> str:
     lines.append(f"| lies | {' | '.join(map(str, each))} | {sum(each)} |")
     limits = [sum(row.campaign == campaign and bool(LIES[row.lie].limit) for row in rows) for campaign in campaigns]
     lines.append(f"| declared limits, not counted | {' | '.join(map(str, limits))} | {sum(limits)} |")
+    return "\n".join(lines)
+
+
+def coverage_table(rows: Sequence[Row]) -> str:
+    """A markdown table: share of the values within twice their printed uncertainty, over the runs that nothing doubts."""
+    sound = [row for row in rows if row.within and not any(code.startswith("doubt_") for code in row.said)]
+    figures = sorted({name for row in sound for name in row.within})
+    lines = ["| figure | within 2 u | runs |", "|---|---|---|"]
+    for name in figures:
+        shares = [row.within[name] for row in sound if np.isfinite(row.within.get(name, np.nan))]
+        lines.append(f"| {name} | {np.mean(shares):.3f} | {len(shares)} |")
     return "\n".join(lines)

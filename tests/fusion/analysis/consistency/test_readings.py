@@ -71,6 +71,16 @@ def test_deviations_in_nm_or_mm_and_positions_in_metres_or_inches_are_doubted(
     assert code in named and "unit" in named[code].remedy
 
 
+def test_a_unit_that_changes_in_the_test_is_named_with_its_cycle_and_compensation_or_averaging_is_none() -> None:
+    test = sound()
+    values, late = test["deviation"].values, np.arange(CYCLES)[:, None, None] >= 24
+    named = failed(with_deviation(test, np.where(late, 0.1 * values, values)))
+    assert "From cycle 25 on scatter and profile are both some 0.1" in named["deviation_unit"].evidence
+    mean = values.mean(axis=0)
+    compensated, averaged = np.where(late, values - mean, values), np.where(late, mean + 0.1 * (values - mean), values)
+    assert not any("deviation_unit" in failed(with_deviation(test, other)) for other in (compensated, averaged))
+
+
 @pytest.mark.parametrize(
     ("travel_mm", "targets", "cycles", "slope_um", "reversal_um", "noise_um", "rounding_um"),
     [

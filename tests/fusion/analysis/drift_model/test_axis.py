@@ -20,8 +20,9 @@ from fusion.analysis.drift_model.axis import (
     hold_out,
     reject_inconsistent_patterns,
     second_search,
+    simplify_rhythms,
 )
-from fusion.analysis.drift_model.fit import ModelFit
+from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
 from fusion.analysis.drift_model.search import Confirmation, Confirmed, Decision, LoopState, Reason, Round, Score, Step
 from fusion.analysis.effects.effect import Candidate, Effect
 from fusion.analysis.effects.library import library
@@ -225,35 +226,6 @@ def test_the_second_look_adds_no_third_event(monkeypatch):
     assert [step.effect for step in state.steps] == ["step_event", "step_event"]
 
 
-def asked(problem: AxisProblem, *scores: Score) -> LoopState[ModelFit]:
-    return problem.evaluate_on_hold_out(problem.start([]).scored(Round(scores)))
-
-
-def test_the_strongest_effect_that_is_undecided_is_asked_for(monkeypatch):
-    effects = {name: Effect(name, "", "", lambda *_: iter(())) for name in ("weak", "a", "b")}
-    problem = problem_of(WAVE, effects=effects)
-    answers = {"a": (1.0, 0.5, 0.005)}
-    put = []
-
-    def ask(model, candidate, rng):
-        put.append(candidate)
-        return answers["a"]
-
-    monkeypatch.setattr(axis, "evaluate_on_hold_out", ask)
-    weak = score("weak", term(LATE).candidate, p_value=0.11)
-    first, second = (score(name, term(WAVE).candidate, p_value=0.1) for name in ("a", "b"))
-    state = asked(problem, Score("none", None), weak, first, second)
-    assert put == [first.candidate]
-    assert state.question.effect == "a"
-    assert (state.question.rmse_before_um, state.question.rmse_after_um, state.question.p_value) == (1.0, 0.5, 0.005)
-    # The answer is reported; it does not let the effect in.
-    assert state.steps == ()
-    # An effect against which something was decided is not asked for.
-    blocked = problem.start([]).decide(Decision("a", Reason.COLLINEAR)).scored(Round((first, second)))
-    assert problem.evaluate_on_hold_out(blocked).question.effect == "b"
-    assert asked(problem, weak).question is None
-
-
 def test_an_event_has_two_cycles_before_it_and_one_after():
     """Of ten used cycles of 130 s: from the start of the third to that of the ninth."""
     instants = (259.0, 260.0, 1040.0, 1041.0)
@@ -400,3 +372,32 @@ def test_a_long_test_is_corrected_some_frames_at_a_time_with_the_same_bits(monke
     for name, variable in corrected_variables(small_fields(), small_fused(), errors).items():
         assert variable.values.tobytes() == at_once[name].values.tobytes(), name
     assert correct_fields(small_fields(), errors)["frame_temperature"].values.tobytes() == frames.tobytes()
+
+
+def test_a_rhythm_found_before_a_step_is_one_wave_beside_it():
+    """The harmonics of a slower rhythm imitate the step that was not in the model yet."""
+    bare, rng = campaign(cycles=80), np.random.default_rng(5)
+    sine = np.sin(2.0 * np.pi * bare.seconds / 1200.0)
+    late = (bare.seconds >= 5000.0).astype(float)
+    readings = replace(bare, response=0.7 * sine + 1.4 * late + 0.3 * rng.standard_normal(bare.seconds.size))
+    problem = AxisProblem(readings, np.ones(bare.seconds.size, bool), library(), rng)
+    near = Candidate(np.empty((0, 2)), {"period_min": 40.0, "shape": "flat"}, ("um", "um"))
+    offered = library()["periodic_disturbance"].candidates(readings, {}, near)
+    harmonics = next(one for one in offered if len(one.units) == 14 and one.parameters["shape"] == "flat")
+    step = term(late, "step_event", parameters={"time_s": 5000.0}, event_s=5000.0)
+    model = fit_model(readings, [Term("periodic_disturbance", harmonics), step], used=problem.used)
+    steps = tuple(
+        Step(Score(one.effect, one.candidate, gain=9.0), Round(()), Confirmed.LATER_CYCLES) for one in model.terms
+    )
+    state = simplify_rhythms(problem, LoopState(model, steps=steps))
+    wave = state.model.terms[0].candidate
+    # The record resolves a period to its square over twice the length, 20 min x 20 min / 275 min.
+    assert "course" not in wave.parameters and wave.parameters["period_min"] == pytest.approx(20.0, abs=1.5)
+    assert state.steps[0].score.best is wave and state.model.terms[1].effect == "step_event"
+    low, high = state.steps[0].score.ranges["period_min"]
+    assert low < 20.0 < high < 22.0
+    # A rhythm whose harmonics are there keeps them.
+    square = replace(readings, response=readings.response - 0.7 * sine + harmonics.columns[:].sum(axis=1))
+    problem = AxisProblem(square, problem.used, library(), rng)
+    whole = LoopState(fit_model(square, model.terms, used=problem.used), steps=steps)
+    assert simplify_rhythms(problem, whole).model is whole.model

@@ -198,17 +198,6 @@ def test_too_few_cycles_are_refused():
         readings_of(cycles=3)
 
 
-def test_the_hold_out_set_is_asked_once_and_the_answer_is_logged():
-    """A reversal of an eighth of the noise is too small for the search, and too large to be left unasked."""
-    readings = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.05), seed=15, cycles=20)
-    found = close_loop(readings, DECLARED, effects=_few("reversal_drift", "dead_path", "air_index"))
-    assert found.state.question is not None
-    logged = found.described(UNTESTED).held_out_test
-    assert logged.effect == "reversal_drift" and logged.entered is bool(found.steps)
-    assert 0.0 < logged.p_value <= 1.0
-    assert 0.3 < logged.rmse_after_um < 0.6 and 0.3 < logged.rmse_before_um < 0.6
-
-
 def test_what_could_be_found_is_found_at_that_size():
     """An effect at twice the size that is found in 80 % of campaigns is found; the size of a reversal is set by the noise alone."""
     few = _few("reversal_drift", "pitch_error", "dead_path")

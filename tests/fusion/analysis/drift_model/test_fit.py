@@ -471,14 +471,6 @@ def test_every_component_has_its_own_factor_and_a_short_set_is_repeated(rng):
     np.testing.assert_allclose(second.ratios, [1e-1, 1e-2])
 
 
-def test_a_drift_can_be_laid_on_other_readings(rng):
-    fit = fit_of(1e-3, rng.standard_normal(40))
-    longer = drift_system(np.arange(5.0), np.ones((5, 1)), order=1, ratios=np.array([77.0]))
-    (system,) = scaled_systems(fit, ((0.0,),), over=longer)
-    assert system.seconds.size == 5
-    assert system.ratios[0] == pytest.approx(1e-3)
-
-
 def test_variances_are_drawn_in_proportion_to_their_restricted_likelihood(rng):
     walk = np.cumsum(rng.standard_normal(40)) * np.sqrt(7200.0 / 39.0 * 2e-3)
     response = walk + rng.standard_normal(40)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fusion.analysis.alignment.readings import Readings
-from fusion.analysis.drift_model.admissibility import CandidateScorer, _judged, evaluate_on_hold_out, prior_rows
-from fusion.analysis.drift_model.fit import SHIFT_AND_STRETCH, ModelFit, PriorRows, moments_of, scaled_systems
+from fusion.analysis.drift_model.admissibility import CandidateScorer, _judged, prior_rows
+from fusion.analysis.drift_model.fit import SHIFT_AND_STRETCH, PriorRows, moments_of
 from fusion.analysis.drift_model.gains import (
     by_width,
     orthogonalise,
@@ -24,7 +24,7 @@ from fusion.analysis.drift_model.search import Confirmed, Score
 from fusion.analysis.effects.effect import Candidate, Prior, Separable
 from interferometry.drift.gls import DriftSystem, drift_system
 from tests.fusion.analysis.drift_model.test_fit import squares_beside
-from tests.fusion.small_campaign import campaign, dense_covariance, model_of, term
+from tests.fusion.small_campaign import campaign, model_of, term
 
 BARE = campaign(cycles=20)
 WAVE = np.sin(BARE.seconds / 100.0)
@@ -151,55 +151,6 @@ def test_an_event_that_all_targets_show_is_confirmed_and_one_of_half_of_them_is_
         assert told.confirmation.passed is passed
         if passed:
             assert told.confirmation.way is Confirmed.OTHER_TARGETS
-
-
-def dense_hold_out_errors(model: ModelFit, columns: np.ndarray) -> list[float]:
-    """Errors of every drift of the grid with the likelihood of the training readings: the most likely one counts."""
-    readings, used = model.readings, model.used
-    whole = np.column_stack([readings.profile, columns])
-    told = []
-    for system in scaled_systems(model.fit, SHIFT_AND_STRETCH, over=model.whole_system()):
-        v = dense_covariance(readings, system.ratios)
-        early, late = v[np.ix_(used, used)], v[np.ix_(~used, used)]
-        root = np.linalg.cholesky(early)
-        y, x = np.linalg.solve(root, readings.response[used]), np.linalg.solve(root, whole[used])
-        beta = np.linalg.lstsq(x, y, rcond=None)[0]
-        variance = ((y - x @ beta) ** 2).mean()
-        likelihood = -0.5 * y.size * np.log(variance) - np.log(np.diag(root)).sum()
-        residual = readings.response - whole @ beta
-        missed = residual[~used] - late @ np.linalg.solve(early, residual[used])
-        told.append((likelihood, float(np.sqrt((missed**2).mean()))))
-    return max(told)[1]
-
-
-def test_the_hold_out_set_is_asked_with_the_drift_that_suits_each_model_best(rng):
-    walk = np.cumsum(0.05 * rng.standard_normal(BARE.seconds.size))
-    model = model_of(measured(0.2 * WAVE, walk), used=TRAINING)
-    before, after, p_value = evaluate_on_hold_out(model, candidate(WAVE), rng)
-    assert before == pytest.approx(dense_hold_out_errors(model, np.empty((BARE.seconds.size, 0))), rel=1e-5)
-    assert after == pytest.approx(dense_hold_out_errors(model, WAVE[:, None]), rel=1e-5)
-    assert 1 / 201 <= p_value <= 1.0
-
-
-def test_an_effect_that_is_present_answers_the_question(rng):
-    model = model_of(measured(WAVE), used=TRAINING)
-    before, after, p_value = evaluate_on_hold_out(model, candidate(WAVE), rng)
-    assert after < 0.15 < 0.5 < before
-    # The model without the effect holds it for noise; in none of its simulated campaigns is the error so small.
-    assert p_value == pytest.approx(1 / 201)
-    _, _, p_value = evaluate_on_hold_out(
-        model_of(measured(), used=TRAINING), candidate(np.cos(BARE.seconds / 37.0)), rng
-    )
-    assert p_value > 0.02
-
-
-def test_the_question_to_a_long_hold_out_set_is_answered_in_parts(monkeypatch):
-    at_once = evaluate_on_hold_out(model_of(measured(), used=TRAINING), candidate(WAVE), np.random.default_rng(3))
-    monkeypatch.setattr("fusion.analysis.drift_model.admissibility._VALUES_AT_ONCE", 5000)
-    monkeypatch.setattr("thermography.fields.large_arrays.IN_MEMORY_BYTES", 100)
-    in_parts = evaluate_on_hold_out(model_of(measured(), used=TRAINING), candidate(WAVE), np.random.default_rng(3))
-    # The products of matrices of another width are rounded differently.
-    np.testing.assert_allclose(in_parts, at_once, rtol=1e-9)
 
 
 # Products of whitened columns against dense algebra, and what candidates explain against one `lstsq` each.

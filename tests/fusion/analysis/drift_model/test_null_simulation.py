@@ -155,12 +155,6 @@ def test_a_simulated_drift_has_the_variances_that_the_likelihood_leaves(rng):
     assert (draws[-1] - draws[0]).var() == pytest.approx(expected, rel=0.1)
 
 
-def test_a_null_can_be_simulated_over_other_readings(rng):
-    fit = quiet_fit(rng.standard_normal(50))
-    longer = drift_system(10.0 * np.arange(80), np.ones((80, 1)), order=1, ratios=np.array([1.0]))
-    assert simulate_null(fit, rng, draws=3, over=longer).shape == (80, 3)
-
-
 def test_however_many_readings_are_simulated_together_the_same_campaigns_come(monkeypatch):
     fit = quiet_fit(np.random.default_rng(5).standard_normal(50), order=2)
     whole = simulate_null(fit, np.random.default_rng(7), draws=4)

@@ -8,7 +8,7 @@ import pytest
 from fusion.analysis.drift_model.record import close_record
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.drift_model.recursion import make_recursion
-from fusion.analysis.drift_model.verification import ChannelVerdict, predicted_ranges, verify
+from fusion.analysis.drift_model.verification import ChannelVerdict, verify
 from fusion.pipeline.record import record_variables
 from fusion.results.recursion import Recursion, RecursionError, run_recursion
 from tests.fusion.record_tables import table_of
@@ -34,16 +34,21 @@ def first():
 
 
 def verified(
-    first, *, gain: float = 1.0, runs: Recursion | None = None, faulty: dict[str, str] | None = None
+    first,
+    *,
+    gain: float = 1.0,
+    runs: Recursion | None = None,
+    faulty: dict[str, str] | None = None,
+    swing_K: float = 1.7,
 ) -> list[ChannelVerdict]:
     """The second test of the machine, with what its control adds."""
     product, loop, model = first
     # Within the range of the first test, beyond which the correction is held.
-    bare = logged(2, swing_K=1.7)
+    bare = logged(2, swing_K=swing_K)
     readings = bare.temperature[:, [bare.sensors.index(one.name) for one in model.inputs]]
     added = run_recursion(runs or model, readings, zero=np.arange(len(readings)) == 0).correction
     after = replace(bare, displacement=bare.displacement + gain * added)
-    return verify(after, model, predicted_ranges(product, loop, after), faulty_sensors=faulty or {})
+    return verify(product, loop, after, model, faulty_sensors=faulty or {})
 
 
 def test_a_compensation_that_acts_as_stated_leaves_what_was_predicted(first):
@@ -66,16 +71,34 @@ def test_a_gain_that_is_wrong_is_named(first, gain, fault):
         assert one.before_um == pytest.approx(before, rel=0.1)
 
 
+def test_a_compensation_that_does_not_act_is_named_where_there_was_little_to_correct(first):
+    for one in verified(first, gain=0.0, swing_K=0.012):
+        assert one.achieved_um < one.predicted_high_um and one.gain == pytest.approx(0.0, abs=0.2)
+        assert (one.is_kept, one.fault) == (False, "not active")
+    assert not any(one.fault for one in verified(first, swing_K=0.012))
+
+
+def test_a_driver_in_another_unit_than_the_model_reads_is_refused(first):
+    product, loop, model = first
+    driven = model.model_copy(
+        update={"inputs": (*model.inputs, model.inputs[0].model_copy(update={"name": "n", "unit": "rpm"}))}
+    )
+    after = replace(logged(2), drivers={"n": {1: np.ones(1200)}}, driver_sizes={"n": (1.0, "Hz")})
+    with pytest.raises(RecursionError, match="n is logged in Hz in the test after it, and the applied model reads rpm"):
+        verify(product, loop, after, driven, faulty_sensors={})
+
+
 def test_other_coefficients_are_named(first):
     swapped = [one.model_copy(update={"coefficients": one.coefficients[::-1]}) for one in first[2].outputs]
     for one in verified(first, runs=first[2].model_copy(update={"outputs": tuple(swapped)})):
         assert one.fault == "stale table"
-        assert "in other proportions than its coefficients" in one.reason
+        assert "other coefficients than the stated ones" in one.reason
 
 
 def test_a_sensor_that_does_not_measure_is_named(first):
     for one in verified(first, faulty={"t2": "stays at 0 degC"}):
-        assert (one.fault, one.is_kept) == ("dead sensor", False)
+        # What the control made of it, and so what the test would have been without it, is not known.
+        assert (one.fault, one.is_kept, one.before_um) == ("dead sensor", False, None)
         assert one.reason.startswith("t2 (stays at 0 degC) does not measure")
 
 
@@ -83,4 +106,4 @@ def test_a_test_without_an_input_of_the_model_is_refused(first):
     product, loop, model = first
     after = replace(logged(2), sensors=("t1", "t2", "other"))
     with pytest.raises(RecursionError, match="does not hold t3, which the applied model reads"):
-        verify(after, model, predicted_ranges(product, loop, after), faulty_sensors={})
+        verify(product, loop, after, model, faulty_sensors={})

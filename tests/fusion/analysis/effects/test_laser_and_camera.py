@@ -63,6 +63,8 @@ def test_a_laser_that_settles_stretches_and_shifts_by_its_dead_path():
     np.testing.assert_allclose(linear.columns[:, 0], settling * readings.position_mm * 1e-3)
     np.testing.assert_allclose(both.columns, np.column_stack([linear.columns, settling]))
     assert (linear.units, both.units) == (("ppm",), ("ppm", "um"))
+    # A shift that dies away is no evidence for the laser.
+    assert (linear.beside, both.beside) == (0, 1)
     assert (linear.parameters["shape"], both.parameters["shape"]) == ("linear", "linear with dead path")
 
 

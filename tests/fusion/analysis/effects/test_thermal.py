@@ -57,8 +57,9 @@ def test_the_table_shifts_all_positions_alike():
 def test_a_lag_delays_the_field_flat_along_the_axis_or_both_or_bends_the_bed():
     readings = seen()
     candidates = list(THERMAL_LAG.candidates(readings, {}, None))
-    assert len(candidates) == 4 * len(LAGS_MIN)
-    flat, linear, both, bending = candidates[4:8]
+    # Four shapes, each of one body or two.
+    assert len(candidates) == 2 * 4 * len(LAGS_MIN)
+    flat, linear, both, bending = candidates[8:12]
     assert [c.parameters["time_constant_min"] for c in (flat, linear, both, bending)] == [7.5] * 4
     # A ramp is followed late by the time constant, once the start has died away as an exponential.
     t, tau = readings.seconds, 7.5 * 60.0
@@ -73,6 +74,10 @@ def test_a_lag_delays_the_field_flat_along_the_axis_or_both_or_bends_the_bed():
     tilt = (t / 30.0 - expected) * readings.position_mm / readings.span_mm
     np.testing.assert_allclose(bending.columns[sampled, 0], tilt[sampled], atol=1e-9)
     assert bending.parameters["shape"] == "bending" and bending.units == ("um/K",)
+    # Behind a second body of a quarter of the time constant a ramp is late by both.
+    behind = candidates[12]
+    assert behind.parameters == {"time_constant_min": 7.5, "second_time_constant_min": 1.875, "shape": "flat"}
+    assert 30.0 * behind.columns[-1, 0] == pytest.approx(t[-1] - 1.25 * tau, abs=60.0 * 7.5 * 0.05)
 
 
 @pytest.mark.parametrize(("step_s", "shortest"), [(150.0, 5.0), (151.0, 7.5)])

@@ -71,22 +71,6 @@ def test_the_loop_and_the_positions_say_what_was_found(page):
     page.wait_for_function("document.documentElement.scrollWidth <= 390")
 
 
-@pytest.mark.slow
-def test_a_changed_run_goes_to_a_folder_of_its_own_and_is_shown(page, app):
-    opened(page, "Run again")
-    page.get_by_text("Nothing was changed.").wait_for()
-    start = page.get_by_role("button", name="Run again", exact=True).last
-    assert start.is_disabled()
-    page.get_by_role("checkbox", name="table_offset").uncheck()
-    page.get_by_text("thermal fields, deviations and correlation are kept").wait_for()
-    start.click()
-    page.get_by_text("campaign_2.toml was written").wait_for()
-    page.get_by_text("Cycle 24 (").wait_for(timeout=120_000)
-    assert page.get_by_label("Results folder").input_value() == str(app[1] / "results_2")
-    declared = json.loads((app[1] / "results_2" / "results.json").read_text(encoding="utf-8"))["loop"]["declared"]
-    assert declared == ["axis_expansion"]
-
-
 def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app):
     name_folder(page, app[1] / "laser_alone")
     page.get_by_text("<img src=x onerror=alert(1)>").wait_for()

@@ -12,10 +12,11 @@ from fusion.report.charts import model as model_charts
 from fusion.report.charts import record as record_charts
 from fusion.report.charts import style
 from fusion.report.charts.campaign import draw_attributed, draw_campaign, draw_measured, draw_modelled, draw_placed
+from fusion.report.charts.embedded import chart_scripts
 from fusion.report.charts.model import plot_block_errors
-from fusion.report.charts.style import Chart, chart_scripts, embed, new_figure
+from fusion.report.charts.record import draw_thermal_tests
+from fusion.report.charts.style import Chart, embed, new_figure
 from fusion.report.numbers import alike, number
-from fusion.report.thermal_test import draw_thermal_tests
 from fusion.results.results import read_results
 from fusion.results.store import group, read_fusion, read_product
 from tests.browser import CHROMIUM, record_faults
@@ -139,7 +140,7 @@ def test_each_chart_is_drawn_once_and_together_they_are_all(results_folder):
     ]
     measured, attributed, modelled, placed = (set(part.charts) for part in parts)
     assert len(measured | attributed | modelled | placed) == sum(len(part.charts) for part in parts)
-    assert {"rise_history", "drift_map", "iso230", "timeline", "drift_temperature"} <= measured
+    assert {"rise_history", "profile", "iso230", "timeline", "drift_temperature"} <= measured
     assert {"clusters", "region_targets"} <= attributed
     assert {"history", "anomalies", "contributions"} <= modelled
     assert placed == {"registration", "thermal_map", *draw_thermal_tests(results.iso230_3)}

@@ -93,11 +93,6 @@ def test_modes_clusters_and_regions_of_a_campaign(fused):
         np.testing.assert_allclose(chart.columns["sensitivity / (µm/K)"], targets["sensitivity"].sel(region=region))
 
 
-def test_a_rate_carries_its_own_uncertainty():
-    # Binomial: sqrt(0.05 * 0.95 / 200) = 1.54 %, and twice that is stated.
-    assert attribution.rate_text(0.05, checks=200) == "5.0 ± 3.1 %"
-
-
 START = np.datetime64("2026-03-09T08:00", "ns")
 HOURS = START + np.arange(4) * np.timedelta64(1, "h")
 
