@@ -38,8 +38,6 @@ _LOSS_SCALE_MM = 0.5
 _GRID_MM = 1.0
 #: Range, s, and number of steps either way of the profile of the misfit over the offset.
 _PROFILE_S, _PROFILE_STEPS = 4.0, 30
-#: Least mean squared residual, mm2: noise-free positions fit to rounding.
-_LEAST_MISFIT_MM2 = 1e-30
 #: Feeds tried, as multiples of the median feed that the readings require at least.
 _FEEDS = np.geomspace(1.0, 20.0, 40)
 #: Feeds are fitted from this one on, mm/s.
@@ -107,7 +105,8 @@ def estimate_clock_offset(
     _check_travel(table[located], np.nan_to_num(table_u[located], nan=1.0), target[order])
     feed = None if feed_mm_per_min is None else feed_mm_per_min / 60
     phase = 1.0 if reading_phase is None else reading_phase
-    motion = _Motion(frame_s[located], table[located], reading_s[order], target[order], feed, phase)
+    variance = float(np.median(np.nan_to_num(table_u[located], nan=0.0))) ** 2
+    motion = _Motion(frame_s[located], table[located], reading_s[order], target[order], feed, phase, variance)
     coarse_s, rivals_s = _search(motion, expected_s, search_s)
     best, u = _fit(motion, coarse_s)
     residual = motion.residual(best)
@@ -181,6 +180,8 @@ class _Motion:
     target_mm: Array
     feed_mm_s: float | None
     reading_phase: float
+    #: Of an observed position as stated, mm2; smaller residuals, as of positions without noise, leave the offset no better known.
+    variance_mm2: float
 
     @property
     def middle_s(self) -> float:
@@ -296,10 +297,10 @@ def _fit(motion: _Motion, offset: float) -> tuple[Array, Array]:
     fits = np.array([motion.fit(start) for start in _starts(motion, offset)])
     misfits = np.array([motion.misfit(parameters) for parameters in fits])
     order = np.argsort(misfits)
-    alike = misfits[order] <= misfits[order[0]] * (1 + 9 / len(motion.table_mm))
+    frames = len(motion.table_mm)
+    alike = misfits[order] <= misfits[order[0]] + 9 / frames * max(misfits[order[0]], motion.variance_mm2)
     solutions = fits[order[alike]]
     best = solutions[0]
-    frames = len(motion.table_mm)
     groups = np.array_split(np.arange(frames), min(_GROUPS, frames // 5))
     left_out = np.array([motion.without(group).fit(best) for group in groups])
     u = np.sqrt((len(groups) - 1) / len(groups) * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
@@ -327,7 +328,9 @@ def _formal_u(motion: _Motion, best: Array) -> Array:
     columns = [(motion.residual(best + step) - motion.residual(best - step)) / (2 * step.sum()) for step in steps]
     jacobian = np.nan_to_num(np.stack(columns, axis=-1))
     residual = np.nan_to_num(motion.residual(best))
-    variance = float(residual @ residual) / max(int(np.count_nonzero(residual)) - len(steps), 1)
+    variance = max(
+        float(residual @ residual) / max(int(np.count_nonzero(residual)) - len(steps), 1), motion.variance_mm2
+    )
     u = np.zeros(4)
     u[motion.free] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
     return u
@@ -339,8 +342,8 @@ def _profile_u(motion: _Motion, best: Array, step_s: float) -> float:
     away = step_s * (_PROFILE_S / step_s) ** growth
     offsets = best[0] + np.concatenate([-away[::-1], [0.0], away])
     misfits = np.array([_profile_misfit(motion, offset, best) for offset in offsets])
-    least = max(misfits.min(), _LEAST_MISFIT_MM2)
-    likelihood = np.exp(-0.5 * len(motion.table_mm) * (misfits - least) / least)
+    least = float(misfits.min())
+    likelihood = np.exp(-0.5 * len(motion.table_mm) * (misfits - least) / max(least, motion.variance_mm2))
     variance = np.trapezoid(likelihood * (offsets - best[0]) ** 2, offsets) / np.trapezoid(likelihood, offsets)
     return float(np.sqrt(variance))
 
