@@ -1099,7 +1099,7 @@ class LoopResult:
             wandering_um=self.wandering_um,
             tracking=self.tracking,
             left_out_of_forecast=self.left_out_of_forecast,
-            unexplained=self._unexplained(),
+            unexplained=self.unexplained,
             residual_drift=self.residual_drift,
             noise=_noise_of(self.after),
             search=[[_score_of(score) for score in scored.scores] for scored in self.state.rounds],
@@ -1111,7 +1111,8 @@ class LoopResult:
             axis_line=axis_line,
         )
 
-    def _unexplained(self) -> schema.AxisUnexplained:
+    @property
+    def unexplained(self) -> schema.AxisUnexplained:
         """What is left, with the effect that explains the largest share of it."""
         added = {step.effect for step in self.steps}
         scores = [score for scored in self.state.rounds for score in scored.scores]
