@@ -230,9 +230,9 @@ def _outside_notices(fused: xr.Dataset) -> Iterator[Notice]:
 
 # Positions that stand out from what the model explains, and their cause.
 
-#: Probability of any false anomaly in a whole test: a run states effects and a remainder as well, and all together may be false in 0.05.
-#: A rare kind reaches it with so many permutations.
-_LEVEL, _PERMUTATIONS = 0.02, 999
+#: Probability of any false anomaly in a whole test: a run states effects (0.025) and a remainder (0.01) as well, and all together may be
+#: false in 0.05. A rare kind reaches it with so many permutations.
+_LEVEL, _PERMUTATIONS = 0.015, 999
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,9 @@ def statements(case: tuple[str, str, int]) -> tuple[str, ...]:
         made = NOISES[noise](np.random.default_rng([seed, 17]), seconds.reshape(shape)).ravel()
         table["deviation_um"] = (table["deviation_um"] + SIGMA_UM * made).round(3)
         table.to_csv(file, index=False)
-        stack.enter_context(mock.patch("fusion.report.page.render_report", return_value=""))
+        # What is drawn states nothing.
+        for drawing in ("report.page.render_report", "pipeline.run._draw_attributed"):
+            stack.enter_context(mock.patch(f"fusion.{drawing}", return_value=""))
         results = run_campaign(folder / "campaign.toml", Path(base) / "out")
     assert results.inputs is not None
     return (*statements_of(results), *(f"doubt {check.code} {check.value:.3g}" for check in results.inputs.doubts))

@@ -82,10 +82,10 @@ def statements_of(results: Results) -> tuple[str, ...]:
     """What the results state beyond the declared model."""
     loop = results.loop
     assert loop is not None
-    said = [f"effect {step.effect}" for step in loop.steps]
-    said += [f"significant {name}" for name in loop.unconfirmed_effects]
-    said += [f"remainder: {loop.unexplained.shape}"] if loop.unexplained.shape else []
-    said += [f"anomaly at target {anomaly.target}" for anomaly in results.anomalies or ()]
+    said = [f"effect {step.effect} (p {step.p_value:.2g})" for step in loop.steps]
+    said += [f"significant {name} (p {p:.2g})" for name, p in loop.unconfirmed_effects.items()]
+    said += [f"remainder: {loop.unexplained.shape} (p {loop.unexplained.p_value})"] if loop.unexplained.shape else []
+    said += [f"anomaly at target {anomaly.target} (p {anomaly.p_value:.2g})" for anomaly in results.anomalies or ()]
     return tuple(said)
 
 

@@ -26,8 +26,9 @@ from thermography.fields.large_arrays import empty_arrays, give_back
 
 _PERMUTATIONS = 400
 _BLOCK = 5
-#: Probability of reporting a shape where none is left, over all statistics together.
-LEVEL = 0.02
+#: Probability of reporting a shape where none is left, over all statistics together: with that of an effect and of an anomalous position
+#: it adds up to the 0.05 of a whole run.
+LEVEL = 0.01
 #: An unexplained drift counts as a remainder from this share of a reading's noise on.
 DRIFT_SHARE = 0.5
 
