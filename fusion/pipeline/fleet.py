@@ -270,7 +270,8 @@ def write_book(path: Path, rows: Sequence[Row]) -> None:
     """Write the workbook of a fleet: one line per campaign that can be sorted and filtered, without columns in which nothing is."""
     whole = [{**asdict(row), "report": row.report} for row in rows]
     kept = [name for name in (*_COLUMNS, "report") if any(line[name] not in (None, "") for line in whole)]
-    write_table_book(path, "Campaigns", kept, [[line[name] for name in kept] for line in whole], chart="A_um")
+    headings = [f"{name} (standard uncertainty, k = 1)" if "_u_" in name else name for name in kept]
+    write_table_book(path, "Campaigns", headings, [[line[name] for name in kept] for line in whole], chart="A_um")
 
 
 def _no_formula(text: str) -> str:

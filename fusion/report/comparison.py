@@ -61,14 +61,16 @@ def conclude_comparison(pair: PairComparison) -> list[str]:
         return ["Nothing can be compared."]
     machine = [_change_words(change) for change in pair.changes if change.significant and change.machine]
     state = [_change_words(change) for change in pair.changes if change.significant and not change.machine]
-    sentences = [
-        f"Changed by more than the uncertainties: {join(machine)}."
-        if machine
-        else "No change of the machine is shown: what no thermal state can cause stayed within its uncertainties."
-    ]
-    if state:
-        sentences.append(f"Also different, which another thermal state of the test alone can cause: {join(state)}.")
-    text = " ".join(sentences)
+    unchanged = "what no thermal state can cause stayed within its uncertainties"
+    if machine:
+        text = f"Changed by more than the uncertainties: {join(machine)}."
+        if state:
+            text += f" Also different, which another thermal state of the test alone can cause: {join(state)}."
+    elif state:
+        text = f"Different by more than the uncertainties: {join(state)}. These tests do not show whether the machine changed or only the "
+        text += f"thermal state in which it was measured: {unchanged}."
+    else:
+        text = f"No change of the machine is shown: {unchanged}."
     for campaign in (pair.before, pair.after):
         text = conditional(text, campaign.results.inputs, "positions")
     shared = [_INPUTS[name] for name in pair.common]

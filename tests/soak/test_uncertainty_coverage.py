@@ -5,8 +5,10 @@ Campaigns of the twin whose true emissivity, reflections, air and distance are d
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from scipy import stats
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
-from fusion.analysis.drift_model.axis import average_over_drifts, coefficients_of, declare
+from fusion.analysis.drift_model.axis import average_over_drifts, close_loop, coefficients_of, declare
 from fusion.analysis.drift_model.fit import fit_model
 from fusion.analysis.effects.library import library
 from fusion.campaign.config import load_campaign
@@ -28,6 +30,7 @@ from fusion.twin.instruments import write_campaign
 from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
+from tests.fusion.loop_bench import DECLARED, effect_of, readings_of
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.thermography.flir_mutations import PARAMETERS
 from tests.thermography.rise_budget import temperature_rise_uncertainty
@@ -164,6 +167,33 @@ def test_coefficients_beside_a_smooth_drift_are_covered(drift: str, capsys: pyte
                     f"\n{drift}, {name}, {way}: rms error {rms:.3f}, median u {np.median(u):.3f}, within 2 u {rate(covered, runs)}"
                 )
     assert all(wilson(covered, runs)[1] >= 0.9 for way, covered in told if way == "reported")
+
+
+def coefficients_beside_unseen_heat(seed: int) -> list[tuple[float, float]]:
+    """Errors and uncertainties of expansion and shift where a source of 0.4 to 1 um, flat or linear in turn, follows the same load."""
+    size_um = float(np.exp(np.random.default_rng([seed, 3]).uniform(np.log(0.4), np.log(1.0))))
+    source = effect_of(f"unseen_heat_source:{('flat', 'linear')[seed % 2]}", size_um, seed)
+    found = close_loop(readings_of(source, seed=seed, cycles=40), DECLARED)
+    true = Recipe().drift.expansion_ppm_per_K, Recipe().drift.offset_um_per_K
+    return [
+        (float(one.value or np.nan) - truth, float(one.u or np.nan))
+        for one, truth in zip(found.declared_coefficients[:2], true, strict=True)
+    ]
+
+
+def test_coefficients_beside_an_effect_of_the_same_heat_are_covered(capsys: pytest.CaptureFixture[str]) -> None:
+    runs, first = campaigns(60), first_seed(89000)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        found = np.array(list(pool.map(coefficients_beside_unseen_heat, range(first, first + runs))))
+    for name, (error, u) in zip(("axis_expansion", "table_offset"), found.transpose(1, 2, 0), strict=True):
+        covered = int((np.abs(error) <= 2.0 * u).sum())
+        with capsys.disabled():
+            print(
+                f"\n{name}: median u {np.median(u):.3f}, rms of error / u {np.sqrt(np.mean((error / u) ** 2)):.2f}, ",
+                end="",
+            )
+            print(f"within 2 u {rate(covered, runs)}")
+        assert wilson(covered, runs)[1] >= 0.95, name
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ from fusion.analysis.drift_model.fit import (
     ModelFit,
     Term,
     coefficient_spread,
+    condition,
     fit_model,
     recompute_term,
     refit_fixed,
@@ -71,6 +72,7 @@ from fusion.analysis.drift_model.search import (
     Score,
     Unseen,
     answers,
+    blur,
     choose,
     error_interval,
     errors_of_predictions,
@@ -84,6 +86,7 @@ from fusion.analysis.drift_model.search import (
     open_hold_out,
     parameter_ranges,
     refine,
+    rivals,
     score_effects,
     search,
     settled,
@@ -234,6 +237,8 @@ def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> s
 
 
 LEAST_CYCLES = 10
+#: Log-likelihood below that of the best up to which a candidate is asked where else the coefficients would lie.
+_ABOUT_AS_WELL = 10.0
 #: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, and the
 #: second look. Every effect that is found opens the search again with the same probability, and a campaign may lack two: half of the 5 %
 #: that a wrong name may have.
@@ -319,7 +324,7 @@ def close_loop(
     errors = {"declared": problem.hold_out_errors(terms), "final": final, **held}
     result = LoopResult(
         declared=list(declared),
-        declared_coefficients=declared_coefficients(sure, len(terms)),
+        declared_coefficients=declared_coefficients(sure, len(terms), moved_by_rivals(problem, state, sure)),
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
         rmse_declared_um=state.errors_um[0],
@@ -449,6 +454,12 @@ class AxisProblem(Problem[ModelFit]):
         )
         told = dict(zip(lasting, asked, strict=True))
         return [told.get(place) for place in range(len(state.steps))]
+
+    def alike(self, score: Score, model: ModelFit) -> list[Candidate]:
+        """Candidates of an effect that fit about as well as the one that was chosen: in the search, and near it."""
+        offered = self.effects[score.name].candidates(self.readings, model.coefficients(), None)
+        wanted = [parameters for parameters, gain in score.tried if gain > score.gain - _ABOUT_AS_WELL]
+        return [one for one in offered if one.parameters in wanted] + self.near(score.name, model, score.best)
 
     def is_late(self, term: Term) -> bool:
         """Whether a term is an event among the hold-out cycles, of which the cycles before say nothing."""
@@ -1321,11 +1332,45 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
     return replace(model, fit=replace(fit, coefficients=mean, covariance=covariance))
 
 
-def declared_coefficients(model: ModelFit, declared: int) -> list[schema.DeclaredCoefficient]:
-    """Coefficients of the declared effects, lagged copies included, and how far they move when parts of the readings are left out."""
+def moved_by_rivals(problem: AxisProblem, state: AxisState, model: ModelFit) -> Array:
+    """Second moments (p, p) of how far coefficients move where an added effect has other parameters, or is one of its rivals.
+
+    The library's shape and its time constant are no better known than their likelihood says, blurred as between rivals; the drift is kept.
+    """
+    moments = np.zeros((model.fit.coefficients.size,) * 2)
+    declared = slice(0, model.place(model.terms[len(state.declared) - 1]).stop if state.declared else 0)
+    before = (model.static().T @ model.fit.coefficients)[declared]
+    for step, term in zip(state.steps, state.added, strict=True):
+        if not any(term is kept for kept in model.terms):
+            continue
+        size = model.size(term)
+        tied, _ = rivals(step.score, step.round.scores, size)
+        others = [Term(score.name, score.best) for score in step.round.scores if score.name in tied]
+        others += [Term(step.effect, one) for one in problem.alike(step.score, model)]
+        weights, moved = [1.0], [np.zeros(before.size)]
+        for other in others:
+            terms = tuple(other if one is term else one for one in model.terms)
+            fit = refit_fixed(model, terms)
+            added = other.width - term.width
+            loss = 0.5 * fit.response.size * float(np.log(fit.rss / model.fit.rss)) + added
+            instead = replace(model, terms=terms, fit=fit)
+            for combination, prior in instead.priors():
+                fit = condition(fit, combination, prior)
+            weights.append(float(np.exp(-max(loss, 0.0) / blur(size))))
+            moved.append((instead.static().T @ fit.coefficients)[declared] - before)
+        moments[declared, declared] += np.average([np.outer(one, one) for one in moved], axis=0, weights=weights)
+    return moments
+
+
+def declared_coefficients(
+    model: ModelFit, declared: int, moved: Array | float = 0.0
+) -> list[schema.DeclaredCoefficient]:
+    """Coefficients of the declared effects, lagged copies included, how far they move when parts of the readings are left out, and, in
+    their uncertainty, as ``moved`` (p, p) by rivals of the added effects.
+    """
     spread, static = coefficient_spread(model), model.static()
     model = average_over_drifts(model)
-    covariance = static.T @ model.fit.covariance @ static
+    covariance = static.T @ model.fit.covariance @ static + moved
     model = replace(model, fit=replace(model.fit, coefficients=model.fit.coefficients @ static, covariance=covariance))
     return [
         schema.DeclaredCoefficient(effect=term.effect, jackknife_u=moved, **coefficient.model_dump(exclude_unset=True))

@@ -329,6 +329,13 @@ class Score:
         }
 
 
+def blur(size: float) -> float:
+    """How many times less a difference of log-likelihoods counts: every shape is wrong by its discrepancy, whose variance adds to that of
+    the noise along the difference of two shapes. ``size`` is as in :func:`rivals`.
+    """
+    return 1.0 + size * DISCREPANCY**2 / TIE_GAIN
+
+
 def rivals(
     score: Score, scores: Sequence[Score], size: float = 0.0
 ) -> tuple[list[str], schema.RunnerUp | schema.Nothing]:
@@ -336,12 +343,11 @@ def rivals(
     explains, in units of the noise.
     """
     others = [other for other in scores if other.name != score.name and other.candidate is not None]
-    # Every shape is wrong by its discrepancy, whose variance adds to that of the noise along the difference of two shapes. What a search
-    # among more candidates gains by chance is not touched by it.
-    blurred = 1.0 + size * DISCREPANCY**2 / TIE_GAIN
+    blurred = blur(size)
 
     def is_rival(other: Score) -> bool:
         ahead = score.gain - other.gain
+        # What a search among more candidates gains by chance is not blurred.
         chance = (other.gain - other.excess) - (score.gain - score.excess)
         return other.p_value < _RIVAL_LEVEL and (ahead / blurred if ahead > 0.0 else ahead) + chance < TIE_GAIN
 
