@@ -86,7 +86,6 @@ from fusion.analysis.drift_model.search import (
     open_hold_out,
     parameter_ranges,
     refine,
-    rivals,
     score_effects,
     search,
     settled,
@@ -324,7 +323,7 @@ def close_loop(
     errors = {"declared": problem.hold_out_errors(terms), "final": final, **held}
     result = LoopResult(
         declared=list(declared),
-        declared_coefficients=declared_coefficients(sure, len(terms), moved_by_rivals(problem, state, sure)),
+        declared_coefficients=declared_coefficients(sure, len(terms), moved_by_rivals(problem, state, steps, sure)),
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
         rmse_declared_um=state.errors_um[0],
@@ -1332,45 +1331,44 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
     return replace(model, fit=replace(fit, coefficients=mean, covariance=covariance))
 
 
-def moved_by_rivals(problem: AxisProblem, state: AxisState, model: ModelFit) -> Array:
-    """Second moments (p, p) of how far coefficients move where an added effect has other parameters, or is one of its rivals.
+def moved_by_rivals(problem: AxisProblem, state: AxisState, steps: Sequence[AddedEffect], model: ModelFit) -> Array:
+    """Variances (p,) by which coefficients move where an added effect has other parameters, is one of its rivals, or, without a name, is
+    not there: the square of each move over twice the log-likelihood that it costs, at most the square, the largest for each effect.
 
-    The library's shape and its time constant are no better known than their likelihood says, blurred as between rivals; the drift is kept.
+    A cost counts as between rivals, because the library's shape is no better known; the variances of the drift are kept.
     """
-    moments = np.zeros((model.fit.coefficients.size,) * 2)
+    variances = np.zeros(model.fit.coefficients.size)
     declared = slice(0, model.place(model.terms[len(state.declared) - 1]).stop if state.declared else 0)
     before = (model.static().T @ model.fit.coefficients)[declared]
-    for step, term in zip(state.steps, state.added, strict=True):
+    for step, term, told in zip(state.steps, state.added, steps, strict=True):
         if not any(term is kept for kept in model.terms):
             continue
-        size = model.size(term)
-        tied, _ = rivals(step.score, step.round.scores, size)
-        others = [Term(score.name, score.best) for score in step.round.scores if score.name in tied]
-        others += [Term(step.effect, one) for one in problem.alike(step.score, model)]
-        weights, moved = [1.0], [np.zeros(before.size)]
-        for other in others:
-            terms = tuple(other if one is term else one for one in model.terms)
+        blurred = blur(model.size(term))
+        others = [[Term(step.effect, one)] for one in problem.alike(step.score, model)]
+        others += [[Term(score.name, score.best)] for score in step.round.scores if score.name in told.tied]
+        squares = [np.zeros(before.size)]
+        for other in [*others, *([[]] if told.withheld else [])]:
+            terms = tuple(one for own in model.terms for one in (other if own is term else [own]))
             fit = refit_fixed(model, terms)
-            added = other.width - term.width
-            loss = 0.5 * fit.response.size * float(np.log(fit.rss / model.fit.rss)) + added
+            cost = 0.5 * fit.response.size * float(np.log(fit.rss / model.fit.rss)) if other else 0.0
             instead = replace(model, terms=terms, fit=fit)
             for combination, prior in instead.priors():
                 fit = condition(fit, combination, prior)
-            weights.append(float(np.exp(-max(loss, 0.0) / blur(size))))
-            moved.append((instead.static().T @ fit.coefficients)[declared] - before)
-        moments[declared, declared] += np.average([np.outer(one, one) for one in moved], axis=0, weights=weights)
-    return moments
+            moved = (instead.static().T @ fit.coefficients)[declared] - before
+            squares.append(moved**2 / max(2.0 * cost / blurred, 1.0))
+        variances[declared] += np.max(squares, axis=0)
+    return variances
 
 
 def declared_coefficients(
     model: ModelFit, declared: int, moved: Array | float = 0.0
 ) -> list[schema.DeclaredCoefficient]:
-    """Coefficients of the declared effects, lagged copies included, how far they move when parts of the readings are left out, and, in
-    their uncertainty, as ``moved`` (p, p) by rivals of the added effects.
+    """Coefficients of the declared effects, lagged copies included, and how far they move when parts of the readings are left out; their
+    variances contain those by rivals of the added effects, ``moved`` (p,).
     """
     spread, static = coefficient_spread(model), model.static()
     model = average_over_drifts(model)
-    covariance = static.T @ model.fit.covariance @ static + moved
+    covariance = static.T @ model.fit.covariance @ static + moved * np.eye(static.shape[1])
     model = replace(model, fit=replace(model.fit, coefficients=model.fit.coefficients @ static, covariance=covariance))
     return [
         schema.DeclaredCoefficient(effect=term.effect, jackknife_u=moved, **coefficient.model_dump(exclude_unset=True))

@@ -23,7 +23,17 @@ from fusion.analysis.drift_model.axis import (
     simplify_rhythms,
 )
 from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
-from fusion.analysis.drift_model.search import Confirmation, Confirmed, Decision, LoopState, Reason, Round, Score, Step
+from fusion.analysis.drift_model.search import (
+    Confirmation,
+    Confirmed,
+    Decision,
+    LoopState,
+    Reason,
+    Round,
+    Score,
+    Step,
+    blur,
+)
 from fusion.analysis.effects.effect import Candidate, Effect
 from fusion.analysis.effects.library import library
 from tests.fusion.small_campaign import campaign, model_of, term
@@ -166,6 +176,29 @@ def test_an_effect_that_is_contradicted_moves_no_declared_coefficient_and_no_for
     assert found.declared_coefficients[0].value == pytest.approx(told, rel=1e-9)
     assert found.after.coefficients()["own"] != pytest.approx(alone.coefficients()["own"], rel=1e-6)
     assert found.left_out_of_forecast == ("other",) and found.rmse_final_um == found.rmse_declared_um
+
+
+@pytest.mark.parametrize("withheld", ["", "its time constant is not determined"])
+def test_coefficients_move_with_what_else_an_added_effect_may_be(withheld):
+    """As far as another candidate moves them that costs half a unit of log-likelihood, and as far as without it where it has no name."""
+    other, alternative = np.sin(BARE.seconds / 90.0), np.sin(BARE.seconds / 88.5)
+    columns = [Candidate(column[:, None], {}, ("um",)) for column in (other, alternative)]
+    effects = {"other": Effect("other", "", "", lambda readings, coefficients, near: iter(columns))}
+    problem = problem_of(WAVE, other, effects=effects)
+    own, added = term(WAVE, "own"), Term("other", columns[0])
+    model = model_of(problem.readings, [own, added])
+    scored = score("other", columns[0])
+    state = LoopState(model, steps=(Step(scored, Round((scored,)), Confirmed.LATER_CYCLES),))
+    told = SimpleNamespace(tied=[], withheld=withheld)
+    variances = axis.moved_by_rivals(problem, state, [told], model)
+
+    instead, without = (model_of(problem.readings, [own, *terms]) for terms in ([Term("other", columns[1])], []))
+    cost = 0.5 * BARE.seconds.size * np.log(instead.fit.rss / model.fit.rss) / blur(model.size(added))
+    assert cost > 0.5
+    changes = [one.coefficients()["own"] - model.coefficients()["own"] for one in (instead, without)]
+    expected = changes[1] ** 2 if withheld else changes[0] ** 2 / (2.0 * cost)
+    assert variances[model.place(own)] == pytest.approx(expected)
+    assert not variances[model.place(added)].any()
 
 
 def second_look(problem: AxisProblem, monkeypatch, *rounds: Round) -> LoopState[ModelFit]:
