@@ -25,6 +25,7 @@ from interferometry.iso230.thermal import (
     resolution,
     scatter,
     tilt,
+    with_start,
 )
 
 #: Standard uncertainty of the sensitivity of a displacement sensor where none is stated: one percent of the reading.
@@ -68,8 +69,8 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     channels = [str(one) for one in table["channel"].values]
     raw = table["displacement"].values
     per_piece = max(1.0, AVERAGED_S / float(np.median(np.diff(elapsed)))) if elapsed.size > 1 else 1.0
-    seconds, displacement = average(elapsed, raw)
-    temperature = average(elapsed, table["temperature"].values)[1]
+    seconds, displacement = with_start(*average(elapsed, raw))
+    temperature = with_start(*average(elapsed, table["temperature"].values))[1]
     share = (
         (ASSUMED_CALIBRATION, "assumed, 1 % of the reading")
         if stated.sensor_calibration is None

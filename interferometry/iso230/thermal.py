@@ -6,7 +6,8 @@ ISO 230-3:2020 (iso.org). The text of the standard is not open. What is computed
 * The range of a displacement, largest minus smallest: so does a maker's manual of a spindle analyser that refers to ISO 230-3 (Lion
   Precision, M017-7500, "total drift per axis").
 * Over the first 60 min, over the whole test and over its last 60 min: no open text was found that states these periods.
-* Readings are averaged over one minute before, so that the range is not that of their noise: no open text.
+* Readings are averaged over one minute before, so that the range is not that of their noise: no open text. A mean is that of the middle of
+  its minute; the value at the start is on the line through the first two.
 * The tilt is the difference of two displacements over the distance of their sensors: geometry, for angles this small.
 * The settling time is the time after which a displacement stays within a tenth of its whole range about its mean of the last 60 min, for
   two hours at least: no open text.
@@ -44,7 +45,7 @@ class Distortion:
     first_hour, whole, last_hour : float
         Largest minus smallest value over the period; NaN where the test is shorter than it or the period holds fewer than two values.
     change : float
-        Mean of the last minute less that of the first.
+        Last value less the first.
     settling_s : float
         Time from the start after which it has settled, s; NaN where it has not, two hours before the end at the latest.
     """
@@ -83,13 +84,21 @@ def average(seconds: Array, values: Array, *, length_s: float = AVERAGED_S) -> t
     return time, np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
+def with_start(seconds: Array, values: Array) -> tuple[Array, Array]:
+    """Return times (n + 1,) and means (n + 1, k) with the value at the start, s = 0, on the line through the first two means."""
+    if seconds.size < 2 or seconds[0] <= 0.0:
+        return seconds, values
+    slope = (values[1] - values[0]) / (seconds[1] - seconds[0])
+    return np.r_[0.0, seconds], np.vstack([values[0] - slope * seconds[0], values])
+
+
 def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
     """Evaluate the course of one quantity.
 
     Parameters
     ----------
     seconds : (n,) ndarray
-        Time since the start of the test, s.
+        Time since the start of the test, s; the last one is its end for all quantities.
     values : (n,) ndarray
         The quantity, averaged; NaN where it is missing.
 
@@ -99,26 +108,32 @@ def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
         In the unit of the values.
     """
     known = np.isfinite(values)
-    seconds, values = seconds[known], values[known]
+    since, end_s = (seconds - seconds[0])[known], float(seconds[-1] - seconds[0])
+    values = values[known]
     if values.size < 2:
         return Distortion(*[np.nan] * 5)
-    since = seconds - seconds[0]
-    last = since >= since[-1] - HOUR_S
-    is_long = since[-1] >= HOUR_S
+    first, last = since <= HOUR_S, since >= end_s - HOUR_S
+    # The last mean stands for its minute.
+    is_long = end_s + AVERAGED_S >= HOUR_S
     whole = float(np.ptp(values))
     settling = np.nan
-    if is_long:
+    if is_long and last.any():
         outside = np.abs(values - values[last].mean()) > SETTLED_SHARE * whole
         after = int(np.flatnonzero(outside).max(initial=-1)) + 1
-        if after < since.size and since[after] <= since[-1] - SETTLED_FOR_S:
+        if after < since.size and since[after] <= end_s - SETTLED_FOR_S:
             settling = float(since[after])
     return Distortion(
-        first_hour=float(np.ptp(values[since <= HOUR_S])) if is_long else np.nan,
+        first_hour=_range(values[first]) if is_long else np.nan,
         whole=whole,
-        last_hour=float(np.ptp(values[last])) if is_long else np.nan,
+        last_hour=_range(values[last]) if is_long else np.nan,
         change=float(values[-1] - values[0]),
         settling_s=settling,
     )
+
+
+def _range(values: Array) -> float:
+    """Return the largest less the smallest value, NaN of fewer than two."""
+    return float(np.ptp(values)) if values.size > 1 else np.nan
 
 
 def scatter(values: Array) -> float:

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from interferometry.deviations import build_deviations
-from interferometry.iso230.thermal import average, axis_courses, evaluate_distortion, resolution, scatter, tilt
+from interferometry.iso230.thermal import (
+    average,
+    axis_courses,
+    evaluate_distortion,
+    resolution,
+    scatter,
+    tilt,
+    with_start,
+)
 
 MINUTES = 60.0 * np.arange(6 * 60 + 1)
 
@@ -46,6 +54,28 @@ def test_the_mean_of_a_minute_lowers_the_noise_and_its_size_is_found():
     assert time.size == 360
     assert scatter(mean[:, 0]) == pytest.approx(0.3 / np.sqrt(30), rel=0.15)
     assert evaluate_distortion(time, mean[:, 0]).whole == pytest.approx(6.0, abs=0.4)
+
+
+def test_a_quick_start_within_the_first_minute_is_not_lost():
+    """20 um with a time constant of 5 min: the mean of the first minute alone is 1.9 um late.
+
+    A line through 30 and 90 s misses half their product times the curvature at the start, 0.3 um.
+    """
+    seconds = np.arange(0.0, 3600.0, 1.0)
+    rise = 20.0 * (1.0 - np.exp(-seconds / 300.0))
+    time, mean = with_start(*average(seconds, rise[:, None]))
+    assert time[0] == 0.0 and mean[0, 0] == pytest.approx(0.0, abs=0.3)
+    found = evaluate_distortion(time, mean[:, 0])
+    # A test of exactly 60 min has a first hour, which is the whole of it.
+    assert found.first_hour == found.whole == pytest.approx(20.0, abs=0.3)
+
+
+def test_the_last_hour_is_that_of_the_test_and_not_of_the_channel():
+    values = MINUTES / 60.0
+    ended = np.where(MINUTES <= 5.5 * 3600.0, values, np.nan)
+    assert evaluate_distortion(MINUTES, values).last_hour == 60.0
+    assert evaluate_distortion(MINUTES, ended).last_hour == 30.0
+    assert np.isnan(evaluate_distortion(MINUTES, np.where(MINUTES < 4 * 3600.0, values, np.nan)).last_hour)
 
 
 def test_two_displacements_tilt_by_their_difference_over_their_distance():
