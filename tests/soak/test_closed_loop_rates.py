@@ -4,8 +4,8 @@ THERMOFUSE_RUNS sets the number of campaigns per case. The quoted figures are fr
 (19 or 20 for the effects of half the size, 33 or 34 for the pairs); the default seeds, from 7000 on, are others on which nothing was
 tuned either. A rate misses its bar where the whole interval lies on the wrong side of it, so that few campaigns do not decide.
 
-A name is asked for only in campaigns that could tell: before it searches, the loop says from which size on every effect would be found
-at best. A lag of this slow table and a wrong material coefficient hide beside the declared model and the drift in nearly all of them;
+A name is asked for only in campaigns that could tell: before it searches, the loop says from which size on the typical candidate of every
+effect would be found; its best one may have another shape than what is planted. A lag of this slow table and a wrong material coefficient hide beside the declared model and the drift in nearly all of them;
 there only a wrong name counts. The quoted figures count all campaigns.
 """
 
@@ -55,8 +55,8 @@ def could_tell(one: Outcome, name: str, rms_um: float) -> bool:
     """Whether the loop said beforehand that an effect of this size could be found."""
     effect = name.partition(":")[0]
     limits = [limit for scored in one.found.state.rounds for limit in scored.detection_limits]
-    best = [limit.best_um for limit in limits if limit.effect == effect]
-    return bool(best) and best[0] is not None and best[0] <= rms_um
+    typical = [limit.detectable_um for limit in limits if limit.effect == effect]
+    return bool(typical) and typical[0] is not None and typical[0] <= rms_um
 
 
 def show(title: str, found: list[Outcome], missing: int) -> None:

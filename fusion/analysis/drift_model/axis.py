@@ -1146,10 +1146,10 @@ class LoopResult:
         shape = left.shape or (BEYOND_PLAIN if self._falls_short else "")
         # The held-out error of a drift that is carried on at its rate says nothing of the size of what drifts.
         size = max(left.rms_um or excess_um(self._error("final"), self.noise_floor_um), self.wandering_um)
-        # What a step without a name describes is not explained either.
+        # What a step without a name describes is not explained either, whether a shape is left beside it or not.
         nameless = [step.rms_um or 0.0 for step in self.steps if step.withheld or not step.keeps_name]
-        size = float(np.linalg.norm([size, *nameless]))
-        return schema.AxisUnexplained(shape=shape, rms_um=size if shape else 0.0, p_value=left.p_value, **nearest)
+        size = float(np.linalg.norm([size if shape else 0.0, *nameless]))
+        return schema.AxisUnexplained(shape=shape, rms_um=size, p_value=left.p_value, **nearest)
 
 
 def _words_of(parameter: tuple[str, Any]) -> str:
