@@ -5,8 +5,8 @@ THERMOFUSE_RUNS sets the number of campaigns per case. The quoted figures are fr
 tuned either. A rate misses its bar where the whole interval lies on the wrong side of it, so that few campaigns do not decide.
 
 A name is asked for only in campaigns that could tell: before it searches, the loop says from which size on the typical candidate of every
-effect would be found; its best one may have another shape than what is planted. A lag of this slow table and a wrong material coefficient hide beside the declared model and the drift in nearly all of them;
-there only a wrong name counts. The quoted figures count all campaigns.
+effect would be found; its best one may have another shape than what is planted. A lag of this slow table and a wrong material coefficient
+hide beside the declared model and the drift in nearly all of them; there only a wrong name counts. The quoted figures count all campaigns.
 """
 
 from __future__ import annotations

@@ -102,6 +102,7 @@ from fusion.results import loop as schema
 from fusion.results.parts import Number
 from interferometry.common import one_thread
 from interferometry.drift.gls import DriftFit
+from interferometry.drift.kalman import DriftModelError
 from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces
 
 if TYPE_CHECKING:
@@ -1349,7 +1350,11 @@ def moved_by_rivals(problem: AxisProblem, state: AxisState, steps: Sequence[Adde
         squares = [np.zeros(before.size)]
         for other in [*others, *([[]] if told.withheld else [])]:
             terms = tuple(one for own in model.terms for one in (other if own is term else [own]))
-            fit = refit_fixed(model, terms)
+            try:
+                fit = refit_fixed(model, terms)
+            except DriftModelError:
+                # What the other effects of the model contain is no rival.
+                continue
             cost = 0.5 * fit.response.size * float(np.log(fit.rss / model.fit.rss)) if other else 0.0
             instead = replace(model, terms=terms, fit=fit)
             for combination, prior in instead.priors():
