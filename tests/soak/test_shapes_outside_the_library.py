@@ -173,8 +173,9 @@ def ask(shape: str, number: int) -> Outcome:
     size = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
     readings = replace(readings, response=readings.response + size * missing / max(missing.std(), 1e-9))
     found = close_loop(readings, DECLARED)
-    # Where a plain regression predicts better by a quarter no cause is separable, and the headline gives no name.
-    given = [step for step in found.steps if step.keeps_name and not step.withheld] if found.separable else []
+    # Without skill, or where a plain regression predicts better by a quarter, the headline gives no name.
+    names = found.verdict in ("explained", "partial")
+    given = [step for step in found.steps if step.keeps_name and not step.withheld] if names else []
     # Which of the logs it follows is the name of a logged influence.
     named = [{step.effect, *step.tied, str(step.parameters.get("follows"))} for step in given]
     right = any(names & SHAPES[shape] for names in named)
