@@ -334,6 +334,13 @@ def _unused_name(name: str, taken: dict[str, Array]) -> str:
     return name if count == 1 else f"{name}_again{count}"
 
 
+def _at_one_state(values: Array, time_s: Array) -> Array:
+    """Return the mean over the cycles at the same instants for all sites: between two approaches of one cycle the machine drifts."""
+    middle_s = time_s.mean(axis=(1, 2))
+    sites = [np.interp(middle_s, time_s[:, i, j], values[:, i, j]) for i, j in np.ndindex(values.shape[1:])]
+    return np.asarray(np.mean(sites, axis=1).reshape(values.shape[1:]))
+
+
 def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Array]) -> xr.Dataset:
     """Return the readings as (cycle, direction, target): measured deviation, time, every part, and what statistics should find."""
     dims = ("cycle", "direction", "target")
@@ -352,7 +359,11 @@ def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Array]) -> xr
             "deviation": (dims, np.where(lost, np.nan, deviation), {"units": "um"}),
             "time": (dims, time),
             **parts,
-            "mean_profile": (dims[1:], (deviation - random).mean(axis=0), profile_of),
+            "mean_profile": (
+                dims[1:],
+                _at_one_state(deviation - random, _by_site(schedule.time_s, schedule.cycles)),
+                profile_of,
+            ),
             "scatter": (dims[1:], scatter, scatter_of),
         },
         coords={

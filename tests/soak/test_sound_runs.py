@@ -18,6 +18,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from fusion.analysis.diagnosis.residual import DRIFT_SHARE
 from fusion.common import FusionError
 from fusion.pipeline.run import run_campaign
 from fusion.results.results import Results
@@ -75,7 +76,11 @@ def run(seed: int) -> Run:
         within = shares_within(truth, results, folder / "out")
     assert results.inputs is not None
     doubts = tuple(f"{check.code} {check.value:.3g}" for check in results.inputs.doubts)
-    return Run(seed, bare, doubts, statements_of(results) if bare else (), within)
+    # The twin's own random walk is undeclared, too: where it is as large as what the loop reports, that it is there is true.
+    walk = truth.readings["nuisance"] - truth.readings["nuisance"].mean("cycle")
+    is_there = float(np.sqrt((walk**2).mean())) > DRIFT_SHARE * recipe.laser.noise_um
+    said = [one for one in statements_of(results) if not (is_there and one.startswith("remainder: a slow,"))]
+    return Run(seed, bare, doubts, tuple(said) if bare else (), within)
 
 
 def statements_of(results: Results) -> tuple[str, ...]:
