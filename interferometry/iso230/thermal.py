@@ -113,8 +113,7 @@ def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
     if values.size < 2:
         return Distortion(*[np.nan] * 5)
     first, last = since <= HOUR_S, since >= end_s - HOUR_S
-    # The last mean stands for its minute.
-    is_long = end_s + AVERAGED_S >= HOUR_S
+    is_long = end_s >= HOUR_S
     whole = float(np.ptp(values))
     settling = np.nan
     if is_long and last.any():

@@ -61,7 +61,7 @@ def test_a_quick_start_within_the_first_minute_is_not_lost():
 
     A line through 30 and 90 s misses half their product times the curvature at the start, 0.3 um.
     """
-    seconds = np.arange(0.0, 3600.0, 1.0)
+    seconds = np.arange(0.0, 3601.0, 1.0)
     rise = 20.0 * (1.0 - np.exp(-seconds / 300.0))
     time, mean = with_start(*average(seconds, rise[:, None]))
     assert time[0] == 0.0 and mean[0, 0] == pytest.approx(0.0, abs=0.3)
