@@ -16,7 +16,7 @@ from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
-from fusion.results.store import group, has, read_json_object, refuse_damaged, require_kind, require_own
+from fusion.results.store import group, has, opened, read_json_object, require_kind, require_own
 from interferometry.drift.estimate import COMPONENTS
 from thermography.common import scatter_by_median
 
@@ -402,7 +402,7 @@ def _drift(path: Path) -> xr.Dataset | None:
     if not path.is_file():
         return None
     require_own(path.parent, [path.name])
-    with refuse_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as stored:
+    with opened(path) as stored:
         if not has(require_kind(stored, "deviations", path), "drift"):
             return None
         drift = group(stored, "drift").assign(position=stored["position"])

@@ -24,7 +24,7 @@ from fusion.report.terminal import summary_rows
 from fusion.report.wording import quoted_window
 from fusion.results.axis import Iso230Tolerance
 from fusion.results.results import Results
-from fusion.results.store import group, has, read_product, refuse_damaged, require_kind
+from fusion.results.store import group, has, opened, read_product, require_kind
 from interferometry import iso230
 
 #: Bytes of a row of fields.csv, measured on the demo.
@@ -104,7 +104,7 @@ def fields_megabytes(folder: Path) -> float | None:
     path = folder / "fields.nc"
     if not path.is_file():
         return None
-    with refuse_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as fields:
+    with opened(path) as fields:
         return require_kind(fields, "fields", path)["temperature"].size * _FIELD_ROW_BYTES / 1e6
 
 
