@@ -602,7 +602,7 @@ def iso230_3(
             help="A campaign file with a [record] or readings of a linear axis, or a results folder.",
         ),
     ],
-    out: Annotated[Path | None, Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
+    out: Annotated[Path | None, Option(help="Write the sheet to sign: sheet.html, .pdf or .docx.")] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Evaluate a test of thermal effects by ISO 230-3.
@@ -611,12 +611,11 @@ def iso230_3(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230_3 import read_thermal_tests
-    from fusion.report.page import write_page
-    from fusion.report.sheet import render_thermal_tests
+    from fusion.report.sheet import describe_thermal_sheet, write_thermal_tests
     from fusion.report.thermal_test import thermal_test_tables
 
     with _answering():
-        title, tests = read_thermal_tests(test)
+        title, tests, files = read_thermal_tests(test)
         if as_json:
             print_json([one.model_dump(mode="json") for one in tests])
         else:
@@ -624,7 +623,9 @@ def iso230_3(
                 _wide().print(table)
             _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
         if out is not None:
-            write_page(out, render_thermal_tests(title, tests, versions=versions()))
+            version = versions()["thermofuse"]
+            sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
+            write_thermal_tests(out, sheets, tests)
             errors.print(f"page: {out.resolve()}")
 
 

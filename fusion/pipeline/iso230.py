@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from fusion.campaign.config import (
     AcceptanceTable,
@@ -20,7 +21,7 @@ from fusion.campaign.config import (
     ReportTable,
     load_campaign,
 )
-from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
+from fusion.campaign.inputs import DATED, is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
@@ -45,7 +46,6 @@ from interferometry.iso230 import (
     settled_window,
 )
 from interferometry.iso230.conditions import check_conditions
-from interferometry.plots import time_span
 
 _RULE = f"of the windows of {STANDARD_CYCLES} cycles in the second half of the test, the one with the least drift by the joint estimate"
 _RULE_WITHOUT_DRIFT = f"the last window of {STANDARD_CYCLES} cycles, as no drift could be estimated"
@@ -252,19 +252,9 @@ def _conditions(
         )
         for name in ("air_temperature", "material_temperature")
     }
+    zone = None if campaign is None else campaign.zone_of("interferometry")
     conditions = {
-        "Report number": report.report_number,
-        "Customer": report.customer,
-        "Date of the test": _date(dataset, None if campaign is None else campaign.zone_of("interferometry")),
-        "Machine": report.machine,
-        "Serial number of the machine": report.machine_serial_number,
-        "Control": report.control,
-        "Location": report.location,
-        "Operator": report.operator,
-        "Approved by": report.approved_by,
-        "Axis": "" if campaign is None else campaign.campaign.axis,
-        **_instruments(report),
-        "Sign convention": report.sign_convention,
+        **identity(report, date_of(dataset["time"].values, zone), "" if campaign is None else campaign.campaign.axis),
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
         "Measured travel": f"{np.ptp(position):g}{unit}, {position.min():g} to {position.max():g}{unit}",
         "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
@@ -283,12 +273,30 @@ def _conditions(
     return {name: text for name, text in conditions.items() if not (rotary and name in _OF_LENGTHS)}
 
 
-def _date(dataset: xr.Dataset, zone: str | None) -> str:
-    """Return from when to when readings were taken, in local time where the zone is stated, else in UTC."""
-    if np.isnat(dataset["time"].values).all():
+def identity(report: ReportTable, date: str, axis: str) -> dict[str, str]:
+    """Return whose test of which machine it was, when and with what, by name; empty where it is not stated."""
+    return {
+        "Report number": report.report_number,
+        "Customer": report.customer,
+        "Date of the test": date,
+        "Machine": report.machine,
+        "Serial number of the machine": report.machine_serial_number,
+        "Control": report.control,
+        "Location": report.location,
+        "Operator": report.operator,
+        "Approved by": report.approved_by,
+        "Axis": axis,
+        **_instruments(report),
+        "Sign convention": report.sign_convention,
+    }
+
+
+def date_of(times: NDArray[np.datetime64], zone: str | None) -> str:
+    """Return from when to when readings were taken, in local time where the zone is stated, else in UTC; empty of times without a date."""
+    known = times[~np.isnat(times)]
+    if not known.size or known.max() < DATED:
         return ""
-    first, last = time_span(dataset)
-    return f"{moment(first, zone)} to {moment(last, zone)}"
+    return f"{moment(known.min(), zone)} to {moment(known.max(), zone)}"
 
 
 def _coefficient(laser: InterferometryTable | None) -> str:
@@ -393,14 +401,15 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
         )
     dataset = read_product(folder, "deviations")
     named = {name: folder / name for name in ("results.json", "deviations.nc", "provenance.json")}
-    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), _hashed(named))
+    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), hashed(named))
 
 
 def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
     return (*describe_notes(deviations), *(notice.message for notice in left_out_notices(deviations, "left_out")))
 
 
-def _hashed(files: Mapping[str, Path]) -> dict[str, str]:
+def hashed(files: Mapping[str, Path]) -> dict[str, str]:
+    """Return the SHA-256 of the files that exist, by name."""
     return {name: file_sha256(path) for name, path in files.items() if path.is_file()}
 
 
@@ -427,7 +436,7 @@ def _evaluate(
     )
     dataset = joined(deviations, iso=windows, settled=settled, **({} if drift is None else {"drift": drift}))
     found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
-    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, _hashed(files))
+    return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, hashed(files))
 
 
 def read_window(text: str, deviations: xr.Dataset) -> list[int]:

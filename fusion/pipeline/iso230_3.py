@@ -6,14 +6,17 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
 from fusion.common import Array
-from fusion.results.parts import Quantity
+from fusion.pipeline.iso230 import date_of, hashed, identity
+from fusion.results.parts import Iso230Condition, Quantity
 from fusion.results.results import read_results
 from fusion.results.thermal_test import TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
 from interferometry.iso230.thermal import (
@@ -226,13 +229,38 @@ def _distortion(course: _Course, seconds: Array) -> ThermalDistortion:
     )
 
 
-def read_thermal_tests(path: Path) -> tuple[str, tuple[ThermalTest, ...]]:
-    """Return title and tests of a campaign file or of a results folder."""
+def with_conditions(
+    tests: Sequence[ThermalTest], campaign: Campaign, times: NDArray[np.datetime64]
+) -> tuple[ThermalTest, ...]:
+    """Return the tests of a campaign with whose test it was, and under which conditions, as the campaign file states."""
+    report, zone = campaign.report, campaign.zone_of("interferometry" if campaign.record is None else "record")
+    conditions = {
+        **identity(report, date_of(times, zone), campaign.campaign.axis),
+        "Warm-up": report.warm_up,
+        "Compensation of the machine": report.machine_compensation,
+        "Places of the sensors": report.sensor_places,
+        "Remarks": report.remarks,
+    }
+    stated = tuple(Iso230Condition(name=name, text=text) for name, text in conditions.items())
+    return tuple(one.model_copy(update={"conditions": stated}) for one in tests)
+
+
+class StatedTests(NamedTuple):
+    """Tests by ISO 230-3: their title, they themselves, and the SHA-256 of the files that they were read from, by name."""
+
+    title: str
+    tests: tuple[ThermalTest, ...]
+    files: dict[str, str]
+
+
+def read_thermal_tests(path: Path) -> StatedTests:
+    """Return the tests of a campaign file or of a results folder."""
     if path.is_dir():
         results = read_results(path)
         if not results.iso230_3:
             raise CampaignError(f"{path}: these results hold no test by ISO 230-3; run the campaign again")
-        return results.campaign, results.iso230_3
+        named = {name: path / name for name in ("results.json", "provenance.json")}
+        return StatedTests(results.campaign, results.iso230_3, hashed(named))
     if path.suffix != ".toml":
         raise CampaignError(
             f"{path}: name a campaign file or a results folder; thermofuse init writes a campaign file for a table"
@@ -243,13 +271,17 @@ def read_thermal_tests(path: Path) -> tuple[str, tuple[ThermalTest, ...]]:
         raise CampaignError(
             f"{path}: a test by ISO 230-3 needs a [record], or readings of a linear axis with their times in two cycles or more"
         )
-    return campaign.campaign.title, tuple(found)
+    of = "interferometry" if campaign.record is None else "record"
+    return StatedTests(campaign.campaign.title, found, hashed({path.name: path, **campaign.files_of(of)}))
 
 
-def thermal_tests(campaign: Campaign) -> list[ThermalTest]:
+def thermal_tests(campaign: Campaign) -> tuple[ThermalTest, ...]:
     """Read and evaluate the tests of a campaign."""
     if campaign.record is not None:
-        return evaluate_record_test(read_record(campaign), campaign.thermal_test)
+        table = read_record(campaign)
+        return with_conditions(evaluate_record_test(table, campaign.thermal_test), campaign, table["time"].values)
     if campaign.interferometry is None:
-        return []
-    return evaluate_axis_test(read_laser(campaign)["deviations"], campaign.thermal_test)
+        return ()
+    deviations = read_laser(campaign)["deviations"]
+    tests = evaluate_axis_test(deviations, campaign.thermal_test)
+    return with_conditions(tests, campaign, deviations["time"].values)

@@ -33,7 +33,7 @@ from fusion.pipeline import positioning as interferometry
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import check_fields, check_loop, check_plan, check_source
 from fusion.pipeline.iso230 import complete_sheet
-from fusion.pipeline.iso230_3 import evaluate_axis_test, evaluate_record_test
+from fusion.pipeline.iso230_3 import evaluate_axis_test, evaluate_record_test, with_conditions
 from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
 from fusion.pipeline.remote import fetched_campaign, is_address, require_outside_cache
 from fusion.pipeline.stages import (
@@ -267,7 +267,8 @@ def _evaluate(run: Run, laser: LaserInputs, evaluation: Callable[[], xr.Dataset]
     run.parts["iso230"] = complete_sheet(
         run.parts["iso230"], deviations, campaign=run.campaign, environment=laser.environment
     )
-    run.parts["iso230_3"] = evaluate_axis_test(deviations, run.campaign.thermal_test)
+    tests = evaluate_axis_test(deviations, run.campaign.thermal_test)
+    run.parts["iso230_3"] = with_conditions(tests, run.campaign, deviations["time"].values)
     return deviations
 
 
@@ -398,7 +399,9 @@ def _join_sensors(run: Run, source: Inputs, fields: Maybe = None) -> Maybe:
 def _model_record(run: Run, record_source: record_stage.RecordSource) -> xr.Dataset:
     """The loop of a record."""
     record: xr.Dataset = run.stage("record", partial(record_stage.model_record, record_source))
-    run.parts["iso230_3"] = evaluate_record_test(record_source.health.table, run.campaign.thermal_test)
+    table = record_source.health.table
+    tests = evaluate_record_test(table, run.campaign.thermal_test)
+    run.parts["iso230_3"] = with_conditions(tests, run.campaign, table["time"].values)
     return record
 
 

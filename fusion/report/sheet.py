@@ -1,4 +1,4 @@
-"""The sheet of a test by ISO 230-2, one page to be signed and what it rests on: as HTML, PDF or Word, and its values for programs."""
+"""Sheets of tests by ISO 230-2 and ISO 230-3, a page to be signed and what it rests on: HTML, PDF, Word, and values for programs."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 import rich.table
 import xarray as xr
@@ -15,14 +16,18 @@ import xarray as xr
 from fusion.report.campaign import describe_iso230, values_to_sign
 from fusion.report.charts.readings import plot_test, plot_windows
 from fusion.report.charts.record import draw_thermal_tests
-from fusion.report.charts.style import Chart, embed
+from fusion.report.charts.style import Chart, embed, of_rank
 from fusion.report.page import page_format, render_page, write_page
-from fusion.report.thermal_test import describe_thermal_tests
+from fusion.report.thermal_test import DRAWN, describe_thermal_tests
 from fusion.report.wording import Table, Words, print_table, table
 from fusion.results.axis import Iso230Part
+from fusion.results.parts import Iso230Condition
 from fusion.results.store import group, write_atomically
 from fusion.results.thermal_test import ThermalTest
-from interferometry.plots import plot_iso230
+from interferometry.plots import new_axes, plot_iso230
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Conditions that say whose test of which axis a sheet is of; the others follow the values. Instruments are numbered.
 _IDENTITY = (
@@ -33,39 +38,76 @@ _IDENTITY = (
 _SIGNED = {"Measured by": "Operator", "Approved by": "Approved by"}
 #: What the standard means by a deviation, where a laboratory states no convention.
 _CONVENTION = "not stated; taken as actual minus target position (ISO 230-2)"
+#: Dashes of lines as matplotlib names them.
+_LINES = {"solid": "-", "dashed": "--", "dotdash": "-.", "dotted": ":"}
 _MET = {True: "yes", False: "no", None: "not known"}
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """What a sheet shows, in words: pairs of name and text, tables, names of those who sign, and SHA-256 of files by name."""
+class Stated:
+    """What is stated of a test, as pairs of name and text: whose it was, its conditions, and who signs."""
 
-    title: str
     identity: list[tuple[str, str]]
-    window: str
-    values: Table
-    requirements: Table
     conditions: list[tuple[str, str]]
     signatures: list[tuple[str, str]]
+
+    @classmethod
+    def of(cls, rows: Sequence[Iso230Condition], convention: str) -> Stated:
+        """Sort the conditions of a test; `convention` stands where no sign convention is stated."""
+        stated = {row.name: row.text for row in rows}
+        told = {
+            name: text or (convention if name == "Sign convention" else "not stated") for name, text in stated.items()
+        }
+        identity = [(name, text) for name, text in told.items() if name.startswith(_IDENTITY)]
+        named = dict(identity).keys() | _SIGNED.values()
+        return cls(
+            identity,
+            [(name, text) for name, text in told.items() if name not in named],
+            [(role, stated.get(name, "")) for role, name in _SIGNED.items()],
+        )
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a sheet shows, in words; `values` under their caption, `requirements` without rows where there are none, SHA-256 of files by
+    name.
+    """
+
+    title: str
+    standard: str
+    stated: Stated
+    caption: str
+    values: Table
+    requirements: Table
     files: Mapping[str, str]
     version: str
 
 
 def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], version: str) -> Sheet:
-    """Return what the sheet of a test shows."""
-    stated = {row.name: row.text for row in part.conditions}
-    told = {name: text or (_CONVENTION if name == "Sign convention" else "not stated") for name, text in stated.items()}
-    identity = [(name, text) for name, text in told.items() if name.startswith(_IDENTITY)]
-    named = dict(identity).keys() | _SIGNED.values()
+    """Return what the sheet of a test by ISO 230-2 shows."""
     requirements = [[check.name, _MET[check.met], check.evidence] for check in part.checks]
     return Sheet(
         title=title,
-        identity=identity,
-        window=(part.settled or part).window,
+        standard="Accuracy and repeatability of positioning by ISO 230-2:2014",
+        stated=Stated.of(part.conditions, _CONVENTION),
+        caption=f"Values of {(part.settled or part).window}",
         values=values_to_sign(part),
         requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
-        conditions=[(name, text) for name, text in told.items() if name not in named],
-        signatures=[(role, stated.get(name, "")) for role, name in _SIGNED.items()],
+        files=files,
+        version=version,
+    )
+
+
+def describe_thermal_sheet(title: str, test: ThermalTest, *, files: Mapping[str, str], version: str) -> Sheet:
+    """Return what the sheet of a test by ISO 230-3 shows."""
+    (described,) = describe_thermal_tests([test])
+    return Sheet(
+        title=title,
+        standard=f"Thermal effects by ISO 230-3:2020. {described['title']}",
+        stated=Stated.of(test.conditions, "not stated"),
+        caption="Largest less smallest value, with expanded uncertainty (k = 2)",
+        values=described["distortions"],
+        requirements=table([], []),
         files=files,
         version=version,
     )
@@ -88,20 +130,41 @@ def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remark
 def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> None:
     """Write the sheet of a test in the format of the file's name; nothing is replaced."""
     if page_format(path, ".html", ".pdf", ".docx") == ".docx":
-        write_atomically(path, lambda temporary: _write_word(temporary, sheet, dataset))
+        drawn = plot_iso230(group(dataset, "settled"), dataset["position"])
+        write_atomically(path, lambda temporary: _write_word(temporary, [(sheet, drawn)]))
     else:
         write_page(path, render_iso230(sheet, part, dataset, remarks=remarks))
 
 
-def render_thermal_tests(title: str, tests: Sequence[ThermalTest], *, versions: Mapping[str, str]) -> str:
-    """Return the page of tests by ISO 230-3 as HTML text."""
+def render_thermal_tests(sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) -> str:
+    """Return the page of tests by ISO 230-3 as HTML text: their sheets, then what they rest on."""
     summary = {"thermal_tests": describe_thermal_tests(tests), "assumptions": {"iso230-3": ""}}
-    shown = {"summary": summary, "title": title, "versions": versions}
-    return render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), **shown)
+    return render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), sheets=sheets, summary=summary)
 
 
-def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
-    """Write the sheet as a document of Word that a laboratory may complete with its own heading."""
+def write_thermal_tests(path: Path, sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) -> None:
+    """Write the sheets of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
+    if page_format(path, ".html", ".pdf", ".docx") == ".docx":
+        drawn = [(sheet, plot_thermal_test(test)) for sheet, test in zip(sheets, tests, strict=True)]
+        write_atomically(path, lambda temporary: _write_word(temporary, drawn))
+    else:
+        write_page(path, render_thermal_tests(sheets, tests))
+
+
+def plot_thermal_test(test: ThermalTest) -> Axes:
+    """Plot the displacements of a test by ISO 230-3 over time."""
+    axes = new_axes(None)
+    for rank, one in enumerate([one for one in test.courses if one.unit == "um"][:DRAWN]):
+        look = of_rank(rank)
+        values = np.array(one.values, float)
+        axes.plot(one.hours, values, color=look["colour"], linestyle=_LINES[look["dash"]], label=one.name)
+    axes.set(xlabel="time since start / h", ylabel="drift / µm")
+    axes.legend(frameon=False, ncols=2)
+    return axes
+
+
+def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
+    """Write sheets, one on each page, as a document of Word that a laboratory may complete with its own heading."""
     import docx
     from docx.shared import Mm, Pt
 
@@ -125,21 +188,27 @@ def _write_word(path: Path, sheet: Sheet, dataset: xr.Dataset) -> None:
         document.add_paragraph()
 
     pairs = (32, 57, 32, 57)
-    document.add_heading(f"Test of positioning by ISO 230-2:2014: {sheet.title}", level=1)
-    put(in_pairs(sheet.identity), pairs)
-    drawn = plot_iso230(group(dataset, "settled"), dataset["position"]).get_figure(root=True)
-    assert drawn is not None
-    picture = io.BytesIO()
-    drawn.savefig(picture, format="png", dpi=200, transparent=False)
-    document.add_picture(picture, width=Mm(125))
-    put([row.cells for row in sheet.values.rows], (70, 38, 28, 42), sheet.values.titles)
-    if sheet.requirements.rows:
-        put([row.cells for row in sheet.requirements.rows], (44, 18, 116), sheet.requirements.titles)
-    if sheet.conditions:
-        put(in_pairs(sheet.conditions), pairs)
-    put([[f"{role}: {name}\n", "Date, signature:"] for role, name in sheet.signatures], (89, 89))
-    hashes = "; ".join(f"{name} {sha256}" for name, sha256 in sheet.files.items())
-    document.add_paragraph(f"thermofuse {sheet.version}. SHA-256: {hashes}")
+    for number, (sheet, axes) in enumerate(sheets):
+        if number:
+            document.add_page_break()
+        document.add_heading(sheet.title, level=1)
+        document.add_paragraph(sheet.standard)
+        put(in_pairs(sheet.stated.identity), pairs)
+        drawn = axes.get_figure(root=True)
+        assert drawn is not None
+        picture = io.BytesIO()
+        drawn.savefig(picture, format="png", dpi=200, transparent=False)
+        document.add_picture(picture, width=Mm(125))
+        # The first column holds names, the others share what is left of the width.
+        titles = sheet.values.titles
+        put([row.cells for row in sheet.values.rows], (58, *[120 // (len(titles) - 1)] * (len(titles) - 1)), titles)
+        if sheet.requirements.rows:
+            put([row.cells for row in sheet.requirements.rows], (44, 18, 116), sheet.requirements.titles)
+        if sheet.stated.conditions:
+            put(in_pairs(sheet.stated.conditions), pairs)
+        put([[f"{role}: {name}\n", "Date, signature:"] for role, name in sheet.stated.signatures], (89, 89))
+        hashes = "; ".join(f"{name} {sha256}" for name, sha256 in sheet.files.items())
+        document.add_paragraph(f"thermofuse {sheet.version}. SHA-256: {hashes}")
     document.save(str(path))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fusion.results.parts import Number, Quantity, ResultPart
+from fusion.results.parts import Iso230Condition, Number, Quantity, ResultPart
 
 TestKind = Literal["environment", "spindle", "linear axis", "rotary axis", "not stated"]
 
@@ -74,3 +74,5 @@ class ThermalTest(ResultPart):
     """Displacements, tilts and temperatures over time."""
     remarks: tuple[str, ...]
     """What is computed where no open text states a definition, and what was not evaluated."""
+    conditions: tuple[Iso230Condition, ...] = ()
+    """Whose test of which machine it was, with what, and under which conditions."""

@@ -15,10 +15,11 @@ from fusion.app.results.data import Linker, Products, Selection
 from fusion.common import FusionError, versions
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.iso230 import read_test
+from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.conclusions import headline
 from fusion.report.page import print_pdf, report_of
-from fusion.report.sheet import describe_sheet, render_iso230
+from fusion.report.sheet import describe_sheet, describe_thermal_sheet, render_iso230, render_thermal_tests
 from fusion.report.wording import say
 
 
@@ -105,7 +106,8 @@ def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
         return made
 
     report = button("Report as PDF", "report.pdf", report_of)
-    sheet = [button("Test sheet to sign (PDF)", "sheet.pdf", _sheet)] if products.results.iso230 is not None else []
+    of_test = _sheet if products.results.iso230 is not None else _thermal_sheet if products.results.iso230_3 else None
+    sheet = [] if of_test is None else [button("Test sheet to sign (PDF)", "sheet.pdf", of_test)]
     return ui.column(pn.FlexBox(*sheet, report), told)
 
 
@@ -114,6 +116,15 @@ def _sheet(results: Path) -> str:
     test = read_test(results, None)
     sheet = describe_sheet(test.title, test.part, files=test.files, version=versions()["thermofuse"])
     return render_iso230(sheet, test.part, test.dataset, remarks=test.remarks)
+
+
+def _thermal_sheet(results: Path) -> str:
+    """Return the sheets of a test by ISO 230-3 as a page."""
+    title, tests, files = read_thermal_tests(results)
+    version = versions()["thermofuse"]
+    return render_thermal_tests(
+        [describe_thermal_sheet(title, one, files=files, version=version) for one in tests], tests
+    )
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:

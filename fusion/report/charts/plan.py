@@ -201,7 +201,7 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     unit, scale = ("h", 1.0) if hours[-1] >= _LEAST_HOURS else ("s", 3600.0)
     hours = scale * hours
     drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K", zero=True)
-    add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
+    add_band(drawn, hours, low, high, ACCENT, "middle 80 % of the cells")
     add_series(drawn, hours, mean, name="mean of the table", colour=ACCENT)
     add_series(drawn, hours, most, name="warmest cell", colour=INK, dash="dashed")
     seen = (

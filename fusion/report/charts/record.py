@@ -49,7 +49,7 @@ def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
     half = 2 * np.where(held, float(chosen["predicted_u"]), missed_fit)
     drawn = new_figure(x=_TIME, y="displacement / µm", title=channel, height=340)
     _shade_hold_out(record, drawn)
-    add_band(drawn, hours, final - half, final + half, _AFTER, legend_label="95 % band")
+    add_band(drawn, hours, final - half, final + half, _AFTER, "95 % band")
     add_series(drawn, hours, declared, name="declared model", colour=BEFORE, dash="dashed")
     add_series(drawn, hours, final, name="final model", colour=_AFTER, width=2.2)
     add_series(drawn, hours, measured, name="measured", colour=INK, width=1.2)
@@ -173,7 +173,9 @@ def draw_thermal_tests(tests: Sequence[ThermalTest]) -> dict[str, Chart]:
             shown = [one for one in test.courses if one.unit == unit][:DRAWN]
             printed = print_unit(unit)
             drawn = new_figure(
-                x="time since start / h", y=f"{'temperature' if unit == 'degC' else 'drift'} / {printed}"
+                x="time since start / h",
+                y=f"{'temperature' if unit == 'degC' else 'drift'} / {printed}",
+                legend_columns=4,
             )
             courses = Courses(drawn, {"time since start / h": np.array(shown[0].hours)})
             for rank, one in enumerate(shown):

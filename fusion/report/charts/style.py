@@ -11,6 +11,7 @@ import bokeh
 import numpy as np
 import xarray as xr
 from bokeh import palettes
+from bokeh.core.properties import value
 from bokeh.core.serialization import Serializer
 from bokeh.document import Document
 from bokeh.model import Model
@@ -20,15 +21,21 @@ from bokeh.models import (
     ColorMapper,
     ColumnDataSource,
     FixedTicker,
+    Glyph,
     GlyphRenderer,
     HoverTool,
     Label,
     LayoutDOM,
     Legend,
+    LegendItem,
+    Line,
     LinearColorMapper,
     PanTool,
     Plot,
     Range1d,
+    Scatter,
+    Segment,
+    VArea,
     WheelZoomTool,
 )
 from bokeh.plotting import figure
@@ -133,6 +140,18 @@ def add_hover(drawn: figure, tips: Tips, renderers: Sequence[GlyphRenderer]) -> 
     drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers)))
 
 
+def add_mark(drawn: figure, source: ColumnDataSource, glyph: Glyph, name: str = "", **options: Any) -> GlyphRenderer:
+    """Draw a mark and name it in the legend. Bokeh's own methods make each one three times, for what is selected and what is muted."""
+    mark = drawn.add_glyph(source, glyph, nonselection_glyph=None, muted_glyph=None, **options)
+    if name:
+        named = next((item for item in drawn.legend[0].items if item.label == value(name)), None)
+        if named is None:
+            drawn.legend[0].items.append(LegendItem(label=value(name), renderers=[mark]))
+        else:
+            named.renderers.append(mark)
+    return mark
+
+
 def add_series(
     drawn: figure,
     x: np.ndarray,
@@ -150,16 +169,18 @@ def add_series(
 ) -> None:
     """Draw a named series with its values under the pointer."""
     source = ColumnDataSource({"x": np.asarray(x), "y": np.asarray(y)})
-    named: dict[str, Any] = {"legend_label": name} if legend else {}
-    parts = []
+    named, parts = name if legend else "", []
     if half is not None:
         source.data["half"] = np.asarray(half)
         source.data["low"], source.data["high"] = np.asarray(y) - half, np.asarray(y) + half
-        drawn.segment("x", "low", "x", "high", source=source, line_color=colour, line_width=1.3, **named)
+        bars = Segment(x0="x", y0="low", x1="x", y1="high", line_color=colour, line_width=1.3)
+        add_mark(drawn, source, bars, named)
     if line:
-        parts.append(drawn.line("x", "y", source=source, line_color=colour, line_dash=dash, line_width=width, **named))
+        course = Line(x="x", y="y", line_color=colour, line_dash=dash, line_width=width)
+        parts.append(add_mark(drawn, source, course, named))
     if marker is not None:
-        parts.append(drawn.scatter("x", "y", source=source, marker=marker, size=size, color=colour, **named))
+        points = Scatter(x="x", y="y", marker=value(marker), size=size, line_color=colour, fill_color=colour)
+        parts.append(add_mark(drawn, source, points, named))
     (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     shown = "@y{0.000}" + (" ± @half{0.000}" if half is not None else "")
     add_hover(drawn, [("", name), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {y_unit}")], parts[-1:])
@@ -241,14 +262,15 @@ def add_hold_out(drawn: figure, low: float, high: float) -> None:
     drawn.add_layout(BoxAnnotation(left=low, right=high, fill_color=ACCENT, fill_alpha=0.08, level="underlay"))
 
 
-def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, **options: Any) -> None:
+def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, name: str = "") -> None:
     """Shade what lies between two lines; a gap in either is a gap."""
     x, low, high = (np.asarray(values, float) for values in (x, low, high))
     valid = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
     for piece in np.split(np.arange(x.size), np.flatnonzero(np.diff(valid.astype(int))) + 1):
         if piece.size and valid[piece[0]]:
-            ends = {"x": x[piece], "y1": low[piece], "y2": high[piece]}
-            drawn.varea(**ends, fill_color=colour, fill_alpha=0.18, level="underlay", **options)
+            ends = ColumnDataSource({"x": x[piece], "y1": low[piece], "y2": high[piece]})
+            area = VArea(x="x", y1="y1", y2="y2", fill_color=colour, fill_alpha=0.18)
+            add_mark(drawn, ends, area, name, level="underlay")
 
 
 def add_colour_bar(

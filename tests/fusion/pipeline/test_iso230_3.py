@@ -1,10 +1,15 @@
-"""A test by ISO 230-3 from a record and from a campaign: ranges, tilts, budget, refusals, and the command."""
+"""A test by ISO 230-3 from a record and from a campaign: ranges, tilts, budget, refusals, and the sheet to sign."""
 
+import re
+
+import docx
 import numpy as np
 import pytest
 
 from fusion.campaign.config import CampaignError, ThermalTestTable
 from fusion.pipeline.iso230_3 import evaluate_record_test, read_thermal_tests
+from fusion.report.sheet import describe_thermal_sheet, write_thermal_tests
+from fusion.results.store import file_sha256
 from tests.fusion.record_tables import runs_table, table_of
 
 SAMPLES = 6 * 60
@@ -77,3 +82,42 @@ def test_a_tilt_of_a_displacement_that_is_not_there_is_refused():
 def test_another_file_is_refused_with_what_to_name(tmp_path):
     with pytest.raises(CampaignError, match="name a campaign file or a results folder; thermofuse init writes"):
         read_thermal_tests(tmp_path / "record.csv")
+
+
+def test_the_sheet_says_whose_test_it_was_and_who_signs_on_the_page_and_in_word(tmp_path):
+    minutes = np.arange(SAMPLES)
+    rows = [f"{60 * k},{20.0 + 8.0 * (1.0 - np.exp(-k / 60.0)):.3f},{k / 10:.2f}" for k in minutes]
+    (tmp_path / "record.csv").write_text("\n".join(["time_s,bearing [degC],X [um]", *rows]) + "\n")
+    (tmp_path / "campaign.toml").write_text(
+        """[campaign]
+title = "Spindle"
+[record]
+file = "record.csv"
+time = "time_s"
+time_unit = "s"
+temperatures = ["bearing*"]
+displacements = ["X*"]
+[report]
+machine = "Mill 7"
+operator = "A. Smith"
+approved_by = "B. Jones"
+"""
+    )
+    title, tests, files = read_thermal_tests(tmp_path / "campaign.toml")
+    assert files == {name: file_sha256(tmp_path / name) for name in ("campaign.toml", "record.csv")}
+    sheet = describe_thermal_sheet(title, tests[0], files=files, version="0")
+    assert dict(sheet.stated.identity) | {"Machine": "Mill 7", "Date of the test": "not stated"} == dict(
+        sheet.stated.identity
+    )
+    assert sheet.stated.signatures == [("Measured by", "A. Smith"), ("Approved by", "B. Jones")]
+    for form in ("html", "docx"):
+        write_thermal_tests(tmp_path / f"sheet.{form}", [sheet], tests)
+    page = re.sub(r"<script.*?</script>", "", (tmp_path / "sheet.html").read_text(), flags=re.DOTALL)
+    written = docx.Document(str(tmp_path / "sheet.docx"))
+    cells = [cell.text for table in written.tables for row in table.rows for cell in row.cells]
+    for text in ("Mill 7", *(cell for row in sheet.values.rows for cell in row.cells)):
+        assert text in page and text in cells
+    assert "Measured by: A. Smith" in page and "Measured by: A. Smith\n" in cells
+    assert page.count("Largest less smallest value, with") == 1, "the table is on the sheet alone"
+    for sha256 in files.values():
+        assert sha256 in page and sha256 in written.paragraphs[-1].text

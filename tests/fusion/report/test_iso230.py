@@ -251,10 +251,10 @@ def stated(campaign_folder, tmp_path_factory):
 @pytest.mark.chain
 def test_the_demo_states_everything_that_a_sheet_asks_for(stated):
     sheet = describe_sheet(stated.title, stated.part, files=stated.files, version="0")
-    every = dict([*sheet.identity, *sheet.conditions])
+    every = dict([*sheet.stated.identity, *sheet.stated.conditions])
     assert len(every) >= 24 and [name for name, text in every.items() if "not stated" in text] == []
     assert every["Instrument 1"].endswith("calibrated 2026-01-15, certificate C-2026-015")
-    assert sheet.signatures == [("Measured by", "R. Meyer"), ("Approved by", "S. Lind")]
+    assert sheet.stated.signatures == [("Measured by", "R. Meyer"), ("Approved by", "S. Lind")]
     assert set(sheet.files) >= {"laser.csv", "environment.csv"} and all(len(sha) == 64 for sha in sheet.files.values())
     decisions = {row.cells[0]: row.cells[2:] for row in sheet.values.rows}
     assert decisions["Bidirectional positioning accuracy A"][0] == "20"
@@ -268,7 +268,7 @@ def test_the_document_of_word_says_what_the_page_says(stated, tmp_path):
     written = docx.Document(str(tmp_path / "sheet.docx"))
     cells = [cell.text for grid in written.tables for row in grid.rows for cell in row.cells]
     shown = [text for row in sheet.values.rows for text in row.cells]
-    shown += [text for pair in (*sheet.identity, *sheet.conditions) for text in pair]
+    shown += [text for pair in (*sheet.stated.identity, *sheet.stated.conditions) for text in pair]
     assert [text for text in shown if text not in cells] == []
     assert len(written.inline_shapes) == 1 and cells.count("Date, signature:") == 2
     assert all(sha in written.paragraphs[-1].text for sha in sheet.files.values())
