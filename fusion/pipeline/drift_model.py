@@ -45,15 +45,15 @@ from thermography.fields.cycle_fields import cycles_with_field
 def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
     """Return the relative standard uncertainty of the rise along the measured line."""
     along = MeasuredLine(fields, axis, position_mm).sample(np.stack(_last_rise(fields)))
-    return float(np.hypot(_weighted(along[0], along[1]), _zero_share(fields)))
+    return float(np.hypot(_weighted(along[0], along[1]), zero_share(fields)))
 
 
 def plan_scale_u(fields: xr.Dataset) -> float:
     """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
-    return float(np.hypot(_weighted(*_last_rise(fields)), _zero_share(fields)))
+    return float(np.hypot(_weighted(*_last_rise(fields)), zero_share(fields)))
 
 
-def _zero_share(fields: xr.Dataset) -> float:
+def zero_share(fields: xr.Dataset) -> float:
     """Uncertainty of the camera's zero, which changes as slowly as the table warms, as a share of the mean rise; over all cycles."""
     if "camera_correction_u" not in fields:
         return 0.0
@@ -71,24 +71,57 @@ def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:
     return plan_scale_u(fields)
 
 
-def scaled(entry: Mapping[str, Any], scale_u: float) -> dict[str, Any]:
-    """Return a quantity per kelvin of the rise with both parts of its uncertainty."""
+def scaled(entry: Mapping[str, Any], scale_u: float, by_zero: float = 0.0) -> dict[str, Any]:
+    """Return a quantity per kelvin of the rise with both parts of its uncertainty; `by_zero` is what the camera's zero may hide of it."""
     value, u = entry["value"], entry["u"]
     expected = 0.0 if entry.get("prior") is None else entry["prior"] * u**2 / entry["prior_u"] ** 2
-    u_scale = abs(value - expected) * scale_u
+    u_scale = float(np.hypot((value - expected) * scale_u, by_zero))
     return {**entry, "u": float(np.hypot(u, u_scale)), "u_fit": u, "u_scale": u_scale}
 
 
+def hidden_by_zero(loop: Mapping[str, Any], fields: xr.Dataset, position_mm: np.ndarray) -> dict[str, float]:
+    """Return by unit how much of a coefficient per kelvin an unknown zero of the camera may hide.
+
+    A zero that swings as the table warms makes the rise another course, so that a coefficient is too small and what it lacks is left as
+    drift: at most that drift per kelvin, in the share that the zero has of the rise.
+    """
+    rise = fields["temperature_rise"].mean(("y", "x")).values
+    swing_K, drift = max(float(np.nanstd(rise)), 1e-3), loop["residual_drift"]
+    metres = 1e-3 * max(float(np.sqrt(np.mean(position_mm**2))), 1.0)
+    share = zero_share(fields)
+    return {
+        "um/K": share * drift["common_rms_um"] / swing_K,
+        "ppm/K": share * drift["stretch_rms_um"] / (metres * swing_K),
+    }
+
+
+def with_spread(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a declared coefficient whose uncertainty is no smaller than what it moves when a target or a part of the test is left out."""
+    moved, fitted = entry.get("jackknife_u"), entry.get("u_fit", entry["u"])
+    if moved is None or not np.isfinite(moved):
+        return dict(entry)
+    # What was expected beforehand does not move.
+    share = 1.0 if entry.get("prior") is None else max(0.0, 1.0 - (fitted / entry["prior_u"]) ** 2)
+    more = (share * moved) ** 2 - fitted**2
+    return {**entry, "u": float(np.hypot(entry["u"], np.sqrt(more)))} if more > 0.0 else dict(entry)
+
+
 def scale_coefficients(
-    loop: dict[str, Any], effects: Mapping[str, Effect], *, axis_u: float, plan_u: float
+    loop: dict[str, Any],
+    effects: Mapping[str, Effect],
+    *,
+    axis_u: float,
+    plan_u: float,
+    by_zero: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return the part ``loop`` of results.json with the scale of the rise in every coefficient per kelvin of it."""
+    hidden = by_zero or {}
 
     def completed(entry: Mapping[str, Any], effect: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
         of_rise = parameters.get("follows") == "mean_rise" or (effect in effects and effects[effect].follows_field)
         if not of_rise:
             return dict(entry)
-        return scaled(entry, axis_u if entry["unit"] == "ppm/K" else plan_u)
+        return scaled(entry, axis_u if entry["unit"] == "ppm/K" else plan_u, hidden.get(entry["unit"], 0.0))
 
     declared = [completed(entry, entry["effect"], {}) for entry in loop["declared_coefficients"]]
     steps = []
@@ -174,14 +207,16 @@ def model_drift(
     loop = described.model_dump(exclude_unset=True)
     if isinstance(source, Source) and fields is not None:
         anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
-        axis_u = axis_scale_u(fields, source.axis, deviations["position"].values)
-        loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields))
+        position_mm = deviations["position"].values
+        axis_u, hidden = axis_scale_u(fields, source.axis, position_mm), hidden_by_zero(loop, fields, position_mm)
+        loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields), by_zero=hidden)
         declared = [with_line(entry, loop.get("axis_line")) for entry in loop["declared_coefficients"]]
         loop = {**loop, "declared_coefficients": declared}
     elif "axis_scale_u" in fused:
         scale_u = float(fused["axis_scale_u"])
         loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)
     loop = withhold_names(loop, effects)
+    loop = {**loop, "declared_coefficients": [with_spread(entry) for entry in loop["declared_coefficients"]]}
     parts = {
         "anomalies": [
             {**one, "position_mm": float(deviations["position"].sel(target=one["target"]))} for one in anomalies

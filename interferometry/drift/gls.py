@@ -363,7 +363,7 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     if -optimum.fun < constant + _SETTLING_MARGIN:
         return fit
     settled = fitted(optimum.x[:components], 10.0 ** optimum.x[-2], optimum.x[-1]).system
-    start_scale = float(np.exp(np.log(settled.ratios / system.ratios).mean()))
+    start_scale = float(np.exp(np.log(np.maximum(settled.ratios / system.ratios, 1e-300)).mean()))
     settling = settling_noise_scale(system.seconds, 10.0 ** optimum.x[-2], optimum.x[-1])
     scale = np.maximum(1.0, start_scale * settling)
     return _solve(replace(system, process_noise_scale=scale), problem)

@@ -170,11 +170,8 @@ def check_load_kind(log: xr.Dataset | None, *, file: str) -> list[Check]:
     at = np.asarray((log["time"].values - log["time"].values[0]) / np.timedelta64(1, "s"), float)
     found = []
     for name, load in loads.items():
-        changes = np.diff(load)[np.diff(load) != 0.0]
-        if changes.size >= _COUNTED and (np.sign(changes) == np.sign(changes[0])).all():
-            found.append(
-                f"{name} only {'grows' if changes[0] > 0.0 else 'falls'}, in {changes.size} of {load.size} rows: a counter"
-            )
+        if other := _other_kind(load):
+            found.append(f"{name} {other}")
         elif (share := _between_rows(at, load)) > _BETWEEN_ROWS:
             found.append(
                 f"{name} is known too seldom: {100.0 * share:.0f} % of the variance of what it heats depends on whether it stays or "
@@ -183,6 +180,25 @@ def check_load_kind(log: xr.Dataset | None, *, file: str) -> list[Check]:
     remedy = f"Write the load itself into {file}, a row every minute: of a counter its differences, of events the state after each."
     sound = f"The loads in {file} look like loads."
     return [judge("drivers_kind", len(found), 0.0, f"{file}: {'; '.join(found)}.", remedy, sound=sound)]
+
+
+def _other_kind(load: Array) -> str:
+    """What a column counts or how it changes in place of a load, by its own shape; empty where that does not tell."""
+    load = load[np.isfinite(load)]
+    steps = np.diff(load)
+    rises, falls = steps[steps > 0.0], steps[steps < 0.0]
+    changes, rows = rises.size + falls.size, load.size
+    if changes >= _COUNTED and not (rises.size and falls.size):
+        return f"only {'grows' if rises.size else 'falls'}, in {changes} of {rows} rows: a counter"
+    # It begins again near zero each time, and grows for long in between.
+    reset = load[1:][steps < 0.0]
+    if falls.size >= 2 and rises.size >= _COUNTED * falls.size and reset.max() <= rises.max():
+        return f"grows in {rises.size} of {rows} rows and begins again near zero {falls.size} times: a counter that is reset"
+    moves = np.flatnonzero(load)
+    single = moves.size >= 4 and moves.size < 0.5 * rows and (np.diff(moves) > 1).all()
+    if single and load.min() < 0.0 < load.max():
+        return f"is zero but in {moves.size} single rows of both signs: the changes of a load"
+    return ""
 
 
 def _loads(log: xr.Dataset | None, *, constant: bool = False) -> dict[str, Array]:

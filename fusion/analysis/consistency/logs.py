@@ -207,6 +207,10 @@ _LARGEST_LEVEL_K = 4.0
 #: degrees of freedom; JCGM 100:2008, G.3).
 _PARTS, _PARTS_95 = 6, 2.57
 #: What confirms the scale of the camera's rise.
+_KEEP_IN_VIEW = (
+    "Keep a surface of constant temperature in view (reference_patch under [thermography]), which shows the camera's zero, and check the "
+    "contact of the material sensor."
+)
 _STATE_PLACE = (
     "State where the material sensor sits on the table: material_sensor under [interferometry], its place on the plan."
 )
@@ -334,9 +338,9 @@ def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> C
         return judge("material_rise", 0.0, limit, untestable, unverified=remedy)
     off = _off(slopes)
     where = "at the sensor's place" if stated else "where it resembles the sensor most"
-    unknown = (
-        "" if stated or abs(off) > limit else "Scale not verified, the place of the material sensor is not known. "
-    )
+    open_scale = _STATE_PLACE if not stated else _KEEP_IN_VIEW if slopes[1] - slopes[0] > 2.0 * limit else ""
+    why = "the two do not change in proportion" if stated else "the place of the material sensor is not known"
+    unknown = f"Scale not verified, {why}. " if open_scale and abs(off) <= limit else ""
     return judge(
         "material_rise",
         off,
@@ -346,7 +350,7 @@ def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> C
         "Check emissivity, object_distance and reflected_temperature (a rise that is too large comes from an emissivity that is too "
         "small), the drift of the camera, and whether the sensor sits on the table (material_sensor under [interferometry]).",
         passed=abs(off) <= limit,
-        unverified="" if stated else _STATE_PLACE,
+        unverified=open_scale,
     )
 
 

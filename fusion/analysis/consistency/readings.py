@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from scipy import sparse, special
 
 from fusion.analysis.alignment.readings import known_mean
@@ -33,6 +34,8 @@ _COINCIDENCE = 1e-6
 #: The same for a change of the profile that looks like a shift by one target, of the one largest change; it is an upper bound, which
 #: sound readings reach in far fewer tests.
 _SHIFT_BY_CHANCE = 1e-2
+#: Cycles between which stretches of a test are compared with the rest; of a longer test so many, evenly.
+_MOST_BOUNDS = 60
 #: Cycles that are compared with all others at once.
 _CYCLES_AT_ONCE = 256
 #: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
@@ -226,6 +229,9 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     """One value that far more readings hold than scatter and resolution let them is a limit of the recorder or a filler."""
     values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
     sound = judge("repeated_value", 0.0, 0.0, "No value is repeated beyond what the resolution makes.")
+    held = _held_readings(deviations)
+    if held is not None:
+        return held
     with np.errstate(invalid="ignore"):
         steps = np.abs(np.diff(np.round(values, 6), axis=0))
     least = np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf)
@@ -259,46 +265,88 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     )
 
 
+def _held_readings(deviations: xr.Dataset) -> Check | None:
+    """Readings that hold what the target before in the order of travel read, digit for digit, far more often than the resolution lets
+    them; None where none do.
+    """
+    values = deviations["deviation"].values[:, :, np.argsort(deviations["position"].values)]
+    steps_um = np.diff(np.round(values, 6), axis=2)
+    sizes = np.unique(np.abs(steps_um[np.isfinite(steps_um)]))
+    random_um = random_part_um(values)
+    if sizes.size < 2 or not random_um > sizes[1]:
+        return None
+    # The largest probability of one value of a difference of two readings, that at the centre of a normal distribution.
+    expected = np.count_nonzero(np.isfinite(steps_um)) * sizes[1] / (2.0 * np.sqrt(np.pi) * random_um)
+    count = np.count_nonzero(steps_um == 0.0)
+    if count < 2 or float(special.gammainc(count, expected)) >= _COINCIDENCE:
+        return None
+    return judge(
+        "repeated_value",
+        float(count),
+        expected,
+        f"{count} readings hold what the target before or after them read, digit for digit; scatter and resolution make {expected:.2g}.",
+        "Check what the recorder writes where it has no reading, and the time that a reading needs; leave these readings out of the file.",
+        passed=False,
+    )
+
+
 def _missed_trigger(deviations: xr.Dataset) -> Check:
-    """From one cycle on the profile is that of before, by one target late or early in the order of travel."""
-    sound = judge("missed_trigger", 0.0, 0.0, "The profile does not shift by a target at any cycle.")
+    """In some successive cycles the profile is that of the others, by one target late or early in the order of travel."""
+    sound = judge("missed_trigger", 0.0, 0.0, "The profile does not shift by a target in any cycles.")
     complete = np.isfinite(deviations["deviation"].values).all(axis=(1, 2))
     values, cycles = deviations["deviation"].values[complete], deviations["cycle"].values[complete]
     if len(values) < 2 * _LEAST_SIDE or values.shape[2] < _LEAST_TARGETS:
         return sound
     # In the order of travel, so that a missed trigger shifts both approaches alike.
     order = np.argsort(deviations["position"].values)
-    reverse = deviations["direction"].values == "negative"
+    names = deviations["direction"].values
     passes = values[:, :, order]
-    passes[:, reverse] = passes[:, reverse, ::-1]
+    passes[:, names == "negative"] = passes[:, names == "negative", ::-1]
     totals = np.concatenate([np.zeros((1, *passes.shape[1:])), np.cumsum(passes, axis=0)])
-    count = len(passes)
+    first, end = _stretches(len(passes))
+    inside = (totals[end] - totals[first]) / (end - first)[:, None, None]
+    others = (totals[-1] - totals[end] + totals[first]) / (len(passes) - end + first)[:, None, None]
+    # Squares of the differences as read, late, and early, (3, stretches, approaches).
+    profiles = (others[..., 1:-1], others[..., :-2], others[..., 2:])
+    squares = np.stack([(_bent(inside[..., 1:-1] - one) ** 2).sum(axis=-1) for one in profiles])
     noise_um = max(random_part_um(values), _rounding_um(values))
+    error_um = noise_um * np.sqrt(1.0 / (end - first) + 1.0 / (len(passes) - end + first))
+    # A trigger is missed in one approach alone, or in both.
+    groups = [[k] for k in range(names.size)] + [list(range(names.size))] * (names.size > 1)
     found = []
-    for k in range(_LEAST_SIDE, count - _LEAST_SIDE + 1):
-        before, after = totals[k] / k, (totals[-1] - totals[k]) / (count - k)
-        error_um = noise_um * np.sqrt(1.0 / k + 1.0 / (count - k))
-        profiles = (before[:, 1:-1], before[:, :-2], before[:, 2:])
-        as_read, late, early = (max(_without_line(after[:, 1:-1] - one), error_um) for one in profiles)
-        found.append((as_read / error_um, as_read, min(late, early), k, late < early))
-    _, as_read, left, first, is_late = max(found)
-    # Share of the volume of all changes as large that lies as near to a shift by one target; a line of each approach is fitted.
-    p = 2.0 * (left / as_read) ** (passes.shape[1] * (passes.shape[2] - 4))
+    for group in groups:
+        freedom = len(group) * (passes.shape[2] - 4)
+        as_read, late, early = np.maximum(np.sqrt(squares[..., group].sum(axis=-1) / freedom), error_um)
+        place = int(np.argmax(as_read / error_um))
+        left = min(late[place], early[place])
+        # Share of the volume of all changes as large that lies as near to a shift by one target; a line of each approach is fitted.
+        p = 2.0 * len(groups) * (left / as_read[place]) ** freedom
+        found.append((p, as_read[place], left, place, late[place] < early[place], group))
+    p, as_read_um, left_um, place, is_late, group = min(found, key=lambda one: one[0])
+    since = f"From cycle {cycles[first[place]]} on"
+    if end[place] < len(passes):
+        since = f"In cycles {cycles[first[place]]} to {cycles[end[place] - 1]}, against all others,"
+    one_way = "" if len(group) == names.size else f" in {names[group[0]]} approach"
     return judge(
         "missed_trigger",
-        as_read,
-        left,
-        f"From cycle {cycles[first]} on every target reads what the one {'before' if is_late else 'after'} it in the order of travel read "
-        f"before: the profiles differ by {as_read:.2g} µm as read, by {left:.2g} µm shifted by one target.",
+        as_read_um,
+        left_um,
+        f"{since} every target reads what the one {'before' if is_late else 'after'} it in the order of travel read "
+        f"otherwise{one_way}: the profiles differ by {as_read_um:.2g} µm as read, by {left_um:.2g} µm shifted by one target.",
         "A trigger was missed or counted twice: give these readings to the targets at which they were taken, or leave these cycles out.",
         passed=p >= _SHIFT_BY_CHANCE,
         sound=sound.evidence,
     )
 
 
-def _without_line(profiles: Array) -> float:
-    """Standard deviation of profiles (direction, target) about a straight line of each, um."""
-    return float(np.sqrt((_bent(profiles) ** 2).sum() / (profiles.shape[0] * (profiles.shape[1] - 2))))
+def _stretches(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First cycle of every stretch of successive cycles, and the first one after it: to the end from any cycle on; and between some."""
+    last = count - _LEAST_SIDE
+    onward = np.arange(_LEAST_SIDE, last + 1)
+    bounds = onward[:: max(1, -(-onward.size // _MOST_BOUNDS))]
+    first, end = np.meshgrid(bounds, bounds, indexing="ij")
+    within = end - first >= _LEAST_SIDE
+    return np.concatenate([onward, first[within]]), np.concatenate([np.full(onward.size, count), end[within]])
 
 
 def _bent(profiles: Array) -> Array:

@@ -23,9 +23,9 @@ _SIGMAS, _RELATIVE = 3.0, 0.1
 _CATCH_ALL = {"expansion_coefficient"}
 #: Figures that each check which confirms nothing is printed with.
 _NOT_VERIFIED = {
-    "material_rise": ("expansion", "temperature"),
-    "camera_zero": ("expansion", "temperature"),
-    "camera_picture": ("expansion", "temperature"),
+    "material_rise": ("expansion", "table offset", "temperature"),
+    "camera_zero": ("expansion", "table offset", "temperature"),
+    "camera_picture": ("expansion", "table offset", "temperature"),
     "axis_line": ("expansion",),
 }
 
@@ -107,7 +107,7 @@ def _faults(lie: Lie, truth: Truth, results: Results, folder: Path) -> Iterator[
     # Readings without scatter have no drift, and no cause is named.
     if isinstance(loop, AxisLoop):
         yield from _wrong_causes(lie, truth, loop)
-        yield from _wrong_expansion(loop)
+        yield from _wrong_coefficients(truth, loop)
         yield from _wrong_anomalies(lie, truth, results.anomalies or ())
         yield from _wrong_profile(truth, results)
     yield from _wrong_field(lie, truth, folder / "fields.nc")
@@ -115,7 +115,7 @@ def _faults(lie: Lie, truth: Truth, results: Results, folder: Path) -> Iterator[
 
 def _wrong_causes(lie: Lie, truth: Truth, loop: AxisLoop) -> Iterator[str]:
     """Names that are false, and a verdict that nothing is missing although something is."""
-    named = [(step.effect, set(step.tied)) for step in loop.steps]
+    named = [(step.effect, set(step.tied)) for step in loop.steps if not step.withheld]
     named += [(error.effect, set()) for error in loop.field_corrections]
     missing = {effect.name for effect in truth.recipe.effect}
     untold = missing - {name for name, _ in named}
@@ -131,12 +131,17 @@ def _wrong_causes(lie: Lie, truth: Truth, loop: AxisLoop) -> Iterator[str]:
         yield f"{loop.verdict} without {', '.join(sorted(untold))}"
 
 
-def _wrong_expansion(loop: AxisLoop) -> Iterator[str]:
+def _wrong_coefficients(truth: Truth, loop: AxisLoop) -> Iterator[str]:
+    true_values = {
+        "axis_expansion": ("expansion", EXPANSION_PPM_PER_K),
+        "table_offset": ("table offset", truth.recipe.drift.offset_um_per_K),
+    }
     for entry in loop.declared_coefficients:
-        if entry.effect == "axis_expansion":
+        if entry.effect in true_values:
+            name, true = true_values[entry.effect]
             assert entry.value is not None and entry.u is not None
-            if abs(entry.value - EXPANSION_PPM_PER_K) > max(_RELATIVE * EXPANSION_PPM_PER_K, _SIGMAS * entry.u):
-                yield f"expansion {entry.value:.3g} ± {entry.u:.2g} ppm/K"
+            if abs(entry.value - true) > max(_RELATIVE * abs(true), _SIGMAS * entry.u):
+                yield f"{name} {entry.value:.3g} ± {entry.u:.2g} {entry.unit} (true {true:g})"
 
 
 def _wrong_anomalies(lie: Lie, truth: Truth, anomalies: tuple[AnomalyPart, ...]) -> Iterator[str]:
