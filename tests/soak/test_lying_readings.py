@@ -44,6 +44,27 @@ def missed_trigger(values: Array, rng: np.random.Generator) -> Array:
     return values
 
 
+def missed_in_one_approach(values: Array, rng: np.random.Generator) -> Array:
+    """The same in the negative approach alone."""
+    late = values[len(values) // 2 :]
+    late[:, 1, :-1] = late[:, 1, 1:].copy()
+    return values
+
+
+def missed_for_a_while(values: Array, rng: np.random.Generator) -> Array:
+    """The same in both approaches, for a quarter of the cycles."""
+    third = len(values) // 3
+    late = values[third : third + max(6, len(values) // 4)]
+    late[:, 0, 1:] = late[:, 0, :-1].copy()
+    late[:, 1, :-1] = late[:, 1, 1:].copy()
+    return values
+
+
+def held(values: Array, rng: np.random.Generator) -> Array:
+    """A seventh of the readings is that of the target before."""
+    return np.where(rng.random(values.shape) < 0.15, np.roll(values, 1, axis=2), values)
+
+
 def other_unit(values: Array, rng: np.random.Generator) -> Array:
     """From the middle on the readings are in units of 10 µm."""
     values[len(values) // 2 :] /= 10.0
@@ -64,6 +85,9 @@ LIES: dict[str, tuple[str, Callable[[Array, np.random.Generator], Array]]] = {
     "clipped at the 70th percentile": ("repeated_value", clipped),
     "zeros for a tenth": ("repeated_value", zeros),
     "a trigger missed in the middle": ("missed_trigger", missed_trigger),
+    "a trigger missed in one approach": ("missed_trigger", missed_in_one_approach),
+    "a trigger missed for a quarter of the cycles": ("missed_trigger", missed_for_a_while),
+    "a seventh held from the target before": ("repeated_value", held),
     "another unit from the middle on": ("deviation_unit", other_unit),
     "approaches exchanged from the middle on": ("approach_labels", exchanged_approaches),
 }
@@ -87,7 +111,7 @@ def test_errors_of_operator_and_recorder(lie: str, capsys: pytest.CaptureFixture
     with capsys.disabled():
         print(f"\nreadings {lie}: doubted {rate(doubted, runs)}, by {code or 'any check'} {named if code else doubted}")
     if code:
-        # Three of four: what scatters little or has a straight profile does not show it.
-        assert named >= 0.75 * runs
+        # Two of three: what scatters little or has a straight profile does not show it, in one approach with half of the evidence.
+        assert named >= 0.65 * runs
     else:
         assert doubted <= 0.02 * runs

@@ -229,9 +229,6 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     """One value that far more readings hold than scatter and resolution let them is a limit of the recorder or a filler."""
     values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
     sound = judge("repeated_value", 0.0, 0.0, "No value is repeated beyond what the resolution makes.")
-    held = _held_readings(deviations)
-    if held is not None:
-        return held
     with np.errstate(invalid="ignore"):
         steps = np.abs(np.diff(np.round(values, 6), axis=0))
     least = np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf)
@@ -253,6 +250,8 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     expected = float((chance * np.isfinite(some[:, at]).sum(axis=0)).sum())
     # Any of the values might have been the most frequent one, and its first reading is no repetition.
     p = found.size * float(special.gammainc(counts.max() - 1, expected)) if counts.max() > 1 else 1.0
+    if p >= _COINCIDENCE:
+        return _held_readings(deviations) or sound
     end = {np.nanmax(some): ", the largest of these", np.nanmin(some): ", the smallest of these"}.get(value, "")
     return judge(
         "repeated_value",
@@ -260,8 +259,7 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
         expected,
         f"{counts.max()} readings at targets that scatter hold one value, {value:g} µm{end}; scatter and resolution make {expected:.2g}.",
         "Check the range of the recorder (clipped readings) and what it writes where it has no reading; leave these out of the file.",
-        passed=p >= _COINCIDENCE,
-        sound=sound.evidence,
+        passed=False,
     )
 
 
@@ -269,15 +267,19 @@ def _held_readings(deviations: xr.Dataset) -> Check | None:
     """Readings that hold what the target before in the order of travel read, digit for digit, far more often than the resolution lets
     them; None where none do.
     """
-    values = deviations["deviation"].values[:, :, np.argsort(deviations["position"].values)]
-    steps_um = np.diff(np.round(values, 6), axis=2)
-    sizes = np.unique(np.abs(steps_um[np.isfinite(steps_um)]))
-    random_um = random_part_um(values)
-    if sizes.size < 2 or not random_um > sizes[1]:
-        return None
-    # The largest probability of one value of a difference of two readings, that at the centre of a normal distribution.
-    expected = np.count_nonzero(np.isfinite(steps_um)) * sizes[1] / (2.0 * np.sqrt(np.pi) * random_um)
-    count = np.count_nonzero(steps_um == 0.0)
+    values = np.round(deviations["deviation"].values[:, :, np.argsort(deviations["position"].values)], 6)
+    equal, random_um = np.diff(values, axis=2) == 0.0, random_part_um(values)
+    # A target that is a copy of another is named by itself.
+    equal &= equal.mean(axis=0) < _COPIED_SHARE
+    expected = 0.0
+    for here in values:
+        # The least distance of two readings of a cycle is its resolution: a compensation afterwards is another one in every cycle.
+        apart = np.diff(np.unique(here[np.isfinite(here)]))
+        if not apart.size or apart.min() >= random_um:
+            return None
+        # The largest probability of one value of a difference of two readings, that at the centre of a normal distribution.
+        expected += np.isfinite(np.diff(here, axis=1)).sum() * apart.min() / (2.0 * np.sqrt(np.pi) * random_um)
+    count = int(equal.sum())
     if count < 2 or float(special.gammainc(count, expected)) >= _COINCIDENCE:
         return None
     return judge(

@@ -24,6 +24,7 @@ from fusion.pipeline.drift_model import (
     correction_variables,
     field_notices,
     gap_notices,
+    hidden_by_zero,
     join_fusion,
     library_for,
     loop_variables,
@@ -34,6 +35,7 @@ from fusion.pipeline.drift_model import (
     scale_evidence,
     scaled,
     with_event_times,
+    with_spread,
 )
 from tests.fusion.small_campaign import campaign, logged, model_of, term
 
@@ -342,3 +344,37 @@ def test_results_carry_both_parts_of_every_coefficient(results_folder):
     assert expansion["u_scale"] == pytest.approx(results["radiometry"]["rise_scale_u"] * of_readings, rel=0.1)
     assert all(spot["peak_rise_u_K"] > 0.01 * spot["peak_rise_K"] for spot in results["hotspots"])
     assert "the scale of the rise ±" in (results_folder / "report.html").read_text()
+
+
+def test_a_zero_that_may_swing_hides_what_is_left_as_drift_in_its_share_of_the_rise():
+    rise = np.array([0.0, 1.0, 2.0, 3.0])[:, None, None] * np.ones((1, 2, 2))
+    coords = {"cycle": np.arange(1, 5), "y": [0.0, 10.0], "x": [0.0, 10.0]}
+    fields = xr.Dataset({"temperature_rise": (("cycle", "y", "x"), rise)}, coords=coords)
+    left = {"residual_drift": {"common_rms_um": 0.8, "stretch_rms_um": 0.6}}
+    position = np.array([0.0, 100.0, 200.0])
+    assert hidden_by_zero(left, fields, position) == {"um/K": 0.0, "ppm/K": 0.0}
+    unsure = fields.assign(camera_correction_u=("cycle", [0.0, 0.5, 1.0, 1.5]))
+    swing, reach = np.std([0.0, 1.0, 2.0, 3.0]), np.sqrt(np.mean((1e-3 * position) ** 2))
+    hidden = hidden_by_zero(left, unsure, position)
+    # Half of the rise is the zero's: half of the drift per kelvin, and per kelvin and metre.
+    assert hidden["um/K"] == pytest.approx(0.5 * 0.8 / swing)
+    assert hidden["ppm/K"] == pytest.approx(0.5 * 0.6 / (reach * swing))
+    entry = scaled({"value": 0.02, "u": 0.1}, 0.5, hidden["um/K"])
+    assert entry["u"] == pytest.approx(np.sqrt(0.1**2 + 0.01**2 + hidden["um/K"] ** 2)) and entry["u_fit"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "u"),
+    [
+        ({"u": 0.2, "u_fit": 0.2, "jackknife_u": 0.1}, 0.2),
+        ({"u": 0.2, "u_fit": 0.2, "jackknife_u": 0.5}, 0.5),
+        # The part of the scale stays beside it: 0.3 of the fit becomes 0.5.
+        ({"u": 0.5, "u_fit": 0.3, "jackknife_u": 0.5}, np.hypot(0.4, 0.5)),
+        # Half of the variance is what was expected beforehand, which does not move.
+        ({"u": 1.0, "u_fit": 1.0, "jackknife_u": 4.0, "prior": 11.7, "prior_u": np.sqrt(2.0)}, 2.0),
+        ({"u": 0.2, "u_fit": 0.2, "jackknife_u": None}, 0.2),
+        ({"u": 0.2}, 0.2),
+    ],
+)
+def test_a_declared_coefficient_is_no_surer_than_parts_of_the_test_agree(given, u):
+    assert with_spread(given)["u"] == pytest.approx(u)

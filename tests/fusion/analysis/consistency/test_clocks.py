@@ -10,6 +10,7 @@ from fusion.analysis.consistency.checks import Severity, judge
 from fusion.analysis.consistency.clocks import QUARTERS, Recording, check_clocks, without_consequences
 from fusion.analysis.consistency.courses import (
     _coarse_kind,
+    _other_kind,
     check_load_course,
     check_load_kind,
     check_load_scale,
@@ -182,6 +183,26 @@ def test_logs_that_are_no_load_of_the_table_are_doubted_and_named(change, words:
 )
 def test_a_log_that_shows_less_than_the_load_is_named_after_its_shape(load, words: str) -> None:
     found = _coarse_kind(60.0 * np.arange(len(load)), np.array(load, float))
+    assert found.startswith(words) and bool(found) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("load", "words"),
+    [
+        (np.arange(60.0), "only grows, in 59 of 60 rows: a counter"),
+        (np.tile(np.arange(30.0), 3), "grows in 87 of 90 rows and begins again near zero 2 times"),
+        (
+            np.diff([0.0, 0.0, 1.0, 1.0, 1.0, 0.4, 0.4, 0.4, 0.9, 0.9, 0.9, 0.0, 0.0, 0.0]),
+            "is zero but in 4 single rows",
+        ),
+        # A load that ramps up slowly and is switched off once, one that is switched, and the speed of an axis that goes to and fro.
+        (np.r_[np.linspace(0.0, 1.0, 60), np.zeros(30)], ""),
+        (np.tile([0.0, 0.0, 1.0, 1.0, 0.4, 0.4], 20), ""),
+        (np.tile([0.0, 0.0, 0.0, 0.0, 2.0, 2.0, 0.0, 0.0, 0.0, -2.0, -2.0], 10), ""),
+    ],
+)
+def test_a_counter_and_changes_of_a_load_are_told_by_their_shape(load, words: str) -> None:
+    found = _other_kind(np.asarray(load))
     assert found.startswith(words) and bool(found) == bool(words)
 
 

@@ -219,6 +219,18 @@ def test_a_gain_that_falls_through_the_test_is_doubted_and_a_steady_drift_of_the
         assert of_log(test.environment, fields, stated=True)["material_gain"].passed
 
 
+def test_a_zero_that_swings_leaves_the_scale_unverified_and_a_steady_drift_does_not() -> None:
+    test = recorded()
+    passed = xr.DataArray(np.linspace(0.0, 1.0, test.fields.sizes["time"]), dims="time")
+    shown = test.fields["frame_temperature"]
+    swings = test.fields.assign(frame_temperature=shown + 0.5 * np.sin(4.0 * np.pi * passed))
+    creeps = test.fields.assign(frame_temperature=shown + 0.05 * passed)
+    unsure, sure = (of_log(test.environment, one, stated=True)["material_rise"] for one in (swings, creeps))
+    assert unsure.passed and not unsure.verified and "do not change in proportion" in unsure.evidence
+    assert "reference_patch" in unsure.remedy
+    assert sure.passed and sure.verified
+
+
 # The rise grows nearly as the reciprocal of the emissivity: 0.97 over 0.90, over 0.50, and over 1.0.
 @pytest.mark.parametrize("factor", [1.078, 1.94, 0.85])
 def test_a_wrong_emissivity_is_doubted(factor: float) -> None:

@@ -151,6 +151,38 @@ def test_a_missed_trigger_is_named_with_its_first_cycle(late: int) -> None:
     assert f"From cycle 19 on every target reads what the one {'before' if late > 0 else 'after'} it" in check.evidence
 
 
+@pytest.mark.parametrize(
+    ("cycles", "approaches", "words"),
+    [
+        (slice(18, None), [1], ("From cycle 19 on", "in negative approach")),
+        (slice(18, None), [0], ("From cycle 19 on", "in positive approach")),
+        (slice(12, 24), [0, 1], ("In cycles 13 to 24, against all others", "otherwise:")),
+    ],
+)
+def test_a_trigger_missed_in_one_approach_or_for_some_cycles_is_named_with_where(
+    cycles: slice, approaches: list[int], words: tuple[str, str]
+) -> None:
+    test = sound(noise_um=0.2)
+    values = test["deviation"].values.copy()
+    for approach in approaches:
+        here = values[cycles, approach]
+        here[:, 1:] = here[:, :-1].copy() if approach == 0 else here[:, 1:]
+        here[:, :-1] = here[:, 1:].copy() if approach == 1 else here[:, :-1]
+    evidence = failed(with_deviation(test, values))["missed_trigger"].evidence
+    assert all(text in evidence for text in words)
+
+
+def test_readings_that_hold_the_target_before_are_named_with_their_number() -> None:
+    test = sound()
+    values = np.round(test["deviation"].values, 3)
+    held = np.random.default_rng(4).random(values.shape) < 0.15
+    held[:, :, 0] = False
+    changed = np.where(held, np.roll(values, 1, axis=2), values)
+    check = failed(with_deviation(test, changed))["repeated_value"]
+    assert check.value == np.count_nonzero(np.diff(changed, axis=2) == 0.0)
+    assert "hold what the target before or after them read" in check.evidence
+
+
 def test_coincidences_are_no_chance_in_sound_tests_of_all_lengths_and_resolutions() -> None:
     """Two cycles and more, fine and coarse, with a profile that changes at one cycle, a target at zero, and compensated afterwards."""
     for seed, (cycles, step_um) in enumerate([(2, 0.1), (3, 1.0), (5, 0.001), (12, 0.5), (40, 0.3), (40, 10.0)]):
