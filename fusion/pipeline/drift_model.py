@@ -12,6 +12,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
 from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.consistency.camera import zero_share
 from fusion.analysis.consistency.model import compare_lines, with_line, withhold_names
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
@@ -51,15 +52,6 @@ def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray
 def plan_scale_u(fields: xr.Dataset) -> float:
     """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
     return float(np.hypot(_weighted(*_last_rise(fields)), zero_share(fields)))
-
-
-def zero_share(fields: xr.Dataset) -> float:
-    """Uncertainty of the camera's zero, which changes as slowly as the table warms, as a share of the mean rise; over all cycles."""
-    if "camera_correction_u" not in fields:
-        return 0.0
-    rise, zero_u = fields["temperature_rise"].mean(("y", "x")).values, fields["camera_correction_u"].values
-    known = np.isfinite(rise) & np.isfinite(zero_u)
-    return float(np.sqrt((zero_u[known] ** 2).sum() / max((rise[known] ** 2).sum(), np.finfo(float).tiny)))
 
 
 def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:

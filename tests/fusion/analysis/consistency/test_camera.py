@@ -21,6 +21,7 @@ from fusion.analysis.consistency.camera import (
     check_registration,
     find_gaps,
     gap_words,
+    zero_share,
 )
 from fusion.analysis.consistency.checks import CODES, Check
 from tests.fusion.analysis.consistency.twin_fields import recorded
@@ -426,6 +427,24 @@ def test_a_pattern_in_the_picture_is_doubted_and_a_zero_that_may_be_a_reflection
     assert zero.passed and zero.verified is (zero_K < 0.1) and bool(zero.remedy) is (zero_K > 0.1)
     # Fields of earlier versions do not say.
     assert check_picture(xr.Dataset()) == []
+
+
+@pytest.mark.parametrize(("zero_u_K", "passed"), [(0.2, True), (0.8, False)])
+def test_a_zero_that_may_be_more_than_a_third_of_the_rise_is_doubted(zero_u_K: float, passed: bool) -> None:
+    rise = np.linspace(0.0, 2.0, 5)
+    shown = {"pattern_K": 0.02, "disc": "F3", "zero_K": 0.6, "warming_K": 2.5}
+    fields = xr.Dataset(
+        {
+            "temperature_rise": (("cycle", "y", "x"), rise[:, None, None] * np.ones((1, 2, 2))),
+            "camera_correction_u": ("cycle", np.full(5, zero_u_K)),
+        },
+        attrs={"discs": json.dumps(shown)},
+    )
+    share = zero_u_K / np.sqrt(np.mean(rise**2))
+    assert zero_share(fields) == pytest.approx(share)
+    _, zero = check_picture(fields)
+    assert zero.passed is passed and "reference_patch" in zero.remedy and zero.verified is not zero.passed
+    assert (f"{100.0 * share:.0f} % of the rise" in zero.evidence) is not passed
 
 
 def test_a_picture_that_no_disc_confirms_is_not_verified() -> None:
