@@ -705,12 +705,15 @@ def report(
     """Make the report of a finished run again, or print it to PDF."""
     from fusion.report.page import print_pdf, report_of
     from fusion.results.folder import claim_file
-    from fusion.results.store import write_text
+    from fusion.results.store import StageStamps, write_text
 
     with _answering():
         page = report_of(results)
         file = claim_file(results, "report.pdf" if pdf else "report.html", out)
         written = print_pdf(page, file, browser=browser) if pdf else write_text(file, page)
+        if out is None and not pdf:
+            # The run stays whole: `run --resume` has nothing to do.
+            StageStamps(results).renew(file)
         console.print(str(written), soft_wrap=True)
 
 

@@ -279,6 +279,15 @@ class StageStamps:
         self._stamps[stage] = {"key": key, "files": names, "note": plain(note)}
         write_json(self._path, self._stamps)
 
+    def renew(self, path: Path) -> None:
+        """Stamp a file of finished stages as it is now, after it was written again from their products."""
+        name = path.relative_to(self._folder).as_posix()
+        holding = [stamp for stamp in self._stamps.values() if name in stamp["files"]]
+        for stamp in holding:
+            stamp["files"][name] = file_sha256(path)
+        if holding:
+            write_json(self._path, self._stamps)
+
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return what a JSON file holds by name, empty where it is absent, damaged, or holds no such thing."""

@@ -134,6 +134,10 @@ def test_a_stage_is_done_only_for_the_same_input_and_untouched_files(tmp_path: P
     stamps.record("fields", "key", [product], {})
     product.write_bytes(b"touched")
     assert not stamps.done("fields", "key")
+    stamps.renew(product)
+    assert StageStamps(tmp_path).done("fields", "key")
+    StageStamps(tmp_path / "copied").renew(tmp_path / "copied" / product.name)
+    assert not (tmp_path / "copied").exists()
     assert (finished_stages(tmp_path), finished_stages(tmp_path / "absent")) == (["fields"], [])
 
 
