@@ -21,8 +21,10 @@ import numpy as np
 import pandas as pd
 import psutil
 import rich.table
+import xarray as xr
 
 from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import DATED
 from fusion.common import FusionError
 from fusion.messages import cell
 from fusion.pipeline.stages import kept_results
@@ -211,9 +213,10 @@ def with_findings(row: Row, folder: Path) -> Row:
     """Return a row with what the results of its run say."""
     try:
         results = read_results(folder)
-        hottest, above_range = _hottest(results, folder)
+        maps = read_product(folder, "fields") if (folder / "fields.nc").is_file() else None
     except (FusionError, OSError) as error:
         return replace(row, state="failed", message=str(error))
+    hottest, above_range = _hottest(results, maps)
     drift = _largest_drift(results)
     test = results.iso230
     # The columns are lengths.
@@ -230,7 +233,7 @@ def with_findings(row: Row, folder: Path) -> Row:
         title=results.campaign,
         machine=conditions.get("Machine") or stated.get("machine", ""),
         serial=conditions.get("Serial number of the machine") or stated.get("machine_serial_number", ""),
-        date=_day(results, conditions),
+        date=_day(results, conditions, maps),
         decision=next((one for one in _DECISIONS if one in decided), ""),
         maximum_degC=hottest.value,
         maximum_u_degC=hottest.u,
@@ -268,26 +271,25 @@ def _largest_drift(results: Results) -> Quantity:
     return _largest([Quantity(value=value, u=u) for value, u in ranges])
 
 
-def _hottest(results: Results, folder: Path) -> tuple[Quantity, bool]:
+def _hottest(results: Results, maps: xr.Dataset | None) -> tuple[Quantity, bool]:
     """Return the highest temperature in any picture, region or field, degC, and whether it is the end of the calibrated range."""
     found = {one.maximum_degC: one.overrange_pictures > 0 for one in results.regions or ()}
-    if (folder / "fields.nc").is_file():
-        maps = read_product(folder, "fields")
-        temperature = maps["temperature"].values
-        if np.isfinite(temperature).any():
-            at = np.unravel_index(np.nanargmax(temperature), temperature.shape)
-            u = float(maps["temperature_u"].values[at])
-            found[Quantity(value=float(temperature[at]), u=u if np.isfinite(u) else None)] = False
+    if maps is not None and np.isfinite(temperature := maps["temperature"].values).any():
+        at = np.unravel_index(np.nanargmax(temperature), temperature.shape)
+        u = float(maps["temperature_u"].values[at])
+        found[Quantity(value=float(temperature[at]), u=u if np.isfinite(u) else None)] = False
     hottest = _largest([*found])
     return hottest, found.get(hottest, False)
 
 
-def _day(results: Results, conditions: Mapping[str, str]) -> str:
+def _day(results: Results, conditions: Mapping[str, str], maps: xr.Dataset | None) -> str:
     """Return the day of the first reading or picture; empty where no file says it."""
     pictures = results.thermograms.cameras if results.thermograms else ()
     first = [one.first for one in pictures if one.first]
     if results.time is not None:
         first = [results.time.first]
+    elif maps is not None and (taken := maps["time"].values.min()) > DATED:
+        first = [str(np.datetime_as_string(taken, "D"))]
     return min(first, default=conditions.get("Date of the test", ""))[:10]
 
 

@@ -403,11 +403,11 @@ def _export_without_laser(folder: Path, format: str, out: Path, *, overwrite: bo
         )
     if record:
         frames = tables.record_tables(results, read_product(folder, "record"))
-    elif (folder / "thermograms.nc").is_file():
-        frames = tables.picture_tables(results, read_product(folder, "thermograms"))
-    elif (folder / "fields.nc").is_file():
-        frames = tables.field_tables(results, folder) if format == "xlsx" else {"fields": tables.fields_table(folder)}
+    elif (folder / "fields.nc").is_file() and format == "csv":
+        frames = {"fields": tables.fields_table(folder)}
     else:
+        frames = tables.camera_tables(results, folder)
+    if not frames:
         raise ExportError(f"{folder}: it holds results.json alone, no product to write; run the campaign again")
     if format == "xlsx":
         return Exported(_write(out, _workbook(frames), overwrite=overwrite))

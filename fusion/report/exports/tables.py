@@ -251,8 +251,19 @@ def record_readings_table(record: xr.Dataset) -> pd.DataFrame:
 # Of a camera.
 
 
-def picture_tables(results: Results, thermograms: xr.Dataset) -> dict[str, pd.DataFrame]:
-    """Return the tables of pictures by title."""
+def camera_tables(results: Results, folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the tables of a camera without a laser by title: of its pictures, and of the plan if it sees one; empty without products."""
+    found: dict[str, pd.DataFrame] = {}
+    if (folder / "thermograms.nc").is_file():
+        found["Regions"] = _regions_table(results)
+        found["Pictures"] = _pictures_table(read_product(folder, "thermograms"))
+    if (folder / "fields.nc").is_file():
+        found["Fields"] = _windows_table(read_product(folder, "fields"))
+    return {"Summary": findings_table(results), **found} if found else {}
+
+
+def _regions_table(results: Results) -> pd.DataFrame:
+    """Return highest, lowest and mean temperature of every region over the pictures of one camera."""
     regions = [
         {
             "region": one.name,
@@ -271,8 +282,9 @@ def picture_tables(results: Results, thermograms: xr.Dataset) -> dict[str, pd.Da
         for one in results.regions or ()
     ]
     frame = pd.DataFrame(regions)
-    frame["maximum_degC"] = _bounded(frame["maximum_degC"], frame["pictures_above_range"])
-    return {"Summary": findings_table(results), "Regions": frame, "Pictures": _pictures_table(thermograms)}
+    if regions:
+        frame["maximum_degC"] = _bounded(frame["maximum_degC"], frame["pictures_above_range"])
+    return frame
 
 
 def _bounded(highest: pd.Series[float], beyond: pd.Series[int]) -> pd.Series[Any]:
@@ -293,9 +305,8 @@ def _pictures_table(thermograms: xr.Dataset) -> pd.DataFrame:
     return table.rename(columns={"time": "time_utc"})[[*first, *names.values()]].rename(columns={"source": "picture"})
 
 
-def field_tables(results: Results, folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the tables of a camera that sees the plan, without a laser: what it measured over every window of time."""
-    fields = read_product(folder, "fields")
+def _windows_table(fields: xr.Dataset) -> pd.DataFrame:
+    """Return what a camera measured on the plan over every window of time."""
     plan = ("y", "x")
     columns = {
         "time_utc": fields["cycle_time"],
@@ -306,7 +317,7 @@ def field_tables(results: Results, folder: Path) -> dict[str, pd.DataFrame]:
     }
     frame = xr.Dataset({name: values.variable for name, values in columns.items()}).to_dataframe()
     frame.insert(0, "window", fields["cycle"].values)
-    return {"Summary": findings_table(results), "Fields": frame}
+    return frame
 
 
 def fields_table(folder: Path) -> pd.DataFrame:

@@ -47,6 +47,7 @@ from fusion.results.results import assemble, read_results
 from fusion.results.store import OutputError, open_dataset, write_json
 from tests.browser import CHROMIUM, record_faults
 from tests.fusion.campaign_parts import write_laser
+from tests.fusion.report.exports.small_run import write_fields
 from tests.fusion.results_sample import RECORD_LOOP
 
 
@@ -264,6 +265,12 @@ def test_a_maximum_beyond_the_calibrated_range_is_a_bound_and_pictures_have_a_da
     write_book(tmp_path / "fleet.xlsx", [row])
     cells = {cell.value: cell for cell in openpyxl.load_workbook(tmp_path / "fleet.xlsx")["Campaigns"][2]}
     assert cells[311.67].number_format == '"> "0'
+
+
+def test_fields_without_a_laser_have_a_date_and_a_maximum(tmp_path):
+    write_fields(tmp_path)
+    row = row_of(tmp_path)
+    assert (row.date, row.maximum_degC, row.maximum_u_degC) == ("2026-03-09", 1.0, 1.0)
 
 
 def test_the_drift_of_a_record_is_its_largest_displacement(tmp_path):
