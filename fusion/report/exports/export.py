@@ -150,6 +150,7 @@ def _at_targets(profile: Profile, table: ErrorTable) -> Array:
 #: Setting data that follow a temperature.
 TEMPERATURE_FORMAT = "siemens840d-temperature"
 FORMATS = ("csv", "xlsx", *CONTROLS, TEMPERATURE_FORMAT, *MODELS)
+_NO_LASER = "this campaign has no laser, so there is neither drift nor profile to write; --format csv and xlsx write its temperatures"
 #: Name of an axis that every control accepts.
 _AXIS = re.compile(r"[A-Za-z][A-Za-z0-9]{0,9}")
 
@@ -335,6 +336,8 @@ def _export_model(
     """Write the drift model of a record for a control."""
     results = read_results(folder)
     if not isinstance(results.loop, RecordLoop):
+        if not (folder / "deviations.nc").is_file():
+            raise ExportError(f"{folder}: {_NO_LASER}")
         raise ExportError(
             f"{folder}: a drift model is written from a test with temperature sensors ([record]); that of an axis follows a camera, which "
             "does not stay at the machine: export a compensation table, or siemens840d-temperature"
@@ -398,8 +401,7 @@ def _export_without_laser(folder: Path, format: str, out: Path, *, overwrite: bo
             f"{folder}: a record of displacements has no target positions, so there is no profile to write; --format csv and xlsx write "
             f"its tables, model-json, model-c, model-st and model-linuxcnc its drift for a control"
             if record
-            else f"{folder}: this campaign has no laser, so there is neither drift nor profile to write; --format csv and xlsx write its "
-            "temperatures"
+            else f"{folder}: {_NO_LASER}"
         )
     if record:
         frames = tables.record_tables(results, read_product(folder, "record"))

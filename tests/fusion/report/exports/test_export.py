@@ -109,8 +109,9 @@ def test_a_run_of_the_camera_alone_has_its_fields(tmp_path):
     [book] = export_results(tmp_path, "xlsx", tmp_path / "out").files
     sheet = openpyxl.load_workbook(book)["Fields"]
     assert [cell.value for cell in sheet[1]][:3] == ["window", "time (UTC)", "maximum / °C"] and sheet.max_row == 3
-    with pytest.raises(ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to"):
-        export_results(tmp_path, "linuxcnc", tmp_path / "out")
+    for format in ("linuxcnc", "model-json"):
+        with pytest.raises(ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to"):
+            export_results(tmp_path, format, tmp_path / "out")
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
