@@ -294,8 +294,8 @@ def fleet(
 ) -> None:
     """Run many campaigns, one process for each.
 
-    Writes fleet.json, fleet.csv and fleet.html with a row for each. One that fails does not stop the others; exit code 100 and the number
-    that failed.
+    Writes fleet.html, fleet.xlsx, fleet.csv and fleet.json with a row for each. One that fails does not stop the others; exit code 100 and
+    the number that failed.
     """
     from fusion.pipeline.fleet import Row, count_line, find_members, read_rows, run_fleet, summary_table
 

@@ -9,33 +9,39 @@ import os
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
+import pandas as pd
 import psutil
 import rich.table
+import xarray as xr
 
 from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import DATED
 from fusion.common import FusionError
 from fusion.messages import cell
 from fusion.pipeline.stages import kept_results
 from fusion.pipeline.workers import start_module
-from fusion.report.charts.comparison import plot_trend
+from fusion.report.charts.fleet import plot_history
 from fusion.report.charts.style import Chart, embed
 from fusion.report.conclusions import headline
-from fusion.report.exports.tables import write_table_book
-from fusion.report.numbers import measured, number
+from fusion.report.exports.tables import Bars, Bound, Linked, conditions_of, write_workbook
+from fusion.report.numbers import fixed, measured, upper_first
 from fusion.report.page import render_page
+from fusion.report.wording import ISO230_TERMS
 from fusion.results.folder import MANIFEST, claim, open_folder
+from fusion.results.loop import RecordLoop
+from fusion.results.parts import Quantity
 from fusion.results.progress import Report, silent
-from fusion.results.results import read_results
-from fusion.results.store import write_atomically, write_json, write_text
+from fusion.results.results import Results, read_results
+from fusion.results.store import read_json_object, read_product, write_atomically, write_json, write_text
 from thermography.common import usable_processors
 
 # Campaigns of a fleet: found in folders, each with a name of its own; and whether the results of one are still those
@@ -127,17 +133,19 @@ class Row:
     verdict, headline : str
         Of the closed loop, and as a sentence; empty where there is none.
     drift_um, drift_u_um : float or None, um
-        Largest range of the drift over the targets, and its standard uncertainty.
+        Largest range of the drift over the targets, of a record over its displacements, and its standard uncertainty.
     axis : str
         As the campaign file names it.
     A_um, A_u_um and so on : float or None, um
         Values by ISO 230-2 of the most settled window, each with its standard uncertainty.
-    machine, date : str
-        As the campaign file names it, and the day of the first reading.
+    machine, serial, date : str
+        As the campaign file names them, and the day of the first reading.
     decision : str
         The least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated.
     maximum_degC, maximum_u_degC : float or None, degC
-        Highest temperature in any picture of a camera that measured alone, and its standard uncertainty.
+        Highest temperature that a camera measured in a picture, a region or a field, and its standard uncertainty.
+    above_range : bool
+        Whether it is the end of the calibrated range, which pixels are above.
     held_out_um : float or None, um
         Root mean square error of the final model on what was held out.
     anomalies, warnings : int or None
@@ -146,6 +154,8 @@ class Row:
         Wall time of its run, s, and largest memory of its process; 0 where it was not measured.
     log : str
         File with everything that its run said, as seen from the summary.
+    conditions : mapping of str to str
+        Conditions of the test by name, empty where they are not stated.
     """
 
     name: str
@@ -180,6 +190,9 @@ class Row:
     seconds: float = 0.0
     peak_MB: float = 0.0
     log: str = ""
+    serial: str = ""
+    above_range: bool = False
+    conditions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def is_whole(self) -> bool:
@@ -192,51 +205,92 @@ class Row:
         return f"{self.name}/report.html" if self.is_whole else ""
 
 
-#: Columns of the CSV, and keys of a row in ``fleet.json``.
-_COLUMNS = tuple(field.name for field in fields(Row))
+#: Columns of the CSV, and keys of a row in ``fleet.json``, which has the conditions too.
+_COLUMNS = tuple(one.name for one in fields(Row) if one.name != "conditions")
 
 
 def with_findings(row: Row, folder: Path) -> Row:
     """Return a row with what the results of its run say."""
     try:
         results = read_results(folder)
+        maps = read_product(folder, "fields") if (folder / "fields.nc").is_file() else None
     except (FusionError, OSError) as error:
         return replace(row, state="failed", message=str(error))
-    drift = results.drift
-    ranges = () if drift is None else zip(drift.range_um, drift.range_u_um, strict=True)
-    known = [(value, u) for value, u in ranges if value is not None]
-    most, most_u = max(known, key=lambda one: one[0]) if known else (None, None)
+    hottest, above_range = _hottest(results, maps)
+    drift = _largest_drift(results)
     test = results.iso230
     # The columns are lengths.
     values = (
         {}
         if test is None or test.unit != "um"
-        else {name: getattr(test.settled or test, f"{name}_um") for name in _SYMBOLS}
+        else {name: getattr(test.settled or test, f"{name}_um") for name in ISO230_TERMS}
     )
-    stated = {} if test is None else {one.name: one.text for one in test.conditions}
+    conditions = conditions_of(results)
+    stated = read_json_object(folder / "provenance.json").get("parameters", {}).get("report", {})
     decided = [one.decision for one in test.tolerances] if test else []
-    highest = [one.maximum_degC for one in results.regions or () if one.maximum_degC.value is not None]
-    hottest = max(highest, key=lambda one: one.value or 0.0, default=None)
     return replace(
         row,
         title=results.campaign,
-        machine=stated.get("Machine", ""),
-        date=results.time.first[:10] if results.time else "",
+        machine=conditions.get("Machine") or stated.get("machine", ""),
+        serial=conditions.get("Serial number of the machine") or stated.get("machine_serial_number", ""),
+        date=_day(results, conditions, maps),
         decision=next((one for one in _DECISIONS if one in decided), ""),
-        maximum_degC=hottest.value if hottest else None,
-        maximum_u_degC=hottest.u if hottest else None,
+        maximum_degC=hottest.value,
+        maximum_u_degC=hottest.u,
+        above_range=above_range,
         held_out_um=None if results.loop is None else results.loop.rmse_final_um,
         verdict="" if results.loop is None else results.loop.verdict,
         headline="" if results.loop is None else headline(results),
-        drift_um=most,
-        drift_u_um=most_u,
-        axis=stated.get("Axis", ""),
+        drift_um=drift.value,
+        drift_u_um=drift.u,
+        axis=conditions.get("Axis", ""),
         **{f"{name}_um": one.value for name, one in values.items()},
         **{f"{name}_u_um": one.u for name, one in values.items()},
         anomalies=None if results.anomalies is None else len(results.anomalies),
         warnings=len(results.warnings),
         inputs="" if results.inputs is None else results.inputs.state,
+        conditions=conditions,
     )
+
+
+_UNKNOWN = Quantity(value=None, u=None)
+
+
+def _largest(found: Sequence[Quantity]) -> Quantity:
+    known = [one for one in found if one.value is not None]
+    return max(known, key=lambda one: one.value or 0.0, default=_UNKNOWN)
+
+
+def _largest_drift(results: Results) -> Quantity:
+    """Return the largest range of the drift of an axis over its targets, um; of a record that of its displacements by ISO 230-3."""
+    if isinstance(results.loop, RecordLoop):
+        moved = [one for test in results.iso230_3 or () for one in test.distortions if one.unit == "um"]
+        return _largest([one.whole for one in moved])
+    drift = results.drift
+    ranges = () if drift is None else zip(drift.range_um, drift.range_u_um, strict=True)
+    return _largest([Quantity(value=value, u=u) for value, u in ranges])
+
+
+def _hottest(results: Results, maps: xr.Dataset | None) -> tuple[Quantity, bool]:
+    """Return the highest temperature in any picture, region or field, degC, and whether it is the end of the calibrated range."""
+    found = {one.maximum_degC: one.overrange_pictures > 0 for one in results.regions or ()}
+    if maps is not None and np.isfinite(temperature := maps["temperature"].values).any():
+        at = np.unravel_index(np.nanargmax(temperature), temperature.shape)
+        u = float(maps["temperature_u"].values[at])
+        found[Quantity(value=float(temperature[at]), u=u if np.isfinite(u) else None)] = False
+    hottest = _largest([*found])
+    return hottest, found.get(hottest, False)
+
+
+def _day(results: Results, conditions: Mapping[str, str], maps: xr.Dataset | None) -> str:
+    """Return the day of the first reading or picture; empty where no file says it."""
+    pictures = results.thermograms.cameras if results.thermograms else ()
+    first = [one.first for one in pictures if one.first]
+    if results.time is not None:
+        first = [results.time.first]
+    elif maps is not None and (taken := maps["time"].values.min()) > DATED:
+        first = [str(np.datetime_as_string(taken, "D"))]
+    return min(first, default=conditions.get("Date of the test", ""))[:10]
 
 
 def as_json(rows: Sequence[Row], *, started: str, finished: str) -> dict[str, Any]:
@@ -249,7 +303,7 @@ def read_rows(folder: Path) -> dict[str, Row]:
     """Return the rows of an earlier fleet by name; none where there is no ``fleet.json`` of this layout."""
     try:
         content = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-        rows = [Row(**{key: item[key] for key in _COLUMNS}) for item in content["campaigns"]]
+        rows = [Row(**{one.name: item[one.name] for one in fields(Row)}) for item in content["campaigns"]]
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     return {row.name: row for row in rows}
@@ -266,77 +320,206 @@ def as_csv(rows: Sequence[Row]) -> str:
     return written.getvalue()
 
 
-def write_book(path: Path, rows: Sequence[Row]) -> None:
-    """Write the workbook of a fleet: one line per campaign that can be sorted and filtered, without columns in which nothing is."""
-    whole = [{**asdict(row), "report": row.report} for row in rows]
-    kept = [name for name in (*_COLUMNS, "report") if any(line[name] not in (None, "") for line in whole)]
-    headings = [f"{name} (standard uncertainty, k = 1)" if "_u_" in name else name for name in kept]
-    write_table_book(path, "Campaigns", headings, [[line[name] for name in kept] for line in whole], chart="A_um")
-
-
 def _no_formula(text: str) -> str:
     """Return a text with an apostrophe before a sign with which formulas begin."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
-def cells(row: Row) -> list[str]:
-    """Return a row as page and terminal show it, in the order of `HEADINGS`; a dash where there is nothing."""
-    return [
-        row.name,
-        row.machine or "–",
-        row.axis or "–",
-        row.date or "–",
-        row.decision or "–",
-        row.verdict.replace("_", " ") or ("not modelled" if row.is_whole else row.state),
-        *(measured(getattr(row, f"{name}_um"), getattr(row, f"{name}_u_um")) for name in ("drift", *_SYMBOLS)),
-        measured(row.maximum_degC, row.maximum_u_degC),
-        "–" if row.held_out_um is None else number(row.held_out_um, 3),
-        *("–" if count is None else str(count) for count in (row.anomalies, row.warnings)),
-        row.inputs or "–",
-        "–" if row.exit_code is None else str(row.exit_code),
-        number(row.seconds, 3) if row.seconds else "–",
-        f"{row.peak_MB:.0f}" if row.peak_MB else "–",
-    ]
-
-
-_SYMBOLS = ("A", "R", "E", "M", "B")
 #: Decisions by ISO 14253-1, the least favourable first.
 _DECISIONS = ("fail", "not measured", "not decided within the uncertainty", "pass")
-#: Headings of `cells`.
-HEADINGS = (
-    *(
-        "campaign",
-        "machine",
-        "axis",
-        "date",
-        "decision",
-        "verdict",
-        "drift / µm",
-        *(f"{name} / µm" for name in _SYMBOLS),
-    ),
-    *("maximum / °C", "held-out error / µm"),
-    *("anomalies", "warnings", "inputs", "exit code", "time / s", "memory / MB"),
+
+
+class Column(NamedTuple):
+    """A column of the summary: its heading, the attributes of a row that it shows, and what it means where its heading does not say it."""
+
+    heading: str
+    key: str
+    u: str = ""
+    meaning: str = ""
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it holds texts; the others hold numbers."""
+        return self.key in _TEXT
+
+
+_TEXT = (
+    "name",
+    "machine",
+    "serial",
+    "axis",
+    "date",
+    "decision",
+    "verdict",
+    "inputs",
+    "state",
+    "title",
+    "headline",
+    "message",
 )
-#: Those of text; the others head numbers.
-TEXT = ("campaign", "machine", "axis", "date", "decision", "verdict", "inputs")
-#: What the page alone shows.
-_COST = ("machine", "date", "time / s", "memory / MB")
+#: What was found, as page and workbook show it.
+FINDINGS = (
+    Column("campaign", "name"),
+    *(Column(f"{symbol} / µm", f"{symbol}_um", f"{symbol}_u_um") for symbol in ISO230_TERMS),
+    Column(
+        "maximum / °C", "maximum_degC", "maximum_u_degC", meaning="Maximum: highest temperature that a camera measured."
+    ),
+    Column(
+        "held-out error / µm", "held_out_um", meaning="Held-out error: of the last model, on what took no part in it."
+    ),
+    Column(
+        "decision",
+        "decision",
+        meaning="Decision: the least favourable of the stated tolerances (ISO 14253-1); not decided where one lies within the uncertainty.",
+    ),
+    Column(
+        "drift / µm",
+        "drift_um",
+        "drift_u_um",
+        meaning="Drift: largest range over the targets, or of a displacement, from scatter and estimate alone.",
+    ),
+    Column("verdict", "verdict"),
+    Column("machine", "machine"),
+    Column("serial number", "serial"),
+    Column("axis", "axis"),
+    Column("date", "date"),
+    Column("anomalies", "anomalies", meaning="Anomalies: positions that stand out from the others."),
+    Column("warnings", "warnings"),
+    Column("inputs", "inputs"),
+)
+#: How the runs went.
+RUNS = (
+    Column("state", "state"),
+    Column("exit code", "exit_code"),
+    Column("time / s", "seconds"),
+    Column("memory / MB", "peak_MB"),
+)
+#: What only the workbook has room for.
+_IN_FULL = (Column("title", "title"), Column("conclusion", "headline"), Column("message", "message"))
+#: What the terminal has room for beside the findings, and what it has not.
+_IN_TERMINAL = ("exit_code",)
+_NOT_IN_TERMINAL = ("machine", "serial", "date")
 
 
-def columns(rows: Sequence[Row]) -> dict[str, list[str]]:
-    """Return the cells of all rows by heading, without columns in which no row has anything."""
-    shown = zip(HEADINGS, zip(*map(cells, rows), strict=True), strict=True)
-    return {heading: list(column) for heading, column in shown if set(column) != {"–"}}
+def shown(row: Row, column: Column) -> str:
+    """Return what a row shows in a column; a dash where there is nothing."""
+    value = getattr(row, column.key)
+    if column.key == "verdict":
+        return value.replace("_", " ") or ("not modelled" if row.is_whole else row.state)
+    if value is None or value == "" or (value == 0.0 and column.key in ("seconds", "peak_MB")):
+        return "–"
+    if column.key == "decision":
+        return _short(value)
+    if column.key == "maximum_degC" and row.above_range:
+        return f"> {fixed(value, 0)}"
+    if column.key == "peak_MB":
+        return f"{value:.0f}"
+    return measured(value, getattr(row, column.u) if column.u else None) if isinstance(value, float) else str(value)
+
+
+def _short(decision: str) -> str:
+    return decision.removesuffix(" within the uncertainty")
+
+
+def filled(rows: Sequence[Row], columns: Sequence[Column]) -> list[Column]:
+    """Return those columns in which some row has something."""
+    return [column for column in columns if any(shown(row, column) != "–" for row in rows)]
+
+
+def count_decisions(rows: Sequence[Row]) -> dict[str, int]:
+    """Return how many campaigns there are of each decision, the most favourable first, and without one."""
+    counts = Counter(row.decision for row in rows if row.is_whole)
+    named = {_short(decision): counts[decision] for decision in reversed(_DECISIONS) if counts[decision]}
+    return named | ({"without a tolerance": counts[""]} if counts[""] else {})
+
+
+# The workbook of a fleet: a summary, one row per campaign, and what is stated of each test.
+
+
+def write_book(path: Path, rows: Sequence[Row]) -> None:
+    """Write the workbook of a fleet, without columns in which nothing is."""
+    sheets = {"Summary": _summary_of(rows), "Campaigns": _campaigns_of(rows)}
+    if any(text for row in rows for text in row.conditions.values()):
+        sheets["Conditions"] = _conditions_of(rows)
+    write_workbook(path, sheets, Bars("Campaigns", ("A / µm", "R / µm"), beside="Summary"))
+
+
+def _link(row: Row) -> str | Linked:
+    return Linked(row.name, quote(row.report)) if row.report else row.name
+
+
+def _summary_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """Return counts of campaigns and decisions, the largest A, R and maximum, and the first and last date with their campaigns."""
+    lines: list[tuple[object, ...]] = [("campaigns", len(rows), None, None)]
+    lines += [(state, count, None, None) for state, count in Counter(row.state for row in rows).items()]
+    lines += [(f"decision: {decision}", count, None, None) for decision, count in count_decisions(rows).items()]
+    for key, named in (
+        ("A_um", "largest A / µm"),
+        ("R_um", "largest R / µm"),
+        ("maximum_degC", "highest temperature / °C"),
+    ):
+        known = [row for row in rows if getattr(row, key) is not None]
+        if known:
+            most = max(known, key=lambda row: getattr(row, key))
+            u = getattr(most, key.replace("_", "_u_", 1))
+            lines.append((named, _value(most, key), None if u is None else 2 * u, _link(most)))
+    dated = sorted((row for row in rows if row.date), key=lambda row: row.date)
+    for named, row in zip(("newest date", "oldest date"), (*dated[-1:], *dated[:1]), strict=False):
+        lines.append((named, _value(row, "date"), None, _link(row)))
+    return pd.DataFrame(lines, columns=["finding", "value", "U (k = 2)", "campaign"], dtype=object)
+
+
+def _campaigns_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """Return the findings of every campaign with expanded uncertainties, then how its run went."""
+    table: dict[str, list[object]] = {}
+    for column in filled(rows, (*FINDINGS, *_IN_FULL, *RUNS)):
+        table[column.heading] = [_value(row, column.key) for row in rows]
+        if column.u and any(getattr(row, column.u) is not None for row in rows):
+            quantity, _, unit = column.heading.partition(" / ")
+            expanded = [None if (u := getattr(row, column.u)) is None else 2 * u for row in rows]
+            table[f"U({quantity}) (k = 2) / {unit.replace('°C', 'K')}"] = list(expanded)
+    return pd.DataFrame({heading: pd.Series(values, dtype=object) for heading, values in table.items()})
+
+
+def _value(row: Row, key: str) -> object:
+    """Return what a row holds as a cell: its name with a link to the report, a day as a day, a bound as one."""
+    value = getattr(row, key)
+    if key == "name":
+        return _link(row)
+    if key == "date":
+        return date.fromisoformat(value[:10]) if value else None
+    if key == "maximum_degC" and row.above_range:
+        return Bound(value)
+    if key in ("decision", "verdict"):
+        told = shown(row, Column("", key))
+        return None if told == "–" else told
+    return value
+
+
+def _conditions_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """Return what is stated of each test, without conditions that none states."""
+    asked = dict.fromkeys(name for row in rows for name, text in row.conditions.items() if text)
+    return pd.DataFrame(
+        [
+            {"campaign": _link(row), **{name: row.conditions.get(name) or "not stated" for name in asked}}
+            for row in rows
+            if row.conditions
+        ],
+        dtype=object,
+    )
 
 
 def summary_table(rows: Sequence[Row], title: str) -> rich.table.Table:
     """Return the rows of a fleet as a table for the terminal."""
     printed = rich.table.Table(title=cell(title), title_justify="left")
-    shown = {heading: column for heading, column in columns(rows).items() if heading not in _COST}
-    for heading in shown:
-        printed.add_column(heading, justify="left" if heading in TEXT else "right", overflow="fold")
-    for line in zip(*shown.values(), strict=True):
-        printed.add_row(*map(cell, line))
+    named = [one for one in FINDINGS if one.key not in _NOT_IN_TERMINAL] + [
+        one for one in RUNS if one.key in _IN_TERMINAL
+    ]
+    columns = filled(rows, named)
+    for column in columns:
+        printed.add_column(column.heading, justify="left" if column.is_text else "right", overflow="fold")
+    for row in rows:
+        printed.add_row(*(cell(shown(row, column)) for column in columns))
     return printed
 
 
@@ -359,42 +542,61 @@ def count_line(rows: Sequence[Row]) -> str:
 
 def render_fleet(rows: Sequence[Row], *, started: str) -> str:
     """Return the page of a fleet as HTML text."""
-    shown = columns(rows)
-    trends = draw_trends(rows)
+    histories = draw_histories(rows)
+    columns, runs = filled(rows, FINDINGS[1:]), filled(rows, RUNS)
+    decisions = count_decisions(rows) if any(row.decision for row in rows) else {}
     return render_page(
         "fleet.html.j2",
-        embed({f"trend_{k}": chart for k, chart in enumerate(trends.values())}),
+        embed({f"history_{k}": one.chart for k, one in enumerate(histories)}),
         ("fleet.js",),
-        trends=[(f"trend_{k}", f"{name}. {_TREND}") for k, name in enumerate(trends)],
-        counts=count_line(rows),
-        started=f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M} UTC",
-        headings=[(heading[0].upper() + heading[1:], heading not in TEXT) for heading in shown],
-        rows=[
-            (row, quote(row.report), line[1:])
-            for row, line in zip(rows, zip(*shown.values(), strict=True), strict=True)
+        histories=[
+            (f"history_{k}", one.name, [(row, quote(row.report)) for row in one.rows])
+            for k, one in enumerate(histories)
         ],
+        counts=count_line(rows),
+        decisions=", ".join(f"{count} {decision}" for decision, count in decisions.items()),
+        started=f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M} UTC",
+        meanings=[column.meaning for column in columns if column.meaning],
+        by_iso230=any(column.key == "A_um" for column in columns),
+        headings=[(upper_first(column.heading), not column.is_text) for column in columns],
+        rows=[(row, quote(row.report), [shown(row, column) for column in columns]) for row in rows],
+        run_headings=[(upper_first(column.heading), not column.is_text) for column in runs],
+        runs=[(row, quote(row.log), [shown(row, column) for column in runs]) for row in rows],
         failed=[(row, quote(row.log)) for row in rows if row.state == "failed"],
         summary={"assumptions": {}},
     )
 
 
-_TREND = "With expanded uncertainties (k = 2); dashed: control limits of a chart of individuals, from eight tests on."
+class History(NamedTuple):
+    """The tests of one axis of one machine in the order of their dates."""
+
+    name: str
+    chart: Chart
+    rows: Sequence[Row]
 
 
-def draw_trends(rows: Sequence[Row]) -> dict[str, Chart]:
-    """Draw A, R and B over the dates of every axis that was tested three times or more; tests of a machine state it, or share a folder."""
-    tests: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        if row.date and row.A_um is not None:
-            tests.setdefault((row.machine or row.name.rpartition("/")[0], row.axis), []).append(row)
-    charts = {}
-    for (machine, axis), dated in tests.items():
-        dates = np.array([row.date for row in dated], "datetime64[D]")
-        for name in "ARB":
-            values, u = (np.array([getattr(row, f"{name}_{key}") for row in dated], float) for key in ("um", "u_um"))
-            if (chart := plot_trend(dates, values, u, name)) is not None:
-                charts[", ".join(word for word in (machine, axis and f"axis {axis}", name) if word)] = chart
-    return charts
+def draw_histories(rows: Sequence[Row]) -> list[History]:
+    """Draw A and R over the dates of every axis that was tested twice or more; tests of a machine state it, or share a folder."""
+    tests: dict[tuple[str, str, str], list[Row]] = {}
+    for row in sorted(rows, key=lambda row: row.date):
+        machine = row.machine or ("" if row.serial else row.name.rpartition("/")[0])
+        if row.date and row.A_um is not None and (machine or row.serial):
+            tests.setdefault((machine, row.serial, row.axis), []).append(row)
+    histories = []
+    for (machine, serial, axis), dated in tests.items():
+        if len({row.date for row in dated}) < 2:
+            continue
+        found = {
+            name: (
+                np.array([getattr(row, f"{name}_um") for row in dated], float),
+                np.array([getattr(row, f"{name}_u_um") for row in dated], float),
+            )
+            for name in "AR"
+        }
+        words = (machine, serial and f"serial number {serial}", axis and f"axis {axis}")
+        chart = plot_history(np.array([row.date for row in dated], "datetime64[D]"), found)
+        histories.append(History(", ".join(word for word in words if word), chart, dated))
+    return histories
 
 
 #: Memory that a run is taken to need until one has been seen, bytes.

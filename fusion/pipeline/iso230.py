@@ -256,7 +256,9 @@ def _conditions(
     conditions = {
         **identity(report, date_of(dataset["time"].values, zone), "" if campaign is None else campaign.campaign.axis),
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
-        "Measured travel": f"{np.ptp(position):g}{unit}, {position.min():g} to {position.max():g}{unit}",
+        "Measured travel": f"{np.ptp(position):g}{unit}, {position.min():g} to {position.max():g}{unit}".replace(
+            "-", "−"
+        ),
         "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
         "Feed": "" if feed is None else f"{feed:g} mm/min",
         "Dwell at a target": "" if dwell is None else f"{dwell:g} s",

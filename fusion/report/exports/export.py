@@ -150,6 +150,7 @@ def _at_targets(profile: Profile, table: ErrorTable) -> Array:
 #: Setting data that follow a temperature.
 TEMPERATURE_FORMAT = "siemens840d-temperature"
 FORMATS = ("csv", "xlsx", *CONTROLS, TEMPERATURE_FORMAT, *MODELS)
+_NO_LASER = "this campaign has no laser, so there is neither drift nor profile to write; --format csv and xlsx write its temperatures"
 #: Name of an axis that every control accepts.
 _AXIS = re.compile(r"[A-Za-z][A-Za-z0-9]{0,9}")
 
@@ -245,7 +246,7 @@ def export_results(
             results, format, out, sampling_s=sampling_s, reduced=reduced, force=force, overwrite=overwrite
         )
     if not (results / "deviations.nc").is_file():
-        return _export_camera(results, format, out, overwrite=overwrite)
+        return _export_without_laser(results, format, out, overwrite=overwrite)
     found, deviations = read_results(results), read_product(results, "deviations")
     content: dict[str, Writer]
     if format == "csv":
@@ -254,8 +255,7 @@ def export_results(
         left = () if size is None else (f"fields.csv (about {size:.0f} MB) is written where --fields is given",)
         return Exported(_write(out, content, overwrite=overwrite), left)
     if format == "xlsx":
-        content = {"results.xlsx": lambda path: tables.write_workbook(path, found, deviations)}
-        return Exported(_write(out, content, overwrite=overwrite))
+        return Exported(_write(out, _workbook(tables.axis_tables(found, deviations)), overwrite=overwrite))
     if not has(deviations, "drift"):
         raise ExportError(
             f"{results}: the readings have no times, or are too few, so there is neither drift nor profile to write; --format csv and xlsx "
@@ -336,6 +336,8 @@ def _export_model(
     """Write the drift model of a record for a control."""
     results = read_results(folder)
     if not isinstance(results.loop, RecordLoop):
+        if not (folder / "deviations.nc").is_file():
+            raise ExportError(f"{folder}: {_NO_LASER}")
         raise ExportError(
             f"{folder}: a drift model is written from a test with temperature sensors ([record]); that of an axis follows a camera, which "
             "does not stay at the machine: export a compensation table, or siemens840d-temperature"
@@ -390,15 +392,33 @@ def _axis_name(run: _Run, given: str | None, *, needed: bool) -> str:
     raise ExportError(f"{why}; write a letter and up to nine letters or digits, for example --axis X1")
 
 
-def _export_camera(results: Path, format: str, out: Path, *, overwrite: bool) -> Exported:
-    """Write what a campaign without a laser has: its fields."""
-    if not (results / "fields.nc").is_file():
-        raise ExportError(f"{results}: there is no deviations.nc in it; name the results folder of a finished run")
-    if format != "csv":
+def _export_without_laser(folder: Path, format: str, out: Path, *, overwrite: bool) -> Exported:
+    """Write what a record has, or a campaign of the camera alone; nothing of it is the table of a control."""
+    results = read_results(folder)
+    record = isinstance(results.loop, RecordLoop)
+    if format not in ("csv", "xlsx"):
         raise ExportError(
-            f"{results}: this campaign has no laser, so there is neither drift nor profile to write; its fields are written by --format csv"
+            f"{folder}: a record of displacements has no target positions, so there is no profile to write; --format csv and xlsx write "
+            f"its tables, model-json, model-c, model-st and model-linuxcnc its drift for a control"
+            if record
+            else f"{folder}: {_NO_LASER}"
         )
-    return Exported(_write(out, {"fields.csv": _frame_writer(tables.fields_table(results))}, overwrite=overwrite))
+    if record:
+        frames = tables.record_tables(results, read_product(folder, "record"))
+    elif (folder / "fields.nc").is_file() and format == "csv":
+        frames = {"fields": tables.fields_table(folder)}
+    else:
+        frames = tables.camera_tables(results, folder)
+    if not frames:
+        raise ExportError(f"{folder}: it holds results.json alone, no product to write; run the campaign again")
+    if format == "xlsx":
+        return Exported(_write(out, _workbook(frames), overwrite=overwrite))
+    named = {f"{title.lower().replace(' ', '_')}.csv": _frame_writer(frame) for title, frame in frames.items()}
+    return Exported(_write(out, named, overwrite=overwrite))
+
+
+def _workbook(frames: dict[str, pd.DataFrame]) -> dict[str, Writer]:
+    return {"results.xlsx": lambda path: tables.write_workbook(path, frames)}
 
 
 def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_fields: bool) -> dict[str, Writer]:

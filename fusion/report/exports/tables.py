@@ -1,14 +1,14 @@
-"""Tables of a run for other programs: readings with drift, profile, ISO 230-2 values, and the fields on request."""
+"""Tables of a run for other programs: of an axis, of a record, of pictures, and the fields on request; workbooks of such tables."""
 
 from __future__ import annotations
 
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
-from datetime import datetime
+from collections.abc import Mapping
+from datetime import date, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,18 +17,64 @@ from openpyxl import Workbook
 from openpyxl.cell import WriteOnlyCell
 from openpyxl.cell.cell import ILLEGAL_CHARACTERS_RE
 from openpyxl.chart import BarChart, Reference, ScatterChart, Series
-from openpyxl.styles import Font
+from openpyxl.styles import Alignment, Font
 from openpyxl.utils import get_column_letter
 
+from fusion.report.numbers import print_unit
 from fusion.report.terminal import summary_rows
-from fusion.report.wording import quoted_window
-from fusion.results.axis import Iso230Tolerance
+from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters, quoted_window
+from fusion.results.loop import RecordLoop
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
 from interferometry import iso230
 
 #: Bytes of a row of fields.csv, measured on the demo.
 _FIELD_ROW_BYTES = 38
+
+
+def findings_table(results: Results) -> pd.DataFrame:
+    """Return what was found, in words."""
+    return pd.DataFrame([("campaign", results.campaign), *summary_rows(results)], columns=["finding", "value"])
+
+
+def conditions_of(results: Results) -> dict[str, str]:
+    """Return the conditions of the test by name, empty where they are not stated; nothing where the results hold none."""
+    tests = [one for one in (results.iso230, *(results.iso230_3 or ())) if one is not None]
+    return {one.name: one.text for one in tests[0].conditions} if tests else {}
+
+
+def _conditions_table(results: Results) -> pd.DataFrame:
+    rows = [(name, text or "not stated") for name, text in conditions_of(results).items()]
+    return pd.DataFrame(rows, columns=["condition", "stated or logged"])
+
+
+# Of an axis.
+
+
+def axis_tables(results: Results, deviations: xr.Dataset) -> dict[str, pd.DataFrame]:
+    """Return the tables of a positioning test by title."""
+    return {
+        "Summary": findings_table(results),
+        **({} if results.iso230 is None else {"A R E M B": _judged_table(results)}),
+        "Conditions": _conditions_table(results),
+        "ISO 230-2 axis": iso230_axis_table(deviations),
+        "ISO 230-2 positions": iso230_position_table(deviations, results),
+        **({"Profile": profile_table(deviations)} if has(deviations, "drift") else {}),
+        "Readings": readings_table(deviations),
+    }
+
+
+def _judged_table(results: Results) -> pd.DataFrame:
+    """Return the values to quote with the decision on each that has a tolerance."""
+    assert results.iso230 is not None
+    window, limits = quoted_window(results.iso230), {one.quantity: one for one in results.iso230.tolerances}
+    unit = results.iso230.unit
+    rows = []
+    for name in ISO230_TERMS:
+        found, limit = getattr(window, f"{name}_um"), limits.get(name)
+        judged = (None, "no tolerance stated") if limit is None else (limit.limit_um, limit.decision)
+        rows.append((name, found.value, found.u, *judged))
+    return pd.DataFrame(rows, columns=["quantity", f"value_{unit}", f"u_{unit}", f"limit_{unit}", "decision"])
 
 
 def readings_table(deviations: xr.Dataset) -> pd.DataFrame:
@@ -61,14 +107,16 @@ def iso230_axis_table(deviations: xr.Dataset) -> pd.DataFrame:
     """Return the axis values of every window of cycles with their standard uncertainty, um."""
     windows = group(deviations, "iso")
     rows = []
-    for name in (*iso230.QUANTITIES, "mean_reversal", "E_unidirectional", "R_unidirectional", "A_unidirectional"):
+    for name in (*ISO230_TERMS, "mean_reversal", "E_unidirectional", "R_unidirectional", "A_unidirectional"):
         if name not in windows:
             continue
         frame = xr.Dataset({"value_um": windows[name], "u_um": windows[f"{name}_u"]}).to_dataframe().reset_index()
         rows.append(frame.assign(quantity=name.removesuffix("_unidirectional")))
     table = pd.concat(rows, ignore_index=True)
     table["direction"] = table["direction"].fillna("both") if "direction" in table else "both"
-    return _in_its_units(table[["window", "quantity", "direction", "value_um", "u_um"]], deviations)
+    # A test of as many cycles as the standard asks for is its own only window.
+    columns = ["window", "quantity", "direction", "value_um", "u_um"]
+    return _in_its_units(table[columns].drop_duplicates(ignore_index=True), deviations)
 
 
 def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFrame:
@@ -89,6 +137,187 @@ def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFr
     }
     table = xr.Dataset(columns).to_dataframe().reset_index().assign(window=evaluated.attrs["window"])
     return _in_its_units(table, deviations)
+
+
+# Of a record.
+
+
+def record_tables(results: Results, record: xr.Dataset) -> dict[str, pd.DataFrame]:
+    """Return the tables of a record by title."""
+    loop = results.loop
+    assert isinstance(loop, RecordLoop)
+    named = {"declared model": loop.errors.declared, "with the added effects": loop.errors.final}
+    plain = {words: getattr(loop.baselines, name) for name, words in baseline_words(loop).items()}
+    return {
+        "Summary": findings_table(results),
+        "Distortions": _distortions_table(results),
+        "Conditions": _conditions_table(results),
+        "Model": _steps_table(loop),
+        "Contributions": _contributions_table(record),
+        "Hold-out errors": _channels_table(loop),
+        "Predictions": pd.DataFrame(
+            [(name, one.rmse_um, one.low_um, one.high_um) for name, one in {**named, **plain}.items()],
+            columns=["prediction", "rmse_um", "low_95_percent_um", "high_95_percent_um"],
+        ),
+        "Readings": record_readings_table(record),
+    }
+
+
+def _distortions_table(results: Results) -> pd.DataFrame:
+    """Return how far displacements, tilts and temperatures moved by ISO 230-3, each in its own unit."""
+    periods = {
+        "first_hour": "first_hour",
+        "whole_test": "whole",
+        "last_hour": "last_hour",
+        "last_minus_first": "change",
+    }
+    rows = []
+    for test in results.iso230_3 or ():
+        for one in (*test.distortions, *test.temperatures):
+            found = {name: getattr(one, period) for name, period in periods.items()}
+            values = {
+                key: value for name, each in found.items() for key, value in ((name, each.value), (f"{name}_u", each.u))
+            }
+            run = {"run": test.run} if test.run else {}
+            rows.append(
+                {
+                    **run,
+                    "quantity": one.name,
+                    "unit": print_unit(one.unit),
+                    **values,
+                    "settled_after_min": one.settling_min,
+                }
+            )
+    return pd.DataFrame(rows, columns=None if rows else ["quantity", "unit"])
+
+
+def _steps_table(loop: RecordLoop) -> pd.DataFrame:
+    """Return the declared model and every effect that was added, with its parameters and the errors on the hold-out set."""
+    declared = ", ".join(effect_words(name).name for name in loop.declared) or "nothing"
+    rows: list[tuple[object, ...]] = [(0, f"declared: {declared}", "", None, None, loop.rmse_declared_um)]
+    rows += [
+        (
+            turn,
+            effect_words(step.effect).name,
+            parameters(step.parameters, step.parameter_ranges),
+            step.p_value,
+            step.rmse_before_um,
+            step.rmse_after_um,
+        )
+        for turn, step in enumerate(loop.steps, start=1)
+    ]
+    return pd.DataFrame(rows, columns=["step", "effect", "parameters", "p_value", "rmse_before_um", "rmse_after_um"])
+
+
+def _contributions_table(record: xr.Dataset) -> pd.DataFrame:
+    """Return how much each term of the final model moves each displacement over the record, largest minus smallest."""
+    rows = [
+        (effect_words(str(effect)).name, str(channel), float(np.ptp(record["contribution"].values[at, :, k])))
+        for at, effect in enumerate(record["effect"].values)
+        for k, channel in enumerate(record["channel"].values)
+    ]
+    return pd.DataFrame(rows, columns=["effect", "displacement", "range_um"])
+
+
+def _channels_table(loop: RecordLoop) -> pd.DataFrame:
+    """Return the errors on the hold-out set by displacement, and their means."""
+    names = ("last_value_repeated_um", "declared_model_um", "final_model_um")
+    keys = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
+    rows = [
+        (name, *(getattr(one, key) for key in keys), one.noise_um, one.variance_share)
+        for name, one in loop.channels.items()
+    ]
+    rows.append(("mean", *(getattr(loop, key) for key in keys), loop.noise_floor_um, None))
+    return pd.DataFrame(rows, columns=["displacement", *names, "noise_um", "share_of_variance_left"])
+
+
+def record_readings_table(record: xr.Dataset) -> pd.DataFrame:
+    """Return the readings of a record as they were modelled, means over its blocks, with the predictions of the final model."""
+    time = record["time"].values
+    elapsed = record["elapsed"].values / 3600.0 if "elapsed" in record else (time - time[0]) / np.timedelta64(1, "h")
+    columns: dict[str, Any] = {"time [h]": elapsed}
+    # The times of a record whose start nobody states count from zero.
+    columns |= {"time_utc": time} if time[0] >= np.datetime64("1971-01-01") else {}
+    for k, name in enumerate(record["channel"].values):
+        columns[f"{name} [um]"] = record["displacement"].values[:, k]
+        columns[f"{name}, predicted [um]"] = record["predicted_final"].values[:, k]
+    columns |= {f"{name} [degC]": record["temperature"].values[:, k] for k, name in enumerate(record["sensor"].values)}
+    for k, name in enumerate(record["driver_name"].values):
+        size, unit = (record[key].values[k] for key in ("driver_size", "driver_units"))
+        columns[f"{name} [{unit}]"] = record["driver"].values[:, k] * float(size)
+    return pd.DataFrame({**columns, "held_out": np.where(record["sealed"].values, "yes", "no")})
+
+
+# Of a camera.
+
+
+def camera_tables(results: Results, folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the tables of a camera without a laser by title: of its pictures, and of the plan if it sees one; empty without products."""
+    found: dict[str, pd.DataFrame] = {}
+    if (folder / "thermograms.nc").is_file():
+        found["Regions"] = _regions_table(results)
+        found["Pictures"] = _pictures_table(read_product(folder, "thermograms"))
+    if (folder / "fields.nc").is_file():
+        found["Fields"] = _windows_table(read_product(folder, "fields"))
+    return {"Summary": findings_table(results), **found} if found else {}
+
+
+def _regions_table(results: Results) -> pd.DataFrame:
+    """Return highest, lowest and mean temperature of every region over the pictures of one camera."""
+    regions = [
+        {
+            "region": one.name,
+            **{key: getattr(one, key) for key in ("camera", "kind", "pictures", "emissivity")},
+            **{
+                f"{name}{u}": getattr(getattr(one, f"{name}_degC"), key)
+                for name in ("maximum", "minimum", "mean")
+                for u, key in (("_degC", "value"), ("_u_K", "u"))
+            },
+            "pictures_above_range": one.overrange_pictures,
+            "pictures_below_range": one.underrange_pictures,
+            "hottest_picture": one.maximum_at.file,
+            "column_px": one.maximum_at.column_px,
+            "row_px": one.maximum_at.row_px,
+        }
+        for one in results.regions or ()
+    ]
+    frame = pd.DataFrame(regions)
+    if regions:
+        frame["maximum_degC"] = _bounded(frame["maximum_degC"], frame["pictures_above_range"])
+    return frame
+
+
+def _bounded(highest: pd.Series[float], beyond: pd.Series[int]) -> pd.Series[Any]:
+    """Return highest temperatures, as bounds where pixels are beyond the calibrated range."""
+    pairs = zip(highest, beyond, strict=True)
+    return pd.Series([Bound(value) if count else value for value, count in pairs], dtype=object)
+
+
+def _pictures_table(thermograms: xr.Dataset) -> pd.DataFrame:
+    """Return temperatures of every region in every picture, region by region."""
+    units = {"maximum": "degC", "maximum_u": "K", "minimum": "degC", "minimum_u": "K", "mean": "degC", "mean_u": "K"}
+    counts = {"overrange": "pixels_above_range", "underrange": "pixels_below_range"}
+    names = {**{name: f"{name}_{unit}" for name, unit in units.items()}, "emissivity": "emissivity", **counts}
+    table = thermograms[list(names)].transpose("region", "time").to_dataframe().reset_index().rename(columns=names)
+    table["maximum_degC"] = _bounded(table["maximum_degC"], table["pixels_above_range"])
+    table.insert(0, "time [min]", (table["time"] - table["time"].min()) / np.timedelta64(1, "m"))
+    first = ["region", "source", "time [min]", "time_utc"]
+    return table.rename(columns={"time": "time_utc"})[[*first, *names.values()]].rename(columns={"source": "picture"})
+
+
+def _windows_table(fields: xr.Dataset) -> pd.DataFrame:
+    """Return what a camera measured on the plan over every window of time."""
+    plan = ("y", "x")
+    columns = {
+        "time_utc": fields["cycle_time"],
+        "maximum_degC": fields["temperature"].max(plan),
+        "mean_degC": fields["temperature"].mean(plan),
+        "largest_rise_K": fields["temperature_rise"].max(plan),
+        "mean_rise_K": fields["temperature_rise"].mean(plan),
+    }
+    frame = xr.Dataset({name: values.variable for name, values in columns.items()}).to_dataframe()
+    frame.insert(0, "window", fields["cycle"].values)
+    return frame
 
 
 def fields_table(folder: Path) -> pd.DataFrame:
@@ -115,133 +344,175 @@ def _cycles_of(window: str, deviations: xr.Dataset) -> list[int] | None:
     return [cycle for cycle in measured if ends[0] <= cycle <= ends[1]] or None if len(ends) == 2 else None
 
 
-# Workbooks: of a run, with summary, ISO 230-2, conditions, profile and readings on a sheet each; of any table of results.
+# Workbooks of tables: headings in words with units, uncertainties as U (k = 2), formats, filters and charts.
 
-#: Formats of numbers by the end of a heading; every other number is shown with three decimals.
-_FORMATS = {"_mm": "0.0##", "_degC": "0.00", "_K": "0.00", "seconds": "0.0", "peak_MB": "0"}
-_TIME = "yyyy-mm-dd hh:mm:ss"
-#: Rows of a chart in a workbook; more would not be seen.
-_MOST_ROWS = 4000
-
-
-def write_workbook(path: Path, results: Results, deviations: xr.Dataset) -> None:
-    """Write the workbook of a run."""
-    book = Workbook(write_only=True)
-    findings = [("campaign", results.campaign), *summary_rows(results)]
-    _add_sheet(book, "Summary", ("finding", "value"), findings, widths=(24, 110))
-    if results.iso230 is not None:
-        window, limits = quoted_window(results.iso230), {one.quantity: one for one in results.iso230.tolerances}
-        found = {name: getattr(window, f"{name}_um") for name in iso230.QUANTITIES if hasattr(window, f"{name}_um")}
-        unit = results.iso230.unit
-        rows = [
-            (name, one.value, None if one.u is None else 2 * one.u, *_judged(limits.get(name)))
-            for name, one in found.items()
-        ]
-        heads = ("quantity", f"value_{unit}", f"U_{unit} (k = 2)", f"limit_{unit}", "decision")
-        _add_sheet(book, "A R E M B", heads, rows, widths=(14, 14, 16, 14, 16))
-        stated = [(one.name, one.text or "not stated") for one in results.iso230.conditions]
-        _add_sheet(book, "Conditions", ("condition", "stated or logged"), stated, widths=(40, 80))
-    for title, frame in (
-        ("ISO 230-2 axis", iso230_axis_table(deviations)),
-        ("ISO 230-2 positions", iso230_position_table(deviations, results)),
-        *((("Profile", profile_table(deviations)),) if has(deviations, "drift") else ()),
-        ("Readings", readings_table(deviations)),
-    ):
-        columns = [str(name) for name in frame.columns]
-        widths = [max(12, len(name) + 2) for name in columns]
-        sheet = _add_sheet(book, title, columns, frame.itertuples(index=False), widths=widths)
-        _add_courses(sheet, frame)
-    _save(book, path)
+#: Formats of numbers by the unit at the end of a heading; every other number is shown with three decimals.
+_FORMATS = {
+    " / mm": "0.0##", " / °C": "0.00", " / K": "0.00", " / h": "0.00", " / min": "0.0", " / s": "0.0", " / MB": "0", "p value": "0.0E+00",
+}  # fmt: skip
+_TIME, _DATE = "yyyy-mm-dd hh:mm:ss", "yyyy-mm-dd"
+_UNITS = "um|mm|deg|arcsec|degC|K|min|px"
+#: Rows of a chart in a workbook, and lines; more would not be seen.
+_MOST_ROWS, _MOST_LINES = 4000, 8
+#: Characters of a column; longer text goes on below.
+_WIDEST = 80
 
 
-def _judged(limit: Iso230Tolerance | None) -> tuple[float | None, str]:
-    return (None, "no tolerance stated") if limit is None else (limit.limit_um, limit.decision)
+class Linked(NamedTuple):
+    """A text in a cell that opens something else."""
+
+    text: str
+    target: str
 
 
-def write_table_book(
-    path: Path, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, chart: str
-) -> None:
-    """Write a workbook of one table whose first column names its rows, with bars of one column where the table has it."""
-    book = Workbook(write_only=True)
-    widths = [min(max(12, *(len(str(cell)) + 2 for cell in column)), 60) for column in zip(columns, *rows, strict=True)]
-    sheet = _add_sheet(book, title, columns, rows, widths=widths)
-    if chart in columns and rows:
-        bars = BarChart()
-        bars.type, bars.title, bars.legend = "bar", chart, None
-        bars.height = max(8.0, 0.6 * len(rows))
-        bars.add_data(_column(sheet, columns.index(chart), 1, len(rows) + 1), titles_from_data=True)
-        bars.set_categories(_column(sheet, 0, 2, len(rows) + 1))
-        sheet.add_chart(bars, f"A{len(rows) + 4}")
-    _save(book, path)
+class Bound(float):
+    """The end of what could be measured; the value is beyond it."""
 
 
-def _add_courses(sheet: Any, frame: pd.DataFrame) -> None:
-    """Add a chart of a column of values over position, one line per direction of approach, where the table has it."""
-    names = list(frame.columns)
-    drawn = next((name for name in ("profile_um", "mean_positive_um", "profile_arcsec") if name in names), None)
-    place = next((at for at, name in enumerate(names) if str(name).startswith("position_")), None)
-    if drawn is None or place is None or len(frame) > _MOST_ROWS:
-        return
-    chart = ScatterChart()
-    chart.title, chart.style, chart.x_axis.title, chart.y_axis.title = drawn, 13, names[place], drawn
-    by_direction = frame.groupby("direction", sort=False).indices if "direction" in names else {"": range(len(frame))}
-    lines: list[tuple[str, Any, Any]] = [(drawn, direction, rows) for direction, rows in by_direction.items()]
-    if drawn == "mean_positive_um":
-        lines.append(("mean_negative_um", "", range(len(frame))))
-    for name, direction, rows in lines:
-        first, last = min(rows) + 2, max(rows) + 2
-        values, places = (_column(sheet, at, first, last) for at in (names.index(name), place))
-        chart.series.append(Series(values, places, title=str(direction or name)))
-    sheet.add_chart(chart, f"{get_column_letter(len(names) + 2)}2")
+class Bars(NamedTuple):
+    """Bars of columns of one table, whose first column names its rows, in the sheet of another."""
+
+    table: str
+    columns: tuple[str, ...]
+    beside: str
 
 
-def _column(sheet: Any, at: int, first: int, last: int) -> Reference:
-    return Reference(sheet, min_col=at + 1, min_row=first, max_row=last)
-
-
-def _save(book: Workbook, path: Path) -> None:
+def write_workbook(path: Path, sheets: Mapping[str, pd.DataFrame], bars: Bars | None = None) -> None:
+    """Write a workbook of tables by title, with charts of what was measured over position or time."""
+    book, made = Workbook(write_only=True), {}
+    for title, frame in sheets.items():
+        made[title] = _add_sheet(book, title, in_words(frame))
+        _add_courses(made[title], frame)
+    if bars is not None:
+        _add_bars(made, sheets[bars.table], bars)
     # On a full disk the library's own file would be closed with a traceback for every sheet.
     content = io.BytesIO()
     book.save(content)
     path.write_bytes(content.getvalue())
 
 
-def _add_sheet(
-    book: Workbook, title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], *, widths: Sequence[int]
-) -> Any:
+def in_words(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with headings for people, and expanded uncertainties (k = 2) in place of standard ones."""
+    return pd.DataFrame(
+        {
+            _heading(str(name)): 2 * column if _uncertain(str(name)) and column.dtype.kind == "f" else column
+            for name, column in frame.items()
+        }
+    )
+
+
+def _uncertain(name: str) -> re.Match[str] | None:
+    return re.fullmatch(rf"(?:(.+)_)?u(?:_({_UNITS}))?", name)
+
+
+def _heading(name: str) -> str:
+    """Return the heading of a column in words: "drift / µm" of "drift_um" and "drift [um]", "U(drift) (k = 2) / µm" of "drift_u_um"."""
+    if " / " in name:
+        return name
+    if found := re.fullmatch(r"(.*) \[(.*)\]", name):
+        words, unit = found.groups()
+    elif found := _uncertain(name):
+        of, unit = found.groups()
+        words = f"U({of.replace('_', ' ')}) (k = 2)" if of else "U (k = 2)"
+    elif found := re.fullmatch(rf"(.+)_({_UNITS})", name):
+        words, unit = found[1].replace("_", " "), found[2]
+    else:
+        words, unit = name.replace("_utc", " (UTC)").replace("_", " "), ""
+    printed = print_unit(unit or "").replace("deg", "°")
+    return f"{words} / {printed}" if printed else words
+
+
+def _add_courses(sheet: Any, frame: pd.DataFrame) -> None:
+    """Add a chart of what a table holds over position, one line per direction of approach, or over time, one per displacement or region."""
+    names = [str(name) for name in frame.columns]
+    along = next((name for name in names if name.startswith("position_") or name in ("time [h]", "time [min]")), None)
+    values = ("profile_um", "profile_arcsec", "mean_positive_um", "mean_negative_um", "maximum_degC")
+    shown = [name for name in names if name in values or name.endswith("[um]")]
+    if along is None or not shown or not 1 < len(frame) <= _MOST_ROWS or frame[along].isna().any():
+        return
+    groups = next((name for name in ("direction", "region") if name in names), None)
+    parts = {"": range(len(frame))} if groups is None else frame.groupby(groups, sort=False).indices
+    chart = ScatterChart()
+    chart.style, chart.height, chart.width = 13, 9.0, 18.0
+    _name_axes(chart, _heading(along), _heading(shown[0]) if len(shown) == 1 else "µm")
+    lines = [(name, part, rows) for name in shown for part, rows in parts.items()][:_MOST_LINES]
+    for name, part, rows in lines:
+        first, last = min(rows) + 2, max(rows) + 2
+        places, drawn = (_column(sheet, names.index(one), first, last) for one in (along, name))
+        line = Series(drawn, places, title=str(part) if part else _heading(name).rpartition(" / ")[0])
+        line.smooth = False
+        chart.series.append(line)
+    sheet.add_chart(chart, f"{get_column_letter(len(names) + 2)}2")
+
+
+def _add_bars(made: Mapping[str, Any], frame: pd.DataFrame, bars: Bars) -> None:
+    """Add bars of those columns that the table has."""
+    names = list(frame.columns)
+    shown = [name for name in bars.columns if name in names]
+    if not shown or frame.empty:
+        return
+    chart, table = BarChart(), made[bars.table]
+    chart.type, chart.height, chart.width = "bar", max(8.0, 0.8 * len(frame)), 18.0
+    _name_axes(chart, "", shown[0].rpartition(" / ")[2])
+    # The first row of the table is at the top.
+    chart.x_axis.scaling.orientation = "maxMin"
+    for name in shown:
+        chart.add_data(_column(table, names.index(name), 1, len(frame) + 1), titles_from_data=True)
+    chart.set_categories(_column(table, 0, 2, len(frame) + 1))
+    made[bars.beside].add_chart(chart, "F2")
+
+
+def _name_axes(chart: Any, along: str, values: str) -> None:
+    """Name both axes; a program for spreadsheets leaves out those that are not said to be there."""
+    chart.x_axis.title, chart.y_axis.title = along or None, values
+    chart.x_axis.delete = chart.y_axis.delete = False
+
+
+def _column(sheet: Any, at: int, first: int, last: int) -> Reference:
+    return Reference(sheet, min_col=at + 1, min_row=first, max_row=last)
+
+
+def _add_sheet(book: Workbook, title: str, frame: pd.DataFrame) -> Any:
     """Add a sheet with a bold heading that stays in sight, and with a filter for every column."""
     sheet = book.create_sheet(title)
     sheet.freeze_panes = "B2"
-    for number, width in enumerate(widths, start=1):
-        sheet.column_dimensions[get_column_letter(number)].width = width
-    formats = [next((shown for end, shown in _FORMATS.items() if name.endswith(end)), "0.000") for name in columns]
-    sheet.append([_cell(sheet, name, bold=True) for name in columns])
-    count = 1
-    for row in rows:
+    headings = [str(name) for name in frame.columns]
+    for at, name in enumerate(headings, start=1):
+        lengths = (len(_text(value)) for value in frame.iloc[:_MOST_ROWS, at - 1])
+        sheet.column_dimensions[get_column_letter(at)].width = min(max(12, len(name), *lengths) + 2, _WIDEST)
+    formats = [next((shown for end, shown in _FORMATS.items() if name.endswith(end)), "0.000") for name in headings]
+    sheet.append([_cell(sheet, name, bold=True) for name in headings])
+    for row in frame.itertuples(index=False, name=None):
         sheet.append([_cell(sheet, value, shown=shown) for value, shown in zip(row, formats, strict=True)])
-        count += 1
-    sheet.auto_filter.ref = f"A1:{get_column_letter(len(columns))}{count}"
+    sheet.auto_filter.ref = f"A1:{get_column_letter(len(headings))}{len(frame) + 1}"
     return sheet
 
 
-def _cell(sheet: object, value: object, *, bold: bool = False, shown: str = "General") -> WriteOnlyCell:
+def _text(value: object) -> str:
+    """Return the text of a cell that is one."""
+    return value.text if isinstance(value, Linked) else value if isinstance(value, str) else ""
+
+
+def _cell(sheet: object, value: Any, *, bold: bool = False, shown: str = "General") -> WriteOnlyCell:
     """Return a cell: a text as a text, a number as a number, a time without its zone (UTC), nothing where there is no number."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        value = None
-    if isinstance(value, pd.Timestamp):
-        value = None if pd.isna(value) else value.to_pydatetime(warn=False)
     cell = WriteOnlyCell(sheet)
-    if isinstance(value, str):
-        cell.value = ILLEGAL_CHARACTERS_RE.sub(" ", value)
-        cell.data_type = "s"
-    else:
-        cell.value = value
-    if isinstance(value, float):
-        cell.number_format = shown
-    elif isinstance(value, datetime):
-        cell.number_format = _TIME
+    if isinstance(value, str | Linked):
+        text = ILLEGAL_CHARACTERS_RE.sub(" ", _text(value))
+        cell.value, cell.data_type = text, "s"
+        if isinstance(value, Linked):
+            cell.hyperlink, cell.style = value.target, "Hyperlink"
+            cell.value, cell.data_type = text, "s"
+        elif len(text) > _WIDEST or "\n" in text:
+            cell.alignment = Alignment(wrap_text=True, vertical="top")
+    elif isinstance(value, Bound):
+        cell.value, cell.number_format = float(value), '"> "0'
+    elif value is not None and not pd.isna(value):
+        value = value.item() if isinstance(value, np.generic) else value
+        cell.value = value.to_pydatetime(warn=False) if isinstance(value, pd.Timestamp) else value
+        if isinstance(value, float):
+            cell.value, cell.number_format = (value, shown) if math.isfinite(value) else (None, shown)
+        elif isinstance(value, date):
+            cell.number_format = _TIME if isinstance(value, datetime) else _DATE
     if bold:
         cell.font = Font(bold=True)
     return cell

@@ -3,7 +3,7 @@
 const table = document.querySelector("#campaigns table");
 const value = (row, at) => {
   const text = row.cells[at].innerText.trim();
-  const figure = parseFloat(text.replace("−", "-").replace(/[^\d.eE+-].*$/, ""));
+  const figure = parseFloat(text.replace(/^> /, "").replace("−", "-").replace(/[^\d.eE+-].*$/, ""));
   return text === "–" ? null : Number.isNaN(figure) || /^\d{4}-\d\d/.test(text) ? text : figure;
 };
 const compare = (one, other) =>

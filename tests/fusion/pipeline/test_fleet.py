@@ -1,6 +1,7 @@
 """A fleet: campaigns found and named apart, one that fails stops no other, and a summary that runs nothing that a file holds."""
 
 import csv
+import datetime
 import io
 import json
 import os
@@ -12,34 +13,42 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import openpyxl
 import psutil
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
+from fusion import cli
 from fusion.pipeline.fleet import (
-    HEADINGS,
+    FINDINGS,
+    RUNS,
     SUMMARY,
     FleetError,
     Row,
     as_csv,
     as_json,
-    cells,
-    columns,
+    count_decisions,
     count_line,
-    draw_trends,
+    draw_histories,
+    filled,
     find_members,
     has_room,
     read_rows,
     render_fleet,
     run_fleet,
+    shown,
     summary_table,
     with_findings,
     write_book,
 )
-from fusion.results.results import read_results
-from fusion.results.store import OutputError, write_json
+from fusion.results.results import assemble, read_results
+from fusion.results.store import OutputError, open_dataset, write_json
+from tests.browser import CHROMIUM, record_faults
 from tests.fusion.campaign_parts import write_laser
+from tests.fusion.report.exports.small_run import write_fields
+from tests.fusion.results_sample import RECORD_LOOP
 
 
 def touch(folder, *names):
@@ -195,31 +204,190 @@ def test_a_row_says_what_the_results_say(whole, results_folder):
     assert whole.report == "a/report.html"
     settled = results.iso230.settled
     assert (whole.A_um, whole.A_u_um, whole.B_um) == (settled.A_um.value, settled.A_um.u, settled.B_um.value)
-    shown = dict(zip(HEADINGS, cells(whole), strict=True))
-    assert (shown["campaign"], shown["axis"]) == ("a", "X")
-    assert "±" in shown["drift / µm"] and "±" in shown["A / µm"]
-    assert cells(whole)[-3:] == ["0", "61.2", "412"]
-    assert cells(FAILED)[4:7] == ["–", "failed", "–"]
+    told = {column.heading: shown(whole, column) for column in (*FINDINGS, *RUNS)}
+    assert (told["campaign"], told["axis"]) == ("a", "X")
+    assert "±" in told["drift / µm"] and "±" in told["A / µm"]
+    assert (told["exit code"], told["time / s"], told["memory / MB"]) == ("0", "61.2", "412")
     assert (whole.date, whole.held_out_um) == (results.time.first[:10], results.loop.rmse_final_um)
-    assert list(columns([FAILED])) == ["campaign", "verdict", "exit code", "time / s"]
+    columns = [column.heading for column in filled([FAILED], (*FINDINGS, *RUNS))]
+    assert columns == ["campaign", "verdict", "state", "exit code", "time / s"]
 
 
-def test_tests_of_one_axis_over_the_dates_have_a_trend_and_the_least_favourable_decision_is_shown(whole, tmp_path):
-    months = [f"2026-{month:02d}-01" for month in range(1, 10)]
-    rows = [
-        replace(whole, name=f"m/{date}", date=date, A_um=5.0 + 0.1 * (k % 2), decision="pass")
-        for k, date in enumerate(months)
-    ]
-    assert list(draw_trends(rows)) == ["m, axis X, A", "m, axis X, R", "m, axis X, B"]
-    assert draw_trends(rows[:2]) == {}
+def test_what_is_found_stands_before_how_the_run_went():
+    first = [column.heading for column in FINDINGS[:9]]
+    values = [f"{symbol} / µm" for symbol in "AREMB"]
+    assert first == ["campaign", *values, "maximum / °C", "held-out error / µm", "decision"]
+    assert not {column.key for column in FINDINGS} & {"state", "exit_code", "seconds", "peak_MB"}
+
+
+def test_the_maximum_is_that_of_the_fields_beside_a_laser(whole, results_folder):
+    maps = open_dataset(results_folder / "fields.nc")
+    highest = float(maps["temperature"].max())
+    assert whole.maximum_degC == pytest.approx(highest)
+    at = maps["temperature_u"].where(maps["temperature"] == maps["temperature"].max())
+    assert whole.maximum_u_degC == pytest.approx(float(at.max()))
+
+
+AT = {"file": "b.jpg", "frame": 0, "time": None, "column_px": 1, "row_px": 2}
+PICTURES = {
+    "thermograms": {
+        "pictures": 2,
+        "cameras": [{"name": "C", "pictures": 2, "first": "2024-11-19T19:19:15Z", "last": "2024-11-20T19:21:14Z"}],
+        "series": "C",
+        "scene": "still",
+        "largest_shift_px": 0.1,
+        "emissivity": 0.95,
+        "indicated_degC": 391.0,
+    },
+    "regions": [
+        {
+            "name": "whole picture", "kind": "box", "camera": "C", "pictures": 2, "emissivity": 0.95,
+            "maximum_degC": {"value": 311.67, "u": None}, "maximum_at": AT, "minimum_degC": {"value": 16.4, "u": 1.2}, "minimum_at": AT,
+            "mean_degC": {"value": 31.7, "u": 1.3}, "overrange_pictures": 1, "overrange_pixels": 9, "underrange_pictures": 0,
+            "underrange_pixels": 0,
+        }
+    ],
+}  # fmt: skip
+
+
+def row_of(folder, **parts):
+    """The row of a run that found these parts."""
+    write_json(folder / "results.json", assemble("R", parts, []).as_json())
+    return with_findings(Row("r", state="finished", exit_code=0), folder)
+
+
+def test_a_maximum_beyond_the_calibrated_range_is_a_bound_and_pictures_have_a_date(tmp_path):
+    stated = {"parameters": {"report": {"machine": "Mill 7", "machine_serial_number": "M-7"}}}
+    (tmp_path / "provenance.json").write_text(json.dumps(stated))
+    row = row_of(tmp_path, **PICTURES)
+    assert (row.date, row.machine, row.serial) == ("2024-11-19", "Mill 7", "M-7")
+    assert '<td class="n">&gt; 312</td>' in render_fleet([row], started=STARTED)
+    write_book(tmp_path / "fleet.xlsx", [row])
+    cells = {cell.value: cell for cell in openpyxl.load_workbook(tmp_path / "fleet.xlsx")["Campaigns"][2]}
+    assert cells[311.67].number_format == '"> "0'
+
+
+def test_fields_without_a_laser_have_a_date_and_a_maximum(tmp_path):
+    write_fields(tmp_path)
+    row = row_of(tmp_path)
+    assert (row.date, row.maximum_degC, row.maximum_u_degC) == ("2026-03-09", 1.0, 1.0)
+
+
+def test_the_drift_of_a_record_is_its_largest_displacement(tmp_path):
+    def moved(name, unit, value):
+        whole = {"value": value, "u": 0.9}
+        periods = {key: {"value": None, "u": None} for key in ("first_hour", "last_hour", "change")}
+        return {"name": name, "unit": unit, "whole": whole, "settling_min": None, **periods}
+
+    test = {
+        "kind": "spindle", "duration_h": 46.3, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
+        "distortions": [moved("ch1", "um", 25.0), moved("ch3", "um", 89.2), moved("tilt", "um/m", 120.0)],
+        "conditions": [
+            {"name": "Date of the test", "text": "2026-01-05 06:00 UTC to 2026-01-06 06:00 UTC"},
+            {"name": "Machine", "text": "Mill 9"},
+        ],
+    }  # fmt: skip
+    row = row_of(tmp_path, loop=RECORD_LOOP, iso230_3=[test])
+    assert (row.drift_um, row.drift_u_um, row.date, row.machine) == (89.2, 0.9, "2026-01-05", "Mill 9")
+
+
+def monthly(whole, count):
+    """Monthly tests of one axis of a machine."""
+    return [
+        replace(
+            whole, name=f"m/{month}", date=f"2026-{month:02d}-01", machine="Mill 7", serial="M-7", A_um=5.0 + 0.1 * month,
+            decision="pass",
+        )
+        for month in range(1, count + 1)
+    ]  # fmt: skip
+
+
+def test_the_tests_of_one_axis_of_one_machine_are_drawn_over_their_dates_with_links(whole):
+    rows = monthly(whole, 9)
+    [history] = draw_histories([*reversed(rows), replace(rows[0], axis="Y"), replace(rows[0], serial="M-8")])
+    assert history.name == "Mill 7, serial number M-7, axis X" and history.rows == rows
+    assert list(history.chart.columns["date"]) == [row.date for row in rows]
+    np.testing.assert_allclose(history.chart.columns["A / µm"], [row.A_um for row in rows])
+    np.testing.assert_allclose(history.chart.columns["U(A) (k = 2) / µm"], 2 * whole.A_u_um)
+    assert "control limits" in history.chart.seen
+    assert "control limits" not in draw_histories(rows[:2])[0].chart.seen
+    # One date is no trend, and tests that neither name a machine nor share a folder are not taken for those of one.
+    assert draw_histories(rows[:1]) == []
+    unnamed = [replace(row, name=row.date, machine="", serial="") for row in rows]
+    assert draw_histories(unnamed) == []
     page = render_fleet(rows, started=STARTED)
-    assert page.count("<figure") == 3 and 'id="filter"' in page
-    write_book(tmp_path / "fleet.xlsx", [*rows, FAILED])
-    sheet = openpyxl.load_workbook(tmp_path / "fleet.xlsx")["Campaigns"]
+    assert page.count("<figure") == 1 and '2026-03-01 <a href="m/3/report.html">m/3</a>' in page
+
+
+def test_a_legend_explains_what_is_shown_alone(whole):
+    assert "Drift: " in render_fleet([whole], started=STARTED)
+    page = render_fleet([replace(whole, drift_um=None, anomalies=None)], started=STARTED)
+    assert "Held-out error: " in page and "Drift: " not in page and "Anomalies: " not in page
+
+
+def test_decisions_are_counted(whole):
+    rows = [replace(whole, decision=one) for one in ("fail", "pass", "pass", "not decided within the uncertainty", "")]
+    assert count_decisions([*rows, FAILED]) == {"pass": 2, "not decided": 1, "fail": 1, "without a tolerance": 1}
+
+
+def test_the_workbook_has_links_dates_and_the_columns_of_the_page(whole, tmp_path):
+    rows = [*monthly(whole, 9), FAILED]
+    write_book(tmp_path / "fleet.xlsx", rows)
+    book = openpyxl.load_workbook(tmp_path / "fleet.xlsx")
+    assert book.sheetnames == ["Summary", "Campaigns", "Conditions"]
+    sheet = book["Campaigns"]
+    assert (sheet.freeze_panes, sheet.auto_filter.ref.startswith("A1:")) == ("B2", True)
     names = [cell.value for cell in sheet[1]]
-    assert sheet["A2"].value == "m/2026-01-01" and "maximum_degC" not in names
+    assert names[:5] == ["campaign", "A / µm", "U(A) (k = 2) / µm", "R / µm", "U(R) (k = 2) / µm"]
+    assert names.index("decision") < names.index("state") and not [name for name in names if "_" in name]
+    first = dict(zip(names, sheet[2], strict=True))
+    assert first["campaign"].hyperlink.target == "m/1/report.html"
+    assert first["U(A) (k = 2) / µm"].value == pytest.approx(2 * whole.A_u_um)
+    assert first["date"].value == datetime.datetime(2026, 1, 1) and first["date"].number_format == "yyyy-mm-dd"
     message = sheet.cell(11, 1 + names.index("message"))
     assert (message.data_type, message.value) == ("s", '=HYPERLINK("x")')
+    told = {row[0]: row[1:] for row in book["Summary"].iter_rows(min_row=2, values_only=True)}
+    assert (told["campaigns"][0], told["decision: pass"][0], told["failed"][0]) == (10, 9, 1)
+    assert told["largest A / µm"][0] == pytest.approx(5.9) and told["largest A / µm"][2] == "m/9"
+    assert told["newest date"][0] == datetime.datetime(2026, 9, 1)
+    assert book["Summary"]._charts
+    asked = dict(zip(*book["Conditions"].iter_rows(max_row=2, values_only=True), strict=True))
+    assert asked["campaign"] == "m/1" and asked["Axis"] == "X"
+
+
+def test_the_help_names_every_file_of_the_summary():
+    said = CliRunner().invoke(cli.app, ["fleet", "--help"], env={"COLUMNS": "160"}).output
+    assert all(f"fleet.{ending}" in said for ending in ("html", "xlsx", "csv", "json"))
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed (Debian: apt-get install chromium)")
+def test_the_page_in_a_browser(whole, tmp_path):
+    """What is found fits a window of 1400 px, the name stays in sight on a phone, headings sort, and charts are dark in the dark."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    address, faults = tmp_path / "fleet.html", []
+    rows = [replace(row, A_um=value) for row, value in zip(monthly(whole, 3), (7.0, 30.0, 5.0), strict=True)]
+    address.write_text(render_fleet(rows, started=STARTED), encoding="utf-8")
+    with playwright.sync_playwright() as tools:
+        browser = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1400, "height": 900}, color_scheme="dark")
+        record_faults(page, faults, own=("file:", "blob:", "data:"))
+        page.goto(address.as_uri())
+        right = "(at) => document.querySelectorAll('#campaigns thead th')[at].getBoundingClientRect().right"
+        assert page.evaluate(right, 8) <= 1400
+        page.get_by_role("button", name="A / µm").click()
+        assert page.locator("#campaigns tbody th").all_inner_texts()[0].startswith("m/3")
+        page.wait_for_function("document.documentElement.dataset.charts === 'drawn'")
+        seen = page.locator(".drawing").screenshot()
+        page.set_viewport_size({"width": 390, "height": 844})
+        page.evaluate("document.querySelector('#campaigns .scroll').scrollLeft = 300")
+        box = page.locator("#campaigns tbody th").first.bounding_box()
+        assert box["x"] >= 0 and box["x"] + box["width"] < 200
+        browser.close()
+    image = pytest.importorskip("PIL.Image").open(io.BytesIO(seen)).convert("L")
+    brightness = np.asarray(image)
+    assert np.median(brightness) < 60 and brightness.max() > 120
+    assert faults == []
 
 
 def test_results_that_cannot_be_read_are_a_failure(tmp_path):

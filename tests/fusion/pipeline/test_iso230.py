@@ -68,8 +68,9 @@ STATED = {
 }
 
 
-def sheet(campaign: Campaign | None, environment: xr.Dataset | None = None) -> Iso230Part:
+def sheet(campaign: Campaign | None, environment: xr.Dataset | None = None, *, moved_mm: float = 0.0) -> Iso230Part:
     deviations, _ = simulate(np.random.default_rng(3), cycles=12)
+    deviations = deviations.assign_coords(position=deviations["position"] + moved_mm)
     _, settled, part = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
     dataset = joined(deviations, settled=settled)
     return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=campaign, environment=environment)))
@@ -103,6 +104,13 @@ def test_a_bare_file_has_conditions_checked_and_nothing_judged():
     part = sheet(None)
     assert part.tolerances == () and len(part.checks) == 6 and len(part.other_standards) == 9
     assert all(row.text == "" for row in part.conditions if row.name not in ("Date of the test", "Measured travel"))
+
+
+def test_positions_below_zero_have_the_sign_of_the_other_numbers():
+    position = simulate(np.random.default_rng(3), cycles=12)[0]["position"].values - 500.0
+    conditions = {row.name: row.text for row in sheet(None, moved_mm=-500.0).conditions}
+    ends = f"{position.min():g} to {position.max():g} mm".replace("-", "\u2212")
+    assert position.min() < 0 and conditions["Measured travel"] == f"{np.ptp(position):g} mm, {ends}"
 
 
 def test_the_date_of_the_test_is_that_of_its_readings():

@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 import openpyxl
+import pandas as pd
 import pytest
+import xarray as xr
 
 from fusion import cli
 from fusion.report.exports import tables
 from fusion.report.exports.controls import ExportError, header_lines, read_origin, read_thermal_state
 from fusion.report.exports.export import FORMATS, export_results, objections, remarks
 from fusion.report.exports.tables import write_workbook
-from fusion.results.results import Results, assemble, read_results
-from fusion.results.store import read_dataset
+from fusion.results.results import Results, ResultsError, assemble, read_results
+from fusion.results.store import read_dataset, write_dataset, write_json
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
-from tests.fusion.results_sample import PARTS
+from tests.fusion.results_sample import PARTS, RECORD_LOOP
 
 pytestmark = pytest.mark.long
 
@@ -102,16 +104,158 @@ def test_the_axis_is_a_name(unexplained, tmp_path):
 
 def test_a_run_of_the_camera_alone_has_its_fields(tmp_path):
     write_fields(tmp_path)
+    write_json(tmp_path / "results.json", assemble("C", {}, []).as_json())
     assert [path.name for path in export_results(tmp_path, "csv", tmp_path / "out").files] == ["fields.csv"]
-    with pytest.raises(ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to"):
-        export_results(tmp_path, "linuxcnc", tmp_path / "out")
+    [book] = export_results(tmp_path, "xlsx", tmp_path / "out").files
+    sheet = openpyxl.load_workbook(book)["Fields"]
+    assert [cell.value for cell in sheet[1]][:3] == ["window", "time (UTC)", "maximum / °C"] and sheet.max_row == 3
+    for format in ("linuxcnc", "model-json"):
+        with pytest.raises(ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to"):
+            export_results(tmp_path, format, tmp_path / "out")
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
-    with pytest.raises(ExportError, match=r"there is no deviations.nc in it; name the results folder of a finished"):
+    with pytest.raises(ResultsError, match=r"there is no results.json in it; name the results folder of a finished"):
         export_results(tmp_path, "csv", tmp_path)
     with pytest.raises(ExportError, match=r'there is no format "mazak"; write one of csv, xlsx, linuxcnc'):
         export_results(tmp_path, "mazak", tmp_path)
+
+
+def write_record(folder):
+    """Write the results of a record of two displacements, three sensors and a driver, in 40 blocks of an hour."""
+    rng, count = np.random.default_rng(3), 40
+    time = np.datetime64("2026-01-05T06:00", "ns") + np.arange(count) * np.timedelta64(1, "h")
+    moved = np.cumsum(rng.standard_normal((count, 2)), axis=0)
+    dims = ("time", "channel")
+    record = xr.Dataset(
+        {
+            "displacement": (dims, moved),
+            "predicted_final": (dims, moved + 0.1),
+            "predicted_u": ("channel", [0.1, 0.2]),
+            "contribution": (("effect", *dims), moved[None]),
+            "temperature": (("time", "sensor"), np.full((count, 3), 20.0)),
+            "driver": (("time", "driver_name"), np.linspace(0.0, 1.0, count)[:, None]),
+            "driver_size": ("driver_name", [5000.0]),
+            "driver_units": ("driver_name", np.array(["rpm"], object)),
+            "sealed": ("time", np.arange(count) >= 30),
+        },
+        coords={
+            "time": time, "channel": ["X", "Z"], "sensor": ["t1", "t2", "t3"], "driver_name": ["spindle"], "effect": ["quasi_static"],
+        },
+    )  # fmt: skip
+    write_dataset(folder / "fusion.nc", record)
+    periods = {name: {"value": 3.0, "u": 0.25} for name in ("first_hour", "whole", "last_hour", "change")}
+    test = {
+        "kind": "spindle", "duration_h": 40.0, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
+        "distortions": [{"name": "X", "unit": "um", "settling_min": 90.0, **periods}],
+        "conditions": [{"name": "Machine", "text": "Mill 9"}, {"name": "Operator", "text": ""}],
+    }  # fmt: skip
+    parts = {"loop": RECORD_LOOP, "iso230_3": [test]}
+    write_json(folder / "results.json", assemble("R", parts, []).as_json())
+    return record
+
+
+def test_a_record_has_a_workbook_of_its_own(tmp_path):
+    record = write_record(tmp_path)
+    [path] = export_results(tmp_path, "xlsx", tmp_path / "out").files
+    book = openpyxl.load_workbook(path)
+    assert book.sheetnames == [
+        "Summary", "Distortions", "Conditions", "Model", "Contributions", "Hold-out errors", "Predictions", "Readings",
+    ]  # fmt: skip
+    names, values = (list(line) for line in book["Distortions"].iter_rows(max_row=2, values_only=True))
+    told = dict(zip(names, values, strict=True))
+    assert (told["unit"], told["whole test"], told["U(whole test) (k = 2)"]) == ("µm", 3.0, 0.5)
+    assert told["settled after / min"] == 90.0
+    assert [row[1] for row in book["Conditions"].iter_rows(min_row=2, values_only=True)] == ["Mill 9", "not stated"]
+    contributed = [row[2] for row in book["Contributions"].iter_rows(min_row=2, values_only=True)]
+    assert contributed == pytest.approx(np.ptp(record["displacement"].values, axis=0))
+    errors = list(book["Hold-out errors"].iter_rows(min_row=2, values_only=True))
+    assert [row[:4] for row in errors] == [("X", 0.9, 0.6, 0.4), ("mean", 0.9, 0.6, 0.4)]
+    readings = book["Readings"]
+    first = dict(zip(*readings.iter_rows(max_row=2, values_only=True), strict=True))
+    assert first["X / µm"] == pytest.approx(float(record["displacement"][0, 0])) and first["t1 / °C"] == 20.0
+    assert readings.max_row == 41 and readings.cell(41, readings.max_column).value == "yes"
+    assert readings.cell(41, 10).value == 5000.0
+    assert len(readings._charts[0].series) == 4, "measured and predicted displacement of both channels"
+    written = export_results(tmp_path, "csv", tmp_path / "csv").files
+    assert {path.name for path in written} >= {"distortions.csv", "readings.csv", "hold-out_errors.csv"}
+
+
+def test_a_record_is_no_compensation_table_and_the_message_says_why(tmp_path):
+    write_record(tmp_path)
+    with pytest.raises(
+        ExportError, match=r"a record of displacements has no target positions, .* --format csv and xlsx"
+    ):
+        export_results(tmp_path, "siemens840d", tmp_path / "out")
+
+
+def test_pictures_have_a_workbook_with_bounds_beyond_the_calibrated_range(tmp_path):
+    dims, count = ("time", "region"), 3
+    highest = np.array([[90.0], [250.0], [311.67]])
+    value = dict.fromkeys(("maximum_u", "minimum", "minimum_u", "mean", "mean_u", "emissivity"), np.ones((count, 1)))
+    beyond = np.array([[0], [0], [9]])
+    pictures = xr.Dataset(
+        {
+            "maximum": (dims, highest),
+            **{name: (dims, values) for name, values in value.items()},
+            "overrange": (dims, beyond),
+            "underrange": (dims, 0 * beyond),
+            "thermogram": (("row", "column"), np.zeros((2, 2))),
+        },
+        coords={
+            "time": np.datetime64("2024-11-19T19:19", "ns") + np.arange(count) * np.timedelta64(30, "s"),
+            "region": ["whole picture"],
+            "source": ("time", np.array(["a.jpg", "b.jpg", "c.jpg"], object)),
+        },
+    )
+    write_dataset(tmp_path / "thermograms.nc", pictures)
+    at = {"file": "c.jpg", "frame": 0, "time": None, "column_px": 1, "row_px": 2}
+    region = {
+        "name": "whole picture", "kind": "box", "camera": "C", "pictures": 3, "emissivity": 0.95,
+        "maximum_degC": {"value": 311.67, "u": None}, "maximum_at": at, "minimum_degC": {"value": 16.4, "u": 1.2}, "minimum_at": at,
+        "mean_degC": {"value": 31.7, "u": 1.3}, "overrange_pictures": 1, "overrange_pixels": 9, "underrange_pictures": 0,
+        "underrange_pixels": 0,
+    }  # fmt: skip
+    found = {
+        "pictures": 3, "cameras": [{"name": "C", "pictures": 3, "first": None, "last": None}], "series": "C", "scene": "still",
+        "largest_shift_px": 0.1, "emissivity": 0.95, "indicated_degC": 391.0,
+    }  # fmt: skip
+    write_json(tmp_path / "results.json", assemble("P", {"thermograms": found, "regions": [region]}, []).as_json())
+    [path] = export_results(tmp_path, "xlsx", tmp_path / "out").files
+    book = openpyxl.load_workbook(path)
+    assert book.sheetnames == ["Summary", "Regions", "Pictures"]
+    names = [cell.value for cell in book["Pictures"][1]]
+    column = 1 + names.index("maximum / °C")
+    cells = [book["Pictures"].cell(row, column) for row in (2, 3, 4)]
+    assert [cell.value for cell in cells] == highest.ravel().tolist()
+    assert [cell.number_format for cell in cells] == ["0.00", "0.00", '"> "0']
+    elapsed = 1 + names.index("time / min")
+    assert [book["Pictures"].cell(row, elapsed).value for row in (2, 3, 4)] == [0.0, 0.5, 1.0]
+    told = dict(zip(*book["Regions"].iter_rows(max_row=2, values_only=True), strict=True))
+    assert told["region"] == "whole picture" and told["U(minimum) (k = 2) / K"] == pytest.approx(2.4)
+    with pytest.raises(
+        ExportError, match=r"this campaign has no laser, .* --format csv and xlsx write its temperatures"
+    ):
+        export_results(tmp_path, "linuxcnc", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("column", "heading"),
+    [
+        ("drift_um", "drift / µm"),
+        ("drift_u_um", "U(drift) (k = 2) / µm"),
+        ("u_arcsec", "U (k = 2) / arcsec"),
+        ("whole_test_u", "U(whole test) (k = 2)"),
+        ("time_utc", "time (UTC)"),
+        ("position_deg", "position / °"),
+        ("ch_1(um) [um]", "ch_1(um) / µm"),
+        ("A / µm", "A / µm"),
+    ],
+)
+def test_headings_are_words_with_units(column, heading):
+    [(found, values)] = tables.in_words(pd.DataFrame({column: [1.5]})).items()
+    assert found == heading
+    assert values[0] == (3.0 if heading.startswith("U") else 1.5)
 
 
 SOUND = {"state": "sound", "accepted": [], "checks": []}
@@ -259,7 +403,7 @@ def test_fields_are_tabulated_on_request(tmp_path):
 def test_the_workbook_reads_back(small_run, tmp_path):
     deviations = read_dataset(small_run / "deviations.nc")
     results = read_results(small_run)
-    write_workbook(tmp_path / "results.xlsx", results, deviations)
+    write_workbook(tmp_path / "results.xlsx", tables.axis_tables(results, deviations))
     book = openpyxl.load_workbook(tmp_path / "results.xlsx")
     first = ["Summary", "A R E M B", "Conditions"]
     assert book.sheetnames == [*first, "ISO 230-2 axis", "ISO 230-2 positions", "Profile", "Readings"]
@@ -269,9 +413,13 @@ def test_the_workbook_reads_back(small_run, tmp_path):
     assert not any(cell.data_type == "f" for sheet in book for row in sheet.iter_rows() for cell in row)
     names = [cell.value for cell in book["Readings"][1]]
     first = dict(zip(names, [cell.value for cell in book["Readings"][2]], strict=True))
-    assert first["time_utc"].isoformat() == "2026-03-09T06:30:00"
-    assert first["deviation_um"] == pytest.approx(float(deviations["deviation"][0, 0, 0]))
+    assert first["time (UTC)"].isoformat() == "2026-03-09T06:30:00"
+    assert first["deviation / µm"] == pytest.approx(float(deviations["deviation"][0, 0, 0]))
     assert book["Readings"].max_row == 1 + 192
+    values = list(book["A R E M B"].iter_rows(min_row=2, values_only=True))
+    assert "".join(row[0] for row in values) == "AREMB"
+    headings = [cell.value for cell in book["A R E M B"][1]]
+    assert headings == ["quantity", "value / µm", "U (k = 2) / µm", "limit / µm", "decision"]
     quantity = next(row for row in book["A R E M B"].iter_rows(min_row=2) if row[0].value == "A")
     window = results.iso230.settled
     assert [cell.value for cell in quantity[1:3]] == pytest.approx([window.A_um.value, 2 * window.A_um.u])
