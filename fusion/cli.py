@@ -736,6 +736,7 @@ def compare(
         campaign_names,
         changes_table,
         comparison_json,
+        comparison_notes,
         conclude_comparison,
         render_comparison,
         side_by_side,
@@ -751,13 +752,13 @@ def compare(
         if as_json:
             print_json(comparison_json(pairs))
             return
-        wide = _wide()
-        wide.print(print_table(side_by_side(pairs), "Side by side"))
-        names = campaign_names(pairs)
+        wide, names = _wide(), campaign_names(pairs)
+        wide.print(print_table(side_by_side(pairs), "; ".join(names)))
         for name, pair in zip(names[1:], pairs, strict=True):
             if pair.changes:
-                wide.print(print_table(changes_table(pair), f"{names[0]} -> {name}"))
-            _print_lines((*conclude_comparison(pair), *(f"Not compared: {lack}" for lack in pair.not_compared)))
+                wide.print(print_table(changes_table(pairs, pair), f"{names[0]} -> {name}"))
+            _print_lines([conclude_comparison(pair)])
+        _print_lines(comparison_notes(pairs))
 
 
 @app.command()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ SAME_POSITION_MM = 0.05
 LEAST_POSITIONS = 5
 #: Share of its squared length that a shape must keep given the others to be distinguished from them.
 _LEAST_SHARE = 1e-6
+#: Most shapes by which a changed profile is described where steps and blocks are among them: with more they imitate any profile.
+_MOST_WITH_RUNS = 2
 #: Shapes that the thermal state of a test may take, by drift component.
 _STATE = {"shift": "offset", "stretch": "slope", "bend": "bow"}
 
@@ -46,9 +49,10 @@ class ProfileChange:
     left_out : positions that one test has alone
     remaining_um, remaining_u_um : (n,) difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and
         its standard uncertainty
-    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then the single positions (of
-        both approaches together, or their reversal) beyond the family-wise level, the strongest first
-    tests : how many shapes were tried
+    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then what changed beyond the
+        family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and blocks; last
+        the rest of the profile, with its largest value and the p-value of all of it
+    tests : how many tests were made
     """
 
     position_mm: Array
@@ -59,14 +63,15 @@ class ProfileChange:
     tests: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Shape:
-    """A shape over the cells (direction, target) of both tests; `machine` as in `Change`."""
+    """A shape over the cells (direction, target) of both tests; `until_mm` and `machine` as in `Change`."""
 
     name: str
     position_mm: float | None
     column: Array
     machine: bool
+    until_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -81,19 +86,41 @@ class _Difference:
 
     def fit(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
         """Return the sizes of shapes and their covariance (um2), by generalised least squares, widened by Birge's ratio."""
-        design = np.linalg.solve(self.root, np.column_stack([shape.column for shape in shapes]))
-        value = np.linalg.solve(self.root, self.value)
-        covariance = np.linalg.pinv(design.T @ design)
+        design, value = self._whitened(shapes), np.linalg.solve(self.root, self.value)
+        covariance = np.asarray(np.linalg.pinv(design.T @ design), float)
         sizes = covariance @ design.T @ value
         left = value - design @ sizes
         return sizes, covariance * max(1.0, float(left @ left) / max(value.size - len(shapes), 1))
 
     def separate(self, shape: _Shape, others: Sequence[_Shape]) -> bool:
         """Tell whether a shape can be distinguished from others."""
-        known, _ = np.linalg.qr(np.linalg.solve(self.root, np.column_stack([other.column for other in others])))
-        column = np.linalg.solve(self.root, shape.column)
-        residual = column - known @ (known.T @ column)
-        return bool(residual @ residual > _LEAST_SHARE * (column @ column))
+        return bool(np.isfinite(self.ratios([shape], others)[0]))
+
+    def ratios(self, shapes: Sequence[_Shape], others: Sequence[_Shape]) -> Array:
+        """Return the size of each shape beside others over its standard uncertainty, see `fit`; NaN where it cannot be told from them."""
+        columns, (left, known) = self._whitened(shapes), self.left(others)
+        own = columns - known @ (known.T @ columns)
+        length = (own**2).sum(axis=0)
+        apart = length > _LEAST_SHARE * (columns**2).sum(axis=0)
+        gained = np.full(length.size, np.nan)
+        gained[apart] = (left @ own[:, apart]) ** 2 / length[apart]
+        return np.sqrt(gained / np.maximum(1.0, (left @ left - gained) / max(left.size - len(others) - 1, 1)))
+
+    def remainder_p(self, shapes: Sequence[_Shape]) -> float:
+        """Return the p-value of everything that shapes leave, by the uncertainties of both tests alone."""
+        left, _ = self.left(shapes)
+        freedom = left.size - len(shapes)
+        return float(special.fdtrc(freedom, self.freedom, left @ left / freedom)) if freedom > 0 else 1.0
+
+    def left(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
+        """Return what shapes leave, in cells of unit variance, and an orthonormal basis of the shapes there."""
+        known, _ = np.linalg.qr(self._whitened(shapes))
+        value = np.linalg.solve(self.root, self.value)
+        return value - known @ (known.T @ value), known
+
+    def _whitened(self, shapes: Sequence[_Shape]) -> Array:
+        """Return the columns of shapes in cells of unit variance."""
+        return np.asarray(np.linalg.solve(self.root, np.column_stack([shape.column for shape in shapes])), float)
 
     def p_value(self, ratio: float) -> float:
         """Return the two-sided p-value of a change over its standard uncertainty."""
@@ -109,20 +136,33 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     judged = np.unique(difference.sign).size == 2 and difference.separate(reversal, state)
     candidates = [reversal] if judged else []
     candidates += _single_positions(difference, positions)
-    found = _search(difference, state, candidates, level=level, tests=tests + len(candidates))
+    steps, blocks = _steps(difference, positions), _blocks(difference, positions)
+    made = len(candidates) + len(steps) + 1
+    search = partial(_search, difference, state, most=positions.size // 2, level=level, tests=tests + made)
+    found = search([*candidates, *steps], blocks)
+    several = any(shape in [*steps, *blocks] for shape in found)
+    if several and (len(found) > _MOST_WITH_RUNS or difference.remainder_p([*state, *found]) * (tests + made) <= level):
+        found = search(candidates, ())
     reported = [*state, *([reversal] if judged and reversal not in found else []), *found]
     size, covariance = difference.fit(reported)
     u = np.sqrt(np.diag(covariance))
-    shapes = tuple(
+    shapes = [
         Change(
             shape.name, "profile", shape.position_mm, "um", None, None, Quantity(value=float(size[k]), u=float(u[k])),
-            difference.p_value(size[k] / u[k]), shape.machine,
+            difference.p_value(size[k] / u[k]), shape.machine, until_mm=shape.until_mm,
         )
         for k, shape in enumerate(reported)
         if shape.name not in ("offset", "drift")
-    )  # fmt: skip
+    ]  # fmt: skip
+    rest, rest_u = _remaining(difference, reported, positions)
+    most = int(np.argmax(np.abs(rest)))
+    largest = Quantity(value=float(rest[most]), u=float(rest_u[most]))
+    p_rest, at = difference.remainder_p(reported), float(positions[most])
+    shapes.append(
+        Change("rest of the profile" if found else "profile", "profile", at, "um", None, None, largest, p_rest, True)
+    )
     remaining, remaining_u = _remaining(difference, state, positions)
-    return ProfileChange(positions, left_out, remaining, remaining_u, shapes, len(candidates))
+    return ProfileChange(positions, left_out, remaining, remaining_u, tuple(shapes), made)
 
 
 def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Difference, int]:
@@ -214,33 +254,54 @@ def _single_positions(difference: _Difference, positions: Array) -> list[_Shape]
     return shapes
 
 
+def _steps(difference: _Difference, positions: Array) -> list[_Shape]:
+    """Return the steps of the profile: two positions or more, up to the last, that moved together."""
+    return [
+        _Shape("step", float(start), (difference.position_mm >= start).astype(float), machine=True)
+        for start in positions[2:-1]
+    ]
+
+
+def _blocks(difference: _Difference, positions: Array) -> list[_Shape]:
+    """Return the blocks of the profile: from two to half of the positions, between two that did not move, that moved together."""
+    place = difference.position_mm
+    return [
+        _Shape(
+            "block", float(low), ((place >= low) & (place <= high)).astype(float), machine=True, until_mm=float(high)
+        )
+        for i, low in enumerate(positions[1:-2], start=1)
+        for high in positions[i + 1 : min(i + positions.size // 2, positions.size - 1)]
+    ]
+
+
 def _search(
-    difference: _Difference, state: Sequence[_Shape], candidates: Sequence[_Shape], *, level: float, tests: int
+    difference: _Difference,
+    state: Sequence[_Shape],
+    candidates: Sequence[_Shape],
+    blocks: Sequence[_Shape],
+    *,
+    most: int,
+    level: float,
+    tests: int,
 ) -> list[_Shape]:
-    """Return the shapes beyond the family-wise level, the strongest first."""
+    """Return the shapes beyond the family-wise level, the strongest first; of the many blocks only where all that is left is."""
     found: list[_Shape] = []
-    most = np.unique(difference.position_mm).size // 2
     while len(found) < most:
         beside = [*state, *found]
-        open_ones = [shape for shape in candidates if shape not in found and difference.separate(shape, beside)]
-        fits = [difference.fit([*beside, shape]) for shape in open_ones]
-        ratios = [float(abs(size[-1]) / np.sqrt(covariance[-1, -1])) for size, covariance in fits]
-        if not ratios or difference.p_value(max(ratios)) * tests > level:
+        open_ones = [*candidates, *(blocks if difference.remainder_p(beside) * tests <= level else ())]
+        ratios = np.nan_to_num(difference.ratios(open_ones, beside))
+        if difference.p_value(float(ratios.max())) * tests > level:
             break
         found.append(open_ones[int(np.argmax(ratios))])
     return found
 
 
-def _remaining(difference: _Difference, state: Sequence[_Shape], positions: Array) -> tuple[Array, Array]:
-    """Return what the shapes of a thermal state leave at every position, mean of the approaches, with its standard uncertainty."""
-    design = np.column_stack([shape.column for shape in state])
-    size, covariance = difference.fit(state)
-    left = difference.value - design @ size
-    spread = difference.root @ difference.root.T - design @ covariance @ design.T
-    mean = np.stack(
-        [(difference.position_mm == place) / (difference.position_mm == place).sum() for place in positions]
-    )
-    return mean @ left, np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", mean, spread, mean), 0.0))
+def _remaining(difference: _Difference, shapes: Sequence[_Shape], positions: Array) -> tuple[Array, Array]:
+    """Return what shapes leave at every position, mean of the approaches, with its standard uncertainty by those of both tests."""
+    at = difference.position_mm == positions[:, None]
+    mean = at / at.sum(axis=1, keepdims=True) @ difference.root
+    left, known = difference.left(shapes)
+    return mean @ left, np.sqrt(np.maximum((mean**2).sum(axis=1) - ((mean @ known) ** 2).sum(axis=1), 0.0))
 
 
 # Positions whose readings scatter more, or less, than before: each against the change of all others.
@@ -312,8 +373,10 @@ class Change:
     group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}; what it belongs to
     before, after : in both campaigns; None for a change of shape, which has no value of its own
     change : after minus before; of a scatter the ratio, without unit
-    p_value : two-sided, family-wise over everything that is compared
+    p_value : two-sided, family-wise over the tests of `family`
     machine : whether no thermal state of the test gives it, so that the machine or the set-up must have changed
+    until_mm : last position of a block
+    family : tests that share its level
     """
 
     quantity: str
@@ -325,6 +388,8 @@ class Change:
     change: Quantity
     p_value: float
     machine: bool
+    until_mm: float | None = None
+    family: int = 1
 
     @property
     def significant(self) -> bool:
@@ -340,7 +405,7 @@ class PairComparison:
     ----------
     profile : difference of the profiles; None where they cannot be compared
     not_compared : what cannot be compared, and why, one sentence each
-    tests : tests of the family, over all campaigns
+    tests : tests of profile, scatter and drift per kelvin, over all campaigns, which share one level; the values by ISO 230-2 share another
     common : inputs of both budgets of ISO 230-2 whose error is the same in both tests
     """
 
@@ -379,14 +444,19 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, s
         return PairComparison(before, after, (), None, (f"Everything: {reason}.",), 0)
     lacks: list[str] = []
     common = common_inputs(before, after, same_setup=same_setup)
-    standard = _standard(before, after, lacks, common)
-    changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *standard]
-    profile = _profile(before, after, lacks, pairs=pairs, tests=len(changes) + 2)
-    if profile is not None:
-        changes = [*profile.shapes, *changes]
-    tests = pairs * (len(changes) if profile is None else len(changes) - len(profile.shapes) + 2 + profile.tests)
-    familywise = tuple(replace(change, p_value=min(1.0, change.p_value * tests)) for change in changes)
-    return PairComparison(before, after, familywise, profile, tuple(lacks), tests, common)
+    others = [*_scatters(before, after), *_coefficients(before, after, lacks)]
+    standard = list(_standard(before, after, lacks, common))
+    profile = _profile(before, after, lacks, pairs=pairs, tests=len(others) + 2)
+    shapes: tuple[Change, ...] = () if profile is None else profile.shapes
+    tests = pairs * (len(others) + (0 if profile is None else 2 + profile.tests))
+    changes = (*_in_family([*shapes, *others], tests), *_in_family(standard, pairs * len(standard)))
+    return PairComparison(before, after, changes, profile, tuple(lacks), tests, common)
+
+
+def _in_family(changes: Sequence[Change], tests: int) -> Iterator[Change]:
+    """Yield changes with the p-value that each has among so many tests (Bonferroni)."""
+    for change in changes:
+        yield replace(change, p_value=min(1.0, change.p_value * tests), family=tests)
 
 
 def _axis(folder: Path) -> str:
@@ -506,11 +576,11 @@ def _standard(
         if None in (first.value, second.value, first.u, second.u):
             lacks.append(f"ISO 230-2, {symbol}: not measured with its uncertainty in both campaigns.")
             continue
-        shared = sum(math.prod(_contributions((one, other), name, symbol)) for name in common)
+        shared = sum(math.prod(contributions((one, other), name, symbol)) for name in common)
         yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False, covariance=shared)
 
 
-def _contributions(parts: Sequence[Iso230Part], name: str, symbol: str) -> list[float]:
+def contributions(parts: Sequence[Iso230Part], name: str, symbol: str) -> list[float]:
     """Return what an input of the budget contributes to the uncertainty of a quantity in every test, um."""
     budgets = [
         {row.contributor: row for row in window.contributions} if (window := part.settled or part.first) else {}

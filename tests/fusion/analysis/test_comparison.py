@@ -36,6 +36,17 @@ def loop_with(**parts: Any) -> dict[str, Any]:
     return {**copy.deepcopy(PARTS["loop"]), **parts}
 
 
+def test_values_by_the_standard_do_not_pay_for_the_tests_on_positions(before: Path, tmp_path: Path) -> None:
+    """A falls by 3 standard uncertainties: p 0.0027, of five values 0.013, of all positions it would be 0.1."""
+    later = copy.deepcopy(PARTS["iso230"])
+    later["settled"]["A_um"] = {"value": 1.0 - 3.0 * 0.1 * 2**0.5, "u": 0.1}
+    (pair,) = compare_campaigns([before, write_results(tmp_path / "after", readings_of(32), iso230=later)])
+    fallen = next(change for change in pair.changes if change.group == "ISO 230-2" and change.quantity == "A")
+    assert fallen.family == 5 and fallen.significant
+    assert fallen.p_value == pytest.approx(5 * 0.0027, rel=0.01)
+    assert {change.family for change in pair.changes if change.group != "ISO 230-2"} == {pair.tests}
+
+
 def test_of_two_sound_campaigns_nothing_changed(before: Path, tmp_path: Path) -> None:
     (pair,) = compare_campaigns([before, write_results(tmp_path / "after", readings_of(32))])
     assert changed(pair.changes) == []
@@ -127,8 +138,12 @@ def estimate(
 
 
 def moved_positions(found: ProfileChange) -> list[tuple[str, float | None]]:
-    """Single positions that count as changed."""
-    return [(shape.quantity, shape.position_mm) for shape in found.shapes if shape.position_mm is not None]
+    """Single positions, steps and blocks that count as changed, and the rest of the profile where it does."""
+    return [
+        (shape.quantity, shape.position_mm)
+        for shape in found.shapes
+        if shape.position_mm is not None and (shape is not found.shapes[-1] or shape.p_value * found.tests <= 0.05)
+    ]
 
 
 def test_another_thermal_state_changes_no_position(rng: np.random.Generator) -> None:
@@ -146,6 +161,36 @@ def test_positions_that_moved_are_told_from_their_neighbours(rng: np.random.Gene
     size = next(shape for shape in found.shapes if shape.position_mm == 100.0)
     assert abs(size.change.value - 3.0) < 4 * size.change.u
     assert all(shape.machine for shape in found.shapes if shape.position_mm is not None)
+
+
+@pytest.mark.parametrize(
+    ("cells", "named"),
+    [
+        (slice(3, None), [("step", 150.0, None)]),
+        (slice(2, 5), [("block", 100.0, 200.0)]),
+        (slice(2, 3), [("position", 100.0, None)]),
+    ],
+)
+def test_a_step_and_a_block_are_told_from_a_single_position(
+    rng: np.random.Generator, cells: slice, named: list[tuple[str, float, float | None]]
+) -> None:
+    moved = np.zeros((2, 8))
+    moved[:, cells] = 2.0
+    found = compare_profiles(estimate(rng), estimate(rng, extra=moved), level=0.05)
+    *_, changed, rest = found.shapes
+    assert [(changed.quantity, changed.position_mm, changed.until_mm)] == named
+    assert abs(changed.change.value - 2.0) < 4 * changed.change.u
+    assert rest.quantity == "rest of the profile" and rest.p_value > 0.001
+
+
+def test_a_profile_that_no_shape_describes_is_said_to_have_changed_most_at_a_place(rng: np.random.Generator) -> None:
+    """A wave over the travel: a remainder of known uncertainty, without the steps and blocks that would imitate it."""
+    wave = 2.0 * np.sin(4.0 * np.pi * np.arange(8) / 7.0)
+    found = compare_profiles(estimate(rng), estimate(rng, extra=wave), level=0.05)
+    assert {shape.quantity for shape in found.shapes}.isdisjoint({"step", "block"})
+    rest = found.shapes[-1]
+    assert rest.p_value * found.tests < 1e-3 and rest.machine
+    assert 0.05 < rest.change.u < 0.1
 
 
 def test_slope_and_bow_are_told_and_are_no_change_of_the_machine(rng: np.random.Generator) -> None:
