@@ -485,7 +485,7 @@ def _profile(
     """Compare the profiles, or say why not."""
     without = [one.name for one in (before, after) if one.drift is None]
     if before.drift is None or after.drift is None:
-        lacks.append(f"Profile and scatter: no estimate of the drift in {' and in '.join(without)}.")
+        lacks.append(f"Profile and scatter: no estimate of the drift in {_either(without)}.")
         return None
     try:
         found = compare_profiles(before.drift, after.drift, level=LEVEL / pairs, tests=tests)
@@ -495,6 +495,11 @@ def _profile(
     if found.left_out:
         lacks.append(f"Profile: {found.left_out} positions were measured in one of the two campaigns only.")
     return found
+
+
+def _either(names: Sequence[str]) -> str:
+    """Name the test, or both tests, that lack something."""
+    return names[0] if len(names) == 1 else "either test"
 
 
 def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]:
@@ -518,7 +523,7 @@ def _coefficients(before: ComparedCampaign, after: ComparedCampaign, lacks: list
         campaign.name for campaign, loop in zip((before, after), loops, strict=True) if not isinstance(loop, AxisLoop)
     ]
     if without:
-        lacks.append(f"Drift per kelvin: no model of the axis in {' and in '.join(without)}.")
+        lacks.append(f"Drift per kelvin: no model of the axis in {_either(without)}.")
         return
     one, other = (loop for loop in loops if isinstance(loop, AxisLoop))
     models = [{*loop.declared, *(step.effect for step in loop.steps)} for loop in (one, other)]
@@ -556,7 +561,7 @@ def _standard(
     one, other = parts
     if one is None or other is None:
         missing = [campaign.name for campaign, part in zip((before, after), parts, strict=True) if part is None]
-        lacks.append(f"ISO 230-2: no readings in {' and in '.join(missing)}.")
+        lacks.append(f"ISO 230-2: no readings in {_either(missing)}.")
         return
     if one.unit != other.unit:
         lacks.append("ISO 230-2: one axis is linear, the other a rotary one.")

@@ -12,16 +12,17 @@ from fusion.analysis.comparison import PairComparison, compare_campaigns
 from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if, table_of
 from fusion.common import FusionError
-from fusion.report.charts.comparison import draw_trend, plot_profiles, plot_remaining, plot_scatters
+from fusion.report.charts.comparison import draw_trend, follow_trends, plot_profiles, plot_remaining, plot_scatters
 from fusion.report.comparison import (
     campaign_names,
-    captioned_trends,
     changes_table,
     compared_tests,
     comparison_notes,
     conclude_comparison,
     short_names,
     side_by_side,
+    trend_caption,
+    trend_notes,
 )
 from fusion.results.results import read_results
 
@@ -133,8 +134,9 @@ def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
     profiles = "Drift-free profiles, mean of both approaches, each about its mean, with 95 % bands."
     parts += shown_if(plot_profiles(tests, short), profiles)
     parts += shown_if(plot_scatters(tests, short), "Scatter of single readings with 95 % intervals.")
-    for trend, caption in captioned_trends(pairs):
-        parts += shown_if(draw_trend(trend), caption)
+    trends = follow_trends(pairs)
+    for trend in trends:
+        parts += shown_if(draw_trend(trend), f"{trend_caption(trend)} {trend_notes(pairs, trends)}".strip())
     for name, pair in compared:
         left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed or shaded: changed."
         parts += shown_if(plot_remaining(pair), left)

@@ -50,6 +50,10 @@ _WORDS = {
     "profile": "profile beyond offset, slope and bow",
     "rest of the profile": "rest of the profile",
 }
+#: What is left of a difference of profiles, as a whole.
+_REST = ("profile", "rest of the profile")
+#: Tests beside each other in a table on paper.
+_MOST_COLUMNS = 5
 #: Inputs of the budget of ISO 230-2 that two tests may have in common.
 _INPUTS = {
     "expansion_coefficient": "the error of the expansion coefficient (material on the same side of 20 °C in both)",
@@ -157,7 +161,7 @@ def change_name(change: Change) -> str:
         return f"{words} from {at} on"
     if change.until_mm is not None:
         return f"{words} from {change.position_mm:g} to {change.until_mm:g} mm"
-    return f"{words}, most at {at}," if "profile" in change.quantity else f"{words} at {at}"
+    return f"{words}, most at {at}," if change.quantity in _REST else f"{words} at {at}"
 
 
 def _size(change: Change) -> str:
@@ -165,7 +169,7 @@ def _size(change: Change) -> str:
     if change.group == "scatter":
         return f"× {fixed(change.change.value, 2)}"
     text = measured(change.change.value, change.change.u, print_unit(change.unit))
-    return text if text.startswith("−") else f"+{text}"
+    return f"+{text}" if text.split(" ")[0].strip("0.") and not text.startswith("−") else text
 
 
 def changes_table(pairs: Sequence[PairComparison], pair: PairComparison, *, short: bool = False) -> Table:
@@ -251,7 +255,8 @@ def describe_pair(pair: PairComparison) -> Sheet:
             identity += [(f"{name}, {which}", text) for which, text in zip(("as found", "as left"), both, strict=True)]
     remarks = [text for rows in conditions[1:] for text in (row.text for row in rows if row.name == "Remarks")]
     files = {
-        f"{one.folder.name}/results.json": file_sha256(one.folder / "results.json") for one in (pair.before, pair.after)
+        f"results.json {which}": file_sha256(one.folder / "results.json")
+        for which, one in (("as found", pair.before), ("as left", pair.after))
     }
     return Sheet(
         title="As found, as left",
@@ -306,59 +311,88 @@ def _differs(change: Change) -> str:
     return "differs" if change.significant else _verdict(change)
 
 
-def trend_caption(trend: Trend, common: Sequence[str]) -> str:
-    """Return what a trend shows and how it is drawn."""
-    shared = f" without what all tests have in common: {join([_INPUTS[name] for name in common])}" if common else ""
-    said = [f"Bars: expanded uncertainty (k = 2){shared}."]
-    if trend.limits is not None:
-        said.append("Dashed: control limits that the tests before the last give (individuals, moving ranges).")
-        days = [str(day) for day in trend.when[trend.outside].astype("datetime64[D]")]
-        if trend.outside[-1]:
-            low, high, last = (number(value) for value in (trend.limits.low, trend.limits.high, float(trend.value[-1])))
-            said.insert(
-                0,
-                f"{trend.name} of the last test, {last} {trend.unit}, lies outside the control limits {low} to {high} {trend.unit}.",
-            )
-            days = days[:-1]
-        if days:
-            said.append(
-                f"Also ringed: {join(days)}." if trend.outside[-1] else f"Ringed, outside the limits: {join(days)}."
-            )
-    if trend.tolerance is not None:
-        said.append("Dotted: the tolerance.")
-    return " ".join(said)
+def trend_caption(trend: Trend) -> str:
+    """Return which values of a trend lie outside its control limits."""
+    if trend.limits is None or not trend.outside.any():
+        return ""
+    days, last = [str(day) for day in trend.when[trend.outside].astype("datetime64[D]")], trend.outside[-1]
+    low, high, value = (number(one) for one in (trend.limits.low, trend.limits.high, float(trend.value[-1])))
+    limits = f"outside the control limits {low} to {high} {trend.unit}"
+    if not last:
+        return f"{trend.name} lay {limits}: {join(days)}."
+    earlier = f" So did those of {join(days[:-1])}." if days[1:] else ""
+    return f"{trend.name} of the last test, {value} {trend.unit}, lies {limits}.{earlier}"
 
 
-def captioned_trends(pairs: Sequence[PairComparison]) -> list[tuple[Trend, str]]:
-    """Return A, R and B over the dates with their captions."""
+def trend_notes(pairs: Sequence[PairComparison], trends: Sequence[Trend]) -> str:
+    """Return how trends are drawn."""
     first, *others = [pair.common for pair in pairs]
-    common = [name for name in first if all(name in one for one in others)]
-    return [(trend, trend_caption(trend, common)) for trend in follow_trends(pairs)]
+    common = [_INPUTS[name] for name in first if all(name in one for one in others)]
+    told = [
+        f"Bars: expanded uncertainty (k = 2){f' without what all tests have in common: {join(common)}' if common else ''}."
+    ]
+    if any(trend.limits is not None for trend in trends):
+        told.append(
+            "Dashed: control limits given by the tests before the last (individuals, moving ranges); ringed: outside."
+        )
+    if any(trend.tolerance is not None for trend in trends):
+        told.append("Dotted: the tolerance.")
+    return " ".join(told)
+
+
+def changes_of_all(pairs: Sequence[PairComparison]) -> Table:
+    """Return the change of every quantity from the reference to each test; what differs is marked."""
+    rows: dict[str, list[Change | None]] = {}
+    for k, pair in enumerate(pairs):
+        for change in pair.changes:
+            name = "rest of the profile, largest" if change.quantity in _REST else change_name(change)
+            rows.setdefault(name, [None] * len(pairs))[k] = change
+    shown = [
+        Row(
+            [name, *("–" if one is None else f"{_size(one)}{' *' if one.significant else ''}" for one in found)],
+            marked=any(one is not None and one.significant for one in found),
+        )
+        for name, found in rows.items()
+    ]
+    shown.sort(key=lambda row: not row.marked)
+    return table([Words("Quantity"), *short_names(pairs)[1:]], shown)
+
+
+def _in_width(wide: Table, most: int) -> list[Table]:
+    """Return a table as several with the same first column, of so many others at most."""
+    columns = range(1, len(wide.titles), most)
+    return [
+        Table(
+            (wide.titles[0], *wide.titles[k : k + most]),
+            tuple(Row([row.cells[0], *row.cells[k : k + most]], row.marked) for row in wide.rows),
+        )
+        for k in columns
+    ]
 
 
 def render_comparison(pairs: Sequence[PairComparison]) -> str:
     """Return a comparison as a document: of two tests the sheet to sign, of more their trend; then what changed, then everything."""
     tests, names = compared_tests(pairs), short_names(pairs)
-    trends = captioned_trends(pairs)
+    trends = follow_trends(pairs)
     charts = {
         "profiles": plot_profiles(tests, names),
         "scatters": plot_scatters(tests, names),
         **{f"remaining_{k}": plot_remaining(pair) for k, pair in enumerate(pairs, start=1)},
-        **{f"trend_{trend.name}": draw_trend(trend) for trend, _ in trends},
+        **{f"trend_{trend.name}": draw_trend(trend) for trend in trends},
     }
     return render_page(
         "comparison.html.j2",
         embed({name: chart for name, chart in charts.items() if chart is not None}),
         sheet=describe_pair(pairs[0]) if len(pairs) == 1 else None,
         names=campaign_names(pairs),
-        compared=[
-            (name, conclude_comparison(pair), changes_table(pairs, pair))
-            for name, pair in zip(names[1:], pairs, strict=True)
-        ],
+        compared=_shared([(conclude_comparison(pair), name) for name, pair in zip(names[1:], pairs, strict=True)]),
         short=changes_table(pairs, pairs[0], short=True),
+        every=[changes_table(pairs, pairs[0])] if len(pairs) == 1 else _in_width(changes_of_all(pairs), _MOST_COLUMNS),
         notes=comparison_notes(pairs),
-        figures_table=side_by_side(pairs),
-        trends=[(f"trend_{trend.name}", caption) for trend, caption in trends],
+        figures_tables=_in_width(side_by_side(pairs), _MOST_COLUMNS + 1),
+        others=names[1:],
+        trends=[(f"trend_{trend.name}", trend_caption(trend)) for trend in trends],
+        trend_notes=trend_notes(pairs, trends),
         versions=versions(),
         summary={"assumptions": {}},
     )

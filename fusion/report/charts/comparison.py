@@ -28,8 +28,8 @@ from fusion.report.charts.style import (
 from fusion.report.numbers import number
 from interferometry.plots import ACCENT, INK
 
-#: Entries of a legend beside each other, and the height of a line of them, px.
-_LEGEND_COLUMNS, _LEGEND_LINE_PX = 2, 22
+#: Height of a line of a legend, px.
+_LEGEND_LINE_PX = 28
 _MARKS = ("circle", "square", "triangle", "diamond", "inverted_triangle", "x")
 #: Values of a campaign over position, and half their 95 % intervals, from its drift in order of position.
 _Values = Callable[[xr.Dataset], tuple[np.ndarray, np.ndarray]]
@@ -66,11 +66,9 @@ def _plot_campaigns(
     line: bool,
 ) -> Chart | None:
     """Draw one quantity of every campaign with readings over position: as lines with bands about zero, or as points from zero."""
-    lines = math.ceil(len(names) / _LEGEND_COLUMNS)
-    height = 300 + lines * _LEGEND_LINE_PX
-    drawn = new_figure(
-        x="position / mm", y=f"{quantity} / µm", height=height, legend_columns=_LEGEND_COLUMNS, zero=line
-    )
+    columns = 2 if len(names) <= 6 else 3
+    height = 300 + math.ceil(len(names) / columns) * _LEGEND_LINE_PX
+    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", height=height, legend_columns=columns, zero=line)
     courses = Courses(drawn)
     for k, (campaign, name) in enumerate(zip(campaigns, names, strict=True)):
         if campaign.drift is None:
