@@ -725,6 +725,10 @@ def compare(
         bool,
         Option("--same-setup", help="Laser, its alignment and the sensors stood untouched: their errors are common."),
     ] = False,
+    applied: Annotated[
+        Path | None,
+        Option(metavar="TABLE", help="The exported table that was loaded between two tests: predicted and achieved."),
+    ] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Compare campaigns of one machine: what changed by more than the uncertainties.
@@ -733,11 +737,13 @@ def compare(
     """
     from fusion.analysis.comparison import compare_campaigns
     from fusion.report.comparison import (
+        achieved_table,
         campaign_names,
         changes_table,
         comparison_json,
         comparison_notes,
         conclude_comparison,
+        conclude_table,
         render_comparison,
         side_by_side,
     )
@@ -745,7 +751,7 @@ def compare(
     from fusion.report.wording import print_table
 
     with _answering():
-        pairs = compare_campaigns(results, same_setup=same_setup)
+        pairs = compare_campaigns(results, same_setup=same_setup, applied=applied)
         if out is not None:
             write_page(out, render_comparison(pairs))
             errors.print(f"page: {out.resolve()}")
@@ -757,7 +763,9 @@ def compare(
         for name, pair in zip(names[1:], pairs, strict=True):
             if pair.changes:
                 wide.print(print_table(changes_table(pairs, pair), f"{names[0]} -> {name}"))
-            _print_lines([conclude_comparison(pair)])
+            if pair.achieved:
+                wide.print(print_table(achieved_table(pair), "Predicted and achieved"))
+            _print_lines([conclude_comparison(pair), *conclude_table(pair)])
         _print_lines(comparison_notes(pairs))
 
 

@@ -17,7 +17,8 @@ from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
-from fusion.results.store import group, has, opened, read_json_object, require_kind, require_own
+from fusion.results.store import file_sha256, group, has, opened, read_json_object, require_kind, require_own
+from fusion.results.table_prediction import TablePrediction, read_table_prediction
 from interferometry.drift.estimate import COMPONENTS
 from thermography.common import scatter_by_median
 
@@ -338,6 +339,8 @@ def compare_scatters(
 
 #: Level at which something counts as changed, over everything that is compared.
 LEVEL = 0.05
+#: Inputs of the budget whose error is one and the same in all readings of a test.
+_OF_INSTRUMENTS = ("device", "alignment", "material_temperature", "expansion_coefficient")
 #: Values by ISO 230-2 that are compared.
 _ISO230 = ("A", "R", "E", "M", "B")
 
@@ -398,6 +401,22 @@ class Change:
 
 
 @dataclass(frozen=True)
+class Achieved:
+    """A value by ISO 230-2 with an active table: before it, as predicted, as measured, and achieved minus predicted."""
+
+    quantity: str
+    before: Quantity
+    predicted: Quantity
+    achieved: Quantity
+    difference: Quantity
+
+    @property
+    def as_predicted(self) -> bool:
+        """Whether it differs from what was predicted by no more than its expanded uncertainty (k = 2)."""
+        return abs(self.difference.value or 0.0) <= 2.0 * (self.difference.u or 0.0)
+
+
+@dataclass(frozen=True)
 class PairComparison:
     """One campaign against the reference.
 
@@ -407,6 +426,7 @@ class PairComparison:
     not_compared : what cannot be compared, and why, one sentence each
     tests : tests of profile, scatter and drift per kelvin, over all campaigns, which share one level; the values by ISO 230-2 share another
     common : inputs of both budgets of ISO 230-2 whose error is the same in both tests
+    achieved : values with a table that was loaded between the tests, beside what was predicted of it
     """
 
     before: ComparedCampaign
@@ -416,6 +436,7 @@ class PairComparison:
     not_compared: tuple[str, ...]
     tests: int
     common: tuple[str, ...] = ()
+    achieved: tuple[Achieved, ...] = ()
 
 
 def read_campaign(folder: Path) -> ComparedCampaign:
@@ -424,15 +445,57 @@ def read_campaign(folder: Path) -> ComparedCampaign:
     return ComparedCampaign(folder, results, _axis(folder), _drift(folder / "deviations.nc"))
 
 
-def compare_campaigns(folders: Sequence[Path], *, same_setup: bool = False) -> list[PairComparison]:
-    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them."""
+def compare_campaigns(
+    folders: Sequence[Path], *, same_setup: bool = False, applied: Path | None = None
+) -> list[PairComparison]:
+    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them.
+
+    `applied` is the table that was loaded between two tests, see `read_table_prediction`.
+    """
     unique = {folder.resolve() for folder in folders}
     if len(unique) < 2 or len(unique) < len(folders):
         raise ComparisonError(
             f"{len(folders)} results folders are named, {len(unique)} of them different: name at least two, each once"
         )
+    if applied is not None and len(unique) != 2:
+        raise ComparisonError(
+            f"{applied.name}: a table stands between two tests; name the one before it and the one after it"
+        )
     reference, *others = [read_campaign(folder) for folder in folders]
-    return [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
+    pairs = [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
+    if applied is None:
+        return pairs
+    return [replace(pair, achieved=hold_against(pair, read_table_prediction(applied), applied)) for pair in pairs]
+
+
+def hold_against(pair: PairComparison, prediction: TablePrediction, applied: Path) -> tuple[Achieved, ...]:
+    """Hold the values with an active table against what was predicted of it.
+
+    The table holds the errors of the instruments in the test that it was made from; those that both tests have in common cancel.
+    """
+    if prediction.results_sha256 != file_sha256(pair.before.folder / "results.json"):
+        raise ComparisonError(
+            f"{applied.name} was not made from the results in {pair.before.folder}: name first the results that the table was exported from"
+        )
+    parts = [campaign.results.iso230 for campaign in (pair.before, pair.after)]
+    one, other = parts
+    if one is None or other is None:
+        raise ComparisonError(
+            f"{applied.name}: there are no values by ISO 230-2 in both tests to hold against its prediction"
+        )
+    found = []
+    for symbol, predicted in prediction.predicted_um.items():
+        first, second = (getattr(part.settled or part, f"{symbol}_um") for part in (one, other))
+        if second.value is None or second.u is None or predicted.value is None or predicted.u is None:
+            continue
+        shares = {name: contributions((one, other), name, symbol) for name in _OF_INSTRUMENTS}
+        systematic = sum(
+            was**2 - (2.0 * was * now if name in pair.common else 0.0) for name, (was, now) in shares.items()
+        )
+        u = math.sqrt(max(second.u**2 + systematic, 0.0) + predicted.u**2)
+        difference = Quantity(value=second.value - predicted.value, u=u)
+        found.append(Achieved(symbol, first, predicted, second, difference))
+    return tuple(found)
 
 
 def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, same_setup: bool) -> PairComparison:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fusion.analysis.comparison import LEVEL, Change, ComparedCampaign, PairComparison
+from fusion.analysis.comparison import LEVEL, Achieved, Change, ComparedCampaign, PairComparison
 from fusion.common import versions
 from fusion.report.charts.comparison import (
     Trend,
@@ -108,6 +108,34 @@ def conclude_comparison(pair: PairComparison) -> str:
     for campaign in (pair.before, pair.after):
         text = conditional(text, campaign.results.inputs, "positions")
     return text
+
+
+def conclude_table(pair: PairComparison) -> list[str]:
+    """Return whether a table that was loaded did what was predicted of it; nothing where none was named."""
+    if not pair.achieved:
+        return []
+    missed = [one.quantity for one in pair.achieved if not one.as_predicted]
+    if not missed:
+        are = "is" if len(pair.achieved) == 1 else "are"
+        return [
+            f"With the table {join([one.quantity for one in pair.achieved])} {are} as predicted within the uncertainty."
+        ]
+    differ = "differs" if len(missed) == 1 else "differ"
+    return [
+        f"With the table {join(missed)} {differ} from the prediction by more than the uncertainty: look for a wrong sign or scale, a table "
+        "that was not active, or another thermal state."
+    ]
+
+
+def achieved_table(pair: PairComparison) -> Table:
+    """Return the values before a table, as predicted with it and as achieved."""
+    rows = []
+    for one in pair.achieved:
+        values = [quantity(value) for value in (one.before, one.predicted, one.achieved, one.difference)]
+        verdict = "within the uncertainty" if one.as_predicted else "beyond the uncertainty"
+        rows.append(Row([ISO230_TERMS[one.quantity], *values, verdict], marked=not one.as_predicted))
+    heads = ("as found / µm", "predicted / µm", "achieved / µm", "achieved − predicted / µm")
+    return table([Words("Quantity (k = 2)"), *heads, Words("Verdict")], rows)
 
 
 def comparison_notes(pairs: Sequence[PairComparison]) -> list[str]:
@@ -386,6 +414,8 @@ def render_comparison(pairs: Sequence[PairComparison]) -> str:
         sheet=describe_pair(pairs[0]) if len(pairs) == 1 else None,
         names=campaign_names(pairs),
         compared=_shared([(conclude_comparison(pair), name) for name, pair in zip(names[1:], pairs, strict=True)]),
+        table_said=conclude_table(pairs[0]),
+        achieved=achieved_table(pairs[0]),
         short=changes_table(pairs, pairs[0], short=True),
         every=[changes_table(pairs, pairs[0])] if len(pairs) == 1 else _in_width(changes_of_all(pairs), _MOST_COLUMNS),
         notes=comparison_notes(pairs),
@@ -404,9 +434,17 @@ def comparison_json(pairs: Sequence[PairComparison]) -> dict[str, Any]:
     for pair in pairs:
         said = [conclude_comparison(pair), *comparison_notes([pair])]
         found = {"conclusions": said, "changes": [_change_json(change) for change in pair.changes]}
-        about = {"campaign": pair.after.name, "tests": pair.tests}
+        about: dict[str, Any] = {"campaign": pair.after.name, "tests": pair.tests}
+        if pair.achieved:
+            about["achieved"] = [_achieved_json(one) for one in pair.achieved]
         compared.append({**about, **found, "not_compared": list(pair.not_compared)})
     return {"reference": pairs[0].before.name, "compared": compared}
+
+
+def _achieved_json(one: Achieved) -> dict[str, Any]:
+    named = {"before": one.before, "predicted": one.predicted, "achieved": one.achieved, "difference": one.difference}
+    values = {name: {"value": found.value, "u": found.u} for name, found in named.items()}
+    return plain({"quantity": one.quantity, **values, "as_predicted": one.as_predicted})
 
 
 def _change_json(change: Change) -> dict[str, Any]:

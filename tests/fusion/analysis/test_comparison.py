@@ -18,7 +18,10 @@ from fusion.analysis.comparison import (
     compare_profiles,
     compare_scatters,
 )
+from fusion.results.parts import Quantity
 from fusion.results.results import ResultsError
+from fusion.results.store import file_sha256
+from fusion.results.table_prediction import ENDING, TablePrediction
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 
@@ -323,3 +326,43 @@ def test_an_error_that_both_tests_have_in_common_cancels_as_far_as_it_is_equal(t
     assert u_of([one, other]) == pytest.approx((34.0 - 21.6) ** 0.5)
     assert u_of([one, other], same_setup=True) == pytest.approx((34.0 - 21.6 - 6.0) ** 0.5)
     assert u_of([one, steel]) == pytest.approx(34.0**0.5)
+
+
+def test_achieved_is_held_against_what_a_table_was_predicted_to_leave(tmp_path: Path) -> None:
+    """The coefficient adds 4 um to u(A) = 5 um of either test: in common, it leaves 3 um of the second test and 1 um of the prediction."""
+
+    def part(a_um: float, coefficient: str) -> dict[str, Any]:
+        row = {"contributor": "expansion_coefficient", "u": 2.0, "unit": "ppm/K", "origin": "assumed", "A_um": 4.0}
+        shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
+        stated = {**PARTS["iso230"], "conditions": [{"name": "Expansion coefficient", "text": coefficient}]}
+        stated["settled"] = {
+            **stated["settled"],
+            "A_um": {"value": a_um, "u": 5.0},
+            "contributions": [{**row, **shares}],
+        }
+        return stated
+
+    readings = readings_of(31)
+    before = write_results(tmp_path / "before", readings, iso230=part(20.0, "11.7 ppm/K"))
+    table = tmp_path / "compensation_X.comp"
+
+    def predict(folder: Path) -> None:
+        prediction = TablePrediction(
+            table=table.name, campaign="", results_sha256=file_sha256(folder / "results.json"), cycles=5,
+            predicted_um={"A": Quantity(value=2.0, u=1.0)},
+        )  # fmt: skip
+        table.with_name(table.name + ENDING).write_text(prediction.model_dump_json())
+
+    predict(before)
+    as_predicted, missed, steel = (
+        write_results(tmp_path / name, readings, iso230=part(a_um, text))
+        for name, a_um, text in (("a", 8.0, "11.7 ppm/K"), ("b", 9.0, "11.7 ppm/K"), ("c", 9.0, "10 ppm/K"))
+    )
+    found = [compare_campaigns([before, one], applied=table)[0].achieved[0] for one in (as_predicted, missed, steel)]
+    assert [one.difference.value for one in found] == pytest.approx([6.0, 7.0, 7.0])
+    assert [one.difference.u for one in found] == pytest.approx([10.0**0.5, 10.0**0.5, 42.0**0.5])
+    assert [one.as_predicted for one in found] == [True, False, True]
+    with pytest.raises(ComparisonError, match="a table stands between two tests"):
+        compare_campaigns([before, as_predicted, missed], applied=table)
+    with pytest.raises(ComparisonError, match="was not made from the results in"):
+        compare_campaigns([as_predicted, missed], applied=table)

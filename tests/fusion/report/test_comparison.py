@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusion.analysis.comparison import compare_campaigns
+from fusion.analysis.comparison import Achieved, compare_campaigns
 from fusion.report.charts.comparison import control_limits, draw_trend, follow, follow_trends, plot_profiles
 from fusion.report.comparison import (
+    achieved_table,
     campaign_names,
     change_name,
     changes_of_all,
@@ -15,6 +16,7 @@ from fusion.report.comparison import (
     comparison_json,
     comparison_notes,
     conclude_comparison,
+    conclude_table,
     describe_pair,
     render_comparison,
     short_names,
@@ -64,6 +66,26 @@ def test_a_change_beyond_its_stated_uncertainty_is_not_said_to_lie_within_it(pai
     )  # fmt: skip
     (row,) = changes_table([one := replace(pairs[0], changes=(shown,))], one).rows
     assert row.cells[-1] == verdict
+
+
+def test_predicted_and_achieved_stand_beside_each_other(pairs):
+    def one(symbol, achieved):
+        difference = Quantity(value=achieved - 1.0, u=0.5)
+        known = (Quantity(value=9.0, u=1.0), Quantity(value=1.0, u=0.1), Quantity(value=achieved, u=0.4))
+        return Achieved(symbol, *known, difference)
+
+    pair = replace(pairs[0], achieved=(one("A", 3.0), one("E", 1.5)))
+    a, e = achieved_table(pair).rows
+    assert a.cells[1:] == ["9.0 ± 2.0", "1.00 ± 0.20", "3.00 ± 0.80", "2.0 ± 1.0", "beyond the uncertainty"]
+    assert a.marked and not e.marked
+    assert conclude_table(pair)[0].startswith("With the table A differs from the prediction")
+    as_said = conclude_table(replace(pair, achieved=(one("E", 1.5),)))
+    assert as_said == ["With the table E is as predicted within the uncertainty."]
+    assert conclude_table(pairs[0]) == []
+    page = render_comparison([pair])
+    assert page.index("With the table A differs") < page.index("figure-profiles") < page.index("Predicted and achieved")
+    told = comparison_json([pair])["compared"][0]["achieved"]
+    assert [(row["quantity"], row["as_predicted"]) for row in told] == [("A", False), ("E", True)]
 
 
 def test_sizes_have_no_negative_zero_and_ratios_two_decimals(pairs):
