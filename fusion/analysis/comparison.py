@@ -677,6 +677,12 @@ def common_inputs(before: ComparedCampaign, after: ComparedCampaign, *, same_set
     return (*common, *(("alignment", "material_temperature") if same_setup else ()))
 
 
+def common_to_all(pairs: Sequence[PairComparison]) -> tuple[str, ...]:
+    """Return the inputs whose error is the same in all tests that are compared with the reference."""
+    stated = [pair.common for pair in pairs if pair.changes]
+    return tuple(name for name in stated[0] if all(name in one for one in stated)) if stated else ()
+
+
 def _difference(
     quantity: str, kind: str, unit: str, before: Quantity, after: Quantity, *, machine: bool, covariance: float = 0.0
 ) -> Change:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fusion.analysis.comparison import LEVEL, Achieved, Change, ComparedCampaign, PairComparison
+from fusion.analysis.comparison import LEVEL, Achieved, Change, ComparedCampaign, PairComparison, common_to_all
 from fusion.common import versions
 from fusion.report.charts.comparison import (
     Trend,
@@ -281,7 +281,8 @@ def describe_pair(pair: PairComparison) -> Sheet:
             identity.append((name, both[0]))
         else:
             identity += [(f"{name}, {which}", text) for which, text in zip(("as found", "as left"), both, strict=True)]
-    remarks = [text for rows in conditions[1:] for text in (row.text for row in rows if row.name == "Remarks")]
+    remarks = [{row.name: row.text for row in rows}.get("Remarks", "") for rows in conditions]
+    done = remarks[1] if remarks[1] != remarks[0] else ""
     files = {
         f"results.json {which}": file_sha256(one.folder / "results.json")
         for which, one in (("as found", pair.before), ("as left", pair.after))
@@ -290,7 +291,7 @@ def describe_pair(pair: PairComparison) -> Sheet:
         title="As found, as left",
         standard="Accuracy and repeatability of positioning by ISO 230-2:2014, two tests of one axis",
         stated=Stated(
-            [*identity, ("Done between the tests", remarks[0] if remarks else "not stated")],
+            [*identity, ("Done between the tests", done or "not stated")],
             [],
             Stated.of(conditions[1], "").signatures,
         ),
@@ -354,8 +355,7 @@ def trend_caption(trend: Trend) -> str:
 
 def trend_notes(pairs: Sequence[PairComparison], trends: Sequence[Trend]) -> str:
     """Return how trends are drawn."""
-    first, *others = [pair.common for pair in pairs]
-    common = [_INPUTS[name] for name in first if all(name in one for one in others)]
+    common = [_INPUTS[name] for name in common_to_all(pairs)]
     told = [
         f"Bars: expanded uncertainty (k = 2){f' without what all tests have in common: {join(common)}' if common else ''}."
     ]

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from bokeh.models import BoxAnnotation, DatetimeTickFormatter, NoOverlap
 
-from fusion.analysis.comparison import ComparedCampaign, PairComparison, contributions
+from fusion.analysis.comparison import ComparedCampaign, PairComparison, common_to_all, contributions
 from fusion.report.charts.style import (
     CATEGORIES,
     Chart,
@@ -25,7 +25,7 @@ from fusion.report.charts.style import (
     shared_range,
     span_words,
 )
-from fusion.report.numbers import number
+from fusion.report.numbers import number, print_unit
 from interferometry.plots import ACCENT, INK
 
 #: Height of a line of a legend, px.
@@ -224,23 +224,21 @@ def plot_trend(dates: np.ndarray, values: np.ndarray, u: np.ndarray, name: str, 
 
 def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
     """Return A, R and B by ISO 230-2 over the dates of tests; their error bars leave out what all tests have in common."""
-    if not pairs:
-        return []
-    tests = [pairs[0].before, *(pair.after for pair in pairs)]
+    tests = [pairs[0].before, *(pair.after for pair in pairs if pair.changes)]
     dated = [
         (one.results.iso230, one.results.time.first[:19])
         for one in tests
         if one.results.iso230 is not None and one.results.time is not None
     ]
-    common = set(pairs[0].common).intersection(*(pair.common for pair in pairs))
     parts, dates = [part for part, _ in dated], np.array([first for _, first in dated], "datetime64[s]")
     trends = []
     for name in "ARB":
         found = [getattr(part.settled or part, f"{name}_um") for part in parts]
         values, u = (np.array([getattr(one, key) for one in found], float) for key in ("value", "u"))
-        shares = [np.array(contributions(parts, one, name)) for one in common]
+        shares = [np.array(contributions(parts, one, name)) for one in common_to_all(pairs)]
         own = u**2 - sum(2.0 * share * share.mean() - share.mean() ** 2 for share in shares)
         stated = {one.quantity: one.limit_um for one in parts[int(np.argmax(dates))].tolerances} if parts else {}
-        trend = follow(dates, values, np.sqrt(np.maximum(own, 0.0)), name, tolerance=stated.get(name))
+        unit = print_unit(parts[0].unit) if parts else ""
+        trend = follow(dates, values, np.sqrt(np.maximum(own, 0.0)), name, unit, stated.get(name))
         trends += [] if trend is None else [trend]
     return trends

@@ -155,6 +155,10 @@ def test_the_sheet_states_whose_axis_it_was_what_was_done_and_the_decisions(tmp_
     assert identity["Machine"] == "Mill 7"
     assert identity["Date of the test, as found"] == "1 March" and identity["Date of the test, as left"] == "2 March"
     assert identity["Done between the tests"] == "gib adjusted"
+    (back,) = compare_campaigns(
+        [left, write_results(tmp_path / "again", readings, iso230=part("3 March", 1.0, "pass", Remarks="gib adjusted"))]
+    )
+    assert dict(describe_pair(back).stated.identity)["Done between the tests"] == "not stated"
     assert sheet.stated.signatures[0] == ("Measured by", "R. Meyer")
     row = sheet.values.rows[0]
     assert row.marked

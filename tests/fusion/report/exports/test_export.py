@@ -122,7 +122,7 @@ def test_a_prediction_that_is_missing_or_damaged_says_what_to_do(tmp_path):
     with pytest.raises(TablePredictionError, match=r"x.comp.prediction.json is missing; name the table"):
         read_table_prediction(tmp_path / "x.comp")
     (tmp_path / "x.comp.prediction.json").write_text("[1]")
-    with pytest.raises(TablePredictionError, match="no prediction of a table .* export the table again"):
+    with pytest.raises(TablePredictionError, match=r"no prediction of a table .* export the table again"):
         read_table_prediction(tmp_path / "x.comp")
 
 
