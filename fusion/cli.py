@@ -736,6 +736,7 @@ def compare(
     Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first.
     """
     from fusion.analysis.comparison import compare_campaigns
+    from fusion.report.charts.comparison import follow_trends
     from fusion.report.comparison import (
         achieved_table,
         campaign_names,
@@ -746,6 +747,7 @@ def compare(
         conclude_table,
         render_comparison,
         side_by_side,
+        trend_sentences,
     )
     from fusion.report.page import write_page
     from fusion.report.wording import print_table
@@ -766,7 +768,7 @@ def compare(
             if pair.achieved:
                 wide.print(print_table(achieved_table(pair), "Predicted and achieved"))
             _print_lines([conclude_comparison(pair), *conclude_table(pair)])
-        _print_lines(comparison_notes(pairs))
+        _print_lines([*trend_sentences(follow_trends(pairs)), *comparison_notes(pairs)])
 
 
 @app.command()

@@ -353,6 +353,11 @@ def trend_caption(trend: Trend) -> str:
     return f"{trend.name} of the last test, {value} {trend.unit}, lies {limits}.{earlier}"
 
 
+def trend_sentences(trends: Sequence[Trend]) -> list[str]:
+    """Return what of several trends lies outside its control limits."""
+    return [said for said in map(trend_caption, trends) if said]
+
+
 def trend_notes(pairs: Sequence[PairComparison], trends: Sequence[Trend]) -> str:
     """Return how trends are drawn."""
     common = [_INPUTS[name] for name in common_to_all(pairs)]
@@ -421,7 +426,8 @@ def render_comparison(pairs: Sequence[PairComparison]) -> str:
         notes=comparison_notes(pairs),
         figures_tables=_in_width(side_by_side(pairs), _MOST_COLUMNS + 1),
         others=names[1:],
-        trends=[(f"trend_{trend.name}", trend_caption(trend)) for trend in trends],
+        trends=[f"trend_{trend.name}" for trend in trends],
+        trend_said=trend_sentences(trends),
         trend_notes=trend_notes(pairs, trends),
         versions=versions(),
         summary={"assumptions": {}},

@@ -231,3 +231,16 @@ def test_bars_of_a_trend_leave_out_what_all_tests_have_in_common(tmp_path):
     trend = follow_trends(compare_campaigns(folders))[0]
     assert trend.name == "A"
     assert trend.half == pytest.approx([6.0] * 3)
+
+
+def test_a_last_value_outside_its_limits_leads_the_document(tmp_path):
+    folders = []
+    for k, a_um in enumerate([9.0, 9.2, 9.1, 9.3, 9.0, 9.2, 9.1, 9.3, 12.0]):
+        whole = copy.deepcopy(PARTS["iso230"])
+        whole["settled"]["A_um"] = {"value": a_um, "u": 5.0}
+        time = {"first": f"2026-0{k + 1}-01T00:00:00Z", "last": f"2026-0{k + 1}-01T02:00:00Z", "zone": "UTC"}
+        folders.append(write_results(tmp_path / str(k), readings_of(31), iso230=whole, time=time))
+    page = render_comparison(compare_campaigns(folders))
+    said = "A of the last test, 12.0 µm, lies outside the control limits"
+    assert page.count(said) == 1
+    assert page.index(said) < page.index("figure-trend_A") < page.index("figure-profiles")
