@@ -728,6 +728,10 @@ def compare(
         bool,
         Option("--same-setup", help="Laser, its alignment and the sensors stood untouched: their errors are common."),
     ] = False,
+    applied: Annotated[
+        Path | None,
+        Option(metavar="TABLE", help="The exported table that was loaded between two tests: predicted and achieved."),
+    ] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Compare campaigns of one machine: what changed by more than the uncertainties.
@@ -735,32 +739,39 @@ def compare(
     Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first.
     """
     from fusion.analysis.comparison import compare_campaigns
+    from fusion.report.charts.comparison import follow_trends
     from fusion.report.comparison import (
+        achieved_table,
         campaign_names,
         changes_table,
         comparison_json,
+        comparison_notes,
         conclude_comparison,
+        conclude_table,
         render_comparison,
         side_by_side,
+        trend_sentences,
     )
     from fusion.report.page import write_page
     from fusion.report.wording import print_table
 
     with _answering():
-        pairs = compare_campaigns(results, same_setup=same_setup)
+        pairs = compare_campaigns(results, same_setup=same_setup, applied=applied)
         if out is not None:
             write_page(out, render_comparison(pairs))
             errors.print(f"page: {out.resolve()}")
         if as_json:
             print_json(comparison_json(pairs))
             return
-        wide = _wide()
-        wide.print(print_table(side_by_side(pairs), "Side by side"))
-        names = campaign_names(pairs)
+        wide, names = _wide(), campaign_names(pairs)
+        wide.print(print_table(side_by_side(pairs), "; ".join(names)))
         for name, pair in zip(names[1:], pairs, strict=True):
             if pair.changes:
-                wide.print(print_table(changes_table(pair), f"{names[0]} -> {name}"))
-            _print_lines((*conclude_comparison(pair), *(f"Not compared: {lack}" for lack in pair.not_compared)))
+                wide.print(print_table(changes_table(pairs, pair), f"{names[0]} -> {name}"))
+            if pair.achieved:
+                wide.print(print_table(achieved_table(pair), "Predicted and achieved"))
+            _print_lines([conclude_comparison(pair), *conclude_table(pair)])
+        _print_lines([*trend_sentences(follow_trends(pairs)), *comparison_notes(pairs)])
 
 
 @app.command()

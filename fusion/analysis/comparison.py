@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
-from fusion.results.store import group, has, opened, read_json_object, require_kind, require_own
+from fusion.results.store import file_sha256, group, has, opened, read_json_object, require_kind, require_own
+from fusion.results.table_prediction import TablePrediction, read_table_prediction
 from interferometry.drift.estimate import COMPONENTS
 from thermography.common import scatter_by_median
 
@@ -28,6 +30,8 @@ SAME_POSITION_MM = 0.05
 LEAST_POSITIONS = 5
 #: Share of its squared length that a shape must keep given the others to be distinguished from them.
 _LEAST_SHARE = 1e-6
+#: Most shapes by which a changed profile is described where steps and blocks are among them: with more they imitate any profile.
+_MOST_WITH_RUNS = 2
 #: Shapes that the thermal state of a test may take, by drift component.
 _STATE = {"shift": "offset", "stretch": "slope", "bend": "bow"}
 
@@ -46,9 +50,10 @@ class ProfileChange:
     left_out : positions that one test has alone
     remaining_um, remaining_u_um : (n,) difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and
         its standard uncertainty
-    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then the single positions (of
-        both approaches together, or their reversal) beyond the family-wise level, the strongest first
-    tests : how many shapes were tried
+    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then what changed beyond the
+        family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and blocks; last
+        the rest of the profile, with its largest value and the p-value of all of it
+    tests : how many tests were made
     """
 
     position_mm: Array
@@ -59,14 +64,15 @@ class ProfileChange:
     tests: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Shape:
-    """A shape over the cells (direction, target) of both tests; `machine` as in `Change`."""
+    """A shape over the cells (direction, target) of both tests; `until_mm` and `machine` as in `Change`."""
 
     name: str
     position_mm: float | None
     column: Array
     machine: bool
+    until_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -81,19 +87,41 @@ class _Difference:
 
     def fit(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
         """Return the sizes of shapes and their covariance (um2), by generalised least squares, widened by Birge's ratio."""
-        design = np.linalg.solve(self.root, np.column_stack([shape.column for shape in shapes]))
-        value = np.linalg.solve(self.root, self.value)
-        covariance = np.linalg.pinv(design.T @ design)
+        design, value = self._whitened(shapes), np.linalg.solve(self.root, self.value)
+        covariance = np.asarray(np.linalg.pinv(design.T @ design), float)
         sizes = covariance @ design.T @ value
         left = value - design @ sizes
         return sizes, covariance * max(1.0, float(left @ left) / max(value.size - len(shapes), 1))
 
     def separate(self, shape: _Shape, others: Sequence[_Shape]) -> bool:
         """Tell whether a shape can be distinguished from others."""
-        known, _ = np.linalg.qr(np.linalg.solve(self.root, np.column_stack([other.column for other in others])))
-        column = np.linalg.solve(self.root, shape.column)
-        residual = column - known @ (known.T @ column)
-        return bool(residual @ residual > _LEAST_SHARE * (column @ column))
+        return bool(np.isfinite(self.ratios([shape], others)[0]))
+
+    def ratios(self, shapes: Sequence[_Shape], others: Sequence[_Shape]) -> Array:
+        """Return the size of each shape beside others over its standard uncertainty, see `fit`; NaN where it cannot be told from them."""
+        columns, (left, known) = self._whitened(shapes), self.left(others)
+        own = columns - known @ (known.T @ columns)
+        length = (own**2).sum(axis=0)
+        apart = length > _LEAST_SHARE * (columns**2).sum(axis=0)
+        gained = np.full(length.size, np.nan)
+        gained[apart] = (left @ own[:, apart]) ** 2 / length[apart]
+        return np.sqrt(gained / np.maximum(1.0, (left @ left - gained) / max(left.size - len(others) - 1, 1)))
+
+    def remainder_p(self, shapes: Sequence[_Shape]) -> float:
+        """Return the p-value of everything that shapes leave, by the uncertainties of both tests alone."""
+        left, _ = self.left(shapes)
+        freedom = left.size - len(shapes)
+        return float(special.fdtrc(freedom, self.freedom, left @ left / freedom)) if freedom > 0 else 1.0
+
+    def left(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
+        """Return what shapes leave, in cells of unit variance, and an orthonormal basis of the shapes there."""
+        known, _ = np.linalg.qr(self._whitened(shapes))
+        value = np.linalg.solve(self.root, self.value)
+        return value - known @ (known.T @ value), known
+
+    def _whitened(self, shapes: Sequence[_Shape]) -> Array:
+        """Return the columns of shapes in cells of unit variance."""
+        return np.asarray(np.linalg.solve(self.root, np.column_stack([shape.column for shape in shapes])), float)
 
     def p_value(self, ratio: float) -> float:
         """Return the two-sided p-value of a change over its standard uncertainty."""
@@ -109,20 +137,33 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     judged = np.unique(difference.sign).size == 2 and difference.separate(reversal, state)
     candidates = [reversal] if judged else []
     candidates += _single_positions(difference, positions)
-    found = _search(difference, state, candidates, level=level, tests=tests + len(candidates))
+    steps, blocks = _steps(difference, positions), _blocks(difference, positions)
+    made = len(candidates) + len(steps) + 1
+    search = partial(_search, difference, state, most=positions.size // 2, level=level, tests=tests + made)
+    found = search([*candidates, *steps], blocks)
+    several = any(shape in [*steps, *blocks] for shape in found)
+    if several and (len(found) > _MOST_WITH_RUNS or difference.remainder_p([*state, *found]) * (tests + made) <= level):
+        found = search(candidates, ())
     reported = [*state, *([reversal] if judged and reversal not in found else []), *found]
     size, covariance = difference.fit(reported)
     u = np.sqrt(np.diag(covariance))
-    shapes = tuple(
+    shapes = [
         Change(
             shape.name, "profile", shape.position_mm, "um", None, None, Quantity(value=float(size[k]), u=float(u[k])),
-            difference.p_value(size[k] / u[k]), shape.machine,
+            difference.p_value(size[k] / u[k]), shape.machine, until_mm=shape.until_mm,
         )
         for k, shape in enumerate(reported)
         if shape.name not in ("offset", "drift")
-    )  # fmt: skip
+    ]  # fmt: skip
+    rest, rest_u = _remaining(difference, reported, positions)
+    most = int(np.argmax(np.abs(rest)))
+    largest = Quantity(value=float(rest[most]), u=float(rest_u[most]))
+    p_rest, at = difference.remainder_p(reported), float(positions[most])
+    shapes.append(
+        Change("rest of the profile" if found else "profile", "profile", at, "um", None, None, largest, p_rest, True)
+    )
     remaining, remaining_u = _remaining(difference, state, positions)
-    return ProfileChange(positions, left_out, remaining, remaining_u, shapes, len(candidates))
+    return ProfileChange(positions, left_out, remaining, remaining_u, tuple(shapes), made)
 
 
 def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Difference, int]:
@@ -214,33 +255,54 @@ def _single_positions(difference: _Difference, positions: Array) -> list[_Shape]
     return shapes
 
 
+def _steps(difference: _Difference, positions: Array) -> list[_Shape]:
+    """Return the steps of the profile: two positions or more, up to the last, that moved together."""
+    return [
+        _Shape("step", float(start), (difference.position_mm >= start).astype(float), machine=True)
+        for start in positions[2:-1]
+    ]
+
+
+def _blocks(difference: _Difference, positions: Array) -> list[_Shape]:
+    """Return the blocks of the profile: from two to half of the positions, between two that did not move, that moved together."""
+    place = difference.position_mm
+    return [
+        _Shape(
+            "block", float(low), ((place >= low) & (place <= high)).astype(float), machine=True, until_mm=float(high)
+        )
+        for i, low in enumerate(positions[1:-2], start=1)
+        for high in positions[i + 1 : min(i + positions.size // 2, positions.size - 1)]
+    ]
+
+
 def _search(
-    difference: _Difference, state: Sequence[_Shape], candidates: Sequence[_Shape], *, level: float, tests: int
+    difference: _Difference,
+    state: Sequence[_Shape],
+    candidates: Sequence[_Shape],
+    blocks: Sequence[_Shape],
+    *,
+    most: int,
+    level: float,
+    tests: int,
 ) -> list[_Shape]:
-    """Return the shapes beyond the family-wise level, the strongest first."""
+    """Return the shapes beyond the family-wise level, the strongest first; of the many blocks only where all that is left is."""
     found: list[_Shape] = []
-    most = np.unique(difference.position_mm).size // 2
     while len(found) < most:
         beside = [*state, *found]
-        open_ones = [shape for shape in candidates if shape not in found and difference.separate(shape, beside)]
-        fits = [difference.fit([*beside, shape]) for shape in open_ones]
-        ratios = [float(abs(size[-1]) / np.sqrt(covariance[-1, -1])) for size, covariance in fits]
-        if not ratios or difference.p_value(max(ratios)) * tests > level:
+        open_ones = [*candidates, *(blocks if difference.remainder_p(beside) * tests <= level else ())]
+        ratios = np.nan_to_num(difference.ratios(open_ones, beside))
+        if difference.p_value(float(ratios.max())) * tests > level:
             break
         found.append(open_ones[int(np.argmax(ratios))])
     return found
 
 
-def _remaining(difference: _Difference, state: Sequence[_Shape], positions: Array) -> tuple[Array, Array]:
-    """Return what the shapes of a thermal state leave at every position, mean of the approaches, with its standard uncertainty."""
-    design = np.column_stack([shape.column for shape in state])
-    size, covariance = difference.fit(state)
-    left = difference.value - design @ size
-    spread = difference.root @ difference.root.T - design @ covariance @ design.T
-    mean = np.stack(
-        [(difference.position_mm == place) / (difference.position_mm == place).sum() for place in positions]
-    )
-    return mean @ left, np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", mean, spread, mean), 0.0))
+def _remaining(difference: _Difference, shapes: Sequence[_Shape], positions: Array) -> tuple[Array, Array]:
+    """Return what shapes leave at every position, mean of the approaches, with its standard uncertainty by those of both tests."""
+    at = difference.position_mm == positions[:, None]
+    mean = at / at.sum(axis=1, keepdims=True) @ difference.root
+    left, known = difference.left(shapes)
+    return mean @ left, np.sqrt(np.maximum((mean**2).sum(axis=1) - ((mean @ known) ** 2).sum(axis=1), 0.0))
 
 
 # Positions whose readings scatter more, or less, than before: each against the change of all others.
@@ -277,6 +339,8 @@ def compare_scatters(
 
 #: Level at which something counts as changed, over everything that is compared.
 LEVEL = 0.05
+#: Inputs of the budget whose error is one and the same in all readings of a test.
+_OF_INSTRUMENTS = ("device", "alignment", "material_temperature", "expansion_coefficient")
 #: Values by ISO 230-2 that are compared.
 _ISO230 = ("A", "R", "E", "M", "B")
 
@@ -312,8 +376,10 @@ class Change:
     group : {"profile", "scatter", "drift per kelvin", "ISO 230-2"}; what it belongs to
     before, after : in both campaigns; None for a change of shape, which has no value of its own
     change : after minus before; of a scatter the ratio, without unit
-    p_value : two-sided, family-wise over everything that is compared
+    p_value : two-sided, family-wise over the tests of `family`
     machine : whether no thermal state of the test gives it, so that the machine or the set-up must have changed
+    until_mm : last position of a block
+    family : tests that share its level
     """
 
     quantity: str
@@ -325,11 +391,29 @@ class Change:
     change: Quantity
     p_value: float
     machine: bool
+    until_mm: float | None = None
+    family: int = 1
 
     @property
     def significant(self) -> bool:
         """Whether it differs by more than the uncertainties allow."""
         return self.p_value <= LEVEL
+
+
+@dataclass(frozen=True)
+class Achieved:
+    """A value by ISO 230-2 with an active table: before it, as predicted, as measured, and achieved minus predicted."""
+
+    quantity: str
+    before: Quantity
+    predicted: Quantity
+    achieved: Quantity
+    difference: Quantity
+
+    @property
+    def as_predicted(self) -> bool:
+        """Whether it differs from what was predicted by no more than its expanded uncertainty (k = 2)."""
+        return abs(self.difference.value or 0.0) <= 2.0 * (self.difference.u or 0.0)
 
 
 @dataclass(frozen=True)
@@ -340,8 +424,9 @@ class PairComparison:
     ----------
     profile : difference of the profiles; None where they cannot be compared
     not_compared : what cannot be compared, and why, one sentence each
-    tests : tests of the family, over all campaigns
+    tests : tests of profile, scatter and drift per kelvin, over all campaigns, which share one level; the values by ISO 230-2 share another
     common : inputs of both budgets of ISO 230-2 whose error is the same in both tests
+    achieved : values with a table that was loaded between the tests, beside what was predicted of it
     """
 
     before: ComparedCampaign
@@ -351,6 +436,7 @@ class PairComparison:
     not_compared: tuple[str, ...]
     tests: int
     common: tuple[str, ...] = ()
+    achieved: tuple[Achieved, ...] = ()
 
 
 def read_campaign(folder: Path) -> ComparedCampaign:
@@ -359,15 +445,57 @@ def read_campaign(folder: Path) -> ComparedCampaign:
     return ComparedCampaign(folder, results, _axis(folder), _drift(folder / "deviations.nc"))
 
 
-def compare_campaigns(folders: Sequence[Path], *, same_setup: bool = False) -> list[PairComparison]:
-    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them."""
+def compare_campaigns(
+    folders: Sequence[Path], *, same_setup: bool = False, applied: Path | None = None
+) -> list[PairComparison]:
+    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them.
+
+    `applied` is the table that was loaded between two tests, see `read_table_prediction`.
+    """
     unique = {folder.resolve() for folder in folders}
     if len(unique) < 2 or len(unique) < len(folders):
         raise ComparisonError(
             f"{len(folders)} results folders are named, {len(unique)} of them different: name at least two, each once"
         )
+    if applied is not None and len(unique) != 2:
+        raise ComparisonError(
+            f"{applied.name}: a table stands between two tests; name the one before it and the one after it"
+        )
     reference, *others = [read_campaign(folder) for folder in folders]
-    return [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
+    pairs = [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
+    if applied is None:
+        return pairs
+    return [replace(pair, achieved=hold_against(pair, read_table_prediction(applied), applied)) for pair in pairs]
+
+
+def hold_against(pair: PairComparison, prediction: TablePrediction, applied: Path) -> tuple[Achieved, ...]:
+    """Hold the values with an active table against what was predicted of it.
+
+    The table holds the errors of the instruments in the test that it was made from; those that both tests have in common cancel.
+    """
+    if prediction.results_sha256 != file_sha256(pair.before.folder / "results.json"):
+        raise ComparisonError(
+            f"{applied.name} was not made from the results in {pair.before.folder}: name first the results that the table was exported from"
+        )
+    parts = [campaign.results.iso230 for campaign in (pair.before, pair.after)]
+    one, other = parts
+    if one is None or other is None:
+        raise ComparisonError(
+            f"{applied.name}: there are no values by ISO 230-2 in both tests to hold against its prediction"
+        )
+    found = []
+    for symbol, predicted in prediction.predicted_um.items():
+        first, second = (getattr(part.settled or part, f"{symbol}_um") for part in (one, other))
+        if second.value is None or second.u is None or predicted.value is None or predicted.u is None:
+            continue
+        shares = {name: contributions((one, other), name, symbol) for name in _OF_INSTRUMENTS}
+        systematic = sum(
+            was**2 - (2.0 * was * now if name in pair.common else 0.0) for name, (was, now) in shares.items()
+        )
+        u = math.sqrt(max(second.u**2 + systematic, 0.0) + predicted.u**2)
+        difference = Quantity(value=second.value - predicted.value, u=u)
+        found.append(Achieved(symbol, first, predicted, second, difference))
+    return tuple(found)
 
 
 def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, same_setup: bool) -> PairComparison:
@@ -379,14 +507,19 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, s
         return PairComparison(before, after, (), None, (f"Everything: {reason}.",), 0)
     lacks: list[str] = []
     common = common_inputs(before, after, same_setup=same_setup)
-    standard = _standard(before, after, lacks, common)
-    changes = [*_scatters(before, after), *_coefficients(before, after, lacks), *standard]
-    profile = _profile(before, after, lacks, pairs=pairs, tests=len(changes) + 2)
-    if profile is not None:
-        changes = [*profile.shapes, *changes]
-    tests = pairs * (len(changes) if profile is None else len(changes) - len(profile.shapes) + 2 + profile.tests)
-    familywise = tuple(replace(change, p_value=min(1.0, change.p_value * tests)) for change in changes)
-    return PairComparison(before, after, familywise, profile, tuple(lacks), tests, common)
+    others = [*_scatters(before, after), *_coefficients(before, after, lacks)]
+    standard = list(_standard(before, after, lacks, common))
+    profile = _profile(before, after, lacks, pairs=pairs, tests=len(others) + 2)
+    shapes: tuple[Change, ...] = () if profile is None else profile.shapes
+    tests = pairs * (len(others) + (0 if profile is None else 2 + profile.tests))
+    changes = (*_in_family([*shapes, *others], tests), *_in_family(standard, pairs * len(standard)))
+    return PairComparison(before, after, changes, profile, tuple(lacks), tests, common)
+
+
+def _in_family(changes: Sequence[Change], tests: int) -> Iterator[Change]:
+    """Yield changes with the p-value that each has among so many tests (Bonferroni)."""
+    for change in changes:
+        yield replace(change, p_value=min(1.0, change.p_value * tests), family=tests)
 
 
 def _axis(folder: Path) -> str:
@@ -415,7 +548,7 @@ def _profile(
     """Compare the profiles, or say why not."""
     without = [one.name for one in (before, after) if one.drift is None]
     if before.drift is None or after.drift is None:
-        lacks.append(f"Profile and scatter: no estimate of the drift in {' and in '.join(without)}.")
+        lacks.append(f"Profile and scatter: no estimate of the drift in {_either(without)}.")
         return None
     try:
         found = compare_profiles(before.drift, after.drift, level=LEVEL / pairs, tests=tests)
@@ -425,6 +558,11 @@ def _profile(
     if found.left_out:
         lacks.append(f"Profile: {found.left_out} positions were measured in one of the two campaigns only.")
     return found
+
+
+def _either(names: Sequence[str]) -> str:
+    """Name the test, or both tests, that lack something."""
+    return names[0] if len(names) == 1 else "either test"
 
 
 def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]:
@@ -448,7 +586,7 @@ def _coefficients(before: ComparedCampaign, after: ComparedCampaign, lacks: list
         campaign.name for campaign, loop in zip((before, after), loops, strict=True) if not isinstance(loop, AxisLoop)
     ]
     if without:
-        lacks.append(f"Drift per kelvin: no model of the axis in {' and in '.join(without)}.")
+        lacks.append(f"Drift per kelvin: no model of the axis in {_either(without)}.")
         return
     one, other = (loop for loop in loops if isinstance(loop, AxisLoop))
     models = [{*loop.declared, *(step.effect for step in loop.steps)} for loop in (one, other)]
@@ -486,7 +624,7 @@ def _standard(
     one, other = parts
     if one is None or other is None:
         missing = [campaign.name for campaign, part in zip((before, after), parts, strict=True) if part is None]
-        lacks.append(f"ISO 230-2: no readings in {' and in '.join(missing)}.")
+        lacks.append(f"ISO 230-2: no readings in {_either(missing)}.")
         return
     if one.unit != other.unit:
         lacks.append("ISO 230-2: one axis is linear, the other a rotary one.")
@@ -506,11 +644,11 @@ def _standard(
         if None in (first.value, second.value, first.u, second.u):
             lacks.append(f"ISO 230-2, {symbol}: not measured with its uncertainty in both campaigns.")
             continue
-        shared = sum(math.prod(_contributions((one, other), name, symbol)) for name in common)
+        shared = sum(math.prod(contributions((one, other), name, symbol)) for name in common)
         yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False, covariance=shared)
 
 
-def _contributions(parts: Sequence[Iso230Part], name: str, symbol: str) -> list[float]:
+def contributions(parts: Sequence[Iso230Part], name: str, symbol: str) -> list[float]:
     """Return what an input of the budget contributes to the uncertainty of a quantity in every test, um."""
     budgets = [
         {row.contributor: row for row in window.contributions} if (window := part.settled or part.first) else {}
@@ -537,6 +675,12 @@ def common_inputs(before: ComparedCampaign, after: ComparedCampaign, *, same_set
     common = ["expansion_coefficient"] if same("Expansion coefficient") else []
     common += ["device"] if same_setup or same("Instrument") else []
     return (*common, *(("alignment", "material_temperature") if same_setup else ()))
+
+
+def common_to_all(pairs: Sequence[PairComparison]) -> tuple[str, ...]:
+    """Return the inputs whose error is the same in all tests that are compared with the reference."""
+    stated = [pair.common for pair in pairs if pair.changes]
+    return tuple(name for name in stated[0] if all(name in one for one in stated)) if stated else ()
 
 
 def _difference(

@@ -12,8 +12,18 @@ from fusion.analysis.comparison import PairComparison, compare_campaigns
 from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if, table_of
 from fusion.common import FusionError
-from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters, plot_trends
-from fusion.report.comparison import campaign_names, changes_table, conclude_comparison, side_by_side
+from fusion.report.charts.comparison import draw_trend, follow_trends, plot_profiles, plot_remaining, plot_scatters
+from fusion.report.comparison import (
+    campaign_names,
+    changes_table,
+    compared_tests,
+    comparison_notes,
+    conclude_comparison,
+    short_names,
+    side_by_side,
+    trend_caption,
+    trend_notes,
+)
 from fusion.results.results import read_results
 
 #: Folders below the one of the application in which results are looked for, and most results that are listed.
@@ -113,28 +123,26 @@ class CompareScreen:
 
 def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
     """Return a comparison as parts of a screen: what changed first, then the figures side by side, charts, and every quantity."""
-    names = campaign_names(pairs)
-    campaigns = [pairs[0].before, *(pair.after for pair in pairs)]
+    names, short, tests = campaign_names(pairs), short_names(pairs), compared_tests(pairs)
     compared = list(zip(names[1:], pairs, strict=True))
     parts: ui.Parts = []
     for name, pair in compared:
-        parts.append(ui.heading(f"From {names[0]} to {name}", level=3))
-        parts += [ui.paragraph(sentence) for sentence in conclude_comparison(pair)]
-        if pair.not_compared:
-            parts += [ui.paragraph("Not compared:"), ui.bullets(pair.not_compared)]
-    figures = table_of(side_by_side(pairs), "Figures of every campaign, expanded uncertainties (k = 2)")
+        parts += [ui.heading(f"From {names[0]} to {name}", level=3), ui.paragraph(conclude_comparison(pair))]
+    parts += [ui.paragraph(note) for note in comparison_notes(pairs)]
+    figures = table_of(side_by_side(pairs), "Figures of every test, expanded uncertainties (k = 2)")
     parts += [ui.heading("Side by side", level=3), figures]
     profiles = "Drift-free profiles, mean of both approaches, each about its mean, with 95 % bands."
-    parts += shown_if(plot_profiles(campaigns, names), profiles)
-    parts += shown_if(plot_scatters(campaigns, names), "Scatter of single readings with 95 % intervals.")
-    for chart in plot_trends(campaigns).values():
-        parts += shown_if(chart, "Over the dates of the tests, with expanded uncertainties (k = 2).")
+    parts += shown_if(plot_profiles(tests, short), profiles)
+    parts += shown_if(plot_scatters(tests, short), "Scatter of single readings with 95 % intervals.")
+    trends = follow_trends(pairs)
+    for trend in trends:
+        parts += shown_if(draw_trend(trend), f"{trend_caption(trend)} {trend_notes(pairs, trends)}".strip())
     for name, pair in compared:
-        left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed: changed."
+        left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed or shaded: changed."
         parts += shown_if(plot_remaining(pair), left)
         if pair.changes:
             every = f"Everything that was compared, {names[0]} before and {name} after"
-            parts.append(table_of(changes_table(pair), every))
+            parts.append(table_of(changes_table(pairs, pair), every))
     return parts
 
 

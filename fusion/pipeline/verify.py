@@ -42,7 +42,7 @@ def verify_compensation(before: Path, after: Path, applied: Path) -> Verificatio
     if applied.suffix.lower() != ".json":
         raise CampaignError(
             f"{applied}: name the model that the control runs, model.json of export --format model-json; what a table of positions did "
-            "shows in thermofuse compare of both results"
+            "shows in thermofuse compare BEFORE AFTER --applied TABLE"
         )
     results, model, campaign = read_results(before), read_recursion(applied), load_campaign(after)
     if not isinstance(results.loop, RecordLoop) or campaign.record is None:

@@ -5,13 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fusion.analysis.comparison import LEVEL, Change, ComparedCampaign, PairComparison
+from fusion.analysis.comparison import LEVEL, Achieved, Change, ComparedCampaign, PairComparison, common_to_all
 from fusion.common import versions
-from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters, plot_trends
+from fusion.report.charts.comparison import (
+    Trend,
+    draw_trend,
+    follow_trends,
+    plot_profiles,
+    plot_remaining,
+    plot_scatters,
+)
 from fusion.report.charts.style import embed
-from fusion.report.numbers import join, measured, number, p_cell, print_unit
+from fusion.report.numbers import fixed, join, measured, number, p_cell, print_unit
 from fusion.report.page import render_page
+from fusion.report.sheet import Sheet, Stated
 from fusion.report.wording import (
+    ISO230_TERMS,
     Row,
     Table,
     Words,
@@ -26,7 +35,7 @@ from fusion.report.wording import (
 )
 from fusion.results.loop import AxisLoop
 from fusion.results.parts import Quantity
-from fusion.results.store import plain
+from fusion.results.store import file_sha256, plain
 
 #: Quantities of a comparison in words; others are effects.
 _WORDS = {
@@ -36,7 +45,15 @@ _WORDS = {
     "position": "deviation",
     "reversal at a position": "reversal error",
     "scatter": "scatter",
+    "step": "deviation",
+    "block": "deviation",
+    "profile": "profile beyond offset, slope and bow",
+    "rest of the profile": "rest of the profile",
 }
+#: What is left of a difference of profiles, as a whole.
+_REST = ("profile", "rest of the profile")
+#: Tests beside each other in a table on paper.
+_MOST_COLUMNS = 5
 #: Inputs of the budget of ISO 230-2 that two tests may have in common.
 _INPUTS = {
     "expansion_coefficient": "the error of the expansion coefficient (material on the same side of 20 °C in both)",
@@ -48,17 +65,34 @@ _INPUTS = {
 _STATE = "differs; the thermal state of a test alone can cause that"
 
 
+def compared_tests(pairs: Sequence[PairComparison]) -> list[ComparedCampaign]:
+    """Return the tests of a comparison, the reference first."""
+    return [pairs[0].before, *(pair.after for pair in pairs)]
+
+
+def _letters(pairs: Sequence[PairComparison]) -> list[str]:
+    """Return what a test is called: as found and as left where there are two, a letter where there are more."""
+    if len(pairs) == 1:
+        return ["as found", "as left"]
+    return [chr(ord("A") + k) if k < 26 else str(k + 1) for k in range(len(pairs) + 1)]
+
+
 def campaign_names(pairs: Sequence[PairComparison]) -> list[str]:
-    """Return the names of the campaigns: a letter, the title and the day; the reference is A."""
-    campaigns = [pairs[0].before, *(pair.after for pair in pairs)]
-    letters = (chr(ord("A") + k) if k < 26 else str(k + 1) for k in range(len(campaigns)))
-    return [f"{letter} ({one.name})" for letter, one in zip(letters, campaigns, strict=True)]
+    """Return the names of the tests with their title and day."""
+    return [f"{letter} ({one.name})" for letter, one in zip(_letters(pairs), compared_tests(pairs), strict=True)]
 
 
-def conclude_comparison(pair: PairComparison) -> list[str]:
-    """Return what a comparison shows, in sentences."""
+def short_names(pairs: Sequence[PairComparison]) -> list[str]:
+    """Return the names of the tests for legends and columns; a letter comes with the day."""
+    days = [one.results.time.first[:10] if one.results.time else "" for one in compared_tests(pairs)]
+    named = zip(_letters(pairs), days, strict=True)
+    return [f"{letter}, {day}" if day and len(pairs) > 1 else letter for letter, day in named]
+
+
+def conclude_comparison(pair: PairComparison) -> str:
+    """Return what a comparison shows."""
     if not pair.changes:
-        return ["Nothing can be compared."]
+        return "Nothing can be compared."
     machine = [_change_words(change) for change in pair.changes if change.significant and change.machine]
     state = [_change_words(change) for change in pair.changes if change.significant and not change.machine]
     unchanged = "what no thermal state can cause stayed within its uncertainties"
@@ -73,17 +107,66 @@ def conclude_comparison(pair: PairComparison) -> list[str]:
         text = f"No change of the machine is shown: {unchanged}."
     for campaign in (pair.before, pair.after):
         text = conditional(text, campaign.results.inputs, "positions")
-    shared = [_INPUTS[name] for name in pair.common]
+    return text
+
+
+def conclude_table(pair: PairComparison) -> list[str]:
+    """Return whether a table that was loaded did what was predicted of it; nothing where none was named."""
+    if not pair.achieved:
+        return []
+    missed = [one.quantity for one in pair.achieved if not one.as_predicted]
+    if not missed:
+        are = "is" if len(pair.achieved) == 1 else "are"
+        return [
+            f"With the table {join([one.quantity for one in pair.achieved])} {are} as predicted within the uncertainty."
+        ]
+    differ = "differs" if len(missed) == 1 else "differ"
     return [
-        text,
-        *(
-            [f"Common to both tests, and therefore not counted twice in the differences by ISO 230-2: {join(shared)}."]
-            if shared
-            else []
-        ),
-        f"Each counts at {100 * LEVEL:.0f} % over all {pair.tests} tests together. Positions are compared beyond offset, slope and bow of "
-        "the profile; that presumes that the laser measured along the same line.",
+        f"With the table {join(missed)} {differ} from the prediction by more than the uncertainty: look for a wrong sign or scale, a table "
+        "that was not active, or another thermal state."
     ]
+
+
+def achieved_table(pair: PairComparison) -> Table:
+    """Return the values before a table, as predicted with it and as achieved."""
+    rows = []
+    for one in pair.achieved:
+        values = [quantity(value) for value in (one.before, one.predicted, one.achieved, one.difference)]
+        verdict = "within the uncertainty" if one.as_predicted else "beyond the uncertainty"
+        rows.append(Row([ISO230_TERMS[one.quantity], *values, verdict], marked=not one.as_predicted))
+    heads = ("as found / µm", "predicted / µm", "achieved / µm", "achieved − predicted / µm")
+    return table([Words("Quantity (k = 2)"), *heads, Words("Verdict")], rows)
+
+
+def comparison_notes(pairs: Sequence[PairComparison]) -> list[str]:
+    """Return what holds for all comparisons with the reference: level, what was presumed, common errors, and what cannot be compared."""
+    tests = max(pair.tests for pair in pairs)
+    standard = max((one.family for pair in pairs for one in pair.changes if one.group == "ISO 230-2"), default=0)
+    levels = [f"all {tests} tests on profile, scatter and drift per kelvin together"] if tests else []
+    levels += [f"all {standard} values by ISO 230-2 together"] if standard else []
+    notes = []
+    if levels:
+        notes.append(
+            f"Each counts at {100 * LEVEL:.0f} % over {', and over '.join(levels)}. Positions are compared beyond offset, slope and bow of "
+            "the profile; that presumes that the laser measured along the same line."
+        )
+    names = _letters(pairs)[1:]
+    for common, whose in _shared([(pair.common, name) for pair, name in zip(pairs, names, strict=True) if pair.common]):
+        which = "" if len(whose) == len(pairs) else f" ({join(whose)})"
+        inputs = join([_INPUTS[name] for name in common])
+        notes.append(
+            f"Common to the tests{which}, and therefore not counted twice in the differences by ISO 230-2: {inputs}."
+        )
+    lacks = [(lack, name) for pair, name in zip(pairs, names, strict=True) for lack in pair.not_compared]
+    for lack, whose in _shared(lacks):
+        which = "" if len(whose) == len(pairs) else f" ({join(whose)})"
+        notes.append(f"Not compared{which}: {lack}")
+    return notes
+
+
+def _shared(told: Sequence[tuple[Any, str]]) -> list[tuple[Any, list[str]]]:
+    """Return what is told of several tests once, with their names."""
+    return [(what, [name for one, name in told if one == what]) for what in dict.fromkeys(one for one, _ in told)]
 
 
 def _change_words(change: Change) -> str:
@@ -99,25 +182,38 @@ def change_name(change: Change) -> str:
     if change.group == "ISO 230-2":
         return f"{change.quantity} by ISO 230-2"
     words = _WORDS.get(change.quantity) or effect_words(change.quantity).name
-    return words if change.position_mm is None else f"{words} at {change.position_mm:g} mm"
+    if change.position_mm is None:
+        return words
+    at = f"{change.position_mm:g} mm"
+    if change.quantity == "step":
+        return f"{words} from {at} on"
+    if change.until_mm is not None:
+        return f"{words} from {change.position_mm:g} to {change.until_mm:g} mm"
+    return f"{words}, most at {at}," if change.quantity in _REST else f"{words} at {at}"
 
 
 def _size(change: Change) -> str:
     """The change with its expanded uncertainty; of a scatter the ratio."""
     if change.group == "scatter":
-        return f"× {number(change.change.value, 2)}"
+        return f"× {fixed(change.change.value, 2)}"
     text = measured(change.change.value, change.change.u, print_unit(change.unit))
-    return text if text.startswith("−") else f"+{text}"
+    return f"+{text}" if text.split(" ")[0].strip("0.") and not text.startswith("−") else text
 
 
-def changes_table(pair: PairComparison) -> Table:
-    """Return everything that was compared, with both values, the change and the verdict; what differs is marked and comes first."""
-    rows = []
+def changes_table(pairs: Sequence[PairComparison], pair: PairComparison, *, short: bool = False) -> Table:
+    """Return what was compared, with both values, the change and the verdict; what differs is marked and comes first.
+
+    A `short` table leaves out single positions that did not change, and the values by ISO 230-2, which stand elsewhere.
+    """
+    names, rows = short_names(pairs), []
     for change in sorted(pair.changes, key=lambda one: not one.significant):
+        if short and (change.group == "ISO 230-2" or (change.group == "scatter" and not change.significant)):
+            continue
         both = [_value(found, change.unit) for found in (change.before, change.after)]
-        cells = [change_name(change), *both, _size(change), p_cell(change.p_value), _verdict(change)]
+        p = "> 0.99" if change.p_value > 0.99 else p_cell(change.p_value)
+        cells = [change_name(change).rstrip(","), *both, _size(change), p, _verdict(change)]
         rows.append(Row(cells, marked=change.significant))
-    figures = ("before (k = 2)", "after (k = 2)", "Change (k = 2)", "p (family-wise)")
+    figures = (names[0], names[1 + list(pairs).index(pair)], "change (k = 2)", "p (family-wise)")
     return table([Words("Quantity"), *figures, Words("Verdict")], rows)
 
 
@@ -128,16 +224,17 @@ def _value(found: Quantity | None, unit: str) -> str:
 def _verdict(change: Change) -> str:
     if change.significant:
         return "changed" if change.machine else _STATE
+    if change.change.u and abs(change.change.value or 0.0) > 2 * change.change.u:
+        return f"not significant among {change.family} comparisons"
     return "within the uncertainties" if change.change.u or change.group == "scatter" else "no uncertainty: not judged"
 
 
 def side_by_side(pairs: Sequence[PairComparison]) -> Table:
-    """Return the main figures of all campaigns, a column for each."""
-    campaigns = [pairs[0].before, *(pair.after for pair in pairs)]
-    columns = [_figures(one) for one in campaigns]
+    """Return the main figures of all tests, a column for each."""
+    columns = [_figures(one) for one in compared_tests(pairs)]
     names = list(dict.fromkeys(name for column in columns for name in column))
     rows = [[name, *(column.get(name, "–") for column in columns)] for name in names]
-    return table([Words("Figure (k = 2)"), *(Words(name) for name in campaign_names(pairs))], rows)
+    return table([Words("Figure (k = 2)"), *(Words(name) for name in short_names(pairs))], rows)
 
 
 def _figures(campaign: ComparedCampaign) -> dict[str, str]:
@@ -169,28 +266,169 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
     return figures
 
 
-def render_comparison(pairs: Sequence[PairComparison]) -> str:
-    """Return a comparison as a document: what changed and the figures first, then charts, trend and everything that was compared."""
-    names, campaigns = campaign_names(pairs), [pairs[0].before, *(pair.after for pair in pairs)]
-    trends = plot_trends(campaigns)
-    remaining = {f"remaining_{k}": plot_remaining(pair) for k, pair in enumerate(pairs, start=1)}
-    charts = {
-        "profiles": plot_profiles(campaigns, names),
-        "scatters": plot_scatters(campaigns, names),
-        **remaining,
-        **trends,
+# As found and as left: the sheet to sign.
+
+
+def describe_pair(pair: PairComparison) -> Sheet:
+    """Return the sheet of two tests: whose they were, what was adjusted, A, R, E, M, B of both, their change and decisions."""
+    parts = [one.results.iso230 for one in (pair.before, pair.after)]
+    conditions = [() if part is None else part.conditions for part in parts]
+    found, left = (dict(Stated.of(rows, "not stated").identity) for rows in conditions)
+    identity = []
+    for name in dict.fromkeys([*found, *left]):
+        both = [one.get(name, "not stated") for one in (found, left)]
+        if both[0] == both[1]:
+            identity.append((name, both[0]))
+        else:
+            identity += [(f"{name}, {which}", text) for which, text in zip(("as found", "as left"), both, strict=True)]
+    remarks = [{row.name: row.text for row in rows}.get("Remarks", "") for rows in conditions]
+    done = remarks[1] if remarks[1] != remarks[0] else ""
+    files = {
+        f"results.json {which}": file_sha256(one.folder / "results.json")
+        for which, one in (("as found", pair.before), ("as left", pair.after))
     }
-    compared = [
-        (name, conclude_comparison(pair), pair.not_compared, changes_table(pair))
-        for name, pair in zip(names[1:], pairs, strict=True)
+    return Sheet(
+        title="As found, as left",
+        standard="Accuracy and repeatability of positioning by ISO 230-2:2014, two tests of one axis",
+        stated=Stated(
+            [*identity, ("Done between the tests", done or "not stated")],
+            [],
+            Stated.of(conditions[1], "").signatures,
+        ),
+        caption="Values by ISO 230-2, expanded uncertainties (k = 2); of the change without what both tests have in common",
+        values=_values_as_left(pair),
+        requirements=table([], []),
+        files=files,
+        version=versions()["thermofuse"],
+    )
+
+
+def _values_as_left(pair: PairComparison) -> Table:
+    """Return A, R, E, M, B of two tests, the change of each, and the decisions against the tolerances that are stated."""
+    parts = [one.results.iso230 for one in (pair.before, pair.after)]
+    changes = {one.quantity: one for one in pair.changes if one.group == "ISO 230-2"}
+    judged = [{} if part is None else {one.quantity: one for one in part.tolerances} for part in parts]
+    any_judged = bool(judged[0] or judged[1])
+    rows = []
+    for symbol, term in ISO230_TERMS.items():
+        both = ["–" if part is None else quantity(getattr(quoted_window(part), f"{symbol}_um")) for part in parts]
+        change = changes.get(symbol)
+        cells = [
+            term,
+            *both,
+            *(
+                ["–", "not compared"]
+                if change is None
+                else [_size(change).removesuffix(f" {print_unit(change.unit)}"), _differs(change)]
+            ),
+        ]
+        stated = [one.get(symbol) for one in judged]
+        if any_judged:
+            limits = dict.fromkeys(f"{one.limit_um:g}" for one in stated if one is not None)
+            cells += [" / ".join(limits) or "–", *("–" if one is None else one.decision for one in stated)]
+        rows.append(Row(cells, marked=change is not None and change.significant))
+    unit = print_unit(next((part.unit for part in parts if part is not None), "um"))
+    decided = (
+        [f"tolerance / {unit}", Words("as found (ISO 14253-1)"), Words("as left (ISO 14253-1)")] if any_judged else []
+    )
+    heads = [Words("Quantity"), f"as found / {unit}", f"as left / {unit}", f"change / {unit}", Words("Change")]
+    return table([*heads, *decided], rows)
+
+
+def _differs(change: Change) -> str:
+    """The verdict on a value by ISO 230-2 in short."""
+    return "differs" if change.significant else _verdict(change)
+
+
+def trend_caption(trend: Trend) -> str:
+    """Return which values of a trend lie outside its control limits."""
+    if trend.limits is None or not trend.outside.any():
+        return ""
+    days, last = [str(day) for day in trend.when[trend.outside].astype("datetime64[D]")], trend.outside[-1]
+    low, high, value = (number(one) for one in (trend.limits.low, trend.limits.high, float(trend.value[-1])))
+    limits = f"outside the control limits {low} to {high} {trend.unit}"
+    if not last:
+        return f"{trend.name} lay {limits}: {join(days)}."
+    earlier = f" So did those of {join(days[:-1])}." if days[1:] else ""
+    return f"{trend.name} of the last test, {value} {trend.unit}, lies {limits}.{earlier}"
+
+
+def trend_sentences(trends: Sequence[Trend]) -> list[str]:
+    """Return what of several trends lies outside its control limits."""
+    return [said for said in map(trend_caption, trends) if said]
+
+
+def trend_notes(pairs: Sequence[PairComparison], trends: Sequence[Trend]) -> str:
+    """Return how trends are drawn."""
+    common = [_INPUTS[name] for name in common_to_all(pairs)]
+    told = [
+        f"Bars: expanded uncertainty (k = 2){f' without what all tests have in common: {join(common)}' if common else ''}."
     ]
+    if any(trend.limits is not None for trend in trends):
+        told.append(
+            "Dashed: control limits given by the tests before the last (individuals, moving ranges); ringed: outside."
+        )
+    if any(trend.tolerance is not None for trend in trends):
+        told.append("Dotted: the tolerance.")
+    return " ".join(told)
+
+
+def changes_of_all(pairs: Sequence[PairComparison]) -> Table:
+    """Return the change of every quantity from the reference to each test; what differs is marked."""
+    rows: dict[str, list[Change | None]] = {}
+    for k, pair in enumerate(pairs):
+        for change in pair.changes:
+            name = "rest of the profile, largest" if change.quantity in _REST else change_name(change)
+            rows.setdefault(name, [None] * len(pairs))[k] = change
+    shown = [
+        Row(
+            [name, *("–" if one is None else f"{_size(one)}{' *' if one.significant else ''}" for one in found)],
+            marked=any(one is not None and one.significant for one in found),
+        )
+        for name, found in rows.items()
+    ]
+    shown.sort(key=lambda row: not row.marked)
+    return table([Words("Quantity"), *short_names(pairs)[1:]], shown)
+
+
+def _in_width(wide: Table, most: int) -> list[Table]:
+    """Return a table as several with the same first column, of so many others at most."""
+    columns = range(1, len(wide.titles), most)
+    return [
+        Table(
+            (wide.titles[0], *wide.titles[k : k + most]),
+            tuple(Row([row.cells[0], *row.cells[k : k + most]], row.marked) for row in wide.rows),
+        )
+        for k in columns
+    ]
+
+
+def render_comparison(pairs: Sequence[PairComparison]) -> str:
+    """Return a comparison as a document: of two tests the sheet to sign, of more their trend; then what changed, then everything."""
+    tests, names = compared_tests(pairs), short_names(pairs)
+    trends = follow_trends(pairs)
+    charts = {
+        "profiles": plot_profiles(tests, names),
+        "scatters": plot_scatters(tests, names),
+        **{f"remaining_{k}": plot_remaining(pair) for k, pair in enumerate(pairs, start=1)},
+        **{f"trend_{trend.name}": draw_trend(trend) for trend in trends},
+    }
     return render_page(
         "comparison.html.j2",
         embed({name: chart for name, chart in charts.items() if chart is not None}),
-        names=names,
-        compared=compared,
-        figures_table=side_by_side(pairs),
-        trends=list(trends),
+        sheet=describe_pair(pairs[0]) if len(pairs) == 1 else None,
+        names=campaign_names(pairs),
+        compared=_shared([(conclude_comparison(pair), name) for name, pair in zip(names[1:], pairs, strict=True)]),
+        table_said=conclude_table(pairs[0]),
+        achieved=achieved_table(pairs[0]),
+        short=changes_table(pairs, pairs[0], short=True),
+        every=[changes_table(pairs, pairs[0])] if len(pairs) == 1 else _in_width(changes_of_all(pairs), _MOST_COLUMNS),
+        notes=comparison_notes(pairs),
+        figures_tables=_in_width(side_by_side(pairs), _MOST_COLUMNS + 1),
+        others=names[1:],
+        trends=[f"trend_{trend.name}" for trend in trends],
+        trend_said=trend_sentences(trends),
+        trend_notes=trend_notes(pairs, trends),
         versions=versions(),
         summary={"assumptions": {}},
     )
@@ -200,10 +438,19 @@ def comparison_json(pairs: Sequence[PairComparison]) -> dict[str, Any]:
     """Return a comparison in JSON's own types."""
     compared = []
     for pair in pairs:
-        found = {"conclusions": conclude_comparison(pair), "changes": [_change_json(change) for change in pair.changes]}
-        about = {"campaign": pair.after.name, "tests": pair.tests}
+        said = [conclude_comparison(pair), *comparison_notes([pair])]
+        found = {"conclusions": said, "changes": [_change_json(change) for change in pair.changes]}
+        about: dict[str, Any] = {"campaign": pair.after.name, "tests": pair.tests}
+        if pair.achieved:
+            about["achieved"] = [_achieved_json(one) for one in pair.achieved]
         compared.append({**about, **found, "not_compared": list(pair.not_compared)})
     return {"reference": pairs[0].before.name, "compared": compared}
+
+
+def _achieved_json(one: Achieved) -> dict[str, Any]:
+    named = {"before": one.before, "predicted": one.predicted, "achieved": one.achieved, "difference": one.difference}
+    values = {name: {"value": found.value, "u": found.u} for name, found in named.items()}
+    return plain({"quantity": one.quantity, **values, "as_predicted": one.as_predicted})
 
 
 def _change_json(change: Change) -> dict[str, Any]:
@@ -213,7 +460,8 @@ def _change_json(change: Change) -> dict[str, Any]:
     }
     return plain(
         {
-            "quantity": change.quantity, "group": change.group, "position_mm": change.position_mm, "unit": change.unit, **values,
-            "p_value": change.p_value, "significant": change.significant, "machine": change.machine,
+            "quantity": change.quantity, "group": change.group, "position_mm": change.position_mm, "until_mm": change.until_mm,
+            "unit": change.unit, **values,
+            "p_value": change.p_value, "family": change.family, "significant": change.significant, "machine": change.machine,
         }
     )  # fmt: skip

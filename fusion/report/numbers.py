@@ -35,7 +35,7 @@ def measured(value: float | None, u: float | None, unit: str = "", *, decimals: 
     if u is None or not math.isfinite(u) or u <= 0:
         return f"{number(value)}{tail}"
     places = decimals_of(u) if decimals is None else decimals
-    return f"{value:.{places}f} ± {2 * u:.{places}f}{tail}".replace("-", "−")
+    return f"{value:z.{places}f} ± {2 * u:.{places}f}{tail}".replace("-", "−")
 
 
 def print_unit(unit: str) -> str:

@@ -20,6 +20,7 @@ from typer.testing import CliRunner, Result
 from fusion import cli
 from fusion.results.results import results_schema
 from tests.fusion.campaign_parts import change, record_of_rows
+from tests.fusion.compared_tests import readings_of, write_results
 
 pytestmark = pytest.mark.long
 
@@ -335,6 +336,19 @@ def test_results_that_were_edited_are_not_reported(results_folder: Path, tmp_pat
         told = invoke(*arguments)
         assert told.exit_code == 2, told.output
         assert "edited/results.json: is not the file that this run wrote" in told.output.replace("\n", "")
+
+
+def test_a_table_that_was_loaded_is_held_against_its_prediction(tmp_path: Path) -> None:
+    before, after = (write_results(tmp_path / name, readings_of(seed)) for name, seed in (("a", 31), ("b", 32)))
+    exported = invoke("export", before, "--format", "linuxcnc", "--out", tmp_path / "t", "--force")
+    assert exported.exit_code == 0, exported.output
+    table = tmp_path / "t/compensation_X.comp"
+    told = invoke("compare", before, after, "--applied", table)
+    assert told.exit_code == 0, told.output
+    assert "as found" in told.stdout and "Predicted and achieved" in told.stdout and "With the table " in told.stdout
+    (table.parent / "compensation_X.comp.prediction.json").unlink()
+    missing = invoke("compare", before, after, "--applied", table)
+    assert missing.exit_code == 2 and "prediction.json is missing; name the table" in missing.output.replace("\n", " ")
 
 
 @pytest.mark.parametrize("pdf", [(), ("--pdf",)])

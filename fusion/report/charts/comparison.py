@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from bokeh.models import BoxAnnotation, DatetimeTickFormatter, NoOverlap
 
-from fusion.analysis.comparison import ComparedCampaign, PairComparison
+from fusion.analysis.comparison import ComparedCampaign, PairComparison, common_to_all, contributions
 from fusion.report.charts.style import (
     CATEGORIES,
     Chart,
     Courses,
     add_band,
+    add_label,
     add_series,
+    fix_range,
     new_figure,
     of_rank,
+    shared_range,
     span_words,
 )
-from fusion.report.numbers import number
-from interferometry.plots import ACCENT
+from fusion.report.numbers import number, print_unit
+from interferometry.plots import ACCENT, INK
 
+#: Height of a line of a legend, px.
+_LEGEND_LINE_PX = 28
 _MARKS = ("circle", "square", "triangle", "diamond", "inverted_triangle", "x")
 #: Values of a campaign over position, and half their 95 % intervals, from its drift in order of position.
 _Values = Callable[[xr.Dataset], tuple[np.ndarray, np.ndarray]]
@@ -58,7 +66,9 @@ def _plot_campaigns(
     line: bool,
 ) -> Chart | None:
     """Draw one quantity of every campaign with readings over position: as lines with bands about zero, or as points from zero."""
-    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", legend_columns=1, zero=line)
+    columns = 2 if len(names) <= 6 else 3
+    height = 300 + math.ceil(len(names) / columns) * _LEGEND_LINE_PX
+    drawn = new_figure(x="position / mm", y=f"{quantity} / µm", height=height, legend_columns=columns, zero=line)
     courses = Courses(drawn)
     for k, (campaign, name) in enumerate(zip(campaigns, names, strict=True)):
         if campaign.drift is None:
@@ -80,27 +90,40 @@ def _plot_campaigns(
 
 
 def plot_remaining(pair: PairComparison) -> Chart | None:
-    """Draw the difference of two profiles beyond offset, slope and bow with its 95 % interval; positions that changed are marked."""
+    """Draw the difference of two profiles beyond offset, slope and bow with its 95 % interval; what changed is ringed or shaded."""
     if pair.profile is None:
         return None
     x, value, half = pair.profile.position_mm, pair.profile.remaining_um, 2 * pair.profile.remaining_u_um
     drawn = new_figure(x="position / mm", y="difference / µm", zero=True)
     style: dict[str, Any] = {"colour": CATEGORIES[0], "line": False, "marker": "circle", "legend": False}
     add_series(drawn, x, value, name="after − before", half=half, **style)
-    changed = [change.position_mm for change in pair.changes if change.group == "profile" and change.significant]
-    places = sorted({place for place in changed if place is not None})
+    changed = [change for change in pair.changes if change.group == "profile" and change.significant]
+    places = sorted({one.position_mm for one in changed if one.position_mm is not None and one.quantity not in _RUNS})
     at = np.isin(x, places)
     if at.any():
         drawn.scatter(x[at], value[at], marker="circle", size=17, fill_color=None, line_color=ACCENT, line_width=2.5)
-    marked = f"changed: {', '.join(f'{place:g} mm' for place in places)}" if places else "no position changed"
+    told = [f"{place:g} mm" for place in places]
+    for one in changed:
+        if one.quantity in _RUNS:
+            drawn.add_layout(
+                BoxAnnotation(
+                    left=one.position_mm, right=one.until_mm, fill_color=ACCENT, fill_alpha=0.08, level="underlay"
+                )
+            )
+            told.append(f"from {one.position_mm:g} mm " + ("on" if one.until_mm is None else f"to {one.until_mm:g} mm"))
+    marked = f"changed: {', '.join(told)}" if told else "no position changed"
     seen = f"Difference of the profiles beyond offset, slope and bow: {span_words(value, 'µm')}; {marked}."
     return Chart(drawn, seen, {"position / mm": x, "difference / µm": value, "95 % interval ± / µm": half})
 
 
+#: Changes of the profile over several positions.
+_RUNS = ("step", "block")
+
+
 # The trend of a quantity over the dates of many tests, with the limits of a control chart of individuals.
 
-#: Fewer tests give no limits that deserve the name: with eight, their own uncertainty is a quarter.
-_LEAST_FOR_LIMITS = 8
+#: Fewer tests before the last give no limits that deserve the name: with seven, their own uncertainty is a quarter.
+_LEAST_FOR_LIMITS = 7
 #: Three standard deviations over the expected moving range of two values (Shewhart's d2 = 1.128).
 _LIMIT_PER_RANGE = 3.0 / 1.128
 
@@ -114,46 +137,108 @@ class Limits(NamedTuple):
 
 
 def control_limits(values: np.ndarray) -> Limits | None:
-    """Return the limits of a chart of individuals with moving ranges (NIST/SEMATECH e-Handbook, 6.3.2.2); None of fewer than 8 values."""
+    """Return the limits of a chart of individuals with moving ranges (NIST/SEMATECH e-Handbook, 6.3.2.2); None of fewer than 7 values."""
     if values.size < _LEAST_FOR_LIMITS:
         return None
     middle, reach = float(values.mean()), _LIMIT_PER_RANGE * float(np.abs(np.diff(values)).mean())
     return Limits(middle - reach, middle, middle + reach)
 
 
-def plot_trend(dates: np.ndarray, values: np.ndarray, u: np.ndarray, name: str, unit: str = "µm") -> Chart | None:
-    """Draw a quantity over the dates of at least three tests with its expanded uncertainty, and from eight on its control limits."""
+@dataclass(frozen=True)
+class Trend:
+    """A quantity over the dates of tests, in their order.
+
+    Attributes
+    ----------
+    when, value, half : (n,) days, values, and half the length of their error bars
+    limits : control limits that the tests before the last give (ISO 7870-2, phase 2); None of fewer than eight tests
+    tolerance : upper limit that the last test states; None without one
+    """
+
+    name: str
+    unit: str
+    when: np.ndarray
+    value: np.ndarray
+    half: np.ndarray
+    limits: Limits | None
+    tolerance: float | None
+
+    @property
+    def outside(self) -> np.ndarray:
+        """Whether each value lies outside the control limits."""
+        if self.limits is None:
+            return np.zeros(self.value.size, bool)
+        return (self.value < self.limits.low) | (self.value > self.limits.high)
+
+
+def follow(
+    dates: np.ndarray, values: np.ndarray, u: np.ndarray, name: str, unit: str = "µm", tolerance: float | None = None
+) -> Trend | None:
+    """Return a quantity over the dates of at least three tests; None of fewer."""
     known = np.isfinite(values) & ~np.isnat(dates)
-    order = np.argsort(dates[known])
-    when, value = dates[known][order], values[known][order]
+    order = np.argsort(dates[known], kind="stable")
+    value, half = values[known][order], 2 * np.nan_to_num(u[known][order])
     if value.size < 3:
         return None
+    return Trend(name, unit, dates[known][order], value, half, control_limits(value[:-1]), tolerance)
+
+
+def draw_trend(trend: Trend) -> Chart:
+    """Draw a quantity over dates with its error bars, its control limits and its tolerance; values outside the limits are ringed."""
+    name, unit, when, value, half, limits = trend.name, trend.unit, trend.when, trend.value, trend.half, trend.limits
     drawn = new_figure(x="date", y=f"{name} / {unit}", x_type="datetime", height=240)
-    half = 2 * np.nan_to_num(u[known][order])
+    drawn.xaxis[0].update(
+        formatter=DatetimeTickFormatter(days="%Y-%m-%d", months="%Y-%m", years="%Y"),
+        major_label_policy=NoOverlap(min_distance=8),
+    )
     add_series(drawn, when, value, name=name, colour=CATEGORIES[0], marker="circle", half=half, legend=False)
     seen = f"{name} of {value.size} tests: {span_words(value, unit)}"
-    limits = control_limits(value)
+    drawn_um = [value - half, value + half]
     if limits is None:
-        seen += f"; control limits need {_LEAST_FOR_LIMITS} tests"
+        seen += f"; control limits need {_LEAST_FOR_LIMITS + 1} tests"
     else:
         for level, dash in zip(limits, ("dashed", "solid", "dashed"), strict=True):
             drawn.hspan(level, line_color=ACCENT, line_dash=dash, line_width=1.3)
-        beyond = int(((value < limits.low) | (value > limits.high)).sum())
+        drawn_um.append(np.array(limits))
+        at = trend.outside
+        if at.any():
+            ring = {"fill_color": None, "line_color": ACCENT, "line_width": 2.5}
+            drawn.scatter(when[at], value[at], marker="circle", size=17, **ring)
         low, high = number(limits.low, 3), number(limits.high, 3)
-        seen += f"; control limits {low} to {high} {unit}, {beyond} of {value.size} outside"
+        seen += f"; control limits {low} to {high} {unit}, {int(at.sum())} of {value.size} outside"
+    if trend.tolerance is not None:
+        drawn.hspan(trend.tolerance, line_color=INK, line_dash="dotted", line_width=1.6)
+        add_label(drawn, when[0], trend.tolerance, "tolerance", offset=(0, 3), size="11px")
+        drawn_um.append(np.array([trend.tolerance]))
+        seen += f"; tolerance {trend.tolerance:g} {unit}"
+    fix_range(drawn, *shared_range(*drawn_um))
     columns = {"date": np.datetime_as_string(when, "D"), f"{name} / {unit}": value, f"± (k = 2) / {unit}": half}
     return Chart(drawn, f"{seen}.", columns)
 
 
-def plot_trends(campaigns: Sequence[ComparedCampaign]) -> Mapping[str, Chart]:
-    """Draw A, R and B by ISO 230-2 over the dates of campaigns."""
-    tests = [(one.results.iso230, one.results.time) for one in campaigns]
-    dated = [(part.settled or part, time.first[:19]) for part, time in tests if part is not None and time is not None]
-    dates = np.array([first for _, first in dated], "datetime64[s]")
-    charts = {}
+def plot_trend(dates: np.ndarray, values: np.ndarray, u: np.ndarray, name: str, unit: str = "µm") -> Chart | None:
+    """Draw a quantity over the dates of at least three tests with its expanded uncertainty, and from eight on its control limits."""
+    trend = follow(dates, values, u, name, unit)
+    return None if trend is None else draw_trend(trend)
+
+
+def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
+    """Return A, R and B by ISO 230-2 over the dates of tests; their error bars leave out what all tests have in common."""
+    tests = [pairs[0].before, *(pair.after for pair in pairs if pair.changes)]
+    dated = [
+        (one.results.iso230, one.results.time.first[:19])
+        for one in tests
+        if one.results.iso230 is not None and one.results.time is not None
+    ]
+    parts, dates = [part for part, _ in dated], np.array([first for _, first in dated], "datetime64[s]")
+    trends = []
     for name in "ARB":
-        found = [getattr(part, f"{name}_um") for part, _ in dated]
+        found = [getattr(part.settled or part, f"{name}_um") for part in parts]
         values, u = (np.array([getattr(one, key) for one in found], float) for key in ("value", "u"))
-        if (chart := plot_trend(dates, values, u, name)) is not None:
-            charts[f"trend_{name}"] = chart
-    return charts
+        shares = [np.array(contributions(parts, one, name)) for one in common_to_all(pairs)]
+        own = u**2 - sum(2.0 * share * share.mean() - share.mean() ** 2 for share in shares)
+        stated = {one.quantity: one.limit_um for one in parts[int(np.argmax(dates))].tolerances} if parts else {}
+        unit = print_unit(parts[0].unit) if parts else ""
+        trend = follow(dates, values, np.sqrt(np.maximum(own, 0.0)), name, unit, stated.get(name))
+        trends += [] if trend is None else [trend]
+    return trends

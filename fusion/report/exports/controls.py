@@ -127,6 +127,14 @@ def read_profile(deviations: xr.Dataset) -> Profile:
     )
 
 
+def read_scatter(deviations: xr.Dataset) -> Array:
+    """Return the standard deviation of a reading (2, n), um, in the order of `read_profile`."""
+    drift = group(deviations, "drift").sel(direction=list(APPROACHES))
+    order = np.argsort(deviations["position"].values)
+    scatter = drift["scatter"].fillna(drift["scatter_position"])
+    return np.asarray(scatter.isel(target=order).transpose("direction", "target").values, float)
+
+
 def tabulate(profile: Profile, *, spacing_mm: float | None = None, reference_mm: float | None = None) -> ErrorTable:
     """Return the deviations at the points of a table, relative to the reference."""
     targets = profile.position_mm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from fusion.report.exports.controls import (
     path_variance,
     read_origin,
     read_profile,
+    read_scatter,
     read_thermal_state,
     siemens_temperature,
     tabulate,
@@ -39,8 +41,11 @@ from fusion.report.numbers import number
 from fusion.report.wording import anomaly_cause, anomaly_place
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
+from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically
+from fusion.results.table_prediction import ENDING, TablePrediction
+from interferometry.iso230 import STANDARD_CYCLES
 
 # The guard of compensation tables: why a run's profile should not go into a control, and what to know where it may.
 
@@ -131,6 +136,32 @@ def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Predicti
         resampling_um=float(np.abs(relative - _at_targets(profile, table)).max()),
         value_u_um=float(table.u_um[:, inside].max()),
     )
+
+
+def predict_test(
+    profile: Profile, table: ErrorTable, scatter_um: Array, *, cycles: int, one_table: bool
+) -> dict[str, Quantity]:
+    """Predict A, E, M and B of a test of so many cycles with an active table: median over tests, each with its own readings.
+
+    `scatter_um` (2, n) is the standard deviation of a reading. The errors of the profile are those of the table too.
+    """
+    rng, left = np.random.default_rng(_SEED), remainder_um(profile, table, one_table=one_table)
+    errors = rng.multivariate_normal(
+        np.zeros(left.size), profile.covariance_um2.reshape(left.size, left.size), _DRAWS, method="eigh"
+    )
+    mean = left - errors.reshape(_DRAWS, *left.shape) + rng.normal(0.0, scatter_um / cycles**0.5, (_DRAWS, *left.shape))
+    spread = 2.0 * scatter_um * np.sqrt(rng.chisquare(cycles - 1, mean.shape) / (cycles - 1))
+    drawn = {
+        "A": (mean + spread).max(axis=(1, 2)) - (mean - spread).min(axis=(1, 2)),
+        "E": np.ptp(mean, axis=(1, 2)),
+        "M": np.ptp(mean.mean(axis=1), axis=1),
+        "B": np.abs(mean[:, 0] - mean[:, 1]).max(axis=1),
+    }
+    return {
+        symbol: Quantity(value=float(np.median(values)), u=float(values.std(ddof=1)))
+        for symbol, values in drawn.items()
+        if np.isfinite(values).all()
+    }
 
 
 def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Array:
@@ -304,9 +335,26 @@ def _table_texts(
     header = header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
     file = control.file_name.format(axis=name) if name else control.file_name.replace("_{axis}", "")
     texts = {file: control.write(table, name, header if control.comment else ())}
+    texts[f"{file}{ENDING}"] = _prediction_text(run, profile, table, control, file)
     if not control.comment:
         texts[f"{file}.README.txt"] = "\n".join(header) + "\n"
     return texts, [*_forced(against), *remarks(run.results)]
+
+
+def _prediction_text(run: _Run, profile: Profile, table: ErrorTable, control: Control, file: str) -> str:
+    """Return what a test with the table is predicted to show, for ``thermofuse compare --applied``."""
+    iso = run.results.iso230
+    cycles = len(iso.settled.cycles) if iso is not None and iso.settled is not None else STANDARD_CYCLES
+    prediction = TablePrediction(
+        table=file,
+        campaign=run.results.campaign,
+        results_sha256=run.origin.results_sha256,
+        cycles=cycles,
+        predicted_um=predict_test(
+            profile, table, read_scatter(run.deviations), cycles=max(cycles, 2), one_table=control.one_table
+        ),
+    )
+    return json.dumps(prediction.model_dump(mode="json"), indent=2) + "\n"
 
 
 def _temperature_text(

@@ -18,7 +18,10 @@ from fusion.analysis.comparison import (
     compare_profiles,
     compare_scatters,
 )
+from fusion.results.parts import Quantity
 from fusion.results.results import ResultsError
+from fusion.results.store import file_sha256
+from fusion.results.table_prediction import ENDING, TablePrediction
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 
@@ -34,6 +37,17 @@ def changed(changes: tuple[Change, ...]) -> list[tuple[str, float | None]]:
 
 def loop_with(**parts: Any) -> dict[str, Any]:
     return {**copy.deepcopy(PARTS["loop"]), **parts}
+
+
+def test_values_by_the_standard_do_not_pay_for_the_tests_on_positions(before: Path, tmp_path: Path) -> None:
+    """A falls by 3 standard uncertainties: p 0.0027, of five values 0.013, of all positions it would be 0.1."""
+    later = copy.deepcopy(PARTS["iso230"])
+    later["settled"]["A_um"] = {"value": 1.0 - 3.0 * 0.1 * 2**0.5, "u": 0.1}
+    (pair,) = compare_campaigns([before, write_results(tmp_path / "after", readings_of(32), iso230=later)])
+    fallen = next(change for change in pair.changes if change.group == "ISO 230-2" and change.quantity == "A")
+    assert fallen.family == 5 and fallen.significant
+    assert fallen.p_value == pytest.approx(5 * 0.0027, rel=0.01)
+    assert {change.family for change in pair.changes if change.group != "ISO 230-2"} == {pair.tests}
 
 
 def test_of_two_sound_campaigns_nothing_changed(before: Path, tmp_path: Path) -> None:
@@ -127,8 +141,12 @@ def estimate(
 
 
 def moved_positions(found: ProfileChange) -> list[tuple[str, float | None]]:
-    """Single positions that count as changed."""
-    return [(shape.quantity, shape.position_mm) for shape in found.shapes if shape.position_mm is not None]
+    """Single positions, steps and blocks that count as changed, and the rest of the profile where it does."""
+    return [
+        (shape.quantity, shape.position_mm)
+        for shape in found.shapes
+        if shape.position_mm is not None and (shape is not found.shapes[-1] or shape.p_value * found.tests <= 0.05)
+    ]
 
 
 def test_another_thermal_state_changes_no_position(rng: np.random.Generator) -> None:
@@ -146,6 +164,36 @@ def test_positions_that_moved_are_told_from_their_neighbours(rng: np.random.Gene
     size = next(shape for shape in found.shapes if shape.position_mm == 100.0)
     assert abs(size.change.value - 3.0) < 4 * size.change.u
     assert all(shape.machine for shape in found.shapes if shape.position_mm is not None)
+
+
+@pytest.mark.parametrize(
+    ("cells", "named"),
+    [
+        (slice(3, None), [("step", 150.0, None)]),
+        (slice(2, 5), [("block", 100.0, 200.0)]),
+        (slice(2, 3), [("position", 100.0, None)]),
+    ],
+)
+def test_a_step_and_a_block_are_told_from_a_single_position(
+    rng: np.random.Generator, cells: slice, named: list[tuple[str, float, float | None]]
+) -> None:
+    moved = np.zeros((2, 8))
+    moved[:, cells] = 2.0
+    found = compare_profiles(estimate(rng), estimate(rng, extra=moved), level=0.05)
+    *_, changed, rest = found.shapes
+    assert [(changed.quantity, changed.position_mm, changed.until_mm)] == named
+    assert abs(changed.change.value - 2.0) < 4 * changed.change.u
+    assert rest.quantity == "rest of the profile" and rest.p_value > 0.001
+
+
+def test_a_profile_that_no_shape_describes_is_said_to_have_changed_most_at_a_place(rng: np.random.Generator) -> None:
+    """A wave over the travel: a remainder of known uncertainty, without the steps and blocks that would imitate it."""
+    wave = 2.0 * np.sin(4.0 * np.pi * np.arange(8) / 7.0)
+    found = compare_profiles(estimate(rng), estimate(rng, extra=wave), level=0.05)
+    assert {shape.quantity for shape in found.shapes}.isdisjoint({"step", "block"})
+    rest = found.shapes[-1]
+    assert rest.p_value * found.tests < 1e-3 and rest.machine
+    assert 0.05 < rest.change.u < 0.1
 
 
 def test_slope_and_bow_are_told_and_are_no_change_of_the_machine(rng: np.random.Generator) -> None:
@@ -278,3 +326,43 @@ def test_an_error_that_both_tests_have_in_common_cancels_as_far_as_it_is_equal(t
     assert u_of([one, other]) == pytest.approx((34.0 - 21.6) ** 0.5)
     assert u_of([one, other], same_setup=True) == pytest.approx((34.0 - 21.6 - 6.0) ** 0.5)
     assert u_of([one, steel]) == pytest.approx(34.0**0.5)
+
+
+def test_achieved_is_held_against_what_a_table_was_predicted_to_leave(tmp_path: Path) -> None:
+    """The coefficient adds 4 um to u(A) = 5 um of either test: in common, it leaves 3 um of the second test and 1 um of the prediction."""
+
+    def part(a_um: float, coefficient: str) -> dict[str, Any]:
+        row = {"contributor": "expansion_coefficient", "u": 2.0, "unit": "ppm/K", "origin": "assumed", "A_um": 4.0}
+        shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
+        stated = {**PARTS["iso230"], "conditions": [{"name": "Expansion coefficient", "text": coefficient}]}
+        stated["settled"] = {
+            **stated["settled"],
+            "A_um": {"value": a_um, "u": 5.0},
+            "contributions": [{**row, **shares}],
+        }
+        return stated
+
+    readings = readings_of(31)
+    before = write_results(tmp_path / "before", readings, iso230=part(20.0, "11.7 ppm/K"))
+    table = tmp_path / "compensation_X.comp"
+
+    def predict(folder: Path) -> None:
+        prediction = TablePrediction(
+            table=table.name, campaign="", results_sha256=file_sha256(folder / "results.json"), cycles=5,
+            predicted_um={"A": Quantity(value=2.0, u=1.0)},
+        )  # fmt: skip
+        table.with_name(table.name + ENDING).write_text(prediction.model_dump_json())
+
+    predict(before)
+    as_predicted, missed, steel = (
+        write_results(tmp_path / name, readings, iso230=part(a_um, text))
+        for name, a_um, text in (("a", 8.0, "11.7 ppm/K"), ("b", 9.0, "11.7 ppm/K"), ("c", 9.0, "10 ppm/K"))
+    )
+    found = [compare_campaigns([before, one], applied=table)[0].achieved[0] for one in (as_predicted, missed, steel)]
+    assert [one.difference.value for one in found] == pytest.approx([6.0, 7.0, 7.0])
+    assert [one.difference.u for one in found] == pytest.approx([10.0**0.5, 10.0**0.5, 42.0**0.5])
+    assert [one.as_predicted for one in found] == [True, False, True]
+    with pytest.raises(ComparisonError, match="a table stands between two tests"):
+        compare_campaigns([before, as_predicted, missed], applied=table)
+    with pytest.raises(ComparisonError, match="was not made from the results in"):
+        compare_campaigns([as_predicted, missed], applied=table)

@@ -1,19 +1,31 @@
+import copy
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fusion.analysis.comparison import compare_campaigns
-from fusion.report.charts.comparison import control_limits, plot_trend
+from fusion.analysis.comparison import Achieved, compare_campaigns
+from fusion.report.charts.comparison import control_limits, draw_trend, follow, follow_trends, plot_profiles
 from fusion.report.comparison import (
+    achieved_table,
     campaign_names,
+    change_name,
+    changes_of_all,
     changes_table,
     comparison_json,
+    comparison_notes,
     conclude_comparison,
+    conclude_table,
+    describe_pair,
     render_comparison,
+    short_names,
     side_by_side,
+    trend_caption,
 )
+from fusion.results.parts import Quantity
 from tests.fusion.compared_tests import readings_of, repaired, write_results
+from tests.fusion.results_sample import PARTS
 
 
 @pytest.fixture(scope="module")
@@ -25,15 +37,75 @@ def pairs(tmp_path_factory):
 
 
 def test_what_changed_is_said_with_its_uncertainty(pairs):
-    first, assumption = conclude_comparison(pairs[0])
+    first = conclude_comparison(pairs[0])
     assert first.startswith("Changed by more than the uncertainties: deviation at 80 mm by −1.")
     assert "±" in first
-    assert "5 % over all" in assumption
-    assert conclude_comparison(pairs[1]) == ["Nothing can be compared."]
+    assert conclude_comparison(pairs[1]) == "Nothing can be compared."
+
+
+def test_what_holds_for_all_tests_is_said_once(pairs):
+    level, *others = comparison_notes(pairs)
+    assert f"5 % over all {pairs[0].tests} tests on profile" in level and "over all 10 values by ISO 230-2" in level
+    assert "Not compared (C): Everything: the axes differ (X and Y): nothing is compared." in others
+    same = comparison_notes([pairs[0], pairs[0]])
+    assert len(same) == len(set(same)) and not any(note.startswith("Not compared (") for note in same)
+
+
+@pytest.mark.parametrize(
+    ("change", "u", "verdict"),
+    [
+        (9.3, 3.1, "not significant among 58 comparisons"),
+        (5.0, 3.1, "within the uncertainties"),
+        (5.0, None, "no uncertainty: not judged"),
+    ],
+)
+def test_a_change_beyond_its_stated_uncertainty_is_not_said_to_lie_within_it(pairs, change, u, verdict):
+    shown = replace(
+        pairs[0].changes[0], quantity="A", group="ISO 230-2", position_mm=None, change=Quantity(value=change, u=u),
+        p_value=0.15, family=58,
+    )  # fmt: skip
+    (row,) = changes_table([one := replace(pairs[0], changes=(shown,))], one).rows
+    assert row.cells[-1] == verdict
+
+
+def test_predicted_and_achieved_stand_beside_each_other(pairs):
+    def one(symbol, achieved):
+        difference = Quantity(value=achieved - 1.0, u=0.5)
+        known = (Quantity(value=9.0, u=1.0), Quantity(value=1.0, u=0.1), Quantity(value=achieved, u=0.4))
+        return Achieved(symbol, *known, difference)
+
+    pair = replace(pairs[0], achieved=(one("A", 3.0), one("E", 1.5)))
+    a, e = achieved_table(pair).rows
+    assert a.cells[1:] == ["9.0 ± 2.0", "1.00 ± 0.20", "3.00 ± 0.80", "2.0 ± 1.0", "beyond the uncertainty"]
+    assert a.marked and not e.marked
+    assert conclude_table(pair)[0].startswith("With the table A differs from the prediction")
+    as_said = conclude_table(replace(pair, achieved=(one("E", 1.5),)))
+    assert as_said == ["With the table E is as predicted within the uncertainty."]
+    assert conclude_table(pairs[0]) == []
+    page = render_comparison([pair])
+    assert page.index("With the table A differs") < page.index("figure-profiles") < page.index("Predicted and achieved")
+    told = comparison_json([pair])["compared"][0]["achieved"]
+    assert [(row["quantity"], row["as_predicted"]) for row in told] == [("A", False), ("E", True)]
+
+
+def test_sizes_have_no_negative_zero_and_ratios_two_decimals(pairs):
+    none = replace(pairs[0].changes[0], change=Quantity(value=-0.0001, u=0.05), p_value=1.0, position_mm=None)
+    ratio = replace(none, group="scatter", quantity="scatter", change=Quantity(value=1.04, u=None))
+    rows = changes_table([one := replace(pairs[0], changes=(none, ratio))], one).rows
+    assert [row.cells[3:5] for row in rows] == [["0.00 ± 0.10 µm", "> 0.99"], ["× 1.04", "> 0.99"]]
+
+
+def test_steps_and_blocks_are_named_by_where_they_are(pairs):
+    def named(quantity, until=None):
+        return change_name(replace(pairs[0].changes[0], quantity=quantity, position_mm=100.0, until_mm=until))
+
+    assert named("step") == "deviation from 100 mm on"
+    assert named("block", 200.0) == "deviation from 100 to 200 mm"
+    assert named("profile") == "profile beyond offset, slope and bow, most at 100 mm,"
 
 
 def test_the_table_marks_what_changed(pairs):
-    shown = changes_table(pairs[0])
+    shown = changes_table(pairs, pairs[0])
     marked = {row.cells[0]: row.cells[-1] for row in shown.rows if row.marked}
     assert marked["deviation at 80 mm"] == "changed"
     assert set(marked.values()) <= {"changed", "differs; the thermal state of a test alone can cause that"}
@@ -42,6 +114,7 @@ def test_the_table_marks_what_changed(pairs):
 
 def test_all_campaigns_stand_side_by_side(pairs):
     assert campaign_names(pairs) == ["A (before the repair)", "B (after the repair)", "C (X axis)"]
+    assert campaign_names(pairs[:1]) == ["as found (before the repair)", "as left (after the repair)"]
     shown = {row.cells[0]: row.cells[1:] for row in side_by_side(pairs).rows}
     assert shown["A by ISO 230-2"] == ["1.00 ± 0.20 µm"] * 3
     assert shown["positions that stand out"] == ["none"] * 3
@@ -54,24 +127,120 @@ def test_programs_get_the_same_as_json(pairs, tmp_path):
     assert told["compared"][1]["not_compared"] == ["Everything: the axes differ (X and Y): nothing is compared."]
 
 
-def test_the_document_says_what_changed_before_it_shows_it(pairs):
-    page = render_comparison(pairs)
-    assert (
-        page.index("Changed by more than the uncertainties") < page.index("Signature") < page.index("figure-profiles")
+def test_two_tests_are_a_sheet_to_sign_and_what_changed(pairs):
+    page = render_comparison(pairs[:1])
+    places = [
+        page.index(words)
+        for words in ("Changed by more than the uncertainties", "figure-profiles", "Date, signature", "What changed", "Annex")
+    ]  # fmt: skip
+    assert places == sorted(places)
+
+
+def test_the_sheet_states_whose_axis_it_was_what_was_done_and_the_decisions(tmp_path):
+    def part(day, a_um, decision, **more):
+        stated = {"Date of the test": day, "Machine": "Mill 7", "Operator": "R. Meyer", **more}
+        judged = {"quantity": "A", "limit_um": 2.0, "value_um": a_um, "expanded_u_um": 0.2, "decision": decision}
+        whole = {
+            **copy.deepcopy(PARTS["iso230"]), "conditions": [{"name": name, "text": text} for name, text in stated.items()],
+            "tolerances": [judged],
+        }  # fmt: skip
+        whole["settled"]["A_um"] = {"value": a_um, "u": 0.1}
+        return whole
+
+    readings = readings_of(31)
+    found = write_results(tmp_path / "found", readings, iso230=part("1 March", 3.0, "fail"))
+    left = write_results(tmp_path / "left", readings, iso230=part("2 March", 1.0, "pass", Remarks="gib adjusted"))
+    sheet = describe_pair(compare_campaigns([found, left])[0])
+    identity = dict(sheet.stated.identity)
+    assert identity["Machine"] == "Mill 7"
+    assert identity["Date of the test, as found"] == "1 March" and identity["Date of the test, as left"] == "2 March"
+    assert identity["Done between the tests"] == "gib adjusted"
+    (back,) = compare_campaigns(
+        [left, write_results(tmp_path / "again", readings, iso230=part("3 March", 1.0, "pass", Remarks="gib adjusted"))]
     )
+    assert dict(describe_pair(back).stated.identity)["Done between the tests"] == "not stated"
+    assert sheet.stated.signatures[0] == ("Measured by", "R. Meyer")
+    row = sheet.values.rows[0]
+    assert row.marked
+    assert row.cells[1:] == ["3.00 ± 0.20", "1.00 ± 0.20", "−2.00 ± 0.28", "differs", "2", "fail", "pass"]
+    assert len(set(sheet.files.values())) == 2
+
+
+def test_more_tests_are_a_trend_with_short_names_and_room_for_them(pairs):
+    page = render_comparison(pairs)
+    assert "Trend of 3 tests" in page and "As found, as left" not in page
+    assert page.index("Changed by more than the uncertainties".lower()[1:]) < page.index("figure-profiles")
+    tests = [pairs[0].before] * 6
+    names = [f"{letter}, 2026-03-09" for letter in "ABCDEF"]
+    few, many = plot_profiles(tests[:2], names[:2]).figure, plot_profiles(tests, names).figure
+    assert many.legend[0].ncols == 2
+    assert many.height - few.height == pytest.approx(2 * 28)
+    assert short_names(pairs) == ["A", "B", "C"]
+    assert {len(row.cells) for row in changes_of_all(pairs).rows} == {3}
 
 
 def test_control_limits_are_those_of_the_handbook():
     """NIST/SEMATECH e-Handbook of Statistical Methods, 6.3.2.2: flow rates of ten batches."""
     flow = np.array([49.6, 47.6, 49.9, 51.3, 47.8, 51.2, 52.6, 52.4, 53.6, 52.1])
     assert control_limits(flow) == pytest.approx((45.8159, 50.81, 55.8041), abs=0.001)
-    assert control_limits(flow[:7]) is None
+    assert control_limits(flow[:6]) is None
 
 
-def test_a_trend_says_what_lies_outside_its_limits():
-    dates = np.datetime64("2026-01-01", "D") + 30 * np.arange(12)
-    values = np.array([5.0, 5.2, 4.9, 5.1, 5.0, 5.2, 4.8, 5.1, 5.0, 4.9, 5.1, 9.0])
-    seen = plot_trend(dates, values, np.full(12, 0.1), "A").seen
-    assert "A of 12 tests: 4.80 to 9.00 µm" in seen and "1 of 12 outside" in seen
-    assert "control limits need 8 tests" in plot_trend(dates[:3], values[:3], np.zeros(3), "A").seen
-    assert plot_trend(dates[:2], values[:2], np.zeros(2), "A") is None
+DATES = np.datetime64("2026-01-01", "D") + 30 * np.arange(12)
+
+
+def test_the_last_test_is_held_against_limits_of_those_before_it():
+    """Among those that give the limits, its own leap would widen them so that it lay within."""
+    values = np.array([5.0, 5.2, 4.9, 5.1, 5.0, 5.2, 4.8, 5.1, 5.0, 4.9, 5.1, 5.7])
+    trend = follow(DATES, values, np.full(12, 0.1), "A")
+    assert control_limits(values).high > 5.7 > trend.limits.high
+    assert trend.outside.tolist() == [False] * 11 + [True]
+    assert "A of 12 tests: 4.80 to 5.70 µm" in draw_trend(trend).seen and "1 of 12 outside" in draw_trend(trend).seen
+    assert trend_caption(trend).startswith("A of the last test, 5.70 µm, lies outside the control limits 4.47 to 5.")
+    assert trend_caption(follow(DATES[:7], values[:7], np.zeros(7), "A")) == ""
+
+
+def test_fewer_tests_have_no_limits_and_no_word_of_them():
+    values = np.arange(3.0)
+    assert "control limits need 8 tests" in draw_trend(follow(DATES[:3], values, np.zeros(3), "A")).seen
+    assert follow(DATES[:2], values[:2], np.zeros(2), "A") is None
+
+
+def test_a_tolerance_lies_within_the_chart():
+    trend = follow(DATES[:3], np.array([5.0, 6.0, 5.0]), np.zeros(3), "A", tolerance=20.0)
+    chart = draw_trend(trend)
+    assert chart.figure.y_range.start < 5.0 and chart.figure.y_range.end > 20.0
+    assert "tolerance 20 µm" in chart.seen
+
+
+def test_bars_of_a_trend_leave_out_what_all_tests_have_in_common(tmp_path):
+    """u² = 5² of which 4² is the coefficient's in every test: 3 is left."""
+
+    def part():
+        row = {"contributor": "expansion_coefficient", "u": 2.0, "unit": "ppm/K", "origin": "assumed"}
+        shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
+        whole = copy.deepcopy(PARTS["iso230"])
+        whole["conditions"] = [{"name": "Expansion coefficient", "text": "11.7 ppm/K"}]
+        whole["settled"] |= {"A_um": {"value": 9.0, "u": 5.0}, "contributions": [{**row, "A_um": 4.0, **shares}]}
+        return whole
+
+    folders = []
+    for k in range(3):
+        time = {"first": f"2026-0{k + 1}-01T00:00:00Z", "last": f"2026-0{k + 1}-01T02:00:00Z", "zone": "UTC"}
+        folders.append(write_results(tmp_path / str(k), readings_of(31), iso230=part(), time=time))
+    trend = follow_trends(compare_campaigns(folders))[0]
+    assert trend.name == "A"
+    assert trend.half == pytest.approx([6.0] * 3)
+
+
+def test_a_last_value_outside_its_limits_leads_the_document(tmp_path):
+    folders = []
+    for k, a_um in enumerate([9.0, 9.2, 9.1, 9.3, 9.0, 9.2, 9.1, 9.3, 12.0]):
+        whole = copy.deepcopy(PARTS["iso230"])
+        whole["settled"]["A_um"] = {"value": a_um, "u": 5.0}
+        time = {"first": f"2026-0{k + 1}-01T00:00:00Z", "last": f"2026-0{k + 1}-01T02:00:00Z", "zone": "UTC"}
+        folders.append(write_results(tmp_path / str(k), readings_of(31), iso230=whole, time=time))
+    page = render_comparison(compare_campaigns(folders))
+    said = "A of the last test, 12.0 µm, lies outside the control limits"
+    assert page.count(said) == 1
+    assert page.index(said) < page.index("figure-trend_A") < page.index("figure-profiles")

@@ -18,7 +18,7 @@ from fusion.report.exports.controls import (
     siemens_temperature,
     tabulate,
 )
-from fusion.report.exports.export import predict, remainder_um
+from fusion.report.exports.export import predict, predict_test, remainder_um
 from fusion.results.store import read_dataset
 from tests.fusion.report.exports.small_run import (
     SHIFT_UM_PER_K,
@@ -210,6 +210,19 @@ def test_the_repeated_test_has_the_range_of_independent_errors():
     profile = Profile(position, np.zeros((2, 6)), np.eye(12).reshape(2, 6, 2, 6))
     # Monte Carlo with 400 draws: the median is known within some 3 %.
     assert predict(profile, tabulate(profile), one_table=False).after_um == pytest.approx(3.2 * 2**0.5, rel=0.06)
+
+
+def test_a_test_with_a_table_has_the_errors_of_the_table_and_its_own():
+    """Means with variance 1 of the table and 2²/4 of four cycles; median ranges of 12 and of 6 normal values: 3.2 and 2.47."""
+    profile = Profile(np.arange(6.0), np.zeros((2, 6)), np.eye(12).reshape(2, 6, 2, 6))
+    found = predict_test(profile, tabulate(profile), np.full((2, 6), 2.0), cycles=4, one_table=False)
+    # Monte Carlo with 400 draws: a median is known within some 3 %.
+    assert found["E"].value == pytest.approx(3.2 * 2**0.5, rel=0.06)
+    assert found["M"].value == pytest.approx(2.47, rel=0.08)
+    assert found["B"].value == pytest.approx(2.0 * 1.6, rel=0.08)  # largest of six |normal|: 1.6
+    exact = Profile(np.arange(6.0), np.zeros((2, 6)), 1e-12 * np.eye(12).reshape(2, 6, 2, 6))
+    many = predict_test(exact, tabulate(exact), np.full((2, 6), 2.0), cycles=10**6, one_table=False)
+    assert many["A"].value == pytest.approx(4 * 2.0, rel=0.01)
 
 
 def test_one_table_leaves_the_part_of_the_reversal_that_is_not_constant(small_run):

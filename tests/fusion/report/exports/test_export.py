@@ -18,6 +18,7 @@ from fusion.report.exports.export import FORMATS, export_results, objections, re
 from fusion.report.exports.tables import write_workbook
 from fusion.results.results import Results, ResultsError, assemble, read_results
 from fusion.results.store import read_dataset, write_dataset, write_json
+from fusion.results.table_prediction import TablePredictionError, read_table_prediction
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 
@@ -45,22 +46,22 @@ def test_csv_writes_tables_and_leaves_the_large_one_out(small_run, tmp_path):
     ("format", "names"),
     [
         ("xlsx", ["results.xlsx"]),
-        ("linuxcnc", ["compensation_X.comp", "compensation_X.comp.README.txt"]),
-        ("siemens840d", ["compensation_X.MPF"]),
+        ("linuxcnc", ["compensation_X.comp.README.txt", "compensation_X.comp", "compensation_X.comp.prediction.json"]),
+        ("siemens840d", ["compensation_X.MPF", "compensation_X.MPF.prediction.json"]),
         ("siemens840d-temperature", ["temperature_X.MPF"]),
-        ("heidenhain", ["AXIS_X.COM", "AXIS_X.COM.README.txt"]),
-        ("renishaw", ["compensation_X.ren", "compensation_X.ren.README.txt"]),
+        ("heidenhain", ["AXIS_X.COM.README.txt", "AXIS_X.COM", "AXIS_X.COM.prediction.json"]),
+        ("renishaw", ["compensation_X.ren.README.txt", "compensation_X.ren", "compensation_X.ren.prediction.json"]),
     ],
 )
 def test_nothing_is_overwritten_in_silence(small_run, tmp_path, format, names):
     options = {"spacing_mm": 20.0} if format in ("siemens840d", "renishaw") else {}
     written = export_results(small_run, format, tmp_path, **options)
-    assert [path.name for path in written.files] == names
+    assert sorted(path.name for path in written.files) == sorted(names)
     if format != "xlsx":
-        header = written.files[-1].read_text(encoding="ascii")
+        header = (tmp_path / names[0]).read_text(encoding="ascii")
         assert "thermal state: mean of cycles 1 to 12: material 22.04 degC" in header and "machine: Mill 5" in header
     before = {path: path.read_bytes() for path in written.files}
-    with pytest.raises(ExportError, match=rf"{names[0]}.* exists already; add --overwrite"):
+    with pytest.raises(ExportError, match=r"exists already; add --overwrite"):
         export_results(small_run, format, tmp_path, **options)
     assert before == {path: path.read_bytes() for path in written.files}
     export_results(small_run, format, tmp_path, overwrite=True, **options)
@@ -89,7 +90,10 @@ def test_the_guard_refuses_and_a_forced_table_says_why(unexplained, tmp_path, fo
     assert not list(tmp_path.iterdir())
     forced = export_results(unexplained, format, tmp_path, axis="X", force=True)
     assert forced.remarks[0].startswith("forced, although the verdict is unexplained")
-    assert "FORCED, although the verdict is unexplained" in forced.files[-1].read_text(encoding="ascii")
+    (header,) = (
+        text for path in forced.files if "compensation that was active" in (text := path.read_text(encoding="ascii"))
+    )
+    assert "FORCED, although the verdict is unexplained" in header
 
 
 def test_the_axis_is_a_name(unexplained, tmp_path):
@@ -99,7 +103,29 @@ def test_the_axis_is_a_name(unexplained, tmp_path):
     with pytest.raises(ExportError, match="is no name of an axis"):
         export_results(unexplained, "linuxcnc", tmp_path, force=True, axis="X\nM30")
     files = export_results(unexplained, "linuxcnc", tmp_path, force=True).files
-    assert files[0].name == "compensation.comp" and "axis: not stated" in files[1].read_text()
+    assert files[0].name == "compensation.comp" and "axis: not stated" in files[-1].read_text()
+
+
+def test_what_a_table_is_predicted_to_leave_is_stored_beside_it(small_run, tmp_path):
+    """Readings of 0.05 um: E of a repeated test is far below the profile's, A holds four times the scatter."""
+    table = export_results(small_run, "linuxcnc", tmp_path).files[0]
+    prediction = read_table_prediction(table)
+    assert prediction == read_table_prediction(tmp_path / f"{table.name}.prediction.json")
+    assert prediction.table == table.name
+    assert prediction.results_sha256 == hashlib.sha256((small_run / "results.json").read_bytes()).hexdigest()
+    values = {symbol: found.value for symbol, found in prediction.predicted_um.items()}
+    assert set(values) == set("AEMB")
+    assert 0.05 < values["E"] < 0.3 and values["M"] < values["E"]
+    assert values["A"] == pytest.approx(values["E"] + 4 * 0.05, abs=0.1)
+    assert all(0.0 < found.u < 0.2 for found in prediction.predicted_um.values())
+
+
+def test_a_prediction_that_is_missing_or_damaged_says_what_to_do(tmp_path):
+    with pytest.raises(TablePredictionError, match=r"x.comp.prediction.json is missing; name the table"):
+        read_table_prediction(tmp_path / "x.comp")
+    (tmp_path / "x.comp.prediction.json").write_text("[1]")
+    with pytest.raises(TablePredictionError, match=r"no prediction of a table .* export the table again"):
+        read_table_prediction(tmp_path / "x.comp")
 
 
 def test_a_run_of_the_camera_alone_has_its_fields(tmp_path):
