@@ -151,7 +151,7 @@ class Trend:
     Attributes
     ----------
     when, value, half : (n,) days, values, and half the length of their error bars
-    limits : control limits that the tests before the last give (ISO 7870-2, phase 2); None of fewer than eight tests
+    limits : control limits that the tests before the last give; None of fewer than eight tests
     tolerance : upper limit that the last test states; None without one
     """
 
