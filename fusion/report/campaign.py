@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -114,22 +114,38 @@ def passes(p: float | None) -> bool:
     return p is not None and p <= LEVEL
 
 
-def _other_modes(correlation: CorrelationPart) -> tuple[list[PlacePart], list[PlacePart]]:
+class _OtherMode(NamedTuple):
+    """A mode beside the leading one, with the part of the drift for which it is most significant."""
+
+    mode: PlacePart
+    part: str
+    p_value: float
+
+
+def _other_modes(correlation: CorrelationPart) -> tuple[list[_OtherMode], list[_OtherMode]]:
     """Return the modes that are significant given the leading one, and those that are so only on their own."""
+
+    def significant(p_of: str, modes: Sequence[PlacePart]) -> list[_OtherMode]:
+        best = [
+            min((_OtherMode(mode, name, p) for name, part in mode.parts.items() if passes(p := getattr(part, p_of))),
+                key=lambda one: one.p_value, default=None)
+            for mode in modes
+        ]
+        return [one for one in best if one is not None]
+
     others = [mode for mode in correlation.modes if mode.name != f"mode {correlation.source.name}"]
-    adding = [mode for mode in others if any(passes(part.p_given_leading_mode) for part in mode.parts.values())]
-    alone = [mode for mode in others if any(passes(part.p_value) for part in mode.parts.values())]
-    return adding, [mode for mode in alone if mode not in adding]
+    adding = significant("p_given_leading_mode", others)
+    return adding, significant("p_value", [mode for mode in others if mode not in [one.mode for one in adding]])
 
 
 def _map_facts(maps: xr.DataTree, name: str, channel: str) -> dict[str, Any]:
-    """Return what the maps of cells, or of modes, can show: rate of false alarms, unexplained drift (µm in 1 h), limit (µm/K)."""
+    """Return what the maps of cells, or of modes, can show: rate of false alarms, random drift allowed for (µm in 1 h), limit (µm/K)."""
     tested = maps.children[name].to_dataset() if name else maps.to_dataset()
     limit = tested["detectable_sensitivity"].sel(channel=channel)
     return {
         "name": name or "cells",
         "false_alarms": rate_text(float(tested["false_alarm_rate" if name else "cells_false_alarm_rate"])),
-        "unexplained_um": float(maps["unexplained_drift"].sel(channel=channel)),
+        "random_um": float(maps["unexplained_drift"].sel(channel=channel)),
         "limit_um_per_K": float(limit.where(np.isfinite(limit)).median()),
     }
 
@@ -140,7 +156,7 @@ def _strongest_cell(maps: xr.Dataset, channel: str) -> dict[str, Any]:
     flat = maps[names].sel(channel=channel).stack(cell=("y", "x"))
     best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
     values = {name: float(best[name]) for name in (*names, "x", "y")}
-    return {"channel": channel, "unexplained_um": float(maps["unexplained_drift"].sel(channel=channel)), **values}
+    return {"channel": channel, "random_um": float(maps["unexplained_drift"].sel(channel=channel)), **values}
 
 
 def _strength(maps: xr.DataTree, kind: str) -> xr.DataArray:
@@ -196,7 +212,7 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict
     if shown is None:
         rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
         axis = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
-        return {**tables, "quoted": part, "axis": axis, "missing": "", "sharper": None}
+        return {**tables, "quoted": part, "axis": axis, "missing": "", "sharper": None, "scatter_um": None}
     if dataset is not None and has(dataset, "settled"):
         tables["positions"] = _iso230_positions_table(group(dataset, "settled"), dataset["position"], unit)
     return {
@@ -206,8 +222,21 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict
         # Of one cycle nothing is known of the uncertainty.
         "budget": _budget_table(shown, unit) if len(shown.cycles) > 1 else None,
         "sharper": sharpen(part),
+        "scatter_um": _scatter_um(part, dataset),
         "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
     }
+
+
+def _scatter_um(part: Iso230Part, dataset: xr.Dataset | None) -> float | None:
+    """Return the median scatter of the readings without drift, of a test whose first window stands beside the quoted one."""
+    if dataset is None or not has(dataset, "drift") or not _is_beside_first(part):
+        return None
+    return float(group(dataset, "drift")["scatter"].median())
+
+
+def _is_beside_first(part: Iso230Part) -> bool:
+    """Return whether the quoted window is another than the first."""
+    return part.first is not None and part.settled is not None and part.first.window != part.settled.window
 
 
 def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
@@ -286,7 +315,7 @@ def values_to_sign(part: Iso230Part) -> Table:
 
 def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
     """Return the axis values of the settled window with their decisions, those of the first one and their range over the windows."""
-    several = part.first is not None and part.first.window != shown.window
+    several = _is_beside_first(part)
     judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
     rows = []
 
@@ -407,7 +436,9 @@ def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
     left = loop.residual_drift
     common, stretch = small(left.common_rms_um), small(left.stretch_rms_um)
     size = f"{common} µm rms common to all positions, {stretch} µm rms of stretch along the axis"
-    rows.append(("unexplained drift", f"{left.kind}: {size}"))
+    if loop.wandering_um is not None:
+        size += f"; together {small(loop.wandering_um)} µm rms at its far end"
+    rows.append(("random drift beside the effects", f"{left.kind}: {size}"))
     return rows + refused_effects(loop)
 
 
@@ -605,7 +636,6 @@ def _camera(fields: xr.Dataset) -> dict[str, Any]:
         "cell_size": float(np.median(np.diff(fields["x"]))),
         "visible": float(np.isfinite(rise).mean()),
         "mean_rise_K": float(rise.mean()),
-        "largest_rise_K": float(rise.max()),
         "fiducials": list(zip(*(fields[f"fiducial_{name}"].values.tolist() for name in names), strict=True)),
     }
 
