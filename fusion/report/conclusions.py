@@ -69,24 +69,35 @@ def _if_so(statement: str) -> str:
 def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: str) -> dict[str, Any]:
     """Return what a reader learns before anything else: which machine, whether it passes, why, what to doubt, what to do."""
     iso, inputs = results.iso230, results.inputs
+    # A camera alone is no acceptance test, and says with its temperatures what is beyond its range.
+    alone = iso is None and results.loop is None
+    if alone and inputs is not None:
+        inputs = inputs.model_copy(update={"accepted": (*inputs.accepted, "camera_range")})
     serial = report.get("machine_serial_number", "")
-    named = [report.get("machine") or "machine not stated", f"no. {serial}" if serial else ""]
     still_open = "" if inputs is None else say("open_inputs", inputs)
+    decision = "" if alone else "Not an acceptance test: no tolerance applies."
+    if iso is not None:
+        decision = _if_so(conditional(say("decision", iso), inputs, "positions"))
     return {
         "identity": [
-            *named,
+            report.get("machine") or (_cameras(results) if alone else "machine not stated"),
+            f"no. {serial}" if serial else "",
             f"{axis} axis" if axis and f"{axis} axis" not in results.campaign else "",
             report.get("operator", ""),
             begun[:10] or "date not stated",
         ],
-        "decision": "Not an acceptance test: no tolerance applies."
-        if iso is None
-        else _if_so(conditional(say("decision", iso), inputs, "positions")),
+        "decision": decision,
         "unmet": "" if iso is None else say("unmet", iso),
         "cause": _if_so(say("why", results)),
         "open": still_open,
         "next": [in_brief(step) for step in next_steps(results)[: _FIRST_STEPS - bool(still_open)]],
     }
+
+
+def _cameras(results: Results) -> str:
+    """Return the camera that took the pictures, with its serial number, or of how many cameras they are; empty where it is not known."""
+    names = [one.name.rpartition(", ")[0] for one in results.thermograms.cameras] if results.thermograms else []
+    return names[0] if len(names) == 1 else f"{len(names)} cameras" if names else ""
 
 
 # Added effects in words: what each is, and what to check.

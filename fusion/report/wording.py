@@ -39,6 +39,7 @@ from fusion.report.numbers import (
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Iso230Window
 from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
+from fusion.results.progress import counted
 from fusion.results.results import Results
 
 # Tables as the report and the terminal show them: columns, rows, and which rows are marked.
@@ -274,7 +275,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        condition, conditional, duration, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
+        condition, conditional, counted, duration, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
         print_unit, quantity, region_words, small, upper_first,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}

@@ -34,6 +34,10 @@ from thermography.fields.large_arrays import in_pieces
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
+#: A colour outside the scale, for values beyond its ends.
+BEYOND = "#7fe3ff"
+#: Room about a plan or a picture, as a share of its length, so that a mark at its rim is whole.
+_ROOM = 0.025
 #: Length of a recording from which its time is drawn in hours.
 _LEAST_HOURS = 0.1
 
@@ -95,11 +99,21 @@ def draw_picture(
     *,
     colours: str = SEQUENTIAL,
     block: int = 1,
+    marked: bool = False,
 ) -> figure:
-    """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey."""
+    """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey.
+
+    Where `marked`, what lies beyond the ends of the scale has a colour of its own.
+    """
     rows, columns = (block * size for size in values.shape)
     mapper = LinearColorMapper(palette(colours), low=low, high=high, nan_color="#e1e5e7")
-    ranges: dict[str, Any] = {"x_range": (-0.5, columns - 0.5), "y_range": (rows - 0.5, -0.5)}
+    if marked:
+        mapper.low_color = mapper.high_color = BEYOND
+    room = _ROOM * columns
+    ranges: dict[str, Any] = {
+        "x_range": (-0.5 - room, columns - 0.5 + room),
+        "y_range": (rows - 0.5 + room, -0.5 - room),
+    }
     # The width that axis and scale take beside the picture, and the height of the axis below it.
     width, beside, below = 520, 120, 55
     drawn = new_figure(x="column / px", y="row / px", height=round((width - beside) * rows / columns) + below, **ranges)
@@ -299,10 +313,6 @@ def _hours_since(times: np.ndarray, start: np.datetime64) -> np.ndarray:
 #: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
 _MAP_BUDGET = 3_000_000
 _MISSING = -32768
-#: A colour outside the scale, for values beyond its ends.
-_BEYOND = "#7fe3ff"
-#: Room about the plan, as a share of its length, so that a ring at its rim is whole.
-_ROOM = 0.025
 
 
 class Layer(NamedTuple):
@@ -391,7 +401,7 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
     room = _ROOM * (right - left)
     drawn = new_plan((left - room, right + room, bottom - room, top + room))
     mapper = LinearColorMapper(
-        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
+        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=BEYOND, high_color=BEYOND,
         name="scale",
     )  # fmt: skip
     cells = drawn.image(
