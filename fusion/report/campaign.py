@@ -15,6 +15,7 @@ from fusion.report.conclusions import first_screen, headline, next_steps, sharpe
 from fusion.report.numbers import (
     alike,
     decimals_of,
+    exact,
     fixed,
     gain,
     join,
@@ -54,6 +55,7 @@ from fusion.report.wording import (
     spaced,
     table,
     untouched,
+    with_values,
 )
 from fusion.results.axis import CorrelationPart, Evidence, Iso230Part, Iso230Window, PlacePart
 from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RunnerUp, StepPart
@@ -127,8 +129,11 @@ def _other_modes(correlation: CorrelationPart) -> tuple[list[_OtherMode], list[_
 
     def significant(p_of: str, modes: Sequence[PlacePart]) -> list[_OtherMode]:
         best = [
-            min((_OtherMode(mode, name, p) for name, part in mode.parts.items() if passes(p := getattr(part, p_of))),
-                key=lambda one: one.p_value, default=None)
+            min(
+                (_OtherMode(mode, name, p) for name, part in mode.parts.items() if passes(p := getattr(part, p_of))),
+                key=lambda one: one.p_value,
+                default=None,
+            )
             for mode in modes
         ]
         return [one for one in best if one is not None]
@@ -253,7 +258,7 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
     rows = [
         [
             str(target),
-            f"{place:g}",
+            exact(place),
             *(fixed(value, places) for value in row),
             ", ".join(str(int(count)) for count in counts),
         ]
@@ -261,9 +266,8 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
     ]
     titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in ARROWS.values()]
     unit_along = str(position.attrs.get("units", "mm"))
-    return table(
-        ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"Bᵢ / {unit}", f"Rᵢ / {unit}", "n↑, n↓"], rows
-    )
+    columns = ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"Bᵢ / {unit}", f"Rᵢ / {unit}", "n↑, n↓"]
+    return with_values(table(columns, rows))
 
 
 def _along(position: xr.DataArray) -> np.ndarray:
@@ -274,9 +278,16 @@ def _along(position: xr.DataArray) -> np.ndarray:
 def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
     """Return which readings of a window are missing, and why."""
     within = dataset[["deviation", "quality_flag"]].sel(cycle=list(cycles))
-    missing = np.argwhere(np.isnan(within["deviation"].values))
+    read = within["deviation"].notnull().any(("cycle", "target"))
+    within = within.isel(direction=np.flatnonzero(read.values))
+    side = (
+        ""
+        if read.all()
+        else f"Approached from one side only ({', '.join(ARROWS[str(one)] for one in within['direction'].values)}). "
+    )
+    missing = np.argwhere(np.isnan(within["deviation"].transpose("cycle", "direction", "target").values))
     if missing.size == 0:
-        return "No reading of the window is missing."
+        return f"{side}No reading of the window is missing."
     named = []
     for cycle, direction, target in missing[:_NAMED]:
         bits = int(within["quality_flag"].values[cycle, direction, target])
@@ -287,7 +298,7 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
         )
     more = len(missing) - len(named)
     rest = f" and {more} more" if more else ""
-    return f"{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
+    return f"{side}{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
 
 
 def values_to_sign(part: Iso230Part) -> Table:
@@ -310,7 +321,8 @@ def values_to_sign(part: Iso230Part) -> Table:
             verdict = judged.get(symbol, ["–", "no tolerance stated"]) if judged else []
             rows.append(Row([term, quantity(value), *verdict], symbol in judged and verdict[1] != "pass"))
     titles = [f"Tolerance / {unit}", Words("Decision (ISO 14253-1)")] if judged else []
-    return table([Words("Quantity of the axis"), f"Value ± U (k = 2) / {unit}", *titles], rows)
+    value = "Value ± U (k = 2)" if any("±" in row.cells[1] for row in rows) else "Value"
+    return table([Words("Quantity of the axis"), f"{value} / {unit}", *titles], rows)
 
 
 def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
@@ -320,7 +332,8 @@ def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
     rows = []
 
     def add(title: str, symbol: str, *cells: str, marked: bool = False) -> None:
-        rows.append(Row([title, cells[0], *(judged.get(symbol, ("–", "–")) if judged else ()), *cells[1:]], marked))
+        if any(cell != "–" for cell in cells) or symbol in judged:
+            rows.append(Row([title, cells[0], *(judged.get(symbol, ("–", "–")) if judged else ()), *cells[1:]], marked))
 
     for symbol, term in ISO230_TERMS.items():
         found = part.range_um.get(symbol)
@@ -649,13 +662,15 @@ def _positions_table(deviations: xr.Dataset) -> Table:
     s = by_approach(conventional["standard_deviation"], target=targets)
     rows = []
     for at, (target, position_mm) in enumerate(zip(targets, deviations["position"].values, strict=True)):
-        row = [str(target), f"{position_mm:g}"]
+        row = [str(target), exact(position_mm)]
         for name, places in decimals.items():
             both = zip(laid[name][at], laid[f"{name}_u"][at], strict=True)
             row += [measured(float(value), float(u), decimals=places) for value, u in both]
         rows.append([*row, *(f"{value:.2f}" for value in s[at])])
     quantities = ("Profile", "Scatter s", "Conventional s")
-    return table(["Position", "mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows)
+    return table(
+        ["Target", "Position / mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows
+    )
 
 
 def _comparison_table(deviations: xr.Dataset) -> Table:
@@ -673,7 +688,7 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
     rows = [
         [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
     ]
-    return table(["Position", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
+    return table(["Target", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
 
 
 def rate_text(rate: float) -> str:

@@ -176,9 +176,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
             told = told._replace(line=line, sharper_um=expanded, decision=decision)
     if not told.line and told.contributor in SAMPLING:
         halved = sum(terms[name][1] ** 2 for name in SAMPLING if name in terms) * (1.0 - 1.0 / _MORE_CYCLES)
-        told = told._replace(
-            sharper_um=2 * (found.u**2 - halved) ** 0.5, cycles=_MORE_CYCLES * len(iso.settled.cycles)
-        )
+        told = told._replace(sharper_um=2 * (found.u**2 - halved) ** 0.5, cycles=_MORE_CYCLES * len(iso.settled.cycles))
     return told
 
 

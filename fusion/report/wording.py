@@ -21,6 +21,7 @@ from fusion.messages import cell, printable
 from fusion.report.numbers import (
     alike,
     duration,
+    exact,
     fixed,
     gain,
     join,
@@ -69,6 +70,13 @@ class Table:
 def table(titles: Iterable[str], rows: Iterable[Row | Sequence[str]], *, stacked: bool = False) -> Table:
     """Return a table."""
     return Table(tuple(titles), tuple(row if isinstance(row, Row) else Row(row) for row in rows), stacked)
+
+
+def with_values(shown: Table) -> Table:
+    """Return a table without the columns in which every row has a dash."""
+    kept = [at for at in range(len(shown.titles)) if any(row.cells[at] != "–" for row in shown.rows)]
+    rows = (Row([row.cells[at] for at in kept], row.marked) for row in shown.rows)
+    return table([shown.titles[at] for at in kept], rows, stacked=shown.stacked)
 
 
 def print_table(shown: Table, title: str) -> rich.table.Table:
@@ -275,8 +283,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        condition, conditional, counted, duration, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
-        print_unit, quantity, region_words, small, upper_first,
+        condition, conditional, counted, duration, exact, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters,
+        percent, place, print_unit, quantity, region_words, small, upper_first,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {

@@ -139,7 +139,13 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
             # The limit of the range is no temperature that was measured: what was there lies above it.
             times, limits = (each[beyond.values] for each in (seconds / scale, values.values))
             add_series(
-                drawn, times, limits, name="above the calibrated range", colour=looks["colour"], line=False, marker="triangle"
+                drawn,
+                times,
+                limits,
+                name="above the calibrated range",
+                colour=looks["colour"],
+                line=False,
+                marker="triangle",
             )
         columns[f"{name} / °C"] = values.values
         told.append(f"{name} {span_words(values, '°C')}{' and above' if beyond.any() else ''}")

@@ -46,6 +46,11 @@
   const tallest = 340;
   function fit(figure, view) {
     figure.querySelector(".drawing").style.minHeight = 0;
+    for (const { model, bbox } of plots(view)) for (const legend of model.above) {  // as many names in a line as there is room for
+      if (legend.type !== "Legend" || !legend.items.length) continue;
+      const longest = Math.max(...legend.items.map((item) => (item.label?.value ?? "").length));
+      legend.ncols = Math.max(1, Math.min(legend.items.length, Math.floor((bbox.width - 70) / (6 * longest + 42))));
+    }
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");
     if (!view.frame.bbox.width) return;

@@ -179,7 +179,7 @@ def test_the_model_and_its_errors_are_told_in_numbers():
     rows = dict(model_section.describe_model(LOOP))
     assert rows["expansion of the axis"] == "11.60 \u00b1 0.40 ppm/K (prior 11.7 \u00b1 4.0 ppm/K)"
     assert rows["sudden step or new zero"] == "1.00 \u00b1 0.20 \u00b5m"
-    unexplained = rows["unexplained drift"]
+    unexplained = rows["random drift beside the effects"]
     assert unexplained.startswith("random walk: 0.10 \u00b5m rms common") and "below 0.001 \u00b5m" in unexplained
     assert rows["not tried: dead path of the laser"] == "no air"
     assert "extra test on the held-out cycles" not in rows
