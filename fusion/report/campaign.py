@@ -33,6 +33,7 @@ from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     ARROWS,
     CONTRIBUTORS,
+    EVIDENCE,
     ISO230_TERMS,
     ONE_WAY_TERMS,
     Row,
@@ -52,7 +53,6 @@ from fusion.report.wording import (
     quoted_window,
     randomised_causes,
     say,
-    spaced,
     table,
     untouched,
     with_values,
@@ -411,7 +411,7 @@ def steps_table(loop: Loop) -> Table:
     numbers = alike([loop.rmse_declared_um, *errors])
     rows = [Row(["0", f"declared: {declared}", "–", numbers[0], "–", "", ""])]
     for turn, step in enumerate(loop.steps, start=1):
-        held_out = " -> ".join(numbers[2 * turn - 1 : 2 * turn + 1])
+        held_out = " → ".join(numbers[2 * turn - 1 : 2 * turn + 1])
         rows.append(Row([str(turn), *_step_cells(step, held_out)], marked=True))
     titles = ("p", "Held out / µm", "Blocks / µm", Words("Borne out"), Words("Next best effect"))
     return table(["Step", Words("Effect"), *titles], rows)
@@ -423,7 +423,7 @@ def _step_cells(step: StepPart, held_out: str) -> list[str]:
         f"{say('names', step)}{f': {text}' if text else ''}{f'; without a name: {step.withheld}' if step.withheld else ''}",
         p_cell(step.p_value),
         held_out,
-        " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
+        " → ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
         say("doubt", step) if step.doubt else "yes",
         _runner_up(step.runner_up),
     ]
@@ -510,7 +510,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
         "support": evidence.support,
         "against": evidence.against,
         "check": evidence.check,
-        "numbers": [(spaced(name), in_words(value)) for name, value in evidence.numbers().items()],
+        "numbers": [(EVIDENCE[name], in_words(value)) for name, value in evidence.numbers().items()],
     }
 
 

@@ -125,6 +125,35 @@ _UNITS = {
 }  # fmt: skip
 
 
+#: Numbers of a diagnosis in words, with their unit.
+EVIDENCE = {
+    "extra_um": "size beyond the other positions / µm",
+    "probability": "probability of the cause that is named",
+    "probability_structural": "probability of mechanical scatter",
+    "probability_stick_slip": "probability of stick-slip",
+    "probability_slow": "probability of a slow motion",
+    "probability_step": "probability of a sudden step",
+    "probability_local_temperature": "probability of a local temperature",
+    "scatter_typical_um": "scatter typical of the other positions / µm",
+    "scatter_positive_um": "scatter, positive approach / µm",
+    "scatter_negative_um": "scatter, negative approach / µm",
+    "serial_p": "serial correlation, p",
+    "approach_gain_nats": "unequal approaches, gain in log-likelihood",
+    "step_p": "step, p",
+    "step_um": "step / µm",
+    "step_u_um": "step, standard uncertainty / µm",
+    "step_cycle": "step, cycle",
+    "step_held_out_nats": "step, gain in log-likelihood on the other approach",
+    "temperature_p": "local temperature, p",
+    "temperature_um_per_K": "local temperature, sensitivity / (µm/K)",
+    "temperature_u_um_per_K": "its standard uncertainty / (µm/K)",
+    "temperature_scale_u_um_per_K": "of which from the scale of the rise / (µm/K)",
+    "temperature_lag_s": "local temperature, lag / s",
+    "temperature_held_out_nats": "local temperature, gain in log-likelihood on the other approach",
+    "temperature_warm_up_share": "local temperature, share of its course that one warm-up explains",
+}
+
+
 class EffectWords(NamedTuple):
     """An effect as a reader meets it: its name, and what to check where it was missing (empty where nothing is stated)."""
 
@@ -263,7 +292,7 @@ CONTRIBUTORS = {
     "expansion_coefficient": "expansion coefficient",
     "environmental_variation": "environmental variation error (EVE)",
     "sampling": "scatter of the readings",
-    "extremes": "largest of noisy values",
+    "extremes": "bias of the largest of scattered values",
 }
 #: A drift of less than this share of the median scatter is none that readings can show.
 _SHARE_OF_SCATTER = 0.01

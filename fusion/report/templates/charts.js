@@ -49,7 +49,7 @@
     for (const { model, bbox } of plots(view)) for (const legend of model.above) {  // as many names in a line as there is room for
       if (legend.type !== "Legend" || !legend.items.length) continue;
       const longest = Math.max(...legend.items.map((item) => (item.label?.value ?? "").length));
-      legend.ncols = Math.max(1, Math.min(legend.items.length, Math.floor((bbox.width - 70) / (6 * longest + 42))));
+      legend.ncols = Math.max(1, Math.min(legend.items.length, Math.floor((bbox.width - 40) / (5.7 * longest + 34))));
     }
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");
@@ -163,17 +163,17 @@
   }
 
   // Paper: charts in the width that they have on A4, so that their text keeps its size; then each becomes a drawing in SVG.
-  const flatter = 0.72, heights = new Map();
+  const flatter = 0.62, heights = new Map();
   const later = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
   async function toPaper() {
     document.documentElement.classList.add("paper");
     for (const figure of figures) if (figure.offsetParent) await draw(figure);
     for (const view of roots.values()) for (const plot of plots(view)) {
       for (const axis of [...plot.model.left, ...plot.model.below]) if (axis.axis_label) axis.axis_label_text_font_size = "10px";
-      // A plan or a picture keeps its proportions, a low chart below others its height.
-      if (plot.model.height === null || plot.model.sizing_mode === "scale_width" || plots(view).length > 2) continue;
+      // A plan or a picture keeps its proportions, a low chart below others most of its height.
+      if (plot.model.height === null || plot.model.sizing_mode === "scale_width") continue;
       heights.set(plot.model, plot.model.height);
-      plot.model.height = Math.round(flatter * plot.model.height);
+      plot.model.height = Math.round((plots(view).length > 2 ? 0.75 : flatter) * plot.model.height);
     }
     await later(300);
     fitAll();

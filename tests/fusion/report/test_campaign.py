@@ -50,7 +50,7 @@ def test_results_without_products_still_make_a_page():
     results = assemble("A", PARTS, [])
     told = describe_campaign(results, ORIGIN, {}, None)
     assert told["verdict"] == "explained"
-    assert told["anomalies"][0]["title"] == "Position 3, both approaches: scatter of the structure"
+    assert told["anomalies"][0]["title"] == "Position 3, both approaches: mechanical scatter"
     assert told["iso230"]["axis"].rows[-2].cells[0] == "Reversal error B"
     assert told["positions"] is None and told["correlation"] is None
     page = "".join(
@@ -156,7 +156,7 @@ def test_steps_start_with_the_declared_model_and_a_doubt_has_its_reason():
     assert added.marked
     told = "sudden step or new zero: 30 min after the start (at least 28 min), shape flat (or linear)"
     assert added.cells[1:3] == [told, "0.001"]
-    assert added.cells[3:6] == ["0.60 -> 0.40", "0.70 -> 0.50", "yes"]
+    assert added.cells[3:6] == ["0.60 → 0.40", "0.70 → 0.50", "yes"]
     assert added.cells[-1] == "dead path of the laser (log-likelihood lower by 4.0)"
     doubted = LOOP.steps[0].model_copy(update={"confirmed": False, "doubt": "0.4 µm without it, 0.5 µm with it"})
     _, added = model_section.steps_table(LOOP.model_copy(update={"steps": (doubted,)})).rows
@@ -190,11 +190,14 @@ def test_candidates_evidence_and_errors_are_told_with_their_numbers():
     assert row.cells == ["1", "sudden step or new zero", "", "9.0", "8.0", "0.01", "4.0", "0.01"]
     told = model_section.describe_evidence(RESULTS.anomalies[0].evidence)
     assert told["stands_out"] == "extra scatter of 0.30 \u00b5m"
-    assert ("step held out / in log-likelihood", "0") in told["numbers"] and ("step cycle", "12") in told["numbers"]
+    assert ("step, gain in log-likelihood on the other approach", "0") in told["numbers"] and (
+        "step, cycle",
+        "12",
+    ) in told["numbers"]
     assert (told["support"], told["against"], told["check"]) == (("a",), ("b",), "c")
     step = LOOP.steps[0].model_copy(update={"rmse_before_um": 1.938, "rmse_after_um": 0.4643})
     rows = model_section.steps_table(LOOP.model_copy(update={"rmse_declared_um": 1.938, "steps": (step,)})).rows
-    assert [row.cells[3] for row in rows] == ["1.94", "1.94 -> 0.46"]
+    assert [row.cells[3] for row in rows] == ["1.94", "1.94 → 0.46"]
 
 
 def test_every_coefficient_has_a_name_of_its_own():

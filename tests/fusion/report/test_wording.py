@@ -122,7 +122,9 @@ def test_a_step_has_both_pairs_of_errors():
         rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
     )
     told = wording.say("step_errors", step)
-    assert "held-out error 0.60 -> 0.70 \u00b5m" in told and told.endswith("from the others 0.50 -> 0.40 \u00b5m")
+    assert "held-out error from 0.60 to 0.70 \u00b5m" in told and told.endswith(
+        "from the others: from 0.50 to 0.40 \u00b5m"
+    )
     late = wording.say("step_errors", step.model_copy(update={"rmse_after_um": None}))
     assert late.startswith("found after the hold-out was opened") and "0.60" not in late
 
@@ -206,7 +208,12 @@ def test_every_verdict_has_its_statement(found, stated):
     [
         (
             {},
-            ["cycles 49 to 60 falls from 1.94 to 0.66 µm", "gives 2.50 µm,", "is 0.42 µm", "others: 0.57 -> 0.45 µm."],
+            [
+                "cycles 49 to 60 falls from 1.94 to 0.66 µm",
+                "gives 2.50 µm,",
+                "is 0.42 µm",
+                "others: from 0.57 to 0.45 µm.",
+            ],
         ),
         (
             {"rmse_declared_um": 0.733, "rmse_final_um": 0.737, "rmse_persistence_um": 0.41},
@@ -234,7 +241,7 @@ def test_a_record_repeats_values_and_predicts_blocks_of_time():
         "the last value",
         "noise of a block mean",
         "blocks of time",
-        "ch2 (3.0 -> 3.2 µm).",
+        "ch2 (from 3.0 to 3.2 µm).",
     )
     assert all(part in stated for part in parts), stated
     # The error rate of a name in a record is larger than its p-value.
