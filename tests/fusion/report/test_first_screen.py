@@ -112,6 +112,12 @@ def test_five_questions_are_answered(reports, new_page):
 
 
 @pytest.mark.chain
+def test_a_camera_alone_is_named_in_place_of_a_machine(reports, new_page):
+    told = " ".join(visible_words(new_page(reports["pictures"], 1400, 900)))
+    assert "machine not stated" not in told and "acceptance" not in told and " pictures, emissivity" in told
+
+
+@pytest.mark.chain
 def test_a_phone_shows_identity_decision_and_cause_first(reports, new_page):
     page = new_page(reports["both"], 390, 844)
     told = " ".join(visible_words(page))
