@@ -48,8 +48,9 @@
     figure.querySelector(".drawing").style.minHeight = 0;
     for (const { model, bbox } of plots(view)) for (const legend of model.above) {  // as many names in a line as there is room for
       if (legend.type !== "Legend" || !legend.items.length) continue;
-      const longest = Math.max(...legend.items.map((item) => (item.label?.value ?? "").length));
-      legend.ncols = Math.max(1, Math.min(legend.items.length, Math.floor((bbox.width - 40) / (5.7 * longest + 34))));
+      const widths = legend.items.map((item) => 34 + 5.7 * (item.label?.value ?? "").length), room = bbox.width - 40;
+      const fitting = widths.reduce((all, one) => all + one) <= room ? widths.length : Math.floor(room / Math.max(...widths));
+      legend.ncols = Math.max(1, Math.min(widths.length, fitting));
     }
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");

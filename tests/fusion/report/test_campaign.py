@@ -106,6 +106,25 @@ def test_every_mode_region_and_part_of_the_drift_has_its_row(parts):
     assert region_words("hotspot 12") == "disc about hotspot 12" and region_words("hotspot plate") == "hotspot plate"
 
 
+def test_a_further_mode_is_named_with_the_part_of_the_drift_that_it_explains(parts):
+    fused, results = parts
+    found = correlation_of(results)
+    leading, other = found.modes[0], found.modes[1]
+    given = {
+        name: part.model_copy(update={"p_given_leading_mode": p, "p_value": 0.5})
+        for (name, part), p in zip(other.parts.items(), (0.9, 0.03, 0.004, 0.6), strict=True)
+    }
+    adding = found.model_copy(
+        update={
+            "verdict": "attributable",
+            "source": found.source.model_copy(update={"kind": "mode", "name": leading.name.removeprefix("mode ")}),
+            "modes": (leading, other.model_copy(update={"parts": given})),
+        }
+    )
+    page = page_of(fused, results.model_copy(update={"correlation": adding}))
+    assert "for the drift of the reversal, p = 0.004)" in page and "significant conditional on the leading mode" in page
+
+
 def test_two_sessions_decide_what_is_a_cause(parts):
     fused, results = parts
     attributable = correlation_of(results).model_copy(update={"verdict": "attributable"})

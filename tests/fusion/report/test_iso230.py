@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import math
 import re
 import shutil
@@ -313,6 +314,15 @@ def test_the_demo_states_everything_that_a_sheet_asks_for(stated):
     decisions = {row.cells[0]: row.cells[2:] for row in sheet.values.rows}
     assert decisions["Bidirectional positioning accuracy A"][0] == "20"
     assert decisions["Reversal error B"] == ["–", "no tolerance stated"]
+
+
+def test_the_sheet_of_results_holds_the_hash_of_what_was_measured(results_folder):
+    test = read_test(results_folder, None)
+    origin = json.loads((results_folder / "provenance.json").read_text(encoding="utf-8"))
+    laser = origin["parameters"]["interferometry"]["deviations"]
+    assert test.files[laser] == origin["inputs"][laser]["sha256"]
+    assert test.files["results.json"] == origin["products"]["results.json"]["sha256"]
+    assert not [name for name in test.files if name.startswith("thermal")]
 
 
 @pytest.mark.chain
