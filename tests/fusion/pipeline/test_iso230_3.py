@@ -122,6 +122,6 @@ approved_by = "B. Jones"
     for text in ("Mill 7", *(cell for row in sheet.values.rows for cell in row.cells)):
         assert text in page and text in cells
     assert "Measured by: A. Smith" in page and "Measured by: A. Smith\n" in cells
-    assert page.count("Largest less smallest value, with") == 1, "the table is on the sheet alone"
+    assert page.count("<caption>Largest less smallest value, with") == 1, "the table is on the sheet alone"
     for sha256 in files.values():
         assert sha256 in page and sha256 in written.paragraphs[-1].text
