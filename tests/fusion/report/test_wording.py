@@ -308,6 +308,10 @@ def test_an_axis_that_fails_by_its_mean_deviation_is_to_be_compensated_first():
     for axis in (axis_of(135.0, 40.0, "fail"), axis_of(135.0, 94.0, "pass")):
         assert next_steps(results(None, iso230=axis, warnings=late)) == [second]
     assert next_steps(results(None, iso230=axis_of(135.0, 94.0, "not decided"), warnings=late)) == [second, first]
+    # Nor is a profile that holds drift without a cause.
+    for verdict, advised in (("explained", True), ("partial", False)):
+        steps = next_steps(results(loop(verdict), iso230=axis_of(135.0, 94.0, "fail")))
+        assert any(one.startswith("Load a compensation table") for one in steps) == advised
 
 
 def test_a_position_has_one_sentence_with_the_cause_of_its_most_significant_finding():
