@@ -28,7 +28,7 @@ from fusion.results.axis import Iso230Part
 from fusion.results.parts import decide
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
-from fusion.results.store import file_sha256, group, has, joined, plain, read_json_object, read_product
+from fusion.results.store import file_sha256, group, has, is_file_list, joined, plain, read_json_object, read_product
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import NoScatterError, estimate_drift
 from interferometry.drift.planning import estimate_settling
@@ -410,10 +410,12 @@ def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
 def files_of_run(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of the files that were measured, as the provenance of a run holds it, and that of its results, by name."""
     origin = read_json_object(folder / "provenance.json")
-    tables = [origin.get("parameters", {}).get(name) or {} for name in ("interferometry", "record")]
-    values = [value for table in tables for value in table.values()]
+    inputs, parameters = origin.get("inputs"), origin.get("parameters")
+    tables = [parameters.get(name) for name in ("interferometry", "record")] if isinstance(parameters, dict) else []
+    values = [value for table in tables if isinstance(table, dict) for value in table.values()]
     stated = {str(name) for value in values for name in (value if isinstance(value, list) else [value])}
-    measured = {name: item["sha256"] for name, item in origin.get("inputs", {}).items() if name in stated}
+    known: dict[str, Any] = inputs if is_file_list(inputs) else {}
+    measured = {name: str(item["sha256"]) for name, item in known.items() if name in stated}
     return {**measured, **hashed({"results.json": folder / "results.json"})}
 
 

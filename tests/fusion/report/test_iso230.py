@@ -14,7 +14,7 @@ import xarray as xr
 from playwright.sync_api import sync_playwright
 
 from fusion.campaign.recompensation import ROTARY_BUDGET
-from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test
+from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, files_of_run, read_test
 from fusion.report.campaign import describe_iso230
 from fusion.report.conclusions import sharpen
 from fusion.report.page import PageFileError
@@ -323,6 +323,19 @@ def test_the_sheet_of_results_holds_the_hash_of_what_was_measured(results_folder
     assert test.files[laser] == origin["inputs"][laser]["sha256"]
     assert test.files["results.json"] == origin["products"]["results.json"]["sha256"]
     assert not [name for name in test.files if name.startswith("thermal")]
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        "[]",
+        '{"inputs": {"laser.csv": -1}, "parameters": {"interferometry": {"deviations": "laser.csv"}}}',
+        '{"parameters": 5}',
+    ],
+)
+def test_damaged_provenance_names_no_measured_file(damaged, tmp_path):
+    (tmp_path / "provenance.json").write_text(damaged)
+    assert files_of_run(tmp_path) == {}
 
 
 @pytest.mark.chain
