@@ -553,7 +553,7 @@ def iso230(
         elif as_csv:
             sys.stdout.write(iso230_csv(found.dataset))
         else:
-            for table in iso230_tables(found.part, found.dataset, title=found.title):
+            for table in iso230_tables(found.part, found.dataset, title=found.title, axis_alone=out is not None):
                 _wide().print(table)
             _print_lines(found.remarks)
         if out is not None:

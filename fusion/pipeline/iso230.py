@@ -23,12 +23,12 @@ from fusion.campaign.config import (
 )
 from fusion.campaign.inputs import DATED, is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
-from fusion.report.numbers import moment
+from fusion.report.numbers import exact, moment
 from fusion.results.axis import Iso230Part
 from fusion.results.parts import decide
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
-from fusion.results.store import file_sha256, group, has, joined, plain, read_product
+from fusion.results.store import file_sha256, group, has, is_file_list, joined, plain, read_json_object, read_product
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import NoScatterError, estimate_drift
 from interferometry.drift.planning import estimate_settling
@@ -256,9 +256,7 @@ def _conditions(
     conditions = {
         **identity(report, date_of(dataset["time"].values, zone), "" if campaign is None else campaign.campaign.axis),
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
-        "Measured travel": f"{np.ptp(position):g}{unit}, {position.min():g} to {position.max():g}{unit}".replace(
-            "-", "−"
-        ),
+        "Measured travel": f"{np.ptp(position):g}{unit}, {exact(position.min())} to {exact(position.max())}{unit}",
         "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
         "Feed": "" if feed is None else f"{feed:g} mm/min",
         "Dwell at a target": "" if dwell is None else f"{dwell:g} s",
@@ -402,12 +400,23 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )
     dataset = read_product(folder, "deviations")
-    named = {name: folder / name for name in ("results.json", "deviations.nc", "provenance.json")}
-    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), hashed(named))
+    return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), files_of_run(folder))
 
 
 def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
     return (*describe_notes(deviations), *(notice.message for notice in left_out_notices(deviations, "left_out")))
+
+
+def files_of_run(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of the files that were measured, as the provenance of a run holds it, and that of its results, by name."""
+    origin = read_json_object(folder / "provenance.json")
+    inputs, parameters = origin.get("inputs"), origin.get("parameters")
+    tables = [parameters.get(name) for name in ("interferometry", "record")] if isinstance(parameters, dict) else []
+    values = [value for table in tables if isinstance(table, dict) for value in table.values()]
+    stated = {str(name) for value in values for name in (value if isinstance(value, list) else [value])}
+    known: dict[str, Any] = inputs if is_file_list(inputs) else {}
+    measured = {name: str(item["sha256"]) for name, item in known.items() if name in stated}
+    return {**measured, **hashed({"results.json": folder / "results.json"})}
 
 
 def hashed(files: Mapping[str, Path]) -> dict[str, str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
 from fusion.common import Array
-from fusion.pipeline.iso230 import date_of, hashed, identity
+from fusion.pipeline.iso230 import date_of, files_of_run, hashed, identity
 from fusion.results.parts import Iso230Condition, Quantity
 from fusion.results.results import read_results
 from fusion.results.thermal_test import TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
@@ -259,8 +259,7 @@ def read_thermal_tests(path: Path) -> StatedTests:
         results = read_results(path)
         if not results.iso230_3:
             raise CampaignError(f"{path}: these results hold no test by ISO 230-3; run the campaign again")
-        named = {name: path / name for name in ("results.json", "provenance.json")}
-        return StatedTests(results.campaign, results.iso230_3, hashed(named))
+        return StatedTests(results.campaign, results.iso230_3, files_of_run(path))
     if path.suffix != ".toml":
         raise CampaignError(
             f"{path}: name a campaign file or a results folder; thermofuse init writes a campaign file for a table"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -15,6 +15,7 @@ from fusion.report.conclusions import first_screen, headline, next_steps, sharpe
 from fusion.report.numbers import (
     alike,
     decimals_of,
+    exact,
     fixed,
     gain,
     join,
@@ -32,6 +33,7 @@ from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     ARROWS,
     CONTRIBUTORS,
+    EVIDENCE,
     ISO230_TERMS,
     ONE_WAY_TERMS,
     Row,
@@ -51,9 +53,9 @@ from fusion.report.wording import (
     quoted_window,
     randomised_causes,
     say,
-    spaced,
     table,
     untouched,
+    with_values,
 )
 from fusion.results.axis import CorrelationPart, Evidence, Iso230Part, Iso230Window, PlacePart
 from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RunnerUp, StepPart
@@ -114,22 +116,41 @@ def passes(p: float | None) -> bool:
     return p is not None and p <= LEVEL
 
 
-def _other_modes(correlation: CorrelationPart) -> tuple[list[PlacePart], list[PlacePart]]:
+class _OtherMode(NamedTuple):
+    """A mode beside the leading one, with the part of the drift for which it is most significant."""
+
+    mode: PlacePart
+    part: str
+    p_value: float
+
+
+def _other_modes(correlation: CorrelationPart) -> tuple[list[_OtherMode], list[_OtherMode]]:
     """Return the modes that are significant given the leading one, and those that are so only on their own."""
+
+    def significant(p_of: str, modes: Sequence[PlacePart]) -> list[_OtherMode]:
+        best = [
+            min(
+                (_OtherMode(mode, name, p) for name, part in mode.parts.items() if passes(p := getattr(part, p_of))),
+                key=lambda one: one.p_value,
+                default=None,
+            )
+            for mode in modes
+        ]
+        return [one for one in best if one is not None]
+
     others = [mode for mode in correlation.modes if mode.name != f"mode {correlation.source.name}"]
-    adding = [mode for mode in others if any(passes(part.p_given_leading_mode) for part in mode.parts.values())]
-    alone = [mode for mode in others if any(passes(part.p_value) for part in mode.parts.values())]
-    return adding, [mode for mode in alone if mode not in adding]
+    adding = significant("p_given_leading_mode", others)
+    return adding, significant("p_value", [mode for mode in others if mode not in [one.mode for one in adding]])
 
 
 def _map_facts(maps: xr.DataTree, name: str, channel: str) -> dict[str, Any]:
-    """Return what the maps of cells, or of modes, can show: rate of false alarms, unexplained drift (µm in 1 h), limit (µm/K)."""
+    """Return what the maps of cells, or of modes, can show: rate of false alarms, random drift allowed for (µm in 1 h), limit (µm/K)."""
     tested = maps.children[name].to_dataset() if name else maps.to_dataset()
     limit = tested["detectable_sensitivity"].sel(channel=channel)
     return {
         "name": name or "cells",
         "false_alarms": rate_text(float(tested["false_alarm_rate" if name else "cells_false_alarm_rate"])),
-        "unexplained_um": float(maps["unexplained_drift"].sel(channel=channel)),
+        "random_um": float(maps["unexplained_drift"].sel(channel=channel)),
         "limit_um_per_K": float(limit.where(np.isfinite(limit)).median()),
     }
 
@@ -140,7 +161,7 @@ def _strongest_cell(maps: xr.Dataset, channel: str) -> dict[str, Any]:
     flat = maps[names].sel(channel=channel).stack(cell=("y", "x"))
     best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
     values = {name: float(best[name]) for name in (*names, "x", "y")}
-    return {"channel": channel, "unexplained_um": float(maps["unexplained_drift"].sel(channel=channel)), **values}
+    return {"channel": channel, "random_um": float(maps["unexplained_drift"].sel(channel=channel)), **values}
 
 
 def _strength(maps: xr.DataTree, kind: str) -> xr.DataArray:
@@ -196,7 +217,7 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict
     if shown is None:
         rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
         axis = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
-        return {**tables, "quoted": part, "axis": axis, "missing": "", "sharper": None}
+        return {**tables, "quoted": part, "axis": axis, "missing": "", "sharper": None, "scatter_um": None}
     if dataset is not None and has(dataset, "settled"):
         tables["positions"] = _iso230_positions_table(group(dataset, "settled"), dataset["position"], unit)
     return {
@@ -206,8 +227,21 @@ def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict
         # Of one cycle nothing is known of the uncertainty.
         "budget": _budget_table(shown, unit) if len(shown.cycles) > 1 else None,
         "sharper": sharpen(part),
+        "scatter_um": _scatter_um(part, dataset),
         "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
     }
+
+
+def _scatter_um(part: Iso230Part, dataset: xr.Dataset | None) -> float | None:
+    """Return the median scatter of the readings without drift, of a test whose first window stands beside the quoted one."""
+    if dataset is None or not has(dataset, "drift") or not _is_beside_first(part):
+        return None
+    return float(group(dataset, "drift")["scatter"].median())
+
+
+def _is_beside_first(part: Iso230Part) -> bool:
+    """Return whether the quoted window is another than the first."""
+    return part.first is not None and part.settled is not None and part.first.window != part.settled.window
 
 
 def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
@@ -224,7 +258,7 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
     rows = [
         [
             str(target),
-            f"{place:g}",
+            exact(place),
             *(fixed(value, places) for value in row),
             ", ".join(str(int(count)) for count in counts),
         ]
@@ -232,9 +266,8 @@ def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: s
     ]
     titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in ARROWS.values()]
     unit_along = str(position.attrs.get("units", "mm"))
-    return table(
-        ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"Bᵢ / {unit}", f"Rᵢ / {unit}", "n↑, n↓"], rows
-    )
+    columns = ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"Bᵢ / {unit}", f"Rᵢ / {unit}", "n↑, n↓"]
+    return with_values(table(columns, rows))
 
 
 def _along(position: xr.DataArray) -> np.ndarray:
@@ -245,9 +278,16 @@ def _along(position: xr.DataArray) -> np.ndarray:
 def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
     """Return which readings of a window are missing, and why."""
     within = dataset[["deviation", "quality_flag"]].sel(cycle=list(cycles))
-    missing = np.argwhere(np.isnan(within["deviation"].values))
+    read = within["deviation"].notnull().any(("cycle", "target"))
+    within = within.isel(direction=np.flatnonzero(read.values))
+    side = (
+        ""
+        if read.all()
+        else f"Approached from one side only ({', '.join(ARROWS[str(one)] for one in within['direction'].values)}). "
+    )
+    missing = np.argwhere(np.isnan(within["deviation"].transpose("cycle", "direction", "target").values))
     if missing.size == 0:
-        return "No reading of the window is missing."
+        return f"{side}No reading of the window is missing."
     named = []
     for cycle, direction, target in missing[:_NAMED]:
         bits = int(within["quality_flag"].values[cycle, direction, target])
@@ -258,7 +298,7 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
         )
     more = len(missing) - len(named)
     rest = f" and {more} more" if more else ""
-    return f"{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
+    return f"{side}{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
 
 
 def values_to_sign(part: Iso230Part) -> Table:
@@ -281,17 +321,19 @@ def values_to_sign(part: Iso230Part) -> Table:
             verdict = judged.get(symbol, ["–", "no tolerance stated"]) if judged else []
             rows.append(Row([term, quantity(value), *verdict], symbol in judged and verdict[1] != "pass"))
     titles = [f"Tolerance / {unit}", Words("Decision (ISO 14253-1)")] if judged else []
-    return table([Words("Quantity of the axis"), f"Value ± U (k = 2) / {unit}", *titles], rows)
+    value = "Value ± U (k = 2)" if any("±" in row.cells[1] for row in rows) else "Value"
+    return table([Words("Quantity of the axis"), f"{value} / {unit}", *titles], rows)
 
 
 def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
     """Return the axis values of the settled window with their decisions, those of the first one and their range over the windows."""
-    several = part.first is not None and part.first.window != shown.window
+    several = _is_beside_first(part)
     judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
     rows = []
 
     def add(title: str, symbol: str, *cells: str, marked: bool = False) -> None:
-        rows.append(Row([title, cells[0], *(judged.get(symbol, ("–", "–")) if judged else ()), *cells[1:]], marked))
+        if any(cell != "–" for cell in cells) or symbol in judged:
+            rows.append(Row([title, cells[0], *(judged.get(symbol, ("–", "–")) if judged else ()), *cells[1:]], marked))
 
     for symbol, term in ISO230_TERMS.items():
         found = part.range_um.get(symbol)
@@ -369,7 +411,7 @@ def steps_table(loop: Loop) -> Table:
     numbers = alike([loop.rmse_declared_um, *errors])
     rows = [Row(["0", f"declared: {declared}", "–", numbers[0], "–", "", ""])]
     for turn, step in enumerate(loop.steps, start=1):
-        held_out = " -> ".join(numbers[2 * turn - 1 : 2 * turn + 1])
+        held_out = " → ".join(numbers[2 * turn - 1 : 2 * turn + 1])
         rows.append(Row([str(turn), *_step_cells(step, held_out)], marked=True))
     titles = ("p", "Held out / µm", "Blocks / µm", Words("Borne out"), Words("Next best effect"))
     return table(["Step", Words("Effect"), *titles], rows)
@@ -381,7 +423,7 @@ def _step_cells(step: StepPart, held_out: str) -> list[str]:
         f"{say('names', step)}{f': {text}' if text else ''}{f'; without a name: {step.withheld}' if step.withheld else ''}",
         p_cell(step.p_value),
         held_out,
-        " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
+        " → ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
         say("doubt", step) if step.doubt else "yes",
         _runner_up(step.runner_up),
     ]
@@ -407,7 +449,9 @@ def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
     left = loop.residual_drift
     common, stretch = small(left.common_rms_um), small(left.stretch_rms_um)
     size = f"{common} µm rms common to all positions, {stretch} µm rms of stretch along the axis"
-    rows.append(("unexplained drift", f"{left.kind}: {size}"))
+    if loop.wandering_um is not None:
+        size += f"; together {small(loop.wandering_um)} µm rms at its far end"
+    rows.append(("random drift beside the effects", f"{left.kind}: {size}"))
     return rows + refused_effects(loop)
 
 
@@ -466,7 +510,7 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
         "support": evidence.support,
         "against": evidence.against,
         "check": evidence.check,
-        "numbers": [(spaced(name), in_words(value)) for name, value in evidence.numbers().items()],
+        "numbers": [(EVIDENCE[name], in_words(value)) for name, value in evidence.numbers().items()],
     }
 
 
@@ -605,7 +649,6 @@ def _camera(fields: xr.Dataset) -> dict[str, Any]:
         "cell_size": float(np.median(np.diff(fields["x"]))),
         "visible": float(np.isfinite(rise).mean()),
         "mean_rise_K": float(rise.mean()),
-        "largest_rise_K": float(rise.max()),
         "fiducials": list(zip(*(fields[f"fiducial_{name}"].values.tolist() for name in names), strict=True)),
     }
 
@@ -619,13 +662,15 @@ def _positions_table(deviations: xr.Dataset) -> Table:
     s = by_approach(conventional["standard_deviation"], target=targets)
     rows = []
     for at, (target, position_mm) in enumerate(zip(targets, deviations["position"].values, strict=True)):
-        row = [str(target), f"{position_mm:g}"]
+        row = [str(target), exact(position_mm)]
         for name, places in decimals.items():
             both = zip(laid[name][at], laid[f"{name}_u"][at], strict=True)
             row += [measured(float(value), float(u), decimals=places) for value, u in both]
         rows.append([*row, *(f"{value:.2f}" for value in s[at])])
     quantities = ("Profile", "Scatter s", "Conventional s")
-    return table(["Position", "mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows)
+    return table(
+        ["Target", "Position / mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows
+    )
 
 
 def _comparison_table(deviations: xr.Dataset) -> Table:
@@ -643,7 +688,7 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
     rows = [
         [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
     ]
-    return table(["Position", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
+    return table(["Target", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
 
 
 def rate_text(rate: float) -> str:

@@ -12,6 +12,7 @@ from fusion.results.axis import Iso230Part
 from fusion.results.loop import StepPart
 from fusion.results.parts import TimePart, decide
 from fusion.results.results import Results
+from interferometry.iso230 import SAMPLING
 
 #: Question of a reader, and the statement that answers it.
 _QUESTIONS = {
@@ -68,24 +69,35 @@ def _if_so(statement: str) -> str:
 def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: str) -> dict[str, Any]:
     """Return what a reader learns before anything else: which machine, whether it passes, why, what to doubt, what to do."""
     iso, inputs = results.iso230, results.inputs
+    # A camera alone is no acceptance test, and says with its temperatures what is beyond its range.
+    alone = iso is None and results.loop is None
+    if alone and inputs is not None:
+        inputs = inputs.model_copy(update={"accepted": (*inputs.accepted, "camera_range")})
     serial = report.get("machine_serial_number", "")
-    named = [report.get("machine") or "machine not stated", f"no. {serial}" if serial else ""]
     still_open = "" if inputs is None else say("open_inputs", inputs)
+    decision = "" if alone else "Not an acceptance test: no tolerance applies."
+    if iso is not None:
+        decision = _if_so(conditional(say("decision", iso), inputs, "positions"))
     return {
         "identity": [
-            *named,
+            report.get("machine") or (_cameras(results) if alone else "machine not stated"),
+            f"no. {serial}" if serial else "",
             f"{axis} axis" if axis and f"{axis} axis" not in results.campaign else "",
             report.get("operator", ""),
             begun[:10] or "date not stated",
         ],
-        "decision": "Not an acceptance test: no tolerance applies."
-        if iso is None
-        else _if_so(conditional(say("decision", iso), inputs, "positions")),
+        "decision": decision,
         "unmet": "" if iso is None else say("unmet", iso),
         "cause": _if_so(say("why", results)),
         "open": still_open,
         "next": [in_brief(step) for step in next_steps(results)[: _FIRST_STEPS - bool(still_open)]],
     }
+
+
+def _cameras(results: Results) -> str:
+    """Return the camera that took the pictures, with its serial number, or of how many cameras they are; empty where it is not known."""
+    names = [one.name.rpartition(", ")[0] for one in results.thermograms.cameras] if results.thermograms else []
+    return names[0] if len(names) == 1 else f"{len(names)} cameras" if names else ""
 
 
 # Added effects in words: what each is, and what to check.
@@ -111,10 +123,17 @@ _STATED: dict[str, tuple[str, float]] = {
     "expansion_coefficient": ('expansion_coefficient = "{value} +- 0.3 ppm/K"', 0.3),
     "material_temperature": ('uncertainty.material_temperature = "0.1 K"', 0.1),
 }
+#: What stands for the first line where no value of the coefficient is known.
+_STATED_WITHOUT_VALUE = "the expansion coefficient with its uncertainty, 0.3 ppm/K"
+#: Cycles for one of the test, so that what shrinks with their square root is halved.
+_MORE_CYCLES = 4
 
 
 class Sharper(NamedTuple):
-    """The largest term of the uncertainty of A, and the line of the campaign file that shrinks it most; an empty `line` where none does."""
+    """The largest term of the uncertainty of A, and the line of the campaign file that shrinks it most; an empty `line` where none does.
+
+    Where the scatter of the readings is the largest term, `cycles` says how many would halve it, otherwise it is 0.
+    """
 
     symbol: str
     contributor: str
@@ -124,6 +143,7 @@ class Sharper(NamedTuple):
     line: str = ""
     sharper_um: float = math.inf
     decision: str = ""
+    cycles: int = 0
 
 
 def sharpen(iso: Iso230Part | None) -> Sharper | None:
@@ -148,12 +168,15 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
         expanded = 2 * (found.u**2 - term**2 + (term * stated_u / one.u) ** 2) ** 0.5
         if expanded < _WORTH * min(told.sharper_um, told.expanded_um):
             value = next(
-                (row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text),
-                "...",
+                (row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text), ""
             )
+            line = line.format(value=value) if value or "{value}" not in line else _STATED_WITHOUT_VALUE
             limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)
             decision = "" if limit is None or found.value is None else decide(found.value, expanded, limit)
-            told = told._replace(line=line.format(value=value), sharper_um=expanded, decision=decision)
+            told = told._replace(line=line, sharper_um=expanded, decision=decision)
+    if not told.line and told.contributor in SAMPLING:
+        halved = sum(terms[name][1] ** 2 for name in SAMPLING if name in terms) * (1.0 - 1.0 / _MORE_CYCLES)
+        told = told._replace(sharper_um=2 * (found.u**2 - halved) ** 0.5, cycles=_MORE_CYCLES * len(iso.settled.cycles))
     return told
 
 
@@ -178,10 +201,7 @@ def next_steps(results: Results) -> list[str]:
         steps += [conditional(one, inputs, "causes") for one in actions]
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
-    steps += [
-        f"{say('position_words', anomaly.target, anomaly.position_mm)}: {anomaly.evidence.check}"
-        for anomaly in results.anomalies or ()
-    ]
+    steps += [say("position_action", anomaly) for anomaly in results.anomalies or ()]
     if correlation is not None and correlation.verdict == "attributable" and not randomised_causes(correlation):
         steps.append(say("test_place", correlation.source))
     steps += [warning.remedy for warning in results.warnings]
@@ -189,5 +209,8 @@ def next_steps(results: Results) -> list[str]:
     if (sharper := sharpen(results.iso230)) is not None and sharper.line:
         # What makes a decision possible comes first.
         unique.insert(0 if sharper.decision in ("pass", "fail") else len(unique), say("sharper_step", sharper))
+    judged = {row.quantity: row.decision for row in results.iso230.tolerances} if results.iso230 else {}
+    if judged.get("A") != "pass" and (compensation := say("compensation_step", results)):
+        unique.insert(0 if judged.get("A") == "fail" else len(unique), compensation)
     values = "profile" if results.drift else "values by ISO 230-2" if results.iso230 else "temperatures"
     return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]

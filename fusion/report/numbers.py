@@ -17,6 +17,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return fixed(value, max(0, digits - 1 - math.floor(math.log10(abs(value))))) if value else "0"
 
 
+def exact(value: float) -> str:
+    """Return a number that is stated, such as a position, with no more digits than it has and a true minus sign."""
+    return f"{value:g}".replace("-", "−")
+
+
 def fixed(value: float | None, decimals: int) -> str:
     """Return a number with so many decimals and a true minus sign; a dash where there is none."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")
@@ -115,7 +120,7 @@ def moment(time: np.datetime64 | str, zone: str | None = None, *, seconds: bool 
 
 def place(x: float | None, y: float | None) -> str:
     """Return a place on the plan to the millimetre."""
-    across, down = ("–" if value is None else f"{value:z.0f}" for value in (x, y))
+    across, down = ("–" if value is None else f"{value:z.0f}".replace("-", "−") for value in (x, y))
     return f"x {across} mm, y {down} mm"
 
 

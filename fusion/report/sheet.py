@@ -219,14 +219,16 @@ def in_pairs(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str, str, str]]
     return [(*rows[k], *right[k]) for k in range(half)]
 
 
-def iso230_tables(part: Iso230Part, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
-    """Return the tables of a test for the terminal."""
+def iso230_tables(
+    part: Iso230Part, dataset: xr.Dataset, *, title: str, axis_alone: bool = False
+) -> list[rich.table.Table]:
+    """Return the tables of a test for the terminal: all of them, or the values of the axis as the sheet has them."""
     described = describe_iso230(part, dataset)
     shown: list[tuple[str, Table | None]] = [
-        (f"{title}, {described['quoted'].window}", described["axis"]),
-        ("per target position", described["positions"]),
-        ("uncertainty budget", described["budget"]),
+        (f"{title}, {described['quoted'].window}", values_to_sign(part) if axis_alone else described["axis"])
     ]
+    if not axis_alone:
+        shown += [("per target position", described["positions"]), ("uncertainty budget", described["budget"])]
     return [print_table(found, name) for name, found in shown if found is not None]
 
 

@@ -33,18 +33,26 @@ def describe_thermal_tests(tests: Sequence[ThermalTest]) -> list[dict[str, Any]]
             "title": f"{_KINDS[test.kind]}{', run ' + test.run if test.run else ''}, {number(test.duration_h)} h",
             "distortions": _distortions(test.distortions, "Displacement or tilt"),
             "temperatures": _distortions(test.temperatures, "Temperature") if test.temperatures else None,
-            "budget": table(
-                [Words("Quantity"), Words("Source"), "u (k = 1)", Words("Origin")],
-                [
-                    [one.name, one.source, "–" if one.u is None else small(one.u), one.origin]
-                    for one in test.contributions
-                ],
-            ),
+            "budget": _budget(test),
             "remarks": test.remarks,
             "drawn": DRAWN,
         }
         for test in tests
     ]
+
+
+def _budget(test: ThermalTest) -> Table:
+    units = {one.name: print_unit(one.unit) for one in test.distortions}
+    rows = [
+        [
+            one.name,
+            one.source,
+            "–" if one.u is None else f"{small(one.u)} {units.get(one.name, '')}".strip(),
+            one.origin,
+        ]
+        for one in test.contributions
+    ]
+    return table([Words("Quantity"), Words("Source"), "u (k = 1)", Words("Origin")], rows)
 
 
 def _distortions(found: Sequence[ThermalDistortion], title: str) -> Table:

@@ -30,6 +30,7 @@ def describe_thermograms(results: Results, thermograms: xr.Dataset) -> dict[str,
         "pictures": _table_of_pictures(thermograms, zone),
         "count": thermograms.sizes["time"],
         "hottest": thermograms.attrs["hottest"],
+        "marked": bool(thermograms["flag"].any()),
     }
     if part is None:
         return {**shown, "of_series": table_of_regions(regions), "every": None, "visible": ""}

@@ -21,6 +21,7 @@ from fusion.messages import cell, printable
 from fusion.report.numbers import (
     alike,
     duration,
+    exact,
     fixed,
     gain,
     join,
@@ -39,6 +40,7 @@ from fusion.report.numbers import (
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Iso230Window
 from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
+from fusion.results.progress import counted
 from fusion.results.results import Results
 
 # Tables as the report and the terminal show them: columns, rows, and which rows are marked.
@@ -68,6 +70,13 @@ class Table:
 def table(titles: Iterable[str], rows: Iterable[Row | Sequence[str]], *, stacked: bool = False) -> Table:
     """Return a table."""
     return Table(tuple(titles), tuple(row if isinstance(row, Row) else Row(row) for row in rows), stacked)
+
+
+def with_values(shown: Table) -> Table:
+    """Return a table without the columns in which every row has a dash."""
+    kept = [at for at in range(len(shown.titles)) if any(row.cells[at] != "–" for row in shown.rows)]
+    rows = (Row([row.cells[at] for at in kept], row.marked) for row in shown.rows)
+    return table([shown.titles[at] for at in kept], rows, stacked=shown.stacked)
 
 
 def print_table(shown: Table, title: str) -> rich.table.Table:
@@ -114,6 +123,35 @@ CHANNELS = {
 _UNITS = {
     "_um_per_K": "µm/K", "_um": "µm", "_nats": "in log-likelihood", "_min": "min", "_mm": "mm", "_s": "s", "_K": "K",
 }  # fmt: skip
+
+
+#: Numbers of a diagnosis in words, with their unit.
+EVIDENCE = {
+    "extra_um": "size beyond the other positions / µm",
+    "probability": "probability of the cause that is named",
+    "probability_structural": "probability of mechanical scatter",
+    "probability_stick_slip": "probability of stick-slip",
+    "probability_slow": "probability of a slow motion",
+    "probability_step": "probability of a sudden step",
+    "probability_local_temperature": "probability of a local temperature",
+    "scatter_typical_um": "scatter typical of the other positions / µm",
+    "scatter_positive_um": "scatter, positive approach / µm",
+    "scatter_negative_um": "scatter, negative approach / µm",
+    "serial_p": "serial correlation, p",
+    "approach_gain_nats": "unequal approaches, gain in log-likelihood",
+    "step_p": "step, p",
+    "step_um": "step / µm",
+    "step_u_um": "step, standard uncertainty / µm",
+    "step_cycle": "step, cycle",
+    "step_held_out_nats": "step, gain in log-likelihood on the other approach",
+    "temperature_p": "local temperature, p",
+    "temperature_um_per_K": "local temperature, sensitivity / (µm/K)",
+    "temperature_u_um_per_K": "its standard uncertainty / (µm/K)",
+    "temperature_scale_u_um_per_K": "of which from the scale of the rise / (µm/K)",
+    "temperature_lag_s": "local temperature, lag / s",
+    "temperature_held_out_nats": "local temperature, gain in log-likelihood on the other approach",
+    "temperature_warm_up_share": "local temperature, share of its course that one warm-up explains",
+}
 
 
 class EffectWords(NamedTuple):
@@ -254,7 +292,7 @@ CONTRIBUTORS = {
     "expansion_coefficient": "expansion coefficient",
     "environmental_variation": "environmental variation error (EVE)",
     "sampling": "scatter of the readings",
-    "extremes": "largest of noisy values",
+    "extremes": "bias of the largest of scattered values",
 }
 #: A drift of less than this share of the median scatter is none that readings can show.
 _SHARE_OF_SCATTER = 0.01
@@ -274,8 +312,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        condition, conditional, duration, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters, percent, place,
-        print_unit, quantity, region_words, small, upper_first,
+        condition, conditional, counted, duration, exact, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters,
+        percent, place, print_unit, quantity, region_words, small, upper_first,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {

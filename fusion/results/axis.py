@@ -376,7 +376,7 @@ class Evidence(ResultPart):
     check: str
     """What to inspect on the machine."""
     probability_structural: Number
-    """Probability of scatter of the structure."""
+    """Probability of mechanical scatter."""
     probability_stick_slip: Number
     """Probability of stick-slip."""
     probability_slow: Number

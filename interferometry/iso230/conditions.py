@@ -94,10 +94,12 @@ def _cycles(cycles: Sequence[int]) -> ConditionCheck:
 
 
 def _completeness(deviations: xr.Dataset, cycles: Sequence[int]) -> ConditionCheck:
-    within = deviations["deviation"].sel(cycle=list(cycles)).values
+    within = deviations["deviation"].sel(cycle=list(cycles)).transpose("direction", ...).values
     missing = int(np.isnan(within).sum())
     evidence = "Every target was read from both sides in every cycle."
-    if missing:
+    if np.isnan(within).all(axis=(1, 2)).any():
+        evidence = "The targets were approached from one side only."
+    elif missing:
         evidence = f"{missing} of {within.size} readings of the window are missing."
     return ConditionCheck("every target from both sides in every cycle", missing == 0, evidence)
 
@@ -106,8 +108,10 @@ def _settled(deviations: xr.Dataset, cycles: Sequence[int], settling: Sequence[S
     name = "warmed-up axis"
     time = deviations["time"].values.astype("datetime64[ns]")
     here = deviations["time"].sel(cycle=list(cycles)).values.astype("datetime64[ns]")
-    if settling is None or np.isnat(here).all():
-        return ConditionCheck(name, None, "The readings have no times, or are too few, to see a warm-up.")
+    if np.isnat(here).all():
+        return ConditionCheck(name, None, "Without times of the readings a warm-up is not seen.")
+    if settling is None:
+        return ConditionCheck(name, None, "The readings are too few to show a warm-up.")
     start_s = float((here[~np.isnat(here)].min() - time[~np.isnat(time)].min()) / np.timedelta64(1, "s"))
     if not settling:
         change_um, p_value = _change_within(deviations.sel(cycle=list(cycles)))

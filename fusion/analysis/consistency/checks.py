@@ -99,7 +99,7 @@ CONDITIONS = {
     "drivers_coverage": Condition("the drivers' log belongs to this test", _LOG, _LOADS),
     "camera_settings": Condition("the camera's settings stayed the same", _CAMERA, _RISES),
     "camera_parameters": Condition("the stored camera parameters are right", _CAMERA, _RISES),
-    "camera_range": Condition("the camera is right outside its range", _CAMERA, _RISES),
+    "camera_range": Condition("what lies beyond the calibrated range of the camera is right", _CAMERA, _RISES),
     "camera_stamps": Condition("the times of the frames are right", _CAMERA, _FIELDS_AT_READINGS),
     "camera_rate": Condition("the camera's clock keeps its rate", _CLOCK, _FIELDS_AT_READINGS),
     "camera_phase": Condition("the table was in place when the frames were taken", _CAMERA, _FIELDS_AT_READINGS),

@@ -23,7 +23,7 @@ class CauseRecord:
 
 CAUSES: dict[Cause, CauseRecord] = {
     "structural": CauseRecord(
-        "scatter of the structure",
+        "mechanical scatter",
         "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat the "
         "test with small steps around it.",
     ),

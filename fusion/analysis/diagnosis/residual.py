@@ -265,7 +265,7 @@ def _time_words(cycles: NDArray[np.int64], series: Array, readings: Readings) ->
         return best
     high = centred > 0
     changes = int((np.diff(high.astype(int)) != 0).sum())
-    return f"irregular, {changes} changes of side over {series.size} cycles (switching or wandering)"
+    return f"irregular, with {changes} changes of sign in {series.size} cycles"
 
 
 def _place_words(sites: list[tuple[int, str]], weights: Array) -> str:

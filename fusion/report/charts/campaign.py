@@ -90,8 +90,9 @@ def draw_placed(
         if "fiducial" in fields.sizes:
             charts["registration"] = plan.plot_registration(fields, results.hotspots or (), followed)
         charts["thermal_map"], controls = plot_thermal_map(
-            fields, results.hotspots or (), position, sensors=results.sensors or (), followed=followed
-        )
+            fields, results.hotspots or (), position, sensors=results.sensors or (), followed=followed,
+            standing_out={one.target for one in results.anomalies or ()},
+        )  # fmt: skip
     return Drawn(embed({**charts, **draw_thermal_tests(results.iso230_3 or ())}), controls)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -34,6 +34,10 @@ from thermography.fields.large_arrays import in_pieces
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
+#: A colour outside the scale, for values beyond its ends.
+BEYOND = "#7fe3ff"
+#: Room about a plan or a picture, as a share of its length, so that a mark at its rim is whole.
+_ROOM = 0.025
 #: Length of a recording from which its time is drawn in hours.
 _LEAST_HOURS = 0.1
 
@@ -62,7 +66,7 @@ def new_plan(extent: Extent, *, title: str = "", height: int | None = None) -> f
     drawn.name = "plan"
     drawn.grid.grid_line_color = None
     if left <= 0 <= right and bottom <= 0 <= top:
-        drawn.scatter([0], [0], marker="cross", size=16, line_color=INK, line_width=2)
+        add_marks(drawn, [0], [0], "cross", 16)
         add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16)
     return drawn
 
@@ -95,11 +99,21 @@ def draw_picture(
     *,
     colours: str = SEQUENTIAL,
     block: int = 1,
+    marked: bool = False,
 ) -> figure:
-    """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey."""
+    """Draw a picture, each value of a block of pixels, row 0 at the top, with the scale of its values; NaN stay grey.
+
+    Where `marked`, what lies beyond the ends of the scale has a colour of its own.
+    """
     rows, columns = (block * size for size in values.shape)
     mapper = LinearColorMapper(palette(colours), low=low, high=high, nan_color="#e1e5e7")
-    ranges: dict[str, Any] = {"x_range": (-0.5, columns - 0.5), "y_range": (rows - 0.5, -0.5)}
+    if marked:
+        mapper.low_color = mapper.high_color = BEYOND
+    room = _ROOM * columns
+    ranges: dict[str, Any] = {
+        "x_range": (-0.5 - room, columns - 0.5 + room),
+        "y_range": (rows - 0.5 + room, -0.5 - room),
+    }
     # The width that axis and scale take beside the picture, and the height of the axis below it.
     width, beside, below = 520, 120, 55
     drawn = new_figure(x="column / px", y="row / px", height=round((width - beside) * rows / columns) + below, **ranges)
@@ -299,10 +313,6 @@ def _hours_since(times: np.ndarray, start: np.datetime64) -> np.ndarray:
 #: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
 _MAP_BUDGET = 3_000_000
 _MISSING = -32768
-#: A colour outside the scale, for values beyond its ends.
-_BEYOND = "#7fe3ff"
-#: Room about the plan, as a share of its length, so that a ring at its rim is whole.
-_ROOM = 0.025
 
 
 class Layer(NamedTuple):
@@ -354,8 +364,9 @@ def plot_thermal_map(
     *,
     sensors: Sequence[ContactSensorPart] = (),
     followed: AreaPart | None = None,
+    standing_out: Set[int] = frozenset(),
 ) -> tuple[Chart, MapControls]:
-    """Draw the plan of the table with measured line, targets, hotspots and the area that the drift follows."""
+    """Draw the plan of the table with measured line, targets, those that stand out, hotspots and the area that the drift follows."""
     shown = [layer for layer in LAYERS if layer.variable in fields]
     kept, note = _thin(fields[[layer.variable for layer in shown]])
     steps = {layer.words: _in_steps(kept[layer.variable].values, layer) for layer in shown}
@@ -363,6 +374,7 @@ def plot_thermal_map(
     last = kept[shown[0].variable].values[-1]
     drawn = draw_map(last, extent_of(kept), shown[0], scales[0])
     draw_places(drawn, fields, position, hotspots, sensors)
+    _ring_targets(drawn, fields, standing_out)
     if followed is not None:
         _draw_both(drawn.line, *_rim(followed))
         middle = (followed.x_low_mm + followed.x_high_mm) / 2
@@ -379,7 +391,7 @@ def plot_thermal_map(
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
     cycle = int(kept["cycle"][-1])
-    chart = Chart(drawn, _seen(kept, last, hotspots, cycle), _columns(kept, shown, cycle))
+    chart = Chart(drawn, _seen(kept, last, hotspots, cycle, standing_out), _columns(kept, shown, cycle))
     return chart, MapControls([layer.words for layer in shown], kept["cycle"].values.tolist(), note)
 
 
@@ -389,7 +401,7 @@ def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[st
     room = _ROOM * (right - left)
     drawn = new_plan((left - room, right + room, bottom - room, top + room))
     mapper = LinearColorMapper(
-        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
+        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=BEYOND, high_color=BEYOND,
         name="scale",
     )  # fmt: skip
     cells = drawn.image(
@@ -474,6 +486,17 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
     add_names(drawn, x[named], y[named], [f"{targets[order[k]]}" for k in named], y_offset=-7, text_align="center")
 
 
+def _ring_targets(drawn: figure, fields: xr.Dataset, targets: Set[int]) -> None:
+    """Ring the targets that stand out and name them, below the line whose ends are numbered above it."""
+    shown = [target for target in sorted(targets) if "target_x" in fields and target in fields["target"].values]
+    if not shown:
+        return
+    x, y = (fields[f"target_{axis}"].sel(target=shown).values for axis in "xy")
+    add_marks(drawn, x, y, "circle", 17)
+    names = [f"position {target}" for target in shown]
+    add_names(drawn, x, y, names, y_offset=12, text_align="center", text_baseline="top")
+
+
 def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart]) -> None:
     """Ring the peak of every hotspot and write its name."""
     if not hotspots:
@@ -505,13 +528,16 @@ def add_marks(
         drawn.scatter(x, y, marker=marker, size=size, fill_color=None, line_color=colour, line_width=width)
 
 
-def _seen(kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], cycle: int) -> str:
+def _seen(
+    kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], cycle: int, standing_out: Set[int]
+) -> str:
     """Say what the map shows when the page opens."""
     if not np.isfinite(last).any():
         return f"Plan of the table in cycle {cycle}: no cell is seen."
     row, column = np.unravel_index(np.nanargmax(last), last.shape)
     count = len(hotspots)
     marked = f"; {count} {'hotspot is' if count == 1 else 'hotspots are'} ringed" if count else ""
+    marked += "".join(f"; position {target} is ringed" for target in sorted(standing_out))
     return (
         f"Plan of the table: in cycle {cycle} the rise is {number(float(np.nanmin(last)))} to {number(float(np.nanmax(last)))} K, largest "
         f"at {place(float(kept['x'][column]), float(kept['y'][row]))}{marked}."

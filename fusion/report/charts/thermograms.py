@@ -49,8 +49,12 @@ def draw_thermograms(thermograms: xr.Dataset, series: str) -> dict[str, Chart]:
 def plot_thermogram(thermograms: xr.Dataset) -> Chart:
     """Draw the hottest picture with its regions and the places of its extremes."""
     values, flag = thermograms["thermogram"].values, thermograms["flag"].values
-    low, high = (float(value) for value in np.nanpercentile(values, (_BEYOND, 100.0 - _BEYOND)))
-    drawn = _draw(values, low, high if high > low else low + 1.0, "temperature / °C")
+    calibrated = values[(flag == 0) & np.isfinite(values)]
+    # Where pixels are beyond the calibrated range, the scale ends with it.
+    marked = bool(calibrated.size and flag.any())
+    ends = (calibrated.min(), calibrated.max()) if marked else np.nanpercentile(values, (_BEYOND, 100.0 - _BEYOND))
+    low, high = (float(value) for value in ends)
+    drawn = _draw(values, low, high if high > low else low + 1.0, "temperature / °C", marked=marked)
     for outline in json.loads(thermograms.attrs["outlines"]):
         _draw_outline(drawn, outline)
     places = {}
@@ -119,18 +123,32 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
     unit, scale = next((unit, scale) for least, unit, scale in _TIMES if seconds[-1] >= least)
     drawn = new_figure(x=f"time since the first picture / {unit}", y="temperature / °C", height=380, legend_columns=3)
     whole, *regions = thermograms["region"].values[: MOST_LINES - 1]
+    highest, above = thermograms["maximum"], thermograms["overrange"] > 0
     lines = [
-        ("highest of the picture", thermograms["maximum"].sel(region=whole)),
-        ("mean of the picture", thermograms["mean"].sel(region=whole)),
-        *((str(name), thermograms["maximum"].sel(region=name)) for name in regions),
+        ("highest of the picture", highest.sel(region=whole), above.sel(region=whole)),
+        ("mean of the picture", thermograms["mean"].sel(region=whole), xr.zeros_like(above.sel(region=whole))),
+        *((str(name), highest.sel(region=name), above.sel(region=name)) for name in regions),
     ]
     columns: dict[str, Any] = {f"time / {unit}": seconds / scale}
     told = []
-    for rank, (name, values) in enumerate(lines):
+    for rank, (name, values, beyond) in enumerate(lines):
+        looks = of_rank(rank)
         marker = "circle" if seconds.size <= 100 else None
-        add_series(drawn, seconds / scale, values.values, name=name, marker=marker, size=4.0, **of_rank(rank))
+        add_series(drawn, seconds / scale, values.where(~beyond).values, name=name, marker=marker, size=4.0, **looks)
+        if beyond.any():
+            # The limit of the range is no temperature that was measured: what was there lies above it.
+            times, limits = (each[beyond.values] for each in (seconds / scale, values.values))
+            add_series(
+                drawn,
+                times,
+                limits,
+                name="above the calibrated range",
+                colour=looks["colour"],
+                line=False,
+                marker="triangle",
+            )
         columns[f"{name} / °C"] = values.values
-        told.append(f"{name} {span_words(values, '°C')}")
+        told.append(f"{name} {span_words(values, '°C')}{' and above' if beyond.any() else ''}")
     return Chart(drawn, f"Temperatures in {seconds.size} pictures: {'; '.join(told)}.", columns)
 
 

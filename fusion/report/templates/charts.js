@@ -10,6 +10,7 @@
         const view = [...views.roots][0];
         roots.set(figure, view);
         fit(figure, view);
+        dress(figure, view, dark.matches);
         if (figure.querySelector(".controls")) steer(figure, view);
         return view;
       }));
@@ -18,10 +19,39 @@
   }
   const plots = (view) => view.model.type === "Figure" ? [view] : view.child_views.flatMap(plots);
 
+  // On a dark page lines and points turn their lightness and keep their hue (report.css); a map keeps the colours of its scale, and what
+  // stands around it turns. Paper and saved pictures are white.
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  const night = { "#1f2a30": "#e7ecee", "#566269": "#a9b5bb" };
+  const day = Object.fromEntries(Object.entries(night).map(([light, other]) => [other, light]));
+  function dress(figure, view, turned) {
+    const colours = turned ? night : day, every = plots(view);
+    const isMap = every.some((plot) => plot.model.renderers.some((part) => part.glyph?.type === "Image"));
+    figure.classList.toggle("lines", !isMap);
+    for (const { el, model } of every) {
+      el.style.backgroundColor = turned ? "transparent" : "";
+      model.background_fill_color = model.border_fill_color = turned ? null : "#ffffff";
+      if (isMap) for (const part of [...model.left, ...model.right, ...model.above, ...model.below]) {
+        for (const [name, value] of Object.entries(part.attributes)) {
+          const other = /_color$/.test(name) && colours[String(value?.value ?? value).toLowerCase()];
+          if (other) part[name] = other;
+        }
+      }
+    }
+  }
+  const dressAll = (turned) => roots.forEach((view, figure) => dress(figure, view, turned));
+  dark.addEventListener("change", () => dressAll(dark.matches));
+
   // A plan has millimetres of one length in both directions: its height follows the width that the page leaves it.
   const tallest = 340;
   function fit(figure, view) {
     figure.querySelector(".drawing").style.minHeight = 0;
+    for (const { model, bbox } of plots(view)) for (const legend of model.above) {  // as many names in a line as there is room for
+      if (legend.type !== "Legend" || !legend.items.length) continue;
+      const widths = legend.items.map((item) => 34 + 5.7 * (item.label?.value ?? "").length), room = bbox.width - 40;
+      const fitting = widths.reduce((all, one) => all + one) <= room ? widths.length : Math.floor(room / Math.max(...widths));
+      legend.ncols = Math.max(1, Math.min(widths.length, fitting));
+    }
     if (view.model.name !== "plan") return;
     figure.classList.add("plan");
     if (!view.frame.bbox.width) return;
@@ -69,7 +99,11 @@
       }
     },
     reset(figure, view) { plots(view).forEach((plot) => plot.reset()); },
-    async image(figure, view) { save(await view.export("png").to_blob(), "image/png", `${figure.id}.png`); },
+    async image(figure, view) {
+      dress(figure, view, false);
+      save(await view.export("png").to_blob(), "image/png", `${figure.id}.png`);
+      dress(figure, view, dark.matches);
+    },
     data(figure, view) {
       const columns = view.model.tags[0].data;
       save(table(columns instanceof Map ? columns : new Map(Object.entries(columns))), "text/csv;charset=utf-8", `${figure.id}.csv`);
@@ -130,17 +164,17 @@
   }
 
   // Paper: charts in the width that they have on A4, so that their text keeps its size; then each becomes a drawing in SVG.
-  const flatter = 0.72, heights = new Map();
+  const flatter = 0.62, heights = new Map();
   const later = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
   async function toPaper() {
     document.documentElement.classList.add("paper");
     for (const figure of figures) if (figure.offsetParent) await draw(figure);
     for (const view of roots.values()) for (const plot of plots(view)) {
       for (const axis of [...plot.model.left, ...plot.model.below]) if (axis.axis_label) axis.axis_label_text_font_size = "10px";
-      // A plan or a picture keeps its proportions, a low chart below others its height.
-      if (plot.model.height === null || plot.model.sizing_mode === "scale_width" || plots(view).length > 2) continue;
+      // A plan or a picture keeps its proportions, a low chart below others most of its height.
+      if (plot.model.height === null || plot.model.sizing_mode === "scale_width") continue;
       heights.set(plot.model, plot.model.height);
-      plot.model.height = Math.round(flatter * plot.model.height);
+      plot.model.height = Math.round((plots(view).length > 2 ? 0.75 : flatter) * plot.model.height);
     }
     await later(300);
     fitAll();
@@ -155,6 +189,7 @@
   }
   function freeze() {
     thaw();
+    dressAll(false);
     for (const [figure, view] of roots) {
       const { width, height } = view.bbox;
       if (!width) continue;
@@ -164,6 +199,7 @@
       drawing.classList.add("printed"); drawing.setAttribute("aria-hidden", "true");
       figure.querySelector(".drawing").after(drawing);
     }
+    dressAll(dark.matches);
   }
   const thaw = () => document.querySelectorAll("svg.printed").forEach((drawing) => drawing.remove());
   window.addEventListener("beforeprint", () => { if (!document.documentElement.classList.contains("paper")) freeze(); });

@@ -9,6 +9,7 @@ import pytest
 from fusion.campaign.config import CampaignError, ThermalTestTable
 from fusion.pipeline.iso230_3 import evaluate_record_test, read_thermal_tests
 from fusion.report.sheet import describe_thermal_sheet, write_thermal_tests
+from fusion.report.thermal_test import describe_thermal_tests
 from fusion.results.store import file_sha256
 from tests.fusion.record_tables import runs_table, table_of
 
@@ -35,6 +36,9 @@ def test_ranges_tilt_and_temperature_of_a_record():
     (test,) = evaluate_record_test(table(), stated)
     assert (test.kind, test.run) == ("spindle", "")
     first, second, tilted = test.distortions
+    (told,) = describe_thermal_tests([test])
+    units = {row.cells[0]: row.cells[2].split()[1:] for row in told["budget"].rows if row.cells[2] != "\u2013"}
+    assert units == {"ch1": ["µm"], "ch2": ["µm"], "B (ch1, ch2)": ["µm/m"]}
     assert (first.name, second.name, tilted.name) == ("ch1", "ch2", "B (ch1, ch2)")
     warm = 1.0 - np.exp(-1.0)
     for one, whole in ((first, 20.0), (second, 35.0), (tilted, 100.0)):

@@ -50,7 +50,7 @@ def test_results_without_products_still_make_a_page():
     results = assemble("A", PARTS, [])
     told = describe_campaign(results, ORIGIN, {}, None)
     assert told["verdict"] == "explained"
-    assert told["anomalies"][0]["title"] == "Position 3, both approaches: scatter of the structure"
+    assert told["anomalies"][0]["title"] == "Position 3, both approaches: mechanical scatter"
     assert told["iso230"]["axis"].rows[-2].cells[0] == "Reversal error B"
     assert told["positions"] is None and told["correlation"] is None
     page = "".join(
@@ -106,6 +106,25 @@ def test_every_mode_region_and_part_of_the_drift_has_its_row(parts):
     assert region_words("hotspot 12") == "disc about hotspot 12" and region_words("hotspot plate") == "hotspot plate"
 
 
+def test_a_further_mode_is_named_with_the_part_of_the_drift_that_it_explains(parts):
+    fused, results = parts
+    found = correlation_of(results)
+    leading, other = found.modes[0], found.modes[1]
+    given = {
+        name: part.model_copy(update={"p_given_leading_mode": p, "p_value": 0.5})
+        for (name, part), p in zip(other.parts.items(), (0.9, 0.03, 0.004, 0.6), strict=True)
+    }
+    adding = found.model_copy(
+        update={
+            "verdict": "attributable",
+            "source": found.source.model_copy(update={"kind": "mode", "name": leading.name.removeprefix("mode ")}),
+            "modes": (leading, other.model_copy(update={"parts": given})),
+        }
+    )
+    page = page_of(fused, results.model_copy(update={"correlation": adding}))
+    assert "for the drift of the reversal, p = 0.004)" in page and "significant conditional on the leading mode" in page
+
+
 def test_two_sessions_decide_what_is_a_cause(parts):
     fused, results = parts
     attributable = correlation_of(results).model_copy(update={"verdict": "attributable"})
@@ -156,7 +175,7 @@ def test_steps_start_with_the_declared_model_and_a_doubt_has_its_reason():
     assert added.marked
     told = "sudden step or new zero: 30 min after the start (at least 28 min), shape flat (or linear)"
     assert added.cells[1:3] == [told, "0.001"]
-    assert added.cells[3:6] == ["0.60 -> 0.40", "0.70 -> 0.50", "yes"]
+    assert added.cells[3:6] == ["0.60 → 0.40", "0.70 → 0.50", "yes"]
     assert added.cells[-1] == "dead path of the laser (log-likelihood lower by 4.0)"
     doubted = LOOP.steps[0].model_copy(update={"confirmed": False, "doubt": "0.4 µm without it, 0.5 µm with it"})
     _, added = model_section.steps_table(LOOP.model_copy(update={"steps": (doubted,)})).rows
@@ -179,7 +198,7 @@ def test_the_model_and_its_errors_are_told_in_numbers():
     rows = dict(model_section.describe_model(LOOP))
     assert rows["expansion of the axis"] == "11.60 \u00b1 0.40 ppm/K (prior 11.7 \u00b1 4.0 ppm/K)"
     assert rows["sudden step or new zero"] == "1.00 \u00b1 0.20 \u00b5m"
-    unexplained = rows["unexplained drift"]
+    unexplained = rows["random drift beside the effects"]
     assert unexplained.startswith("random walk: 0.10 \u00b5m rms common") and "below 0.001 \u00b5m" in unexplained
     assert rows["not tried: dead path of the laser"] == "no air"
     assert "extra test on the held-out cycles" not in rows
@@ -190,11 +209,14 @@ def test_candidates_evidence_and_errors_are_told_with_their_numbers():
     assert row.cells == ["1", "sudden step or new zero", "", "9.0", "8.0", "0.01", "4.0", "0.01"]
     told = model_section.describe_evidence(RESULTS.anomalies[0].evidence)
     assert told["stands_out"] == "extra scatter of 0.30 \u00b5m"
-    assert ("step held out / in log-likelihood", "0") in told["numbers"] and ("step cycle", "12") in told["numbers"]
+    assert ("step, gain in log-likelihood on the other approach", "0") in told["numbers"] and (
+        "step, cycle",
+        "12",
+    ) in told["numbers"]
     assert (told["support"], told["against"], told["check"]) == (("a",), ("b",), "c")
     step = LOOP.steps[0].model_copy(update={"rmse_before_um": 1.938, "rmse_after_um": 0.4643})
     rows = model_section.steps_table(LOOP.model_copy(update={"rmse_declared_um": 1.938, "steps": (step,)})).rows
-    assert [row.cells[3] for row in rows] == ["1.94", "1.94 -> 0.46"]
+    assert [row.cells[3] for row in rows] == ["1.94", "1.94 → 0.46"]
 
 
 def test_every_coefficient_has_a_name_of_its_own():

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import math
 import re
 import shutil
@@ -13,8 +14,9 @@ import xarray as xr
 from playwright.sync_api import sync_playwright
 
 from fusion.campaign.recompensation import ROTARY_BUDGET
-from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test
+from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, files_of_run, read_test
 from fusion.report.campaign import describe_iso230
+from fusion.report.conclusions import sharpen
 from fusion.report.page import PageFileError
 from fusion.report.sheet import (
     describe_sheet,
@@ -190,6 +192,59 @@ def test_the_budget_of_one_approach_has_its_own_quantities():
     assert iso230_tables(found, dataset, title="A")[2].columns[3].header == "A\u2193 / \u00b5m"
 
 
+def test_a_test_from_one_side_says_so_and_has_no_empty_rows_or_columns():
+    x = X.copy()
+    x[:, 1] = np.nan
+    part, dataset = evaluated(x)
+    told = describe_iso230(part, dataset)
+    assert told["missing"] == "Approached from one side only (\u2191). No reading of the window is missing."
+    assert [row.cells[0][-2:] for row in told["axis"].rows] == ["A\u2191", "R\u2191", "E\u2191"]
+    assert not [row for row in told["positions"].rows if "\u2013" in row.cells]
+    x[2, 0, 4] = np.nan
+    assert (
+        "1 of 35 readings of the window are missing: cycle 3, target 5\u2191"
+        in describe_iso230(*evaluated(x))["missing"]
+    )
+
+
+def test_a_value_without_uncertainty_has_no_sign_for_it_and_negative_places_a_minus():
+    part, dataset = evaluated(X[:1])
+    assert sheet_of("A", part).values.titles[1] == "Value / \u00b5m"
+    assert sheet_of("A", evaluated(X)[0]).values.titles[1] == "Value \u00b1 U (k = 2) / \u00b5m"
+    moved = dataset.assign_coords(position=dataset["position"] - 20.0)
+    assert describe_iso230(part, moved)["positions"].rows[0].cells[1] == "\u221220"
+
+
+def test_beside_a_sheet_the_terminal_shows_the_axis_alone(test_sheet):
+    (alone,) = iso230_tables(*test_sheet, title="A", axis_alone=True)
+    assert alone.row_count == 5 and len(iso230_tables(*test_sheet, title="A")) == 3
+
+
+def test_the_scatter_without_drift_stands_beside_two_windows_alone(part):
+    readings, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
+    dataset = joined(readings, drift=estimate_drift(readings))
+    told = describe_iso230(part, dataset)
+    assert told["scatter_um"] == pytest.approx(float(estimate_drift(readings)["scatter"].median()))
+    alone = part.model_copy(update={"settled": part.first})
+    assert describe_iso230(alone, dataset)["scatter_um"] is None
+
+
+def test_more_cycles_are_named_where_scatter_is_the_largest_term():
+    found = sharpen(evaluated(20.0 * X)[0])
+    assert found.contributor == "sampling" and found.cycles == 20 and not found.line
+    (part, _) = evaluated(20.0 * X)
+    terms = {one.contributor: one.A_um or 0.0 for one in part.settled.contributions}
+    halved = {name: u / 2 if name in ("sampling", "extremes") else u for name, u in terms.items()}
+    assert found.sharper_um == pytest.approx(2 * math.hypot(*halved.values()), rel=1e-6)
+    assert "20 cycles of the axis in the same thermal state would give U(A) of about" in say("sharper", found)
+
+
+def test_a_coefficient_without_a_value_is_asked_for_in_words(part):
+    nameless = part.model_copy(update={"conditions": ()})
+    found = sharpen(nameless)
+    assert found is not None and found.line == "the expansion coefficient with its uncertainty, 0.3 ppm/K"
+
+
 @pytest.fixture(scope="module")
 def part():
     deviations, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
@@ -259,6 +314,28 @@ def test_the_demo_states_everything_that_a_sheet_asks_for(stated):
     decisions = {row.cells[0]: row.cells[2:] for row in sheet.values.rows}
     assert decisions["Bidirectional positioning accuracy A"][0] == "20"
     assert decisions["Reversal error B"] == ["–", "no tolerance stated"]
+
+
+def test_the_sheet_of_results_holds_the_hash_of_what_was_measured(results_folder):
+    test = read_test(results_folder, None)
+    origin = json.loads((results_folder / "provenance.json").read_text(encoding="utf-8"))
+    laser = origin["parameters"]["interferometry"]["deviations"]
+    assert test.files[laser] == origin["inputs"][laser]["sha256"]
+    assert test.files["results.json"] == origin["products"]["results.json"]["sha256"]
+    assert not [name for name in test.files if name.startswith("thermal")]
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        "[]",
+        '{"inputs": {"laser.csv": -1}, "parameters": {"interferometry": {"deviations": "laser.csv"}}}',
+        '{"parameters": 5}',
+    ],
+)
+def test_damaged_provenance_names_no_measured_file(damaged, tmp_path):
+    (tmp_path / "provenance.json").write_text(damaged)
+    assert files_of_run(tmp_path) == {}
 
 
 @pytest.mark.chain

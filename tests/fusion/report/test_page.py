@@ -169,6 +169,27 @@ def test_it_is_made_anew_from_its_products(made_anew, report, tmp_path):
             report_of(tmp_path)
 
 
+def test_charts_follow_a_dark_page_and_paper_is_white(opened):
+    """Lines turn by a filter, which no export sees; the frame of a map by its colours, which paper must not keep."""
+    page, _ = opened
+    page.wait_for_function("document.documentElement.dataset.charts == 'drawn'")
+    looks = """() => {
+      const map = [...Bokeh.index.roots].find((one) => one.model.name === "plan").model;
+      const line = document.querySelector("#figure-drift .drawing"), plain = (colour) => colour?.value ?? colour;
+      return [getComputedStyle(line).filter, plain(map.below[0].axis_label_text_color), plain(map.border_fill_color)].join();
+    }"""
+    night, day = "invert(0.9) hue-rotate(180deg),#e7ecee,", "none,#1f2a30,#ffffff"
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_function(f"({looks})() === '{night}'")
+    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    drawn = page.locator("#figure-thermal_map svg.printed").evaluate("part => part.outerHTML")
+    assert "#1f2a30" in drawn and "#e7ecee" not in drawn
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert page.evaluate(looks) == night
+    page.emulate_media(color_scheme="light")
+    page.wait_for_function(f"({looks})() === '{day}'")
+
+
 def test_it_prints(opened):
     page, _ = opened
     assert page.pdf(format="A4").startswith(b"%PDF")

@@ -14,7 +14,8 @@ def test_the_findings_of_a_run_in_a_few_rows():
     assert "A = 1.00 \u00b1 0.20 \u00b5m" in rows["how much"]
     assert rows["where"].startswith("Position 3 repeats worse than the others")
     assert all(
-        part in rows["added"] for part in ("step_event (p = 0.001)", "0.60 -> 0.40 \u00b5m", "0.70 -> 0.50 \u00b5m")
+        part in rows["added"]
+        for part in ("step_event (p = 0.001)", "from 0.60 to 0.40 \u00b5m", "from 0.70 to 0.50 \u00b5m")
     )
     assert rows["held-out error"] == "0.60 [0.50 to 0.70] -> 0.40 [0.35 to 0.46] \u00b5m"
     assert rows["plain predictions"].endswith("ridge regression with lagged copies 0.50 \u00b5m")

@@ -23,7 +23,7 @@ from fusion.results.loop import (
     StepPart,
     Unexplained,
 )
-from fusion.results.parts import AreaPart, InputsPart, Quantity, TimePart
+from fusion.results.parts import AreaPart, InputsPart, Iso230Tolerance, Quantity, TimePart
 from fusion.results.results import AnomalyPart, CorrelationPart, Iso230Part, Notice, RecordLoop, Results, assemble
 from tests.fusion.results_sample import PARTS
 
@@ -45,6 +45,7 @@ def test_a_value_has_the_digits_of_its_uncertainty(value, u, text):
 
 
 def test_numbers_probabilities_and_times_are_printed_as_a_reader_expects_them():
+    assert (numbers.exact(-20.0), numbers.exact(12.5), numbers.place(-3.0, None)) == ("−20", "12.5", "x −3 mm, y – mm")
     assert numbers.p_cell(0.0004) == "< 0.001" and numbers.p_cell(0.0123) == "0.012" and numbers.p_cell(None) == "–"
     assert numbers.duration(90) == "90 s" and numbers.duration(1800) == "30 min" and numbers.duration(25200) == "7.0 h"
     assert numbers.join(["a", "b", "c"]) == "a, b and c" and numbers.join(["a"]) == "a" and numbers.join([]) == ""
@@ -88,6 +89,11 @@ def test_what_a_doubt_touches_is_conditional_and_several_are_named_or_counted():
     assert wording.untouched(two) == "" == wording.untouched(None)
 
 
+def test_every_number_of_a_diagnosis_has_its_words():
+    assert set(wording.EVIDENCE) == set(Evidence.model_fields) - {"kind", "support", "against", "check"}
+    assert not [words for words in wording.EVIDENCE.values() if "_" in words]
+
+
 def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
     told = wording.parameters({"follows": "warm_up", "time_constant_min": 30.0})
     assert told == "follows warm up, time constant 30.0 min"
@@ -122,7 +128,9 @@ def test_a_step_has_both_pairs_of_errors():
         rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
     )
     told = wording.say("step_errors", step)
-    assert "held-out error 0.60 -> 0.70 \u00b5m" in told and told.endswith("from the others 0.50 -> 0.40 \u00b5m")
+    assert "held-out error from 0.60 to 0.70 \u00b5m" in told and told.endswith(
+        "from the others: from 0.50 to 0.40 \u00b5m"
+    )
     late = wording.say("step_errors", step.model_copy(update={"rmse_after_um": None}))
     assert late.startswith("found after the hold-out was opened") and "0.60" not in late
 
@@ -206,7 +214,12 @@ def test_every_verdict_has_its_statement(found, stated):
     [
         (
             {},
-            ["cycles 49 to 60 falls from 1.94 to 0.66 µm", "gives 2.50 µm,", "is 0.42 µm", "others: 0.57 -> 0.45 µm."],
+            [
+                "cycles 49 to 60 falls from 1.94 to 0.66 µm",
+                "gives 2.50 µm,",
+                "is 0.42 µm",
+                "others: from 0.57 to 0.45 µm.",
+            ],
         ),
         (
             {"rmse_declared_um": 0.733, "rmse_final_um": 0.737, "rmse_persistence_um": 0.41},
@@ -234,7 +247,7 @@ def test_a_record_repeats_values_and_predicts_blocks_of_time():
         "the last value",
         "noise of a block mean",
         "blocks of time",
-        "ch2 (3.0 -> 3.2 µm).",
+        "ch2 (from 3.0 to 3.2 µm).",
     )
     assert all(part in stated for part in parts), stated
     # The error rate of a name in a record is larger than its p-value.
@@ -256,6 +269,49 @@ def test_nothing_is_not_said_to_remain_beside_an_effect_that_is_contradicted():
     told = dict(answers.conclude(results(loop("unexplained", struck))))
     assert "0.40 µm rms, has no name: contradicted" in told["What remains"] and "Nothing" not in told["What remains"]
     assert "refractive index" not in answers.headline(results(loop("unexplained", struck)))
+
+
+def test_the_headline_names_the_positions_that_stand_out_in_place_of_nothing_else():
+    (anomaly,) = assemble("A", PARTS, []).anomalies or ()
+    model = loop("explained", step("dead_path"))
+    one = anomaly.model_copy(update={"position_mm": -40.0})
+    others = [one.model_copy(update={"target": target, "position_mm": 0.0}) for target in (9, 7, 5)]
+    assert say("why", results(model, anomalies=())).endswith("Nothing else detected.")
+    told = say("why", results(model, anomalies=(one,)))
+    assert "Nothing" not in told and told.endswith(" dead path. Position 3 (−40 mm) repeats worse than the others.")
+    assert say("why", results(loop("no_skill"), anomalies=(one,))).endswith("repeats worse than the others.")
+    several = say("why", results(model, anomalies=(*others[:2], one, one)))
+    assert several.endswith("Positions 3, 7 and 9 stand out from the others.")
+    assert say("why", results(model, anomalies=(one, *others))).endswith("4 positions stand out from the others.")
+    left = say("what_remains", results(loop("complete"), anomalies=(one,)))
+    assert left.endswith("0.42 µm, except that position 3 (−40 mm) repeats worse than the others.")
+    assert say("what_remains", results(loop("complete"), anomalies=())).endswith("0.42 µm.")
+
+
+def axis_of(a_um: float, m_um: float, decision: str) -> Iso230Part:
+    """A test of five cycles by its values alone, R 55 µm with U 13 µm."""
+    values = {"A": a_um, "R": 55.0, "B": 33.0, "M": m_um, "E": 100.0}
+    told = {f"{name}_um": Quantity(value=value, u=6.5) for name, value in values.items()}
+    judged = Iso230Tolerance.model_construct(quantity="A", decision=decision)
+    return Iso230Part.model_construct(**told, unit="um", window="cycles 1 to 5", tolerances=(judged,), checks=())
+
+
+def test_an_axis_that_fails_by_its_mean_deviation_is_to_be_compensated_first():
+    late = (Notice("times", "No times.", "Export the times."),)
+    first, second = next_steps(results(None, iso230=axis_of(135.0, 94.0, "fail"), warnings=late))
+    assert first.startswith("Load a compensation table from thermofuse export (--format csv)") and second.startswith(
+        "Exp"
+    )
+    assert answers.in_brief(first) == "Load a compensation table from thermofuse export: A would become about 55 µm."
+    assert next_steps(results(None, iso230=axis_of(135.0, 94.0, "fail"))) == [first]
+    # What repeats badly is not compensated, what passes need not be, what is not judged may be.
+    for axis in (axis_of(135.0, 40.0, "fail"), axis_of(135.0, 94.0, "pass")):
+        assert next_steps(results(None, iso230=axis, warnings=late)) == [second]
+    assert next_steps(results(None, iso230=axis_of(135.0, 94.0, "not decided"), warnings=late)) == [second, first]
+    # Nor is a profile that holds drift without a cause.
+    for verdict, advised in (("explained", True), ("partial", False)):
+        steps = next_steps(results(loop(verdict), iso230=axis_of(135.0, 94.0, "fail")))
+        assert any(one.startswith("Load a compensation table") for one in steps) == advised
 
 
 def test_a_position_has_one_sentence_with_the_cause_of_its_most_significant_finding():
@@ -403,7 +459,7 @@ def test_an_action_names_the_time_or_the_load():
 
 
 def test_the_model_comes_first_and_what_asks_for_nothing_is_left_out():
-    evidence = Evidence.model_construct(check="Inspect the guide.")
+    evidence = Evidence.model_construct(check="Inspect the guide at this position.")
     found = results(
         loop("partial", step("dead_path"), shape="a wave of 37 min"),
         anomalies=(AnomalyPart.model_construct(target=3, position_mm=40.0, evidence=evidence),),
@@ -412,7 +468,7 @@ def test_the_model_comes_first_and_what_asks_for_nothing_is_left_out():
     first, second, third, last = next_steps(found)
     assert first == effect_words("dead_path").remedy
     assert "(a wave of 37 min)" in second
-    assert third == "Position 3 (40 mm): Inspect the guide." and last == "Start the camera earlier."
+    assert third == "Inspect the guide at position 3 (40 mm)." and last == "Start the camera earlier."
     (nothing,) = next_steps(results(loop("complete")))
     assert nothing.startswith("Nothing has to be done")
 

@@ -47,6 +47,12 @@ def test_too_few_targets_and_equal_spacings_are_told():
     deviations["deviation"][2, 1, 3] = np.nan
     assert found(deviations)["completeness"].evidence == "1 of 50 readings of the window are missing."
     assert check_conditions(deviations, cycles=[1, 2, 3])[3].met is False
+    deviations["deviation"][:, 1] = np.nan
+    one_side = found(deviations)["completeness"]
+    assert not one_side.met and one_side.evidence == "The targets were approached from one side only."
+    assert "too few" in found(deviations)["settled"].evidence
+    deviations["time"][:] = np.datetime64("NaT", "ns")
+    assert "Without times" in found(deviations)["settled"].evidence
 
 
 @pytest.mark.parametrize(("t95_s", "met"), [(1000.0, True), (1400.0, False)])

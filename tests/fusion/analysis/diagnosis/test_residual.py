@@ -134,7 +134,7 @@ def test_the_leading_pattern_has_its_largest_site_at_one():
         (np.arange(40.0) + 3.0 * np.cos(np.arange(40.0)), "slow growth or decay"),
         (
             np.resize([1.0, 1.0, -1.0, -1.0, -1.0, 1.0, -1.0], 40),
-            "irregular, 21 changes of side over 40 cycles (switching or wandering)",
+            "irregular, with 21 changes of sign in 40 cycles",
         ),
         (np.ones(40), "course in time not determined"),
         (np.arange(7.0), "course in time not determined"),

@@ -112,7 +112,7 @@ def test_a_card_says_why_shows_the_field_and_chooses_the_position(marked):
     selection = Selection(cycle=2, target=1)
     (card,) = anomaly_cards(marked, selection)
     told = texts([card])
-    assert "Position 3, both approaches: scatter of the structure" in told
+    assert "Position 3, both approaches: mechanical scatter" in told
     assert "What to inspect: c" in told and "in cycle 2:" in told
     assert not any("<b>bold" in str(pane.object) for pane in card.select(pn.pane.HTML))
     (field,) = card.select(pn.pane.Bokeh)

@@ -202,6 +202,17 @@ def test_line_and_hotspots_are_drawn_whole(fields):
     assert f"in cycle {int(fields['cycle'][-1])} the rise is" in chart.seen
 
 
+def test_a_target_that_stands_out_is_ringed_where_it_is(fields):
+    plain, _ = thermal_map.plot_thermal_map(fields)
+    chart, _ = thermal_map.plot_thermal_map(fields, standing_out={3, 99})
+    added = chart.figure.renderers[len(plain.figure.renderers) :]
+    marks = [one.data_source.data for one in added if type(one.glyph).__name__ == "Scatter"]
+    (rings,) = {(float(data["x"][0]), float(data["y"][0])) for data in marks}
+    target = fields.sel(target=3)
+    assert rings == (float(target["target_x"]), float(target["target_y"]))
+    assert "position 3 is ringed" in chart.seen and "ringed" not in plain.seen
+
+
 def test_a_long_recording_is_thinned_and_says_so(fields, monkeypatch):
     maps = fields.drop_dims(["time"])
     long = xr.concat([maps, maps.assign_coords(cycle=maps["cycle"] + 24)], "cycle", data_vars="minimal")

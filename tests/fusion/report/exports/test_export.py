@@ -309,7 +309,7 @@ def test_a_sound_run_has_no_objection(verdict):
     found = results(loop=loop(verdict=verdict))
     assert objections(found) == []
     (remark,) = remarks(found)
-    assert remark.startswith("position 3, both approaches, stands out (scatter of the structure, scatter 0.70 um)")
+    assert remark.startswith("position 3, both approaches, stands out (mechanical scatter, scatter 0.70 um)")
 
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained", "no_skill"])
