@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import logging
 import secrets
+import tomllib
 import webbrowser
 from collections.abc import Callable
 from functools import partial
@@ -28,7 +30,7 @@ from tornado.ioloop import IOLoop
 from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
-from fusion.app.parts import PathError, ReportHandler, State, note, state_of, switched
+from fusion.app.parts import PathError, ReportHandler, State, note, schedule_update, state_of, switched
 from fusion.app.runs import RUNS
 from fusion.common import FusionError
 
@@ -176,6 +178,31 @@ SCREENS = {
 }
 
 
+#: Screens that need no data.
+_ALWAYS = ("Set up", "Run")
+
+
+def offered(state: State) -> list[str]:
+    """Return the screens that have something to show: results, two of them to compare, a test of camera or laser to follow."""
+    from fusion.app.compare import find_results
+
+    finished, _ = find_results(state.root)
+    there = {
+        "Results": bool(finished) or state.results is not None,
+        "Compare": len(finished) > 1,
+        "Live": state.campaign is not None and _can_be_followed(state.campaign),
+    }
+    return [name for name in SCREENS if there.get(name, name in _ALWAYS)]
+
+
+def _can_be_followed(campaign: Path) -> bool:
+    """Tell whether a campaign file names an instrument whose files may still grow."""
+    try:
+        return not {"interferometry", "thermography"}.isdisjoint(tomllib.loads(campaign.read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        return False
+
+
 def _screen(name: str, state: State) -> Viewable:
     """Build a screen, which shows the state of the page, and changes it."""
     module, function = SCREENS[name]
@@ -195,8 +222,20 @@ def build_page(root: Path) -> Any:
     state = state_of(root)
     builders = {name: partial(_screen, name, state) for name in SCREENS}
     bar, content = switched("Screens", builders, next(iter(SCREENS)))
+    bar.options = list(_ALWAYS)
+
+    def go(screen: str) -> None:
+        shown = {*bar.options, screen}
+        bar.param.update(options=[name for name in SCREENS if name in shown], value=screen)
+
+    async def offer(*events: object) -> None:
+        shown = {*await asyncio.to_thread(offered, state), bar.value}
+        schedule_update(lambda: bar.param.update(options=[name for name in SCREENS if name in shown]))
+
     bar.param.watch(lambda event: state.param.update(screen=event.new), "value")
-    state.param.watch(lambda event: bar.param.update(value=event.new), "screen")
+    state.param.watch(lambda event: go(event.new), "screen")
+    # What the folder holds is looked for when the first screen stands.
+    state.param.watch(offer, ["looked", "campaign", "results"])
     page = pn.Template((_TEMPLATES / "page.html.j2").read_text(encoding="utf-8"), design=Look)
     page.add_variable("style", (_TEMPLATES / "page.css").read_text(encoding="utf-8"))
     page.add_variable("watched", (_TEMPLATES / "page.js").read_text(encoding="utf-8"))

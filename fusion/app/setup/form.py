@@ -147,8 +147,8 @@ def is_picture(campaign: CampaignText) -> bool:
     return campaign.value("plan", "registration") == "pixels" or campaign.value("plan") is None
 
 
-#: Tables that only hold together with keys that the file does not have yet.
-_WITH_OTHERS = ("plan.axis", "record.header_rows", "record.long", "drivers.header_rows")
+#: Tables that only hold together with keys that the file does not have yet, or that the files of FLIR cameras do not need.
+_WITH_OTHERS = ("plan.axis", "thermography.stack", "record.header_rows", "record.long", "drivers.header_rows")
 
 
 def _is_there(name: str, field: Field, campaign: CampaignText) -> bool:
@@ -211,6 +211,8 @@ def write_fields(campaign: CampaignText, texts: Mapping[str, str]) -> CampaignTe
     """Write the fields that were changed."""
     fields = form_fields(campaign, texts)
     values: dict[tuple[str, ...], Any] = {}
+    place: dict[Any, Any]
+    key: str | tuple[str, ...]
     rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     wrong = []
     for name, typed in texts.items():
@@ -354,7 +356,7 @@ class Form:
             others = {name: fields[name] for name in names if name not in first}
             if first:
                 group = [self._widget(name, fields[name], texts[name]) for name in first]
-                parts += [heading(title, level=3), pn.FlexBox(*group)]
+                parts += [heading(title, level=3), _side_by_side(*group)]
             if others:
                 parts.append(
                     self._folded(f"{title}: {counted(len(others), 'more field' if first else 'field')}", others, texts)
@@ -377,8 +379,8 @@ class Form:
             line = next(places)
             named = {_name(one): one for one in (field._replace(line=line) for field in of_row)}
             widgets = [self._widget(name, one, texts.get(name, ""), width=210) for name, one in named.items()]
-            remove = pn.widgets.Button(label="Remove", align="end")
-            row = column(heading("", level=4), pn.FlexBox(*widgets, remove))
+            remove = pn.widgets.Button(label="Remove")
+            row = column(heading("", level=4), _side_by_side(*widgets, remove))
 
             def take_away(event: object) -> None:
                 # What is written in no field of a row is taken out of the file.
@@ -401,7 +403,7 @@ class Form:
 
         def unfold(event: object) -> None:
             if not card.objects:
-                card[:] = [pn.FlexBox(*(self._widget(name, field, texts[name]) for name, field in fields.items()))]
+                card[:] = [_side_by_side(*(self._widget(name, field, texts[name]) for name, field in fields.items()))]
 
         card.param.watch(unfold, "collapsed")
         return card
@@ -425,6 +427,11 @@ class Form:
         """Write texts into fields, where the campaign file has them."""
         for name in texts.keys() & self._widgets.keys():
             self._widgets[name].value = texts[name]
+
+
+def _side_by_side(*widgets: pn.widgets.Widget) -> pn.FlexBox:
+    """Return fields whose boxes are in line, however many lines their labels take."""
+    return pn.FlexBox(*widgets, align_items="flex-end")
 
 
 def _is_marked(campaign: CampaignText, field: Field) -> bool:

@@ -75,13 +75,13 @@ def test_every_chart_has_ink_in_both_themes_and_sizes(app, flagged, new_page):
     charts_have_ink(3)
     open_part("Live")
     page.get_by_text("Example, not measured").wait_for()
-    charts_have_ink(2)
+    charts_have_ink(3)
     open_part("Results")
     page.get_by_label("Results folder").fill(str(flagged))
     page.get_by_label("Results folder").press("Enter")
     open_part("Open")
     for part, least, shown in (
-        ("Map", 1, "Cycle 24 ("), ("Laser", 5, "Readings at"), ("Positions", 1, "Rise within"), ("Loop", 1, "Round 1"),
+        ("Map", 1, "Cycle 24 ("), ("Laser", 5, "Readings at"), ("Positions", 1, "Rise within"), ("Cause", 1, "Round 1"),
     ):  # fmt: skip
         open_part(part)
         page.get_by_text(shown).first.wait_for()

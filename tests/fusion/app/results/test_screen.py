@@ -63,7 +63,7 @@ def test_places_are_added_by_keyboard_and_by_click(page):
 
 
 def test_the_loop_and_the_positions_say_what_was_found(page):
-    opened(page, "Loop")
+    opened(page, "Cause")
     page.get_by_role("heading", name="Round 1").wait_for()
     page.get_by_text("What the final model leaves").first.wait_for()
     opened(page, "Positions")

@@ -279,13 +279,17 @@ def test_the_form_speaks_of_what_was_measured_with_its_units(copied, record, tmp
 
 
 def test_lists_and_numbers_are_written_as_such_and_words_in_place_of_numbers_refused(copied):
-    texts = {"model.declared": "table_offset", "thermography.stack.scale": "0.5", "interferometry.compensation": "redo"}
+    texts = {
+        "model.declared": "table_offset",
+        "thermography.camera_scale_u": "0.5",
+        "interferometry.compensation": "redo",
+    }
     campaign = write_fields(open_campaign(copied), texts)
     assert campaign.value("model", "declared") == ["table_offset"]
-    assert campaign.value("thermography", "stack", "scale") == 0.5
+    assert campaign.value("thermography", "camera_scale_u") == 0.5
     assert campaign.value("interferometry", "compensation") == "redo"
-    with pytest.raises(FieldError, match=r"Temperature of one count: .*no number"):
-        write_fields(campaign, {"thermography.stack.scale": "half"})
+    with pytest.raises(FieldError, match=r"Standard uncertainty of the camera, as a share.*no number"):
+        write_fields(campaign, {"thermography.camera_scale_u": "half"})
 
 
 def test_every_file_of_a_campaign_has_a_row(campaign_folder):
