@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+import os
 import secrets
+import threading
 import tomllib
 import webbrowser
 from collections.abc import Callable
@@ -250,6 +252,13 @@ _LARGEST_MESSAGE = 12 * 1024 * 1024
 _ADDRESS = "127.0.0.1"
 
 
+#: What the first screen reads a folder with: it is loaded while the browser starts.
+AHEAD = (
+    "fusion.app.setup.screen", "fusion.campaign.config", "interferometry.io.readings", "dask.array", "fusion.campaign.logs",
+    "fusion.results.results",
+)  # fmt: skip
+
+
 class MissingExtraError(FusionError):
     """The application was asked for without the packages that it needs."""
 
@@ -263,8 +272,11 @@ def serve(root: Path, *, port: int = 0, open_browser: bool = False, say: Callabl
     if not root.is_dir():
         raise PathError(f"{root}: no such folder; name the folder that holds the files of the measurement")
     server, address = build_server(root, port=port)
+    # Sheets in Word are drawn in a thread, where no window may open.
+    os.environ.setdefault("MPLBACKEND", "agg")
     server.start()
     say(address)
+    threading.Thread(target=lambda: [import_module(name) for name in AHEAD], daemon=True).start()
     if open_browser:
         webbrowser.open(address)
     try:

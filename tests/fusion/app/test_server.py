@@ -3,6 +3,8 @@
 import importlib.util
 import shutil
 import socket
+import subprocess
+import sys
 from urllib.parse import urlsplit
 
 import pytest
@@ -140,6 +142,18 @@ def test_screens_are_offered_for_which_there_are_data(tmp_path):
         campaign.write_text(f"[{table}]\n")
         state.campaign = campaign
         assert ("Live" in offered(state)) is followed
+
+
+def test_what_a_folder_is_recognised_with_is_loaded_while_the_browser_starts(campaign_folder):
+    code = (
+        "import sys, pathlib, importlib; from fusion.app.server import AHEAD\n"
+        "for name in AHEAD: importlib.import_module(name)\n"
+        "from fusion.app.setup.folder import found_in_folder; before = set(sys.modules)\n"
+        "found_in_folder(pathlib.Path(sys.argv[1])); print(*sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, campaign_folder], capture_output=True, text=True, check=True)
+    late = {name.partition(".")[0] for name in done.stdout.split()}
+    assert not late & {"pandas", "xarray", "dask", "scipy", "pydantic", "panel", "cv2"}, done.stdout
 
 
 def test_credentials_are_long_and_new_for_every_server():
