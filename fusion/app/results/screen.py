@@ -19,7 +19,7 @@ from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.conclusions import first_screen
-from fusion.report.page import print_pdf, report_of
+from fusion.report.page import ProductsError, print_pdf, report_of
 from fusion.report.sheet import describe_sheet, describe_thermal_sheet, write_iso230, write_thermal_tests
 from fusion.report.wording import say
 from fusion.results.store import write_atomically
@@ -115,8 +115,10 @@ def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
     report = button("Report as PDF", "report.pdf", lambda out: print_pdf(report_of(folder), out))
     results = products.results
     write = _write_sheet if results.iso230 is not None else _write_thermal_sheet if results.iso230_3 else None
-    sheets = {"PDF": "sheet.pdf", "Word": "sheet.docx"} if write is not None else {}
-    made = [button(f"Test sheet to sign ({kind})", name, partial(write, folder)) for kind, name in sheets.items()]
+    made = []
+    if write is not None:
+        sheets = {"PDF": "sheet.pdf", "Word": "sheet.docx"}
+        made = [button(f"Test sheet to sign ({kind})", name, partial(write, folder)) for kind, name in sheets.items()]
     return ui.column(pn.FlexBox(*made, report), told)
 
 
@@ -138,6 +140,9 @@ def _write_sheet(results: Path, out: Path) -> None:
 def _write_thermal_sheet(results: Path, out: Path) -> None:
     """Write the sheets of a test by ISO 230-3."""
     title, tests, files = read_thermal_tests(results)
+    if not all(one.conditions for one in tests):
+        told = "these results are of an earlier version and do not say whose test it was; run the campaign again"
+        raise ProductsError(f"{results}: {told}, finished stages are kept")
     version = versions()["thermofuse"]
     sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
     write_thermal_tests(out, sheets, tests)

@@ -185,7 +185,7 @@ def form_fields(campaign: CampaignText, names: Iterable[str] = ()) -> dict[str, 
     return found
 
 
-def _rows(campaign: CampaignText, table: tuple[str, ...]) -> list[dict[str, Any]]:
+def _rows(campaign: CampaignText, table: tuple[str, ...]) -> list[dict[Any, Any]]:
     """Return the rows of a list of tables, or of tables by name, whose names are values of theirs."""
     found = campaign.value(*table) or []
     if isinstance(found, dict):
@@ -210,10 +210,8 @@ def _value(campaign: CampaignText, field: Field) -> Any:
 def write_fields(campaign: CampaignText, texts: Mapping[str, str]) -> CampaignText:
     """Write the fields that were changed."""
     fields = form_fields(campaign, texts)
-    values: dict[tuple[str, ...], Any] = {}
-    place: dict[Any, Any]
-    key: str | tuple[str, ...]
-    rows: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    values: dict[Any, Any] = {}
+    rows: dict[tuple[str, ...], list[dict[Any, Any]]] = {}
     wrong = []
     for name, typed in texts.items():
         field, text = fields[name], typed.strip()
@@ -225,11 +223,13 @@ def write_fields(campaign: CampaignText, texts: Mapping[str, str]) -> CampaignTe
             wrong.append(f"{field.label}: {error}")
             continue
         if field.line is None:
-            place, key, present = values, (*field.table, field.key), campaign.value(*field.table, field.key)
+            place, present = values, campaign.value(*field.table, field.key)
+            key: Any = (*field.table, field.key)
         else:
             lines = rows.setdefault(field.table, _rows(campaign, field.table))
             lines += [{} for _ in range(field.line + 1 - len(lines))]
-            place, key, present = lines[field.line], field.key, lines[field.line].get(field.key)
+            place, key = lines[field.line], field.key
+            present = place.get(key)
         if field.item is not None:
             items = place.get(key) or [one or TO_FILL for one in _items(present, field.items)]
             items[field.item] = value or TO_FILL

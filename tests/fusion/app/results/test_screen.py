@@ -12,10 +12,13 @@ import panel as pn
 import pytest
 
 from fusion.app.results.data import Products
-from fusion.app.results.screen import _outcome, _pictures, _put, _write_sheet
+from fusion.app.results.screen import _outcome, _pictures, _put, _write_sheet, _write_thermal_sheet
 from fusion.pipeline.draft import Asker, write_campaign
+from fusion.pipeline.iso230_3 import StatedTests
 from fusion.pipeline.run import run_campaign
+from fusion.report.page import ProductsError
 from fusion.results.store import file_sha256
+from fusion.results.thermal_test import ThermalTest
 from tests.fusion.app.texts import texts
 
 
@@ -60,6 +63,9 @@ def test_a_sheet_in_word_is_written_and_replaced_whole(products, tmp_path):
         _put(out, partial(_write_sheet, products.folder))
         assert "Accuracy and repeatability" in ZipFile(out).read("word/document.xml").decode()
 
+    _write_thermal_sheet(products.folder, tmp_path / "thermal.docx")
+    assert "Thermal effects by ISO 230-3" in ZipFile(tmp_path / "thermal.docx").read("word/document.xml").decode()
+
     def failing(path):
         path.write_bytes(b"half")
         raise OSError("disk full")
@@ -68,6 +74,14 @@ def test_a_sheet_in_word_is_written_and_replaced_whole(products, tmp_path):
     with pytest.raises(OSError, match="disk full"):
         _put(out, failing)
     assert out.read_bytes() == before
+
+
+def test_a_sheet_that_could_not_say_whose_test_it_was_is_not_written(tmp_path, monkeypatch):
+    nameless = StatedTests("T", (ThermalTest.model_construct(conditions=()),), {})
+    monkeypatch.setattr("fusion.app.results.screen.read_thermal_tests", lambda results: nameless)
+    with pytest.raises(ProductsError, match="do not say whose test it was; run the campaign again"):
+        _write_thermal_sheet(tmp_path, tmp_path / "sheet.docx")
+    assert not list(tmp_path.iterdir())
 
 
 def opened(page, part):
@@ -126,7 +140,7 @@ def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app
 
 def test_the_sheet_is_written_in_word_by_a_click_and_handed_over(page, app, ask, cookie):
     name_folder(page, app[1] / "results")
-    page.get_by_text("Small campaign").first.wait_for()
+    page.get_by_text("Small campaign", exact=True).wait_for()
     page.get_by_role("button", name="Test sheet to sign (Word)").press("Enter")
     page.get_by_role("link", name="Save sheet.docx").wait_for()
     answer = ask(app[0], "/report/results/sheet.docx", Cookie=cookie)
