@@ -139,6 +139,7 @@ def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app
 
 
 def test_the_sheet_is_written_in_word_by_a_click_and_handed_over(page, app, ask, cookie):
+    opened(page, "Results")
     name_folder(page, app[1] / "results")
     page.get_by_text("Small campaign", exact=True).wait_for()
     page.get_by_role("button", name="Test sheet to sign (Word)").press("Enter")
