@@ -49,6 +49,21 @@ PLACES = """all => all.map((one) => {
 
 
 @pytest.mark.browser
+def test_drop_zone_menus_and_number_fields_are_seen_on_a_dark_page(app, new_page):
+    page = new_page(app[0], width=1400, color_scheme="dark")
+    page.get_by_text("12 fiducials agree").wait_for()
+
+    def shot(part) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(part.screenshot())).convert("L"), int)
+
+    zone = shot(page.locator(".filepond--root").first)
+    assert np.median(zone) < 60 and zone.max() > 150, "dark, with its words"
+    for field in (page.get_by_label("Fiducial", exact=True), page.get_by_label("x on the plan (mm)").first):
+        arrow = shot(field)[6:-6, -24:-4]
+        assert np.median(arrow) < 60 and arrow.max() > 150, "a light arrow on a dark field"
+
+
+@pytest.mark.browser
 def test_every_chart_has_ink_in_both_themes_and_sizes(app, flagged, new_page):
     page = new_page(app[0], width=1400, color_scheme="light")
     page.get_by_text("12 fiducials agree").wait_for()
