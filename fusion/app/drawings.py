@@ -9,6 +9,7 @@ from bokeh.models import CustomJS, Range1d
 from bokeh.plotting import figure
 
 from fusion.report.charts.style import new_figure
+from interferometry.plots import INK
 
 #: First and last value of an axis as it is drawn; a descending pair turns it round.
 Ends: TypeAlias = tuple[float, float]
@@ -32,6 +33,12 @@ def scaled_drawing(x: Ends, y: Ends, *, x_name: str, y_name: str, width_px: int)
     drawn = keep_scale(new_figure(x=x_name, y=y_name), x, y)
     drawn.update(max_width=width_px)
     return drawn
+
+
+def add_cross(drawn: figure, x: float, y: float) -> None:
+    """Mark a place by a cross, dark on light, which is seen on any colour and on a dark page."""
+    for colour, size, width in (("#ffffff", 20, 6), (INK, 18, 2.5)):
+        drawn.scatter([x], [y], marker="cross", size=size, line_color=colour, line_width=width)
 
 
 def shown_drawing(drawn: figure) -> pn.pane.Bokeh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.watch import Enough, LiveState, follow
-from fusion.report.charts.style import CATEGORIES, Chart, Courses, add_series, new_figure, palette, span_words
+from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, palette, span_words
 from fusion.report.numbers import number
 from fusion.results.progress import counted
 from interferometry.plots import ACCENT, INK, MUTED
@@ -128,24 +129,33 @@ def plot_field(course: Course) -> Chart | None:
 
 
 def plot_course(course: Course) -> Chart | None:
-    """Draw drift and rise over the cycles."""
-    if not course.cycle:
-        return None
-    cycle, told = np.array(course.cycle, float), []
-    series = (
-        ("drift, mean of the targets / µm", course.mean_drift_um, CATEGORIES[0], "circle"),
-        ("drift at the last target / µm", course.far_drift_um, CATEGORIES[1], "square"),
-        ("rise of the table / K", course.rise_K, ACCENT, "triangle"),
-    )
-    drawn = new_figure(x="cycle", y="since the first cycle / µm or K", legend_columns=1, zero=True)
-    columns: dict[str, np.ndarray] = {"cycle": cycle}
-    for name, values, colour, marker in series:
+    """Draw the drift over the cycles."""
+    series = {
+        "mean of the targets": (course.mean_drift_um, CATEGORIES[0], "circle"),
+        "at the last target": (course.far_drift_um, CATEGORIES[1], "square"),
+    }
+    return _since_first(course, "drift", "µm", series)
+
+
+def plot_rise(course: Course) -> Chart | None:
+    """Draw the rise of the table over the cycles."""
+    return _since_first(course, "rise of the table", "K", {"mean": (course.rise_K, ACCENT, "triangle")})
+
+
+def _since_first(
+    course: Course, quantity: str, unit: str, series: Mapping[str, tuple[Sequence[float], str, str]]
+) -> Chart | None:
+    """Draw lines of one quantity since the first cycle; None where no value is known."""
+    cycle = np.array(course.cycle, float)
+    drawn = new_figure(x="cycle", y=f"{quantity} / {unit}", legend_columns=1, zero=True)
+    courses = Courses(drawn, {"cycle": cycle})
+    for name, (values, colour, marker) in series.items():
         line = np.array(values, float)
         if np.isfinite(line).any():
-            add_series(drawn, cycle, line, name=name, colour=colour, marker=marker)
-            columns[name] = line
-            told.append(f"{name.partition(' /')[0]} {span_words(line, name.rpartition('/ ')[2])}")
-    return Chart(drawn, f"{len(course.cycle)} cycles: {'; '.join(told) or 'no value yet'}.", columns)
+            looks = {"seen": span_words(line, unit), "colour": colour, "marker": marker}
+            courses.add(cycle, line, name, heading=f"{quantity}, {name} / {unit}", **looks)
+    told = f"{counted(cycle.size, 'cycle')}, {quantity}"
+    return courses.chart(told) if len(courses.columns) > 1 else None
 
 
 def plot_standard(course: Course) -> Chart | None:
@@ -179,7 +189,8 @@ def example_course() -> Course:
 
 
 _INTERVAL_MS = 1000
-_DRIFTS = "Drift of the readings and rise of the table since the first cycle."
+_DRIFTS = "Drift of the readings since the first cycle."
+_RISE = "Rise of the table since the first cycle."
 _STANDARD = "By ISO 230-2, the last five cycles after every cycle."
 
 
@@ -198,7 +209,8 @@ class LiveScreen:
         self._end = pn.widgets.Button(label="Stop following", disabled=True)
         example = example_course()
         told = "Example, not measured: the charts that are drawn here while a test runs, with the latest field of the camera above them."
-        charts = (*shown_if(plot_course(example), _DRIFTS), *shown_if(plot_standard(example), _STANDARD))
+        drawn = ((plot_course(example), _DRIFTS), (plot_rise(example), _RISE), (plot_standard(example), _STANDARD))
+        charts = [part for chart, caption in drawn for part in shown_if(chart, caption)]
         self._told, self._charts = ui.markup(""), ui.column(ui.paragraph(told, kind="warning"), *charts)
         self._start.on_click(self._on_start)
         self._end.on_click(lambda event: self.end())
@@ -243,6 +255,7 @@ class LiveScreen:
             *([ui.paragraph(session.fault, kind="fault")] if session.fault else []),
             *shown_if(plot_field(course), "Latest field, on the scale of all fields so far."),
             *shown_if(plot_course(course), _DRIFTS),
+            *shown_if(plot_rise(course), _RISE),
             *shown_if(plot_standard(course), _STANDARD),
         ]
         if course.warnings:

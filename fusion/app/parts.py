@@ -96,12 +96,13 @@ def link(text: str, address: str) -> pn.pane.HTML:
 
 
 def switched(
-    label: str, builders: Mapping[str, Callable[[], Any]], first: str
-) -> tuple[pn.widgets.RadioButtonGroup, pn.Column]:
-    """Return a bar of names, and the part that is chosen with it; each is built when it is first chosen."""
+    label: str, builders: Mapping[str, Callable[[], Any]], first: str, *, menu: bool = False
+) -> tuple[pn.widgets.RadioButtonGroup | pn.widgets.Select, pn.Column]:
+    """Return a bar or a menu of names, and the part that is chosen with it; each is built when it is first chosen."""
     built: dict[str, Any] = {}
     content = column()
-    bar = pn.widgets.RadioButtonGroup(label=label, options=list(builders), value=first, sizing_mode="stretch_width")
+    kind = pn.widgets.Select if menu else pn.widgets.RadioButtonGroup
+    bar = kind(label=label, options=list(builders), value=first, sizing_mode=None if menu else "stretch_width")
 
     def show(name: str) -> None:
         if name not in built:
@@ -166,7 +167,12 @@ def file_name(written: str) -> str:
 # The report of a run, as a page of the application.
 
 #: Files of a results folder that the application sends, with their types.
-_SENT = {"report.html": "text/html; charset=utf-8", "report.pdf": "application/pdf", "sheet.pdf": "application/pdf"}
+_SENT = {
+    "report.html": "text/html; charset=utf-8",
+    "report.pdf": "application/pdf",
+    "sheet.pdf": "application/pdf",
+    "sheet.docx": "application/vnd.openxmlformats-officedocument.wordprocessingml.document",
+}
 
 
 def report_link(root: Path, results: Path, name: str = "report.html") -> str:
@@ -192,7 +198,7 @@ class ReportHandler(RequestHandler):
             self.finish("404: there is no report in that folder\n")
             return
         self.set_header("Content-Type", _SENT[path.name])
-        if path.suffix == ".pdf":
+        if path.suffix != ".html":
             self.set_header("Content-Disposition", f'attachment; filename="{path.name}"')
         self.set_header("Cache-Control", "no-store")
         self.set_header(
@@ -207,13 +213,17 @@ class ReportHandler(RequestHandler):
 
 
 class State(param.Parameterized):
-    """Choices of one page, which a screen watches: nothing outside `root` is read or written; setting `screen` goes there."""
+    """Choices of one page, which a screen watches: nothing outside `root` is read or written; setting `screen` goes there.
+
+    ``looked`` counts how often a folder was looked into.
+    """
 
     root: Path = param.ClassSelector(class_=Path, constant=True)
     folder: Path | None = param.ClassSelector(class_=Path, default=None, allow_None=True)
     campaign: Path | None = param.ClassSelector(class_=Path, default=None, allow_None=True)
     results: Path | None = param.ClassSelector(class_=Path, default=None, allow_None=True)
     screen: str = param.String(default="")
+    looked: int = param.Integer(default=0)
 
 
 def state_of(root: Path) -> State:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import logging
+import os
 import secrets
+import threading
+import tomllib
 import webbrowser
 from collections.abc import Callable
 from functools import partial
@@ -28,7 +32,7 @@ from tornado.ioloop import IOLoop
 from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
-from fusion.app.parts import PathError, ReportHandler, State, note, state_of, switched
+from fusion.app.parts import PathError, ReportHandler, State, note, schedule_update, state_of, switched
 from fusion.app.runs import RUNS
 from fusion.common import FusionError
 
@@ -176,6 +180,31 @@ SCREENS = {
 }
 
 
+#: Screens that need no data.
+_ALWAYS = ("Set up", "Run")
+
+
+def offered(state: State) -> list[str]:
+    """Return the screens that have something to show: results, two of them to compare, a test of camera or laser to follow."""
+    from fusion.app.compare import find_results
+
+    finished, _ = find_results(state.root)
+    there = {
+        "Results": bool(finished) or state.results is not None,
+        "Compare": len(finished) > 1,
+        "Live": state.campaign is not None and _can_be_followed(state.campaign),
+    }
+    return [name for name in SCREENS if there.get(name, name in _ALWAYS)]
+
+
+def _can_be_followed(campaign: Path) -> bool:
+    """Tell whether a campaign file names an instrument whose files may still grow."""
+    try:
+        return not {"interferometry", "thermography"}.isdisjoint(tomllib.loads(campaign.read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        return False
+
+
 def _screen(name: str, state: State) -> Viewable:
     """Build a screen, which shows the state of the page, and changes it."""
     module, function = SCREENS[name]
@@ -195,8 +224,20 @@ def build_page(root: Path) -> Any:
     state = state_of(root)
     builders = {name: partial(_screen, name, state) for name in SCREENS}
     bar, content = switched("Screens", builders, next(iter(SCREENS)))
+    bar.options = list(_ALWAYS)
+
+    def go(screen: str) -> None:
+        shown = {*bar.options, screen}
+        bar.param.update(options=[name for name in SCREENS if name in shown], value=screen)
+
+    async def offer(*events: object) -> None:
+        shown = {*await asyncio.to_thread(offered, state), bar.value}
+        schedule_update(lambda: bar.param.update(options=[name for name in SCREENS if name in shown]))
+
     bar.param.watch(lambda event: state.param.update(screen=event.new), "value")
-    state.param.watch(lambda event: bar.param.update(value=event.new), "screen")
+    state.param.watch(lambda event: go(event.new), "screen")
+    # What the folder holds is looked for when the first screen stands.
+    state.param.watch(offer, ["looked", "campaign", "results"])
     page = pn.Template((_TEMPLATES / "page.html.j2").read_text(encoding="utf-8"), design=Look)
     page.add_variable("style", (_TEMPLATES / "page.css").read_text(encoding="utf-8"))
     page.add_variable("watched", (_TEMPLATES / "page.js").read_text(encoding="utf-8"))
@@ -209,6 +250,13 @@ def build_page(root: Path) -> Any:
 #: Largest message of a page: a chunk of an uploaded file with its frame.
 _LARGEST_MESSAGE = 12 * 1024 * 1024
 _ADDRESS = "127.0.0.1"
+
+
+#: What the first screen reads a folder with: it is loaded while the browser starts.
+AHEAD = (
+    "fusion.app.setup.screen", "fusion.campaign.config", "interferometry.io.readings", "dask.array", "fusion.campaign.logs",
+    "fusion.results.results",
+)  # fmt: skip
 
 
 class MissingExtraError(FusionError):
@@ -224,8 +272,11 @@ def serve(root: Path, *, port: int = 0, open_browser: bool = False, say: Callabl
     if not root.is_dir():
         raise PathError(f"{root}: no such folder; name the folder that holds the files of the measurement")
     server, address = build_server(root, port=port)
+    # Sheets in Word are drawn in a thread, where no window may open.
+    os.environ.setdefault("MPLBACKEND", "agg")
     server.start()
     say(address)
+    threading.Thread(target=lambda: [import_module(name) for name in AHEAD], daemon=True).start()
     if open_browser:
         webbrowser.open(address)
     try:

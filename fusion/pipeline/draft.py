@@ -109,6 +109,8 @@ _AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE 
 _HEADER = 4096
 
 
+#: The line that says whether the table moves in the frames.
+_STILL = 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
 #: What a sheet to sign states beside the machine, by its key under [report], as it is asked for; the same of an instrument.
 _SHEET = {
     "machine_serial_number": "Serial number of the machine",
@@ -124,6 +126,25 @@ _SHEET = {
     "sensor_places": "Places of the sensors",
 }
 _INSTRUMENT = {"serial_number": "Serial number of the instrument", "certificate": "Certificate of its calibration"}
+#: Tolerances of an axis with an example, and what each is of.
+_TOLERANCES = {
+    "A": ("20 um", "bidirectional accuracy"),
+    "R": ("10 um", "bidirectional repeatability"),
+    "E": ("15 um", "bidirectional systematic deviation"),
+    "M": ("10 um", "range of the mean bidirectional deviation"),
+    "B": ("5 um", "reversal"),
+    "A_unidirectional": ("15 um", "of either approach"),
+    "R_unidirectional": ("8 um", "of either approach"),
+    "E_unidirectional": ("12 um", "of either approach"),
+}
+#: Conditions of a positioning test that are asked for together: key under [report] and an example.
+_MOTION = {
+    "travel": ("axis_travel", "900 mm"),
+    "lead": ("screw_lead", "10 mm"),
+    "feed": ("feed", "5000 mm/min"),
+    "dwell": ("dwell", "3 s"),
+}
+_KINDS = ("not stated", "spindle", "environment", "linear axis", "rotary axis")
 
 
 class DraftError(FusionError):
@@ -232,15 +253,17 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
         yield from _axis(readings[0].path, asker)
     yield from _time_zone(readings, asker)
     if content.frames:
-        yield from _thermography(content, asker)
+        yield from _thermography(content, asker, along_axis=bool(readings))
         yield from _plan(content, asker, along_axis=bool(readings))
     if readings:
         yield from _interferometry(content, asker)
-        yield from _report(asker)
+        yield from _report(asker, linear=_attributes(readings[0].path).get("units") != "arcsec")
     if content.frames or readings:
         yield from _drivers(content)
     else:
         yield from _record(content, records, asker)
+        yield from _report(asker, linear=False)
+        yield from _thermal_test(asker)
 
 
 def unused_files(path: Path) -> list[str]:
@@ -286,25 +309,28 @@ def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
     yield f"time_zone = {_quoted(zone)}{doubt}"
 
 
-def _thermography(content: FolderContent, asker: Asker) -> Iterator[str]:
+def _thermography(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
     yield from ("", "[thermography]")
     yield f"frames = [{', '.join(_quoted(pattern) for pattern in content.frames)}]   # {counted(len(content.frame_files), 'file')}"
     if content.of_temperatures:
-        yield from _stack(content, asker)
+        yield from _stack(content, asker, along_axis=along_axis)
         return
-    emissivity = asker.text("Emissivity of the table, such as 0.95 or 0.95 +- 0.02; empty: as stored in the frames", "")
+    emissivity = asker.text(
+        "Emissivity of the surface, such as 0.95 or 0.95 +- 0.02; empty: as stored in the frames", ""
+    )
     example = '# emissivity = "0.95 +- 0.02"            # left out: as stored in the frames'
     yield f"emissivity = {_quoted(emissivity)}" if emissivity else example
     yield '# reflected_temperature = "22 degC"        # this and the next three: left out = as stored in the frames'
     yield '# atmospheric_temperature = "22 degC"'
     yield "# relative_humidity = 0.45"
     yield '# object_distance = "1.2 m"'
-    yield '# clock_offset = "0 s"                     # camera clock minus laser clock; 0 s where both follow one time server'
-    yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
+    if along_axis:
+        yield '# clock_offset = "0 s"                     # camera clock minus laser clock; 0 s where both follow one time server'
+        yield _STILL
     yield from _optional("lens", content, Kind.LENS)
 
 
-def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
+def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
     """Yield what files of temperatures do not hold themselves."""
     first = content.frame_files[0]
     reader = find_reader(first)
@@ -312,7 +338,7 @@ def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
     stored = StackOptions(scale=np.nextafter(1.0, 2.0))
     contents = reader.frame_contents(first, stored)
     yield '# camera_offset_u = "1 K"                  # accuracy in the camera\'s data sheet; left out = that of an uncooled camera'
-    yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
+    yield from [_STILL] if along_axis else []
     yield from _optional("lens", content, Kind.LENS)
     yield from ("", "[thermography.stack]                     # temperatures of another camera: docs/formats.md")
     values = reader.read_values(first, 0, stored)
@@ -435,25 +461,30 @@ def _attributes(path: Path) -> dict[str, str]:
         return {}
 
 
-def _report(asker: Asker) -> Iterator[str]:
-    """Yield the conditions that the ISO 230-2 page and compensation tables print."""
-    machine = asker.text("Machine, as the report names it; empty: nothing is stated for the sheet to sign", "").strip()
-    mark = "" if machine else "# "
-    tolerance = _tolerance(asker) if machine else ""
-    judged = "" if tolerance else "# "
-    yield from (
-        "",
-        f"{judged}[acceptance]                           # tolerances: A, R, E, M, B",
-        f'{judged}A = "{tolerance or "20 um"}"',
-    )
-    yield from (
-        "",
-        f"{mark}[report]                               # identity and conditions of the test, for the sheet to sign",
-    )
-    yield f"{mark}machine = {_quoted(machine or 'name of the machine')}"
+def _report(asker: Asker, *, linear: bool) -> Iterator[str]:
+    """Yield what the sheet to sign prints: machine, people and conditions, of a test along a linear axis its tolerances and motion too."""
+    motion = {}
+    if linear:
+        yield from _acceptance(asker)
+        asked = "Travel of the axis, lead of the screw, feed and dwell, such as"
+        units = {name: example.partition(" ")[2] for name, (_, example) in _MOTION.items()}
+        example = ", ".join(f"{name} {value}" for name, (_, value) in _MOTION.items())
+        motion = _by_name(asker, f"{asked} {example}; empty: not stated", units)
+    machine = asker.text("Machine; empty: the names on the sheet to sign stay to be filled in", "").strip()
+    mark = "" if machine or motion else "# "
+    yield ""
+    yield f"{mark}[report]                               # identity and conditions of the test, for the sheet to sign"
+    yield f"{'' if machine else '# '}machine = {_quoted(machine or 'name of the machine')}"
     for key, question in _SHEET.items():
         answer = asker.text(f"{question}; empty: not stated", "").strip() if machine else ""
         yield f"{key} = {_quoted(answer)}" if answer else f'# {key} = ""'
+    if linear:
+        for name, (key, example) in _MOTION.items():
+            yield f"{key} = {_quoted(motion[name])}" if name in motion else f"# {key} = {_quoted(example)}"
+        for of in ("air", "material"):
+            yield f'# {of}_temperature_before = "20.0 degC"    # left out: as logged'
+            yield f'# {of}_temperature_after = "20.0 degC"'
+    yield '# remarks = ""'
     name = asker.text("Instrument; empty: not stated", "").strip() if machine else ""
     mark = "" if name else "# "
     yield from ("", f"{mark}[[report.instrument]]", f"{mark}name = {_quoted(name or 'laser interferometer')}")
@@ -463,16 +494,48 @@ def _report(asker: Asker) -> Iterator[str]:
     yield _calibrated(asker) if name else "# calibrated = 2026-01-15"
 
 
-def _tolerance(asker: Asker) -> str:
-    """Return the tolerance of A with its unit, empty where there is none."""
-    while answer := asker.text("Tolerance of the bidirectional accuracy A, such as 20 um; empty: none", "").strip():
+def _acceptance(asker: Asker) -> Iterator[str]:
+    """Yield the tolerances of the axis."""
+    question = "Tolerances of the axis by ISO 230-2, such as A 20 um, R 10 um; empty: none"
+    stated = _by_name(asker, question, dict.fromkeys(_TOLERANCES, "um"))
+    yield from (
+        "",
+        f"{'' if stated else '# '}[acceptance]                           # tolerances: what has none is not judged",
+    )
+    for symbol, (example, of) in _TOLERANCES.items():
+        line = f"{symbol} = {_quoted(stated.get(symbol, example))}"
+        yield line if symbol in stated else f"# {line}   # {of}"
+
+
+def _by_name(asker: Asker, question: str, units: dict[str, str]) -> dict[str, str]:
+    """Return quantities that are answered by their names in one line, such as "A 20 um, R 10 um"."""
+    while answer := asker.text(question, "").strip():
+        pairs = [part.strip().replace("=", " ").partition(" ")[::2] for part in answer.split(",")]
+        found = {name: quantity.strip() for name, quantity in pairs}
         try:
-            read_quantity(answer, "um")
-        except QuantityError as error:
+            for name, quantity in found.items():
+                if name not in units:
+                    raise DraftError(f'"{name}" is none of {", ".join(units)}')
+                read_quantity(quantity, units[name])
+        except (DraftError, QuantityError) as error:
             asker.say(str(error))
             continue
-        return answer
-    return ""
+        return found
+    return {}
+
+
+def _thermal_test(asker: Asker) -> Iterator[str]:
+    """Yield what the sheet of ISO 230-3 needs to be told of a record."""
+    kind = asker.choice("What was tested by ISO 230-3", _KINDS)
+    mark = "# " if kind == _KINDS[0] else ""
+    yield from ("", f"{mark}[thermal_test]                         # test of thermal effects by ISO 230-3")
+    others = ", ".join(f'"{one}"' for one in _KINDS[2:])
+    yield f'# kind = "spindle"                       # or {others}' if mark else f"kind = {_quoted(kind)}"
+    yield '# sensor_calibration = "0.5 %"           # standard uncertainty of the sensitivity of the displacement sensors; left out: 1 %'
+    yield '# mounting_length = "100 mm"             # of what holds sensors and target; left out: its expansion is not in the uncertainty'
+    yield '# mounting_expansion = "11.7 ppm/K"'
+    yield "# [thermal_test.tilts]                   # two displacements of one direction whose difference is a tilt"
+    yield '# A = {channels = ["Y1", "Y2"], distance = "150 mm"}'
 
 
 def _calibrated(asker: Asker) -> str:

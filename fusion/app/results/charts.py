@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import panel as pn
@@ -13,7 +14,7 @@ from bokeh.models import ColorBar, ColumnDataSource, GlyphRenderer, HoverTool, L
 from bokeh.plotting import figure
 
 from fusion.app import parts as ui
-from fusion.app.drawings import keep_scale, shown_drawing
+from fusion.app.drawings import add_cross, keep_scale, shown_drawing
 from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Products, Selection
 from fusion.campaign.inputs import lacks_course
 from fusion.report.campaign import (
@@ -29,6 +30,7 @@ from fusion.report.charts.plan import (
     Extent,
     Layer,
     add_cells,
+    add_names,
     draw_map,
     draw_places,
     extent_of,
@@ -39,6 +41,7 @@ from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
 from fusion.report.conclusions import action, conclude, next_steps, step_phrase
 from fusion.report.numbers import join, moment, number, p_words, place
+from fusion.report.record import shown_channels
 from fusion.report.wording import (
     Table,
     anomaly_cause,
@@ -52,6 +55,7 @@ from fusion.report.wording import (
 )
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
+from fusion.results.parts import AreaPart
 from fusion.results.store import DamagedProductError, group, has
 from interferometry.plots import ACCENT, INK, hours_since_start
 
@@ -181,13 +185,41 @@ def loop_steps(products: Products, linker: Linker) -> ui.Parts:
     ]
     if isinstance(loop, RecordLoop):
         parts += [ui.heading("Steps", level=3), table_of(steps_table(loop), "Declared model and added effects")]
-        charts = {} if products.fusion is None else draw_record(products.fusion)
-        parts += [shown(chart, name.partition("_")[0].capitalize()) for name, chart in charts.items()]
+        parts += [] if products.fusion is None else record_charts(products.fusion)
     else:
         caption = "Coefficients, what was not tried and not admitted"
         numbers = ui.table(("Coefficient", "Value (k = 2)"), describe_model(loop), caption=caption)
         parts += [*_rounds(products, loop, linker), ui.heading("The model in numbers", level=3), numbers]
     return [*parts, ui.heading("What to do next", level=3), *(ui.paragraph(step) for step in next_steps(results)[:6])]
+
+
+#: Charts of a record and of each of its displacements, with what they show.
+_OF_RECORD = {
+    "temperatures": "Rise of every sensor; the four with the largest rise are named.",
+    "drivers": "Logged drivers of the machine's heat.",
+    "block_errors": "Errors of predicting every part of the record before and after this step.",
+}
+_OF_DISPLACEMENT = {
+    "prediction": "Measured and predicted. Shaded: held out, predicted without taking part in any fit.",
+    "residual": "Measured minus predicted.",
+    "contribution": "What each term of the final model contributes, about its mean.",
+}
+
+
+def record_charts(record: xr.Dataset) -> ui.Parts:
+    """Return the charts of a record, and those of the displacement that a menu chooses; first the one that moves most."""
+    charts = draw_record(record)
+
+    def of(channel: int) -> pn.viewable.Viewable:
+        drawn = {name: charts.get(f"{name}_{channel}") for name in _OF_DISPLACEMENT}
+        return ui.column(*(part for name, chart in drawn.items() for part in shown_if(chart, _OF_DISPLACEMENT[name])))
+
+    names = list(shown_channels(record))
+    moved = np.ptp(np.nan_to_num(record["displacement"].sel(channel=names).transpose("channel", ...).values), axis=1)
+    builders = {name: partial(of, k) for k, name in enumerate(names)}
+    menu, chosen = ui.switched("Displacement", builders, names[int(moved.argmax())], menu=True)
+    common = [(name, _OF_RECORD.get(re.sub(r"_\d+$", "", name))) for name in charts]
+    return [menu, chosen, *(shown(charts[name], caption) for name, caption in common if caption)]
 
 
 def _require_same_run(products: Products, loop: AxisLoop, stored: xr.Dataset) -> None:
@@ -297,8 +329,8 @@ class ThermalView:
     def view(self) -> pn.viewable.Viewable:
         """The map, its cycle, and the places over time."""
         legend = (
-            "A click on the map adds a place to the chart below. White line: the measured axis; ring: the chosen position; one colour "
-            "scale for all cycles."
+            "A click on the map adds a place to the chart below. White line: the measured axis; ring: the chosen position; white frame: "
+            "the area that the drift follows, where there is one; one colour scale for all cycles."
         )
         chart = shown_drawing(self._map)
         controls = pn.FlexBox(self._x, self._y, self._size, self._add)
@@ -332,6 +364,9 @@ class ThermalView:
         read = self._products.deviations
         position = None if read is None else read["position"]
         draw_places(drawn, fields, position, results.hotspots or (), results.sensors or ())
+        correlation = results.correlation
+        if correlation is not None and correlation.verdict == "attributable" and correlation.source.area is not None:
+            draw_followed(drawn, correlation.source.area)
         to_scale(drawn, extent_of(fields))
         draw_ring(drawn, self._chosen)
         square = {"marker": "square", "size": 11, "fill_color": "colour", "line_color": "#ffffff", "line_width": 1.5}
@@ -423,9 +458,21 @@ class ThermalView:
         self._history[:] = [shown_drawing(drawn), seen]
 
 
+def draw_followed(drawn: figure, area: AreaPart) -> None:
+    """Draw the area whose temperature the drift follows, dark under light, which reads on every colour."""
+    x = [area.x_low_mm, area.x_high_mm, area.x_high_mm, area.x_low_mm, area.x_low_mm]
+    y = [area.y_low_mm, area.y_low_mm, area.y_high_mm, area.y_high_mm, area.y_low_mm]
+    for colour, width in ((INK, 4), ("#ffffff", 1.6)):
+        drawn.line(x, y, line_color=colour, line_width=width)
+    place = {"y_offset": 2, "text_baseline": "top", "text_align": "center"}
+    add_names(drawn, [sum(x[:2]) / 2], [area.y_high_mm], ["the drift follows this"], **place)
+
+
 def to_scale(drawn: figure, extent: Extent) -> None:
     """Show the plan to scale with a margin, y downwards as the camera sees it."""
     left, right, bottom, top = extent
+    if left <= 0 <= right and bottom <= 0 <= top:
+        add_cross(drawn, 0.0, 0.0)
     margin = _MARGIN * max(right - left, top - bottom)
     keep_scale(drawn, (left - margin, right + margin), (top + margin, bottom - margin))
 

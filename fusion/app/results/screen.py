@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,10 +18,11 @@ from fusion.messages import BAD_INPUT
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
-from fusion.report.conclusions import headline
-from fusion.report.page import print_pdf, report_of
-from fusion.report.sheet import describe_sheet, describe_thermal_sheet, render_iso230, render_thermal_tests
+from fusion.report.conclusions import first_screen
+from fusion.report.page import ProductsError, print_pdf, report_of
+from fusion.report.sheet import describe_sheet, describe_thermal_sheet, write_iso230, write_thermal_tests
 from fusion.report.wording import say
+from fusion.results.store import write_atomically
 
 
 def results_screen(state: ui.State) -> pn.viewable.Viewable:
@@ -71,33 +73,38 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
         "Map": (products.fields is not None, lambda: [ThermalView(products, selection, linker).view]),
         "Laser": (read, lambda: laser_charts(products, selection, linker)),
         "Positions": (products.results.anomalies is not None, lambda: anomaly_cards(products, selection)),
-        "Loop": (products.results.loop is not None, lambda: loop_steps(products, linker)),
+        "Cause": (products.results.loop is not None, lambda: loop_steps(products, linker)),
     }
     shown = {name: build for name, (there, build) in builders.items() if there}
     parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in shown.items()}
     chooser, part = ui.switched("Part", parts, next(iter(parts)))
-    results, iso = products.results, products.results.iso230
-    lead = [ui.paragraph(results.campaign), *([ui.paragraph(say("decision", iso))] if iso else [])]
-    lead.append(ui.paragraph(headline(results)))
+    lead = [ui.paragraph(products.results.campaign), *_outcome(products)]
     if (products.folder / "report.html").is_file():
         lead.append(ui.link("Open the report", ui.report_link(state.root, products.folder)))
         lead.append(_printing(state, products))
     return [*lead, *_chosen(selection, targets), chooser, part]
 
 
-def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
-    """Buttons that print the test sheet, which is signed, and the report; then a link to the file."""
-    told = ui.column()
+def _outcome(products: Products) -> ui.Parts:
+    """What the report says before anything else."""
+    said = first_screen(products.results, {}, "", "")
+    kinds = {"open": "warning", "decision": "", "unmet": "warning", "cause": ""}
+    return [ui.paragraph(said[name], kind=kind) for name, kind in kinds.items() if said[name]]
 
-    def button(label: str, name: str, page: Callable[[Path], str]) -> pn.widgets.Button:
+
+def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
+    """Buttons that write the test sheet, which is signed, and print the report; then a link to the file."""
+    told, folder = ui.column(), products.folder
+
+    def button(label: str, name: str, write: Callable[[Path], object]) -> pn.widgets.Button:
         made = pn.widgets.Button(label=label)
 
         async def make(event: object) -> None:
             with ui.disabled_during(made):
-                ui.schedule_parts(told, [ui.note("Printing, which takes half a minute ...")])
+                ui.schedule_parts(told, [ui.note(f"Writing {name}, a PDF in half a minute ...")])
                 try:
-                    await asyncio.to_thread(lambda: print_pdf(page(products.folder), products.folder / name))
-                    link = ui.link(f"Save {name}", ui.report_link(state.root, products.folder, name))
+                    await asyncio.to_thread(_put, folder / name, write)
+                    link = ui.link(f"Save {name}", ui.report_link(state.root, folder, name))
                     ui.schedule_parts(told, [link])
                 except BAD_INPUT as error:
                     ui.schedule_parts(told, ui.faults(error))
@@ -105,26 +112,40 @@ def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
         made.on_click(make)
         return made
 
-    report = button("Report as PDF", "report.pdf", report_of)
-    of_test = _sheet if products.results.iso230 is not None else _thermal_sheet if products.results.iso230_3 else None
-    sheet = [] if of_test is None else [button("Test sheet to sign (PDF)", "sheet.pdf", of_test)]
-    return ui.column(pn.FlexBox(*sheet, report), told)
+    report = button("Report as PDF", "report.pdf", lambda out: print_pdf(report_of(folder), out))
+    results = products.results
+    write = _write_sheet if results.iso230 is not None else _write_thermal_sheet if results.iso230_3 else None
+    made = []
+    if write is not None:
+        sheets = {"PDF": "sheet.pdf", "Word": "sheet.docx"}
+        made = [button(f"Test sheet to sign ({kind})", name, partial(write, folder)) for kind, name in sheets.items()]
+    return ui.column(pn.FlexBox(*made, report), told)
 
 
-def _sheet(results: Path) -> str:
-    """Return the test sheet of a run by ISO 230-2 as a page."""
+def _put(out: Path, write: Callable[[Path], object]) -> None:
+    """Write a file in place of the one that is there, once it is whole."""
+    with tempfile.TemporaryDirectory() as apart:
+        whole = Path(apart) / out.name
+        write(whole)
+        write_atomically(out, lambda part: part.write_bytes(whole.read_bytes()))
+
+
+def _write_sheet(results: Path, out: Path) -> None:
+    """Write the test sheet of a run by ISO 230-2."""
     test = read_test(results, None)
     sheet = describe_sheet(test.title, test.part, files=test.files, version=versions()["thermofuse"])
-    return render_iso230(sheet, test.part, test.dataset, remarks=test.remarks)
+    write_iso230(out, sheet, test.part, test.dataset, remarks=test.remarks)
 
 
-def _thermal_sheet(results: Path) -> str:
-    """Return the sheets of a test by ISO 230-3 as a page."""
+def _write_thermal_sheet(results: Path, out: Path) -> None:
+    """Write the sheets of a test by ISO 230-3."""
     title, tests, files = read_thermal_tests(results)
+    if not all(one.conditions for one in tests):
+        told = "these results are of an earlier version and do not say whose test it was; run the campaign again"
+        raise ProductsError(f"{results}: {told}, finished stages are kept")
     version = versions()["thermofuse"]
-    return render_thermal_tests(
-        [describe_thermal_sheet(title, one, files=files, version=version) for one in tests], tests
-    )
+    sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
+    write_thermal_tests(out, sheets, tests)
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:
@@ -146,8 +167,24 @@ def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> ui.Parts:
 
 
 def _pictures(products: Products) -> ui.Parts:
-    """The hottest picture, the temperatures over time, and the difference of last and first."""
-    part = products.results.thermograms
-    assert products.thermograms is not None and part is not None
-    charts = draw_thermograms(products.thermograms, part.series)
-    return [pn.pane.Bokeh(chart.figure, sizing_mode="scale_width", max_width=820) for chart in charts.values()]
+    """The charts of the pictures of a camera alone, each with what it shows."""
+    part, thermograms = products.results.thermograms, products.thermograms
+    assert thermograms is not None and part is not None
+    hottest = thermograms.attrs["hottest"]
+    captions = {
+        "thermogram": f"{hottest}, the hottest picture. △ highest, ▽ lowest.",
+        "region_history": "Temperature over time, by the camera's clock.",
+        "profile": f"Temperature along the lines in {hottest}.",
+        "difference": "Last picture minus first.",
+        "histogram": f"How many pixels of {hottest} have which temperature.",
+    }
+    charts = draw_thermograms(thermograms, part.series)
+    return [
+        ui.column(
+            ui.heading(caption, level=3),
+            pn.pane.Bokeh(charts[name].figure, sizing_mode="scale_width", max_width=820),
+            ui.note(charts[name].seen),
+        )
+        for name, caption in captions.items()
+        if name in charts
+    ]

@@ -159,6 +159,8 @@ def _set(table: Any, name: str, value: object) -> None:
 
 def _without_marks(found: Any) -> Any:
     """Return a value with None in place of every mark of what has to be filled in."""
+    if isinstance(found, dict):
+        return {name: _without_marks(value) for name, value in found.items()}
     if isinstance(found, list):
         return [_without_marks(item) for item in found]
     return None if found == TO_FILL else found

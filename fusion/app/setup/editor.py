@@ -23,6 +23,7 @@ from fusion.app.setup.form import (
     is_picture,
     missing,
     read_direction,
+    with_unit,
     write_fields,
 )
 from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView, corners_of
@@ -153,7 +154,7 @@ class CampaignEditor:
     def _quantity(self, name: str, unit: str) -> float | None:
         """Return the quantity in a field; None where there is none."""
         try:
-            return read_quantity(self._form.texts.get(name, ""), unit)
+            return read_quantity(with_unit(self._form.texts.get(name, ""), unit), unit)
         except QuantityError:
             return None
 

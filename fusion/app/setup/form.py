@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import count
 from typing import Any, NamedTuple
 
 import panel as pn
 
 from fusion.app.parts import Parts, column, heading
 from fusion.app.setup.campaign import CampaignText
+from fusion.app.setup.labels import CHOICES, HINTS, LABELS, TITLES, UNITS
 from fusion.campaign.config import campaign_schema
 from fusion.campaign.values import read_quantity
 from fusion.common import FusionError
 from fusion.pipeline.draft import TO_FILL
+from fusion.report.numbers import print_unit
 from fusion.results.progress import counted
 
 #: Directions along the plan, as `thermofuse init` names them.
@@ -48,33 +51,34 @@ class Field(NamedTuple):
 
 
 _DIRECTION = "plan.axis.direction"
-#: Headings of the tables that are always shown with their keys; those of others are taken from the schema.
-_TITLES = {
-    "campaign": "Test", "thermography": "Camera", "plan": "Plan", "plan.axis": "Axis on the plan", "interferometry": "Laser",
-    "record": "Record", "acceptance": "Tolerances", "report": "Machine, people and conditions, as the report names them",
-    "report.instrument": "Instruments",
-}  # fmt: skip
-_AS_STORED, _SPINDLE = "as stored in the frames", "Spindle at axis position 0"
-#: What the schema does not say of the keys that nearly every test states; they stand first, all others of their table are folded below.
-_FIRST: dict[str, dict[str, Any]] = {
-    "campaign.title": {"label": "Title of the report", "needed": True},
-    "campaign.axis": {"label": "Axis that was measured", "hint": "X"},
-    "campaign.time_zone": {"label": "Time zone of times without one", "hint": "Europe/Vienna"},
-    "thermography.emissivity": {"label": "Emissivity of the table", "hint": _AS_STORED},
-    "thermography.reflected_temperature": {"hint": _AS_STORED},
-    "thermography.clock_offset": {"label": "Camera clock minus laser clock", "hint": "0 s"},
-    "thermography.table": {"label": "The table in the frames"},
-    "plan.size.0": {"label": "Width of the plan (x)", "hint": "700 mm", "needed": True},
-    "plan.size.1": {"label": "Height of the plan (y)", "hint": "180 mm", "needed": True},
-    "plan.cell_size": {"label": "Size of a cell of the field"},
-    "plan.axis.origin.0": {"label": f"{_SPINDLE}, x", "hint": "500 mm", "needed": True},
-    "plan.axis.origin.1": {"label": f"{_SPINDLE}, y", "hint": "90 mm", "needed": True},
-    _DIRECTION: {"label": "It moves, as the position grows", "hint": "left", "needed": True},
-    "interferometry.expansion_coefficient": {"hint": "11.7 +- 0.3 ppm/K"},
-    "interferometry.dead_path": {"label": "Dead path of the laser", "hint": "0 mm"},
-}
+#: Keys without which a campaign cannot run.
+_NEEDED = ("campaign.title", "plan.size.0", "plan.size.1", "plan.axis.origin.0", "plan.axis.origin.1", _DIRECTION)
+#: Keys that nearly every test states; they stand first, all others of their table are folded below.
+_FIRST = (
+    *_NEEDED, "campaign.axis", "campaign.time_zone", "thermography.emissivity", "thermography.reflected_temperature",
+    "thermography.clock_offset", "thermography.table", "plan.cell_size", "interferometry.expansion_coefficient",
+    "interferometry.dead_path", "thermal_test.kind", "thermal_test.sensor_calibration", "thermal_test.mounting_length",
+    "thermal_test.mounting_expansion",
+)  # fmt: skip
 #: Tables all of whose keys stand first: what a signed sheet names.
-_WHOLE = ("acceptance", "report", "report.instrument")
+_WHOLE = ("acceptance", "report")
+#: Tables with one row for each of several things: what one of them is called, and how many rows are shown where none is stated.
+_ROWS = {"report.instrument": ("Instrument", 1), "thermal_test.tilts": ("Tilt", 0)}
+_LASER, _RECORD = ("interferometry",), ("record",)
+#: Keys that say something only where one of these tables is there.
+_ONLY_WITH = {
+    **dict.fromkeys(("campaign.axis", "report.sign_convention", "report.warm_up", "report.machine_compensation"), _LASER + _RECORD),
+    **dict.fromkeys(("report.sensor_places", "thermal_test.kind"), _LASER + _RECORD),
+    **dict.fromkeys(("thermography.clock_offset", "thermography.table", "report.axis_travel", "report.screw_lead"), _LASER),
+    **dict.fromkeys(("report.feed", "report.dwell"), _LASER),
+    **dict.fromkeys(
+        [f"report.{of}_temperature_{when}" for of in ("air", "material") for when in ("before", "after")], _LASER
+    ),
+    **dict.fromkeys(("thermal_test.sensor_calibration", "thermal_test.mounting_length", "thermal_test.mounting_expansion"), _RECORD),
+    **dict.fromkeys([f"thermal_test.tilts.{key}" for key in ("name", "channels.0", "channels.1", "distance")], _RECORD),
+}  # fmt: skip
+#: A number without its unit, maybe with an uncertainty: the label names the unit.
+_BARE = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(\s*(\+-|±)\s*(\d+\.?\d*|\.\d+))?")
 
 
 @cache
@@ -82,7 +86,14 @@ def known_fields() -> dict[str, Field]:
     """Return a field for every key of a campaign file that holds text, a number or a list of texts, by its dotted name."""
     schema = campaign_schema()
     fields = {_name(field): field for field in _fields_of((), schema, schema["$defs"])}
-    return {name: field._replace(**_FIRST.get(name, {})) for name, field in fields.items()}
+    return {name: _labelled(name, field) for name, field in fields.items()}
+
+
+def _labelled(name: str, field: Field) -> Field:
+    """Return a field under its label, which names the unit of a quantity."""
+    label, unit = LABELS.get(name, field.label), UNITS.get(name, field.unit)
+    label += f" ({print_unit(unit)})" if unit else ""
+    return field._replace(label=label, unit=unit, hint=HINTS.get(name, field.hint), needed=name in _NEEDED)
 
 
 def _name(field: Field) -> str:
@@ -94,13 +105,14 @@ def _fields_of(table: tuple[str, ...], model: Mapping[str, Any], models: Mapping
     """Yield the fields of a table and of the tables in it."""
     for key, given in model["properties"].items():
         spec, optional = _resolved(given, models)
-        inner, _ = _resolved(spec.get("items") or {}, models)
+        inner, _ = _resolved(spec.get("items") or spec.get("additionalProperties") or {}, models)
         if "properties" in spec:
             yield from _fields_of((*table, key), spec, models)
         elif "properties" in inner:
-            keys = list(_fields_of((*table, key), inner, models))
-            # Tables of lists, such as the corners of a region, are drawn, not typed.
-            yield from keys if len(keys) == len(inner["properties"]) and {one.kind for one in keys} == {"text"} else ()
+            # Corners of a region are drawn, roles of columns are chosen beside their values.
+            if (named := ".".join((*table, key))) in _ROWS:
+                yield from [Field((*table, key), "name", "")] if "name" not in inner["properties"] else []
+                yield from _fields_of(tuple(named.split(".")), inner, models)
         elif ".".join((*table, key)) == _DIRECTION:
             yield Field(table, key, "")
         elif "prefixItems" in spec:
@@ -135,36 +147,50 @@ def is_picture(campaign: CampaignText) -> bool:
     return campaign.value("plan", "registration") == "pixels" or campaign.value("plan") is None
 
 
-#: Tables that only hold together with keys that the file does not have yet.
-_WITH_OTHERS = ("plan.axis", "record.header_rows", "record.long", "drivers.header_rows")
+#: Tables that only hold together with keys that the file does not have yet, or that the files of FLIR cameras do not need.
+_WITH_OTHERS = ("plan.axis", "thermography.stack", "record.header_rows", "record.long", "drivers.header_rows")
 
 
-def _is_there(table: tuple[str, ...], campaign: CampaignText) -> bool:
-    """Whether a campaign file has a table, or may be given it without more."""
-    top = table[0]
+def _is_there(name: str, field: Field, campaign: CampaignText) -> bool:
+    """Whether a campaign file has a table, or may be given it without more, and a key of it says something beside what was measured."""
+    table, top = field.table, field.table[0]
     if top == "plan" and is_picture(campaign):
         return False
-    if top == "acceptance":
-        return campaign.value("interferometry") is not None
-    if top in ("report", "accept") or campaign.value(*table) is not None:
+    if campaign.value(*table, field.key) is None and name in _ONLY_WITH:
+        return any(campaign.value(one) is not None for one in _ONLY_WITH[name])
+    if top in ("report", "accept", "thermal_test") or campaign.value(*table) is not None:
         return True
-    if top == "model":
+    if top in ("acceptance", "model"):
         return campaign.value("interferometry") is not None
     return len(table) > 1 and ".".join(table) not in _WITH_OTHERS and campaign.value(top) is not None
 
 
-def form_fields(campaign: CampaignText) -> dict[str, Field]:
-    """Return the fields of the tables that a campaign file has or may be given; of a list of tables those of every line and a new one."""
+def form_fields(campaign: CampaignText, names: Iterable[str] = ()) -> dict[str, Field]:
+    """Return the fields of the tables that a campaign file has or may be given; of a table with rows those of every row, a new one, and
+    as many as `names` of fields mean.
+    """
     found: dict[str, Field] = {}
     for name, field in known_fields().items():
-        if not _is_there(field.table, campaign):
+        if not _is_there(name, field, campaign):
             continue
-        if field.table == ("report", "instrument"):
-            lines = len(campaign.value(*field.table) or ()) + 1
-            found |= {_name(one): one for one in (field._replace(line=line) for line in range(lines))}
+        table = ".".join(field.table)
+        if table in _ROWS:
+            typed = [
+                int(one.removeprefix(f"{table}.").partition(".")[0]) for one in names if one.startswith(f"{table}.")
+            ]
+            count = max(len(_rows(campaign, field.table)), *typed, 0) + 1
+            found |= {_name(one): one for one in (field._replace(line=line) for line in range(count))}
         else:
             found[name] = field
     return found
+
+
+def _rows(campaign: CampaignText, table: tuple[str, ...]) -> list[dict[Any, Any]]:
+    """Return the rows of a list of tables, or of tables by name, whose names are values of theirs."""
+    found = campaign.value(*table) or []
+    if isinstance(found, dict):
+        return [{"name": name, **row} for name, row in found.items()]
+    return [dict(row) for row in found]
 
 
 def read_fields(campaign: CampaignText) -> dict[str, str]:
@@ -173,49 +199,57 @@ def read_fields(campaign: CampaignText) -> dict[str, str]:
 
 
 def _value(campaign: CampaignText, field: Field) -> Any:
-    if field.line is not None:
-        lines = campaign.value(*field.table) or []
-        return lines[field.line].get(field.key) if field.line < len(lines) else None
-    value = campaign.value(*field.table, field.key)
+    if field.line is None:
+        value = campaign.value(*field.table, field.key)
+    else:
+        rows = _rows(campaign, field.table)
+        value = rows[field.line].get(field.key) if field.line < len(rows) else None
     return value if field.item is None else _items(value, field.items)[field.item]
 
 
 def write_fields(campaign: CampaignText, texts: Mapping[str, str]) -> CampaignText:
     """Write the fields that were changed."""
-    fields, before = form_fields(campaign), read_fields(campaign)
-    values: dict[tuple[str, ...], Any] = {}
+    fields = form_fields(campaign, texts)
+    values: dict[Any, Any] = {}
+    rows: dict[tuple[str, ...], list[dict[Any, Any]]] = {}
     wrong = []
     for name, typed in texts.items():
         field, text = fields[name], typed.strip()
-        if text == before[name]:
+        if text == _shown(_value(campaign, field), field):
             continue
-        key = (*field.table, field.key)
         try:
             value = _written(text, field)
         except FusionError as error:
             wrong.append(f"{field.label}: {error}")
             continue
-        if field.line is not None:
-            lines = values.setdefault(field.table, [dict(one) for one in campaign.value(*field.table) or []])
+        if field.line is None:
+            place, present = values, campaign.value(*field.table, field.key)
+            key: Any = (*field.table, field.key)
+        else:
+            lines = rows.setdefault(field.table, _rows(campaign, field.table))
             lines += [{} for _ in range(field.line + 1 - len(lines))]
-            lines[field.line] = {**lines[field.line], field.key: value}
-            continue
+            place, key = lines[field.line], field.key
+            present = place.get(key)
         if field.item is not None:
-            items = values.get(key) or [one or TO_FILL for one in _items(campaign.value(*key), field.items)]
+            items = place.get(key) or [one or TO_FILL for one in _items(present, field.items)]
             items[field.item] = value or TO_FILL
             value = items if field.needed or set(items) != {TO_FILL} else None
-        values[key] = value
+        place[key] = value
     if wrong:
         raise FieldError("\n".join(wrong))
-    return campaign.with_values({key: _without_empty(value) for key, value in values.items()})
+    return campaign.with_values({**values, **{table: _table_of(table, lines) for table, lines in rows.items()}})
 
 
-def _without_empty(value: Any) -> Any:
-    """Return a list of tables without keys and tables in which nothing is written; other values as they are."""
-    if not (isinstance(value, list) and value and isinstance(value[0], dict)):
-        return value
-    kept = [{key: text for key, text in line.items() if text} for line in value]
-    return [line for line in kept if line] or None
+def _table_of(table: tuple[str, ...], rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Return rows as the campaign file holds them, without empty ones: a list of tables, or tables by name; None where nothing is left."""
+    kept = [{key: value for key, value in row.items() if value} for row in rows]
+    kept = [row for row in kept if row]
+    if ".".join(table) == "thermal_test.tilts":
+        names = [row.pop("name", "") for row in kept]
+        if "" in names or len(set(names)) < len(names):
+            raise FieldError("every tilt needs a name of its own")
+        return dict(zip(names, kept, strict=True)) or None
+    return kept or None
 
 
 def missing(campaign: CampaignText) -> list[str]:
@@ -277,9 +311,15 @@ def _written(text: str, field: Field) -> Any:
             # With an uncertainty or as a percentage it is text, which the check of the file reads.
             if not re.match(r"[+-]?\.?\d", text):
                 raise FieldError(f'"{text}" is no number; write digits, with a point before the decimals') from None
+    text = with_unit(text, field.unit)
     if field.unit and "+-" not in text and "±" not in text:
         read_quantity(text, field.unit)
     return text
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Return a quantity as it was typed; a number alone with the unit that its label names."""
+    return f"{text} {unit}" if unit and _BARE.fullmatch(text) else text
 
 
 # The fields as widgets.
@@ -305,34 +345,75 @@ class Form:
             tables.setdefault(".".join(field.table), []).append(name)
         parts: Parts = []
         for table, names in tables.items():
+            title = TITLES.get(table, table)
+            if table in _ROWS:
+                shown = [fields[name] for name in names]
+                parts += [heading(title, level=3), self._rows(table, shown, texts, _rows(campaign, shown[0].table))]
+                continue
             first = [name for name in names if name in _FIRST or table in _WHOLE]
             # A draft marks what has to be filled in: that is never folded.
             first += [name for name in names if name not in first and _is_marked(campaign, fields[name])]
             others = {name: fields[name] for name in names if name not in first}
             if first:
                 group = [self._widget(name, fields[name], texts[name]) for name in first]
-                parts += [heading(_TITLES.get(table, table), level=3), pn.FlexBox(*group)]
+                parts += [heading(title, level=3), _side_by_side(*group)]
             if others:
                 parts.append(
-                    self._folded(f"[{table}]: {counted(len(others), 'more key' if first else 'key')}", others, texts)
+                    self._folded(f"{title}: {counted(len(others), 'more field' if first else 'field')}", others, texts)
                 )
         self.view[:] = parts
+
+    def _rows(
+        self, table: str, fields: Sequence[Field], texts: Mapping[str, str], stated: Sequence[object]
+    ) -> pn.viewable.Viewable:
+        """Return the rows of a table one below another, each with its number and a button that removes it; the last button adds one."""
+        called, least = _ROWS[table]
+        of_row = [field for field in fields if field.line == 0]
+        below, places = column(), count()
+
+        def number() -> None:
+            for k, (title, *_) in enumerate(below, start=1):
+                title.object = f"<h4>{called} {k}</h4>"
+
+        def add(event: object = None) -> None:
+            line = next(places)
+            named = {_name(one): one for one in (field._replace(line=line) for field in of_row)}
+            widgets = [self._widget(name, one, texts.get(name, ""), width=210) for name, one in named.items()]
+            remove = pn.widgets.Button(label="Remove")
+            row = column(heading("", level=4), _side_by_side(*widgets, remove))
+
+            def take_away(event: object) -> None:
+                # What is written in no field of a row is taken out of the file.
+                self.write(dict.fromkeys(named, ""))
+                below.remove(row)
+                number()
+
+            remove.on_click(take_away)
+            below.append(row)
+            number()
+
+        for _ in range(max(len(stated), least)):
+            add()
+        button = pn.widgets.Button(label=f"Add {'an' if called[0] in 'AEIOU' else 'a'} {called.lower()}")
+        button.on_click(add)
+        return column(below, button)
 
     def _folded(self, title: str, fields: Mapping[str, Field], texts: Mapping[str, str]) -> pn.Card:
         card = pn.Card(title=title, collapsed=True, sizing_mode="stretch_width", margin=(4, 10))
 
         def unfold(event: object) -> None:
             if not card.objects:
-                card[:] = [pn.FlexBox(*(self._widget(name, field, texts[name]) for name, field in fields.items()))]
+                card[:] = [_side_by_side(*(self._widget(name, field, texts[name]) for name, field in fields.items()))]
 
         card.param.watch(unfold, "collapsed")
         return card
 
-    def _widget(self, name: str, field: Field, text: str) -> pn.widgets.Widget:
+    def _widget(self, name: str, field: Field, text: str, *, width: int = 250) -> pn.widgets.Widget:
         if field.options:
-            widget = pn.widgets.Select(label=field.label, options=list(field.options), value=text, width=250)
+            options = {CHOICES.get(one, one): one for one in field.options}
+            widget = pn.widgets.Select(label=field.label, options=options, value=text, width=width)
         else:
-            widget = pn.widgets.TextInput(label=field.label, value=text, placeholder=field.hint, width=250)
+            widget = pn.widgets.TextInput(label=field.label, value=text, placeholder=field.hint, width=width)
         widget.param.watch(lambda event: self._on_change(name), "value")
         self._widgets[name] = widget
         return widget
@@ -346,6 +427,11 @@ class Form:
         """Write texts into fields, where the campaign file has them."""
         for name in texts.keys() & self._widgets.keys():
             self._widgets[name].value = texts[name]
+
+
+def _side_by_side(*widgets: pn.widgets.Widget) -> pn.FlexBox:
+    """Return fields whose boxes are in line, however many lines their labels take."""
+    return pn.FlexBox(*widgets, align_items="flex-end")
 
 
 def _is_marked(campaign: CampaignText, field: Field) -> bool:

@@ -19,10 +19,11 @@ from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from fusion.app.drawings import scaled_drawing, shown_drawing
+from fusion.app.drawings import add_cross, scaled_drawing, shown_drawing
 from fusion.app.parts import column, heading, markup, note, paragraph_markup, table
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.common import FusionError
+from fusion.report.charts.plan import add_names
 from fusion.report.charts.style import add_colour_bar, add_hover
 from fusion.results.store import write_text
 from interferometry.plots import ACCENT, COLOURS, INK
@@ -380,6 +381,8 @@ class FrameView:
 
 
 _ORIGIN, _DIRECTION, _REGION = "Axis origin", "Axis direction", "Region"
+#: Free margin around the plan, as a share of its longer side.
+_ROOM = 0.02
 #: Cells of the thermogram on the plan, along its longer side.
 _CELLS = 280
 
@@ -453,9 +456,10 @@ class PlanView:
         self._axis.visible = not in_px
         if in_px:
             self._mode.value = _REGION
-        # The centre of the first pixel is (0, 0), the corner of a plan in mm too.
+        # The centre of the first pixel is (0, 0), the corner of a plan in mm too; its cross and the discs at its rim are seen whole.
         left = -0.5 if in_px else 0.0
-        ranges = (left, plan.width_mm + left), (plan.height_mm + left, left)
+        room = 0.0 if in_px else _ROOM * max(plan.width_mm, plan.height_mm)
+        ranges = (left - room, plan.width_mm + left + room), (plan.height_mm + left + room, left - room)
         # A tall plan stays as high as a screen.
         width_px = round(min(1100, 900 * plan.width_mm / plan.height_mm + 60))
         drawn = scaled_drawing(*ranges, x_name=f"x / {plan.unit}", y_name=f"y / {plan.unit}", width_px=width_px)
@@ -465,6 +469,11 @@ class PlanView:
                 add_thermogram(drawn, seen, (left, left), (plan.width_mm, plan.height_mm))
         x, y = [one.x_mm for one in placed.fiducials], [one.y_mm for one in placed.fiducials]
         drawn.scatter(x, y, marker="circle", size=9, line_color=TEAL, fill_alpha=0, line_width=2)
+        names = [one.name for one in placed.fiducials]
+        drawn.text(x, y, names, x_offset=7, y_offset=-4, text_color=TEAL, background_fill_alpha=0.75, **_LABEL)
+        if not in_px:
+            add_cross(drawn, 0.0, 0.0)
+            add_names(drawn, [0], [0], ["origin"], x_offset=6, y_offset=16)
         for name, corners in plan.regions:
             drawn.patch(*corners.T.tolist(), fill_color=ACCENT, fill_alpha=0.15, line_color=ACCENT, line_width=2)
             drawn.text(corners[:1, 0], corners[:1, 1], [name], text_color=ACCENT, **_LABEL)
@@ -497,7 +506,7 @@ def _draw_axis(drawn: Any, plan: Plan) -> None:
     if plan.origin_mm is None:
         return
     x, y = plan.origin_mm
-    drawn.scatter([x], [y], marker="cross", size=18, line_color=INK, line_width=3)
+    add_cross(drawn, x, y)
     targets = plan.targets_mm()
     if len(targets):
         drawn.scatter(*targets.T.tolist(), marker="circle", size=6, color=INK)

@@ -55,6 +55,7 @@ class SetUpScreen:
                 ui.schedule_update(lambda: self._show(opened))
             except BAD_INPUT as error:
                 ui.schedule_parts(self._found, [*found, ui.paragraph(str(error), kind="fault")])
+        ui.schedule_update(lambda: self._state.param.update(looked=self._state.looked + 1))
 
     def _show(self, opened: Opened) -> None:
         """Show the editor with what was read."""

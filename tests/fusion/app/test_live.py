@@ -13,6 +13,7 @@ from fusion.app.live import (
     enough_words,
     plot_course,
     plot_field,
+    plot_rise,
     plot_standard,
     standing,
 )
@@ -75,13 +76,14 @@ def test_a_campaign_file_that_cannot_be_used_is_refused(tmp_path):
 
 
 def test_charts_say_what_is_seen_and_nothing_is_drawn_before_a_cycle_is_finished():
-    assert plot_field(Course()) is None and plot_course(Course()) is None and plot_standard(Course()) is None
+    assert [plot(Course()) for plot in (plot_field, plot_course, plot_rise, plot_standard)] == [None] * 4
     course = Course()
     for number in (1, 2, 3):
         course.take(state_of(number))
-    field, drift, standard = plot_field(course), plot_course(course), plot_standard(course)
+    field, drift, rise, standard = (plot(course) for plot in (plot_field, plot_course, plot_rise, plot_standard))
     assert "in cycle 3: 20.00 to 20.00 °C" in field.seen
-    assert "3 cycles: drift, mean of the targets 1.50 to 4.50 µm" in drift.seen
+    assert "3 cycles, drift: mean of the targets 1.50 to 4.50 µm" in drift.seen
+    assert [chart.figure.yaxis.axis_label for chart in (drift, rise)] == ["drift / µm", "rise of the table / K"]
     assert standard.seen == "By ISO 230-2, cycles 1 to 2: A 4.00 µm."
 
 

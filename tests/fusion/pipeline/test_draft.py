@@ -1,13 +1,16 @@
 """Campaign files for folders: what the files tell, what is asked, and a check that says what is missing."""
 
 import os
+import re
 import shutil
+import tomllib
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fusion.campaign.config import load_campaign
+from fusion.campaign.config import campaign_schema, load_campaign
 from fusion.campaign.values import QuantityError
 from fusion.pipeline.check import check_campaign
 from fusion.pipeline.draft import Asker, DraftError, draft_lines, unused_files, write_campaign, write_campaigns
@@ -288,13 +291,14 @@ def test_nothing_is_asked_without_a_terminal_and_a_useless_answer_is_asked_again
     assert Asker(lambda question, default: "").quantity("Width", "mm") == '"FILL IN"'
 
 
-def test_whoever_names_the_machine_is_asked_for_the_sheet_to_sign_and_enter_skips(tmp_path):
+def test_the_sheet_to_sign_is_asked_for_in_few_questions_and_enter_skips(tmp_path):
     write_laser(tmp_path / "test", 6, 5)
     folder = tmp_path / "test"
     (folder / "campaign.toml").unlink()
     given = {
         "Machine": "Mill 900",
-        "Tolerance": ["20", "20 um"],
+        "Tolerance": ["20 um", "A 20 um, Q 3 um", "A 20 um, R 8", "A 20 um, R = 8 um"],
+        "Travel": "travel 900 mm, lead 10 mm, feed 6 m/min, dwell 3 s",
         "Operator": "J. Doe",
         "Number of the report": "17",
         "Instrument": "laser",
@@ -311,17 +315,60 @@ def test_whoever_names_the_machine_is_asked_for_the_sheet_to_sign_and_enter_skip
     path, missing = write_campaign(folder, Asker(ask, said.append))
     campaign = load_campaign(path)
     report, (instrument,) = campaign.report, campaign.report.instrument
-    assert missing == [] and campaign.acceptance.limits() == {"A": 20.0}
+    assert missing == [] and campaign.acceptance.limits() == {"A": 20.0, "R": 8.0}
+    assert (report.axis_travel_mm, report.screw_lead_mm, report.feed_mm_per_min, report.dwell_s) == (900, 10, 6000, 3)
     assert (report.machine, report.operator, report.report_number, report.customer) == ("Mill 900", "J. Doe", "17", "")
     assert (instrument.name, instrument.certificate, instrument.calibrated.isoformat()) == (
         "laser",
         "C-17",
         "2026-01-15",
     )
-    assert len(said) == 2  # a tolerance without unit, a day in another order
+    assert len(said) == 4  # no symbol, no quantity of the standard, no unit, a day in another order
 
+
+def test_tolerances_and_conditions_need_no_name_of_the_machine(tmp_path):
+    write_laser(tmp_path / "test", 6, 5)
+    (tmp_path / "test" / "campaign.toml").unlink()
+    given, asked = {"Tolerance": "B 5 um", "Travel": "lead 10 mm"}, []
+
+    def ask(question: str, default: str) -> str:
+        asked.append(question)
+        return next((answer for key, answer in given.items() if question.startswith(key)), default)
+
+    path, _ = write_campaign(tmp_path / "test", Asker(ask))
+    campaign = load_campaign(path)
+    assert campaign.acceptance.limits() == {"B": 5.0} and campaign.report.screw_lead_mm == 10.0
+    assert campaign.report.machine == "" and not [one for one in asked if one.startswith(("Operator", "Instrument"))]
+
+
+def uncommented(text: str) -> dict[str, Any]:
+    """Return what a drafted text says with its examples taken out of their comments."""
+    return tomllib.loads(re.sub("(?m)^# ", "", text))
+
+
+def test_every_key_that_a_sheet_prints_stands_in_the_draft_ready_to_be_uncommented(tmp_path):
+    write_laser(tmp_path / "test", 6, 5)
+    (tmp_path / "test" / "campaign.toml").unlink()
+    path, _ = write_campaign(tmp_path / "test", Asker(None))
+    text = path.read_text()
+    assert load_campaign(path).report.machine == "" and load_campaign(path).acceptance.limits() == {}
+    stated = uncommented(text[text.index("# [acceptance]") :])
+    schema = campaign_schema()["$defs"]
+    assert stated["acceptance"].keys() == schema["AcceptanceTable"]["properties"].keys()
+    assert stated["report"].keys() == schema["ReportTable"]["properties"].keys()
+    assert stated["report"]["instrument"][0].keys() == schema["InstrumentTable"]["properties"].keys()
+
+
+def test_a_record_is_drafted_with_what_its_sheet_prints(tmp_path):
+    rows = [f"{60 * k},{20 + k / 9:.2f},{k / 3:.2f},{k / 5:.2f}" for k in range(300)]
+    (tmp_path / "log.csv").write_text("\n".join(["time [s],T1 [degC],Y1 [um],Y2 [um]", *rows]) + "\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    assert load_campaign(path).thermal_test.kind is None
+    text = path.read_text()
+    tail = uncommented(text[text.index("# [report]") :])
+    assert tail["thermal_test"].keys() == campaign_schema()["$defs"]["ThermalTestTable"]["properties"].keys()
+    assert {"sensor_places", "warm_up", "remarks", "instrument"} <= tail["report"].keys()
+    assert not {"screw_lead", "feed"} & tail["report"].keys()
     path.unlink()
-    asked = []
-    write_campaign(folder, Asker(lambda question, default: asked.append(question) or default))
-    assert not [question for question in asked if question.startswith(("Tolerance", "Operator", "Instrument"))]
-    assert load_campaign(path).report.machine == ""
+    path, _ = write_campaign(tmp_path, Asker(lambda question, default: "spindle" if "230-3" in question else default))
+    assert load_campaign(path).thermal_test.kind == "spindle"

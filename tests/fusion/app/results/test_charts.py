@@ -5,7 +5,7 @@ import panel as pn
 import pytest
 import xarray as xr
 from bokeh.events import Tap
-from bokeh.models import LinearColorMapper
+from bokeh.models import LinearColorMapper, Text
 
 from fusion.app.results.charts import (
     ThermalView,
@@ -14,13 +14,17 @@ from fusion.app.results.charts import (
     laser_charts,
     loop_steps,
     reading_hours,
+    record_charts,
     table_of,
 )
 from fusion.app.results.data import Linker, Place, Products, Selection
 from fusion.report.wording import table
-from fusion.results.results import AnomalyPart, AxisLoop
+from fusion.results.axis import SourcePart
+from fusion.results.parts import AreaPart
+from fusion.results.results import AnomalyPart, AxisLoop, CorrelationPart
 from fusion.results.store import DamagedProductError
 from tests.fusion.app.texts import texts
+from tests.fusion.report.test_record import record
 from tests.fusion.results_sample import PARTS
 
 
@@ -98,6 +102,18 @@ def test_text_of_a_table_is_never_markup():
     assert "<b>x" not in shown.object and "&lt;b&gt;x" in shown.object and "<i>" not in shown.object
 
 
+def test_the_charts_of_one_displacement_of_a_record_are_chosen_in_a_menu():
+    measured = record(channels=3).assign(driver_units=("driver_name", ["1/min"]), driver_size=("driver_name", [1.0]))
+    measured["displacement"].loc[{"channel": "c1"}] = [0.0, 1.0, 2.0, 3.0]
+    shown = pn.Column(*record_charts(measured))
+    (menu,) = shown.select(pn.widgets.Select)
+    assert menu.options == ["X", "c1", "c2"] and menu.value == "c1", "the one that moves most stands first"
+    assert len(shown.select(pn.pane.Bokeh)) == 4, "two of the displacement, temperatures, drivers"
+    assert "c1 measured from 0" in texts([shown]) and "X measured" not in texts([shown])
+    menu.value = "X"
+    assert "X measured from" in texts([shown])
+
+
 @pytest.fixture
 def marked(results_folder):
     """The results with one position that stands out, whose texts hold markup."""
@@ -157,6 +173,24 @@ def test_the_map_follows_the_cycle_on_one_scale(seen):
     assert selection.cycle == 5 and (mapper.low, mapper.high) == scale
     np.testing.assert_array_equal(image(view), products.map_of(products.layers[0], 5))
     assert "Cycle 5 (" in texts([view.view])
+
+
+def test_the_area_that_the_drift_follows_is_drawn_on_the_map(results_folder):
+    area = AreaPart(x_low_mm=280.0, x_high_mm=420.0, y_low_mm=40.0, y_high_mm=150.0)
+
+    def written(verdict):
+        products = Products(results_folder)
+        source = SourcePart.model_construct(area=area)
+        correlation = CorrelationPart.model_construct(verdict=verdict, source=source)
+        products.results = products.results.model_copy(update={"correlation": correlation})
+        selection = Selection(cycle=24, target=2)
+        view = ThermalView(products, selection, Linker(selection, products.targets, products.cycles, None))
+        drawn = view.view.select(pn.pane.Bokeh)[0].object
+        texts = [one for one in drawn.renderers if isinstance(one.glyph, Text)]
+        return {word for one in texts for word in np.ravel(one.data_source.data.get(one.glyph.text, one.glyph.text))}
+
+    assert "the drift follows this" in written("attributable")
+    assert "the drift follows this" not in written("not attributable")
 
 
 def test_another_quantity_has_its_own_scale_and_unit(seen):

@@ -3,11 +3,23 @@
 import json
 import re
 import shutil
+from functools import partial
+from html import unescape
 from pathlib import Path
+from zipfile import ZipFile
 
+import panel as pn
 import pytest
 
+from fusion.app.results.data import Products
+from fusion.app.results.screen import _outcome, _pictures, _put, _write_sheet, _write_thermal_sheet
+from fusion.pipeline.draft import Asker, write_campaign
+from fusion.pipeline.iso230_3 import StatedTests
+from fusion.pipeline.run import run_campaign
+from fusion.report.page import ProductsError
 from fusion.results.store import file_sha256
+from fusion.results.thermal_test import ThermalTest
+from tests.fusion.app.texts import texts
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +34,54 @@ def page(app, new_page):
     provenance["products"]["results.json"]["sha256"] = file_sha256(laser / "results.json")
     (laser / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
     return new_page(app[0], width=390)
+
+
+def test_the_screen_says_what_the_report_says_first(products):
+    told = texts(_outcome(products))
+    report = unescape((products.folder / "report.html").read_text(encoding="utf-8"))
+    sentences = [line for line in re.sub("<[^>]*>", "\n", told).splitlines() if line.strip()]
+    assert len(sentences) >= 2 and all(sentence in report for sentence in sentences)
+
+
+def test_every_chart_of_pictures_says_what_it_shows(campaign_folder, tmp_path):
+    for picture in sorted((campaign_folder / "thermal").glob("*.jpg"))[:2]:
+        shutil.copy(picture, tmp_path)
+    path, _ = write_campaign(tmp_path, Asker(None))
+    run_campaign(path, tmp_path / "results")
+    products = Products(tmp_path / "results")
+    hottest = products.thermograms.attrs["hottest"]
+    shown = _pictures(products)
+    titles = [re.sub("<[^>]*>", "", part[0].object) for part in shown]
+    assert titles[0].startswith(f"{hottest}, the hottest picture") and "Last picture minus first." in titles
+    assert f"How many pixels of {hottest} have which temperature." in titles
+    assert all(part.select(pn.pane.Bokeh) and part[-1].object for part in shown)
+
+
+def test_a_sheet_in_word_is_written_and_replaced_whole(products, tmp_path):
+    out = tmp_path / "sheet.docx"
+    for _ in range(2):
+        _put(out, partial(_write_sheet, products.folder))
+        assert "Accuracy and repeatability" in ZipFile(out).read("word/document.xml").decode()
+
+    _write_thermal_sheet(products.folder, tmp_path / "thermal.docx")
+    assert "Thermal effects by ISO 230-3" in ZipFile(tmp_path / "thermal.docx").read("word/document.xml").decode()
+
+    def failing(path):
+        path.write_bytes(b"half")
+        raise OSError("disk full")
+
+    before = out.read_bytes()
+    with pytest.raises(OSError, match="disk full"):
+        _put(out, failing)
+    assert out.read_bytes() == before
+
+
+def test_a_sheet_that_could_not_say_whose_test_it_was_is_not_written(tmp_path, monkeypatch):
+    nameless = StatedTests("T", (ThermalTest.model_construct(conditions=()),), {})
+    monkeypatch.setattr("fusion.app.results.screen.read_thermal_tests", lambda results: nameless)
+    with pytest.raises(ProductsError, match="do not say whose test it was; run the campaign again"):
+        _write_thermal_sheet(tmp_path, tmp_path / "sheet.docx")
+    assert not list(tmp_path.iterdir())
 
 
 def opened(page, part):
@@ -63,7 +123,7 @@ def test_places_are_added_by_keyboard_and_by_click(page):
 
 
 def test_the_loop_and_the_positions_say_what_was_found(page):
-    opened(page, "Loop")
+    opened(page, "Cause")
     page.get_by_role("heading", name="Round 1").wait_for()
     page.get_by_text("What the final model leaves").first.wait_for()
     opened(page, "Positions")
@@ -76,6 +136,17 @@ def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app
     page.get_by_text("<img src=x onerror=alert(1)>").wait_for()
     page.get_by_text("Deviation along the axis").wait_for()
     assert page.get_by_text("Map", exact=True).count() == 0
+
+
+def test_the_sheet_is_written_in_word_by_a_click_and_handed_over(page, app, ask, cookie):
+    opened(page, "Results")
+    name_folder(page, app[1] / "results")
+    page.get_by_text("Small campaign", exact=True).wait_for()
+    page.get_by_role("button", name="Test sheet to sign (Word)").press("Enter")
+    page.get_by_role("link", name="Save sheet.docx").wait_for()
+    answer = ask(app[0], "/report/results/sheet.docx", Cookie=cookie)
+    assert answer.status == 200 and answer.headers["Content-Disposition"] == 'attachment; filename="sheet.docx"'
+    assert answer.body[:2] == b"PK"
 
 
 def test_a_folder_without_results_says_so(page, app):

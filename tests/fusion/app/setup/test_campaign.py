@@ -1,5 +1,6 @@
 """A campaign file from a folder: comments stay while values change, fields read back, files found and uploaded."""
 
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from fusion.app.setup.form import (
 )
 from fusion.campaign.config import campaign_schema, load_campaign
 from fusion.pipeline.draft import DraftError
+from fusion.report.numbers import print_unit
 
 
 def test_a_folder_without_a_campaign_file_gets_the_draft_of_init(copied):
@@ -98,9 +100,9 @@ def test_fields_are_read_back_and_every_fault_is_named_with_its_field(copied):
     names = ("campaign.title", "plan.size.0", "plan.axis.direction", "thermography.table")
     assert [texts[name] for name in names] == ["Small campaign", "700 mm", "left", "still"]
     assert texts["report.machine"] == "", "a table that can be added is shown"
-    told = r"(?s)Width of the plan \(x\): .*unit.*It moves, as the position grows: .* no direction"
+    told = r"(?s)Width of the plan, x \(mm\): .*K.*It moves, as the position grows: .* no direction"
     with pytest.raises(FieldError, match=told):
-        write_fields(open_campaign(copied), {"plan.size.0": "700", "plan.axis.direction": "0, 0"})
+        write_fields(open_campaign(copied), {"plan.size.0": "700 K", "plan.axis.direction": "0, 0"})
 
 
 def test_changed_fields_are_written_and_all_others_stay(copied):
@@ -118,7 +120,7 @@ def test_changed_fields_are_written_and_all_others_stay(copied):
 def test_a_needed_field_may_be_left_for_later(copied):
     campaign = write_fields(open_campaign(copied), {"plan.axis.origin.0": ""})
     assert campaign.value("plan", "axis", "origin")[0] is None and campaign.value("plan", "axis", "origin")[1]
-    assert missing(campaign) == ["Spindle at axis position 0, x"] and missing(open_campaign(copied)) == []
+    assert missing(campaign) == ["Spindle at axis position 0, x (mm)"] and missing(open_campaign(copied)) == []
     (copied / "campaign.toml").unlink()
     (copied / "fiducials.csv").unlink()
     assert missing(open_campaign(copied))[-1] == 'fiducials = "FILL IN"'
@@ -148,7 +150,9 @@ def test_the_form_reads_back_what_it_shows(campaign_folder):
     assert form.texts == {name: shown[name] for name in form.texts} and not changes
     form.write({"plan.size.0": "710 mm", "no such field": "x"})
     assert form.texts["plan.size.0"] == "710 mm" and changes == ["plan.size.0"]
-    folded = next(card for card in form.view.select(pn.Card) if "[interferometry.uncertainty]" in card.title)
+    folded = next(
+        card for card in form.view.select(pn.Card) if card.title == "Standard uncertainties (k = 1): 5 fields"
+    )
     folded.collapsed = False
     form.write({"interferometry.uncertainty.device": "0.5 ppm"})
     assert form.texts["interferometry.uncertainty.device"] == "0.5 ppm"
@@ -161,6 +165,7 @@ def test_every_key_of_the_schema_has_a_field_but_those_that_are_drawn_or_chosen_
         for key, given in model["properties"].items():
             found = [one for one in (given, *given.get("anyOf", ())) if "$ref" in one or "items" in one]
             named = [one.get("$ref") or one["items"].get("$ref") for one in found]
+            named += [given["additionalProperties"].get("$ref")] if key == "tilts" else []
             inner = schema["$defs"].get((named[0] or "").rpartition("/")[2], {}) if named else {}
             yield from keys((*table, key), inner) if "properties" in inner else [".".join((*table, key))]
 
@@ -168,7 +173,7 @@ def test_every_key_of_the_schema_has_a_field_but_those_that_are_drawn_or_chosen_
     fields = {".".join((*field.table, field.key)) for field in known_fields().values()}
     apart = set(keys((), schema)) - fields
     assert {name for name in apart if not name.startswith("thermography.region.")} == {
-        "record.columns", "drivers.columns", "thermal_test.tilts",
+        "record.columns", "drivers.columns",
     }  # fmt: skip
 
 
@@ -187,14 +192,105 @@ def test_instruments_are_typed_one_after_another(copied):
     assert len(load_campaign(copied / "campaign.toml").report.instrument) == 1
 
 
+def test_each_instrument_has_a_row_of_its_own_that_is_added_and_removed(copied):
+    form, campaign = Form(lambda name: None), open_campaign(copied)
+    form.show(campaign)
+
+    def press(label, at=0):
+        [one for one in form.view.select(pn.widgets.Button) if one.label == label][at].clicks += 1
+
+    def rows():
+        titles = [
+            one for one in form.view.select(pn.Column) if "<h4>Instrument" in getattr(one[:1] and one[0], "object", "")
+        ]
+        return [(one[0].object, [widget.label for widget in one[1][:4]]) for one in titles]
+
+    labels = ["Instrument", "Serial number", "Day of its calibration", "Certificate of its calibration"]
+    assert rows() == [("<h4>Instrument 1</h4>", labels)]
+    press("Add an instrument")
+    press("Add an instrument")
+    assert [title for title, _ in rows()] == [f"<h4>Instrument {k}</h4>" for k in (1, 2, 3)]
+    form.write({f"report.instrument.{k}.name": name for k, name in enumerate(("laser", "camera", "probe"))})
+    saved = write_fields(campaign, form.texts)
+    assert [one["name"] for one in saved.value("report", "instrument")] == ["laser", "camera", "probe"]
+    press("Remove", 1)
+    assert [title for title, _ in rows()] == ["<h4>Instrument 1</h4>", "<h4>Instrument 2</h4>"]
+    press("Add an instrument")
+    form.write({"report.instrument.3.name": "level"})
+    left = write_fields(saved, form.texts)
+    assert [one["name"] for one in left.value("report", "instrument")] == ["laser", "probe", "level"]
+
+
+@pytest.fixture
+def record(tmp_path):
+    rows = [f"{60 * k},{20 + k / 9:.2f},{k / 3:.2f},{k / 5:.2f}" for k in range(300)]
+    folder = tmp_path / "record"
+    folder.mkdir()
+    (folder / "log.csv").write_text("\n".join(["time [s],T1 [degC],Y1 [um],Y2 [um]", *rows]) + "\n")
+    return folder
+
+
+def test_what_a_test_by_iso_230_3_must_be_told_is_in_the_form(record, copied):
+    campaign = open_campaign(record)
+    texts = {
+        "thermal_test.kind": "spindle",
+        "thermal_test.sensor_calibration": "0.5 %",
+        "thermal_test.mounting_length": "100",
+    }
+    tilt = "thermal_test.tilts.0."
+    texts |= {f"{tilt}name": "A", f"{tilt}channels.0": "Y1", f"{tilt}channels.1": "Y2", f"{tilt}distance": "150 mm"}
+    assert texts.keys() <= form_fields(campaign).keys()
+    with pytest.raises(FieldError, match="every tilt needs a name of its own"):
+        write_fields(campaign, texts | {f"{tilt}name": ""})
+    write_fields(campaign, texts).save()
+    stated = load_campaign(record / "campaign.toml").thermal_test
+    assert (stated.kind, stated.sensor_calibration, stated.mounting_length_mm) == ("spindle", 0.005, 100.0)
+    assert stated.tilts["A"].channels == ("Y1", "Y2") and stated.tilts["A"].distance_mm == 150.0
+    again = open_campaign(record)
+    write_fields(again, {f"{tilt}channels.1": ""})
+    assert {name: read_fields(again)[name] for name in texts} == texts | {"thermal_test.mounting_length": "100 mm"}
+    write_fields(again, {name: "" for name in texts if name.startswith(tilt)}).save()
+    assert not load_campaign(record / "campaign.toml").thermal_test.tilts
+    laser = form_fields(open_campaign(copied))
+    assert [name for name in laser if name.startswith("thermal_test")] == ["thermal_test.kind"]
+
+
+def test_the_form_speaks_of_what_was_measured_with_its_units(copied, record, tmp_path_factory):
+    assert known_fields()["acceptance.A"].label == "A: bidirectional accuracy (µm)"
+    for field in known_fields().values():
+        assert not field.unit or f"({print_unit(field.unit)})" in field.label
+        assert "_" not in field.label
+    form = Form(lambda name: None)
+    form.show(open_campaign(copied))
+    assert all("[" not in card.title for card in form.view.select(pn.Card))
+    of_axis = {
+        "campaign.axis",
+        "thermography.clock_offset",
+        "thermography.table",
+        "report.feed",
+        "report.screw_lead",
+        "report.dwell",
+    }
+    assert of_axis <= form_fields(open_campaign(copied)).keys()
+    assert of_axis & form_fields(open_campaign(record)).keys() == {"campaign.axis"}
+    pictures = tmp_path_factory.mktemp("pictures")
+    shutil.copy(next((copied / "thermal").glob("*.jpg")), pictures)
+    assert not of_axis & form_fields(open_campaign(pictures)).keys()
+    assert {"report.machine", "thermography.emissivity"} <= form_fields(open_campaign(pictures)).keys()
+
+
 def test_lists_and_numbers_are_written_as_such_and_words_in_place_of_numbers_refused(copied):
-    texts = {"model.declared": "table_offset", "thermography.stack.scale": "0.5", "interferometry.compensation": "redo"}
+    texts = {
+        "model.declared": "table_offset",
+        "thermography.camera_scale_u": "0.5",
+        "interferometry.compensation": "redo",
+    }
     campaign = write_fields(open_campaign(copied), texts)
     assert campaign.value("model", "declared") == ["table_offset"]
-    assert campaign.value("thermography", "stack", "scale") == 0.5
+    assert campaign.value("thermography", "camera_scale_u") == 0.5
     assert campaign.value("interferometry", "compensation") == "redo"
-    with pytest.raises(FieldError, match=r"Scale: .*no number"):
-        write_fields(campaign, {"thermography.stack.scale": "half"})
+    with pytest.raises(FieldError, match=r"Standard uncertainty of the camera, as a share.*no number"):
+        write_fields(campaign, {"thermography.camera_scale_u": "half"})
 
 
 def test_every_file_of_a_campaign_has_a_row(campaign_folder):

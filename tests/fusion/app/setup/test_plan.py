@@ -5,7 +5,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import panel as pn
 import pytest
+from bokeh.models import Scatter, Text
 
 from fusion.app.setup import plan as module
 from fusion.app.setup.plan import (
@@ -22,6 +24,7 @@ from fusion.app.setup.plan import (
     place,
     region_table,
 )
+from interferometry.plots import INK
 from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 
 pytestmark = pytest.mark.long
@@ -192,6 +195,22 @@ def test_clicks_draw_origin_then_direction_and_a_drag_a_region():
     view._on_drag(SimpleNamespace(x=1.0, y=2.0))
     view._on_drop(SimpleNamespace(x=3.0, y=4.0))
     assert drawn == [("origin", 150.0, 50.0), ("direction", -50.0, 1.0), ("region", (1.0, 2.0), (3.0, 4.0))]
+
+
+def test_the_plan_marks_its_origin_and_names_its_fiducials_as_the_camera_sees_them():
+    view = PlanView(*[lambda *drawn: None] * 3)
+    view.show(PLAN, Placed((Fiducial("F1", 10.0, 15.0, 0.0),)), None)
+    (pane,) = view.view.select(pn.pane.Bokeh)
+    names = {}
+    for one in pane.object.renderers:
+        if isinstance(one.glyph, Text):
+            data = one.data_source.data
+            names |= dict(zip(data["text"], zip(data["x"], data["y"], strict=True), strict=True))
+    assert names == {"F1": (10.0, 15.0), "origin": (0, 0)}
+    assert pane.object.y_range.start > pane.object.y_range.end, "y points downwards: F1 is at the top left"
+    glyphs = [one.glyph for one in pane.object.renderers]
+    crosses = [one.line_color for one in glyphs if isinstance(one, Scatter) and one.marker == "cross"]
+    assert crosses == ["#ffffff", INK] * 2, "dark on light is seen on any page"
 
 
 def test_regions_are_read_as_the_campaign_file_writes_them():

@@ -114,8 +114,8 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
     save.press("Enter")
     page.get_by_text("Before it can run, fill in:").wait_for()
     for label, text in (
-        ("Spindle at axis position 0, x", "500 mm"),
-        ("Spindle at axis position 0, y", "90 mm"),
+        ("Spindle at axis position 0, x (mm)", "500"),
+        ("Spindle at axis position 0, y (mm)", "90 mm"),
         ("It moves, as the position grows", "left"),
         ("Machine", "<b>Mill</b>"),
     ):
@@ -137,7 +137,7 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
     again = new_page(app[0])
     look_into(again, ".new")
     again.get_by_label("Machine", exact=True).wait_for()
-    assert again.get_by_label("Spindle at axis position 0, x").input_value() == "500 mm"
+    assert again.get_by_label("Spindle at axis position 0, x (mm)").input_value() == "500 mm"
 
 
 @pytest.mark.slow
