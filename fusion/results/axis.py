@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from fusion.results.parts import (
     AreaPart,
@@ -358,6 +358,13 @@ class DriftPart(ResultPart):
     """Largest minus smallest drift of every target during the test, mean of both approaches, um."""
     range_u_um: tuple[Number, ...] = ()
     """Standard uncertainty of that, um."""
+
+    @model_validator(mode="after")
+    def _one_of_each_target(self) -> DriftPart:
+        """Refuse ranges without a target or an uncertainty."""
+        if self.range_um and not len(self.position_mm) == len(self.range_um) == len(self.range_u_um):
+            raise ValueError("position_mm, range_um and range_u_um have one value for each target")
+        return self
 
 
 class Evidence(ResultPart):

@@ -453,11 +453,12 @@ def header_lines(origin: Origin, **facts: Any) -> list[str]:
 
 
 def _parameters(path: Path) -> Mapping[str, Any]:
-    """Return the campaign as the provenance of a run states it; empty where the file is absent."""
+    """Return the tables of the campaign as the provenance of a run states it; empty where the file is absent."""
     if not path.is_file():
         return {}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")).get("parameters", {}))
+        stated = json.loads(path.read_text(encoding="utf-8")).get("parameters", {})
+        return {name: table for name, table in stated.items() if isinstance(table, dict)}
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedProductError(
             f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
