@@ -123,6 +123,15 @@ def test_one_wrong_value_is_one_fault_with_its_place(tmp_path: Path, loop: dict[
         read_results(tmp_path)
 
 
+def test_a_drift_that_lacks_a_target_is_refused(tmp_path: Path) -> None:
+    drift = {**PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [1.0, 2.0], "range_u_um": [0.1, 0.1]}
+    content = assemble("X", {**PARTS, "drift": drift}, []).as_json()
+    content["drift"]["range_u_um"] = [0.1]
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    with pytest.raises(ResultsError, match="have one value for each target"):
+        read_results(tmp_path)
+
+
 def test_several_faults_are_counted_after_the_first(tmp_path: Path) -> None:
     document = deepcopy(assemble("A", PARTS, []).as_json())
     document["anomalies"][0]["cause"] = "magic"
