@@ -12,7 +12,6 @@ from fusion.results.axis import Iso230Part
 from fusion.results.loop import StepPart
 from fusion.results.parts import TimePart, decide
 from fusion.results.results import Results
-from interferometry.iso230 import SAMPLING
 
 #: Question of a reader, and the statement that answers it.
 _QUESTIONS = {
@@ -129,6 +128,10 @@ _STATED_WITHOUT_VALUE = "the expansion coefficient with its uncertainty, 0.3 ppm
 _MORE_CYCLES = 4
 
 
+#: Contributions that more cycles lessen, `interferometry.iso230.SAMPLING`: a summary on the terminal does not wait for that package.
+_OF_SCATTER = ("sampling", "extremes")
+
+
 class Sharper(NamedTuple):
     """The largest term of the uncertainty of A, and the line of the campaign file that shrinks it most; an empty `line` where none does.
 
@@ -139,6 +142,7 @@ class Sharper(NamedTuple):
     contributor: str
     share: float
     origin: str
+    unit: str
     expanded_um: float
     line: str = ""
     sharper_um: float = math.inf
@@ -160,7 +164,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
     }
     largest, term = max(terms.values(), key=lambda each: each[1])
     symbol = f"A{ARROWS[side]}" if side else "A"
-    told = Sharper(symbol, largest.contributor, (term / found.u) ** 2, largest.origin, 2 * found.u)
+    told = Sharper(symbol, largest.contributor, (term / found.u) ** 2, largest.origin, iso.unit, 2 * found.u)
     for name, (line, stated_u) in _STATED.items():
         one, term = terms.get(name, (None, 0.0))
         if one is None or not one.u or not one.origin.startswith("assumed"):
@@ -174,8 +178,8 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
             limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)
             decision = "" if limit is None or found.value is None else decide(found.value, expanded, limit)
             told = told._replace(line=line, sharper_um=expanded, decision=decision)
-    if not told.line and told.contributor in SAMPLING:
-        halved = sum(terms[name][1] ** 2 for name in SAMPLING if name in terms) * (1.0 - 1.0 / _MORE_CYCLES)
+    if not told.line and told.contributor in _OF_SCATTER:
+        halved = sum(terms[name][1] ** 2 for name in _OF_SCATTER if name in terms) * (1.0 - 1.0 / _MORE_CYCLES)
         told = told._replace(sharper_um=2 * (found.u**2 - halved) ** 0.5, cycles=_MORE_CYCLES * len(iso.settled.cycles))
     return told
 

@@ -7,9 +7,11 @@ from playwright.sync_api import sync_playwright
 
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
+from fusion.report import conclusions
 from fusion.report.conclusions import in_brief, sharpen
 from fusion.report.page import render_report
 from fusion.results.results import assemble, read_results
+from interferometry.iso230 import SAMPLING
 from tests.browser import CHROMIUM, visible_words
 from tests.fusion.campaign_parts import change, without
 from tests.fusion.report.test_campaign import ORIGIN
@@ -152,3 +154,7 @@ def test_the_sharper_uncertainty_is_what_the_statement_gives(reports):
     assert 2 * part.settled.A_um.u == pytest.approx(advised.sharper_um, rel=1e-6)
     assert part.settled.A_um.value == read_results(folder).iso230.settled.A_um.value
     assert next(row.decision for row in part.tolerances if row.quantity == "A") == advised.decision
+
+
+def test_more_cycles_lessen_the_contributions_of_the_evaluation_that_come_from_scatter() -> None:
+    assert conclusions._OF_SCATTER == SAMPLING
