@@ -19,7 +19,13 @@ from scipy import ndimage
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
-from thermography.radiometry.planck import ZERO_CELSIUS_K, count_line, signal_slope, temperature_from_counts
+from thermography.radiometry.planck import (
+    ZERO_CELSIUS_K,
+    count_line,
+    counts_from_temperature,
+    signal_slope,
+    temperature_from_counts,
+)
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.register import Registration
 
@@ -394,6 +400,11 @@ def compare_discs(frames: Sequence[FrameReference], registration: Registration) 
     pictures = (frames[i].read_counts() for i in index)
     counts = np.array([[[picture[mask].mean() for mask in pair] for pair in masks.values()] for picture in pictures])
     parameters = frames[0].parameters
+    for place, i in enumerate(index):
+        taken = frames[i].parameters
+        # Another range of the camera counts otherwise: what the first one would have counted.
+        if (taken.planck_r1, taken.planck_o) != (parameters.planck_r1, parameters.planck_o):
+            counts[place] = counts_from_temperature(temperature_from_counts(counts[place], taken), parameters)
     gain, _ = count_line(parameters)
     level = temperature_from_counts(counts[..., 1].mean(), parameters) + ZERO_CELSIUS_K
     disc, table = np.moveaxis((counts - counts[0]) / (gain * signal_slope(level, parameters)), -1, 0)

@@ -199,3 +199,26 @@ def test_discs_show_what_the_camera_adds_to_a_table_that_warms(tmp_path, rng):
     assert np.abs(sound.common_K).max() < 0.05 and np.ptp(sound.pattern_K, axis=0).max() < 0.1
     assert creeps.common_K[-1] == pytest.approx(1.0, abs=0.06) and np.ptp(creeps.pattern_K, axis=0).max() < 0.1
     assert np.ptp(narcissus.pattern_K, axis=0).max() > 0.2
+
+
+def test_another_range_with_its_own_parameters_is_no_change_of_the_zero(tmp_path, rng):
+    mask = (Scene(disc_K=1.0).render() - Scene(disc_K=0.0).render()).clip(0.0, 1.0)
+
+    warming = 1.0 + np.linspace(0.0, 1.0, mask.shape[1])
+
+    def warms(index, image):
+        return image + index / (FRAMES - 1) * warming * (1.0 - 0.85 * mask)
+
+    frames = _film(tmp_path / "a.seq", Scene(disc_K=-4.0).render(), rng, warms)
+    switched = []
+    for number, reference in enumerate(frames):
+        frame, of = reference.read(), reference.parameters
+        if number >= FRAMES // 2:
+            # Half as many counts above the offset, and half of R1.
+            counts = np.rint(0.5 * (frame.counts + of.planck_o) - of.planck_o).astype(np.uint16)
+            frame = replace(frame, counts=counts, parameters=replace(of, planck_r1=0.5 * of.planck_r1))
+        write_sequence(tmp_path / f"{number}.seq", [frame])
+        switched += index_frames([tmp_path / f"{number}.seq"])[0]
+    shown = compare_discs(switched, registered())
+    # A dozen pixels of 50 mK per disc; taken for the first range the counts of the second are some 36 K less.
+    assert np.abs(shown.common_K).max() < 0.06 and 1.5 < shown.warming_K < 2.1
