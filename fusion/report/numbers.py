@@ -17,9 +17,9 @@ def number(value: float | None, digits: int = 3) -> str:
     return fixed(value, max(0, digits - 1 - math.floor(math.log10(abs(value))))) if value else "0"
 
 
-def exact(value: float) -> str:
-    """Return a number that is stated, such as a position, with no more digits than it has and a true minus sign."""
-    return f"{value:g}".replace("-", "−")
+def exact(value: float | None) -> str:
+    """Return a number that is stated, such as a position, with no more digits than it has and a true minus sign; a dash without one."""
+    return "–" if value is None else f"{value:g}".replace("-", "−")
 
 
 def fixed(value: float | None, decimals: int) -> str:
@@ -29,7 +29,7 @@ def fixed(value: float | None, decimals: int) -> str:
 
 def decimals_of(u: float) -> int:
     """Return how many decimals show an expanded uncertainty with two significant digits (GUM 7.2.6)."""
-    return max(0, 1 - math.floor(math.log10(2 * u))) if u > 0 and math.isfinite(u) else 2
+    return max(0, 1 - math.floor(math.log10(2 * u))) if u > 0 and math.isfinite(2 * u) else 2
 
 
 def measured(value: float | None, u: float | None, unit: str = "", *, decimals: int | None = None) -> str:
@@ -37,7 +37,7 @@ def measured(value: float | None, u: float | None, unit: str = "", *, decimals: 
     tail = f" {unit}" if unit else ""
     if value is None or not math.isfinite(value):
         return "–"
-    if u is None or not math.isfinite(u) or u <= 0:
+    if u is None or not math.isfinite(2 * u) or u <= 0:
         return f"{number(value)}{tail}"
     places = decimals_of(u) if decimals is None else decimals
     return f"{value:z.{places}f} ± {2 * u:.{places}f}{tail}".replace("-", "−")

@@ -46,6 +46,8 @@ def test_a_value_has_the_digits_of_its_uncertainty(value, u, text):
 
 def test_numbers_probabilities_and_times_are_printed_as_a_reader_expects_them():
     assert (numbers.exact(-20.0), numbers.exact(12.5), numbers.place(-3.0, None)) == ("−20", "12.5", "x −3 mm, y – mm")
+    # A damaged file of results may lack a position, or hold the largest number that there is.
+    assert (numbers.exact(None), numbers.measured(2.0, 1e308), numbers.decimals_of(1e308)) == ("–", "2.00", 2)
     assert numbers.p_cell(0.0004) == "< 0.001" and numbers.p_cell(0.0123) == "0.012" and numbers.p_cell(None) == "–"
     assert numbers.duration(90) == "90 s" and numbers.duration(1800) == "30 min" and numbers.duration(25200) == "7.0 h"
     assert numbers.join(["a", "b", "c"]) == "a, b and c" and numbers.join(["a"]) == "a" and numbers.join([]) == ""
