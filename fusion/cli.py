@@ -611,7 +611,7 @@ def iso230_3(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230_3 import read_thermal_tests
-    from fusion.report.sheet import describe_thermal_sheet, write_thermal_tests
+    from fusion.report.sheet import write_thermal_tests
     from fusion.report.thermal_test import thermal_test_tables
 
     with _answering():
@@ -623,9 +623,7 @@ def iso230_3(
                 _wide().print(table)
             _print_lines(dict.fromkeys(line for one in tests for line in one.remarks))
         if out is not None:
-            version = versions()["thermofuse"]
-            sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
-            write_thermal_tests(out, sheets, tests)
+            write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"])
             errors.print(f"page: {out.resolve()}")
 
 

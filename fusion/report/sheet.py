@@ -142,8 +142,11 @@ def render_thermal_tests(sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) 
     return render_page("iso230_3.html.j2", embed(draw_thermal_tests(tests)), sheets=sheets, summary=summary)
 
 
-def write_thermal_tests(path: Path, sheets: Sequence[Sheet], tests: Sequence[ThermalTest]) -> None:
+def write_thermal_tests(
+    path: Path, title: str, tests: Sequence[ThermalTest], *, files: Mapping[str, str], version: str
+) -> None:
     """Write the sheets of tests by ISO 230-3 in the format of the file's name; nothing is replaced."""
+    sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
     if page_format(path, ".html", ".pdf", ".docx") == ".docx":
         drawn = [(sheet, plot_thermal_test(test)) for sheet, test in zip(sheets, tests, strict=True)]
         write_atomically(path, lambda temporary: _write_word(temporary, drawn))

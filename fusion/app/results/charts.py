@@ -30,7 +30,7 @@ from fusion.report.charts.plan import (
     Extent,
     Layer,
     add_cells,
-    add_names,
+    draw_followed,
     draw_map,
     draw_places,
     extent_of,
@@ -55,7 +55,6 @@ from fusion.report.wording import (
 )
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
-from fusion.results.parts import AreaPart
 from fusion.results.store import DamagedProductError, group, has
 from interferometry.plots import ACCENT, INK, hours_since_start
 
@@ -456,16 +455,6 @@ class ThermalView:
         self._unlink = self._linker.link(drawn, x=HOURS)
         seen = ui.note(f"{quantity[:1].upper()}{quantity[1:]} over time. {'; '.join(told)}.")
         self._history[:] = [shown_drawing(drawn), seen]
-
-
-def draw_followed(drawn: figure, area: AreaPart) -> None:
-    """Draw the area whose temperature the drift follows, dark under light, which reads on every colour."""
-    x = [area.x_low_mm, area.x_high_mm, area.x_high_mm, area.x_low_mm, area.x_low_mm]
-    y = [area.y_low_mm, area.y_low_mm, area.y_high_mm, area.y_high_mm, area.y_low_mm]
-    for colour, width in ((INK, 4), ("#ffffff", 1.6)):
-        drawn.line(x, y, line_color=colour, line_width=width)
-    place = {"y_offset": 2, "text_baseline": "top", "text_align": "center"}
-    add_names(drawn, [sum(x[:2]) / 2], [area.y_high_mm], ["the drift follows this"], **place)
 
 
 def to_scale(drawn: figure, extent: Extent) -> None:

@@ -20,7 +20,7 @@ from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.conclusions import first_screen
 from fusion.report.page import ProductsError, print_pdf, report_of
-from fusion.report.sheet import describe_sheet, describe_thermal_sheet, write_iso230, write_thermal_tests
+from fusion.report.sheet import describe_sheet, write_iso230, write_thermal_tests
 from fusion.report.wording import say
 from fusion.results.store import write_atomically
 
@@ -143,9 +143,7 @@ def _write_thermal_sheet(results: Path, out: Path) -> None:
     if not all(one.conditions for one in tests):
         told = "these results are of an earlier version and do not say whose test it was; run the campaign again"
         raise ProductsError(f"{results}: {told}, finished stages are kept")
-    version = versions()["thermofuse"]
-    sheets = [describe_thermal_sheet(title, one, files=files, version=version) for one in tests]
-    write_thermal_tests(out, sheets, tests)
+    write_thermal_tests(out, title, tests, files=files, version=versions()["thermofuse"])
 
 
 def _or_fault(build: Callable[[], ui.Parts]) -> ui.Parts:

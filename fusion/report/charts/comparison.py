@@ -216,12 +216,6 @@ def draw_trend(trend: Trend) -> Chart:
     return Chart(drawn, f"{seen}.", columns)
 
 
-def plot_trend(dates: np.ndarray, values: np.ndarray, u: np.ndarray, name: str, unit: str = "µm") -> Chart | None:
-    """Draw a quantity over the dates of at least three tests with its expanded uncertainty, and from eight on its control limits."""
-    trend = follow(dates, values, u, name, unit)
-    return None if trend is None else draw_trend(trend)
-
-
 def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
     """Return A, R and B by ISO 230-2 over the dates of tests; their error bars leave out what all tests have in common."""
     tests = [pairs[0].before, *(pair.after for pair in pairs if pair.changes)]

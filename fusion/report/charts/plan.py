@@ -376,23 +376,21 @@ def plot_thermal_map(
     draw_places(drawn, fields, position, hotspots, sensors)
     _ring_targets(drawn, fields, standing_out)
     if followed is not None:
-        _draw_both(drawn.line, *_rim(followed))
-        middle = (followed.x_low_mm + followed.x_high_mm) / 2
-        add_names(
-            drawn,
-            [middle],
-            [followed.y_high_mm],
-            ["the drift follows this"],
-            y_offset=2,
-            text_baseline="top",
-            text_align="center",
-        )
+        draw_followed(drawn, followed)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
     cycle = int(kept["cycle"][-1])
     chart = Chart(drawn, _seen(kept, last, hotspots, cycle, standing_out), _columns(kept, shown, cycle))
     return chart, MapControls([layer.words for layer in shown], kept["cycle"].values.tolist(), note)
+
+
+def draw_followed(drawn: figure, area: AreaPart) -> None:
+    """Draw the area whose temperature the drift follows."""
+    _draw_both(drawn.line, *_rim(area))
+    middle = (area.x_low_mm + area.x_high_mm) / 2
+    place = {"y_offset": 2, "text_baseline": "top", "text_align": "center"}
+    add_names(drawn, [middle], [area.y_high_mm], ["the drift follows this"], **place)
 
 
 def draw_map(values: np.ndarray, extent: Extent, layer: Layer, scale: Mapping[str, Any]) -> figure:

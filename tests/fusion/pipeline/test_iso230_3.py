@@ -115,7 +115,7 @@ approved_by = "B. Jones"
     )
     assert sheet.stated.signatures == [("Measured by", "A. Smith"), ("Approved by", "B. Jones")]
     for form in ("html", "docx"):
-        write_thermal_tests(tmp_path / f"sheet.{form}", [sheet], tests)
+        write_thermal_tests(tmp_path / f"sheet.{form}", title, tests, files=files, version="0")
     page = re.sub(r"<script.*?</script>", "", (tmp_path / "sheet.html").read_text(), flags=re.DOTALL)
     written = docx.Document(str(tmp_path / "sheet.docx"))
     cells = [cell.text for table in written.tables for row in table.rows for cell in row.cells]
