@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numba import njit
 from numpy.typing import NDArray
 from scipy import special
 
@@ -217,50 +216,23 @@ def _stands_out(estimated: xr.Dataset, usable: NDArray[np.int64]) -> NDArray[np.
 def _scatter_test(z: Array, permutations: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return the excess of each target (target,), and the largest one of each permutation of targets within a pass (permutation,)."""
     present = np.isfinite(z)
-    cycle, direction, target = np.nonzero(present)
     squares = np.minimum(z[present] ** 2, WINSOR**2)
-    centred = (squares - squares.mean()) / squares.std()
-    counts = np.zeros((z.shape[2], z.shape[1]))
-    np.add.at(counts, (target, direction), 1.0)
-    starts = np.append(np.flatnonzero(np.diff(cycle * z.shape[1] + direction, prepend=-1)), target.size)
-    excess = _excess(centred, target, direction, counts)
-    return excess, _largest_excess(centred, target, direction, counts, starts, permutations, rng)
+    centred = np.zeros(z.shape)
+    centred[present] = (squares - squares.mean()) / squares.std()
+    shuffled = np.zeros((permutations, *z.shape[1:]))
+    for cycle, direction in np.ndindex(z.shape[:2]):
+        here = present[cycle, direction]
+        values = np.tile(centred[cycle, direction, here], (permutations, 1))
+        shuffled[:, direction, here] += rng.permuted(values, axis=1)
+    counts = present.sum(axis=0)
+    return _excess(centred.sum(axis=0), counts), _excess(shuffled, counts).max(axis=-1)
 
 
-@njit(cache=True)
-def _excess(values: Array, target: NDArray[np.int64], direction: NDArray[np.int64], counts: Array) -> Array:
-    """Sum of the values of each target over the root of their number, the largest of both directions together and of either, (target,)."""
-    sums = np.zeros(counts.shape)
-    for i in range(values.size):
-        sums[target[i], direction[i]] += values[i]
-    excess = np.empty(counts.shape[0])
-    for t in range(excess.size):
-        excess[t] = sums[t].sum() / np.sqrt(max(counts[t].sum(), 1.0))
-        for d in range(counts.shape[1]):
-            excess[t] = max(excess[t], sums[t, d] / np.sqrt(max(counts[t, d], 1.0)))
-    return excess
-
-
-@njit(cache=True)
-def _largest_excess(
-    values: Array,
-    target: NDArray[np.int64],
-    direction: NDArray[np.int64],
-    counts: Array,
-    starts: NDArray[np.int64],
-    permutations: int,
-    rng: np.random.Generator,
-) -> Array:
-    """Shuffle values within each pass (Fisher and Yates 1938) and return the largest excess of a target, (permutation,)."""
-    largest = np.empty(permutations)
-    shuffled = values.copy()
-    for k in range(permutations):
-        for j in range(starts.size - 1):
-            for i in range(starts[j + 1] - 1, starts[j], -1):
-                other = rng.integers(starts[j], i + 1)
-                shuffled[i], shuffled[other] = shuffled[other], shuffled[i]
-        largest[k] = _excess(shuffled, target, direction, counts).max()
-    return largest
+def _excess(sums: Array, counts: NDArray[np.int64]) -> Array:
+    """Sums of each target over the root of their number, the largest of both directions together and of either, (..., target)."""
+    alone = sums / np.sqrt(np.maximum(counts, 1))
+    together = sums.sum(axis=-2) / np.sqrt(np.maximum(counts.sum(axis=0), 1))
+    return np.maximum(together, alone.max(axis=-2))
 
 
 def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.int64]) -> str:
