@@ -1,4 +1,4 @@
-"""Speed of the joint estimate, as ratios against a dense solution of the same model measured in the same run.
+"""Speed of the joint estimate, as ratios against peers that solve the same model, measured in the same run.
 
 Reproduces figures of docs/measured.csv, on the joint estimate.
 """
@@ -6,10 +6,13 @@ Reproduces figures of docs/measured.csv, on the joint estimate.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import linalg
+from statsmodels.tsa.statespace.initialization import Initialization
+from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
 from interferometry.anomalies import detect_anomalies
 from interferometry.deviations import sort_readings
@@ -50,6 +53,37 @@ def test_one_likelihood_against_dense_cholesky(rng: np.random.Generator) -> None
     ratio = cpu_seconds(dense, 1) / recursive
     print(f"\n{t.size} readings: dense scipy Cholesky / recursive filter = {ratio:.0f}")
     assert dense() == pytest.approx(fit.rss, rel=1e-6)
+
+
+def test_one_likelihood_against_statsmodels(rng: np.random.Generator) -> None:
+    """Its exact diffuse likelihood with the fixed effects in the state is the restricted likelihood, but for a constant."""
+    deviations, _ = simulate(rng, cycles=30, kind="rw")
+    fit = fit_joint(deviations, order=1, robust=False, components=["shift", "stretch"]).fit
+    system, (n, p), drifts = fit.system, fit.design.shape, fit.system.ratios.size
+    sigma2, steps = fit.sigma**2, np.append(np.diff(system.seconds), 0.0)
+    model = KalmanFilter(k_endog=1, k_states=drifts + p, k_posdef=drifts, filter_univariate=True)
+    model.bind(fit.response[:, None].copy())
+    model["design"] = np.vstack([system.loadings.T, fit.design.T])[None]
+    model["transition"], model["selection"] = np.eye(drifts + p), np.eye(drifts + p, drifts)
+    model["obs_cov"] = (sigma2 * system.variance)[None, None]
+    start = Initialization(drifts + p)
+    start.set((0, drifts), "known", constant=np.zeros(drifts), stationary_cov=np.zeros((drifts, drifts)))
+    start.set((drifts, drifts + p), "diffuse")
+    model.initialization = start
+
+    def peer(ratios: np.ndarray) -> float:
+        model["state_cov"] = sigma2 * ratios[:, None, None] * np.eye(drifts)[:, :, None] * steps
+        return float(model.loglike())
+
+    def ours(ratios: np.ndarray) -> float:
+        fitted = fit_fixed_effects(replace(system, ratios=ratios), fit.response, fit.design)
+        # At the same variance of the noise, which the fit has put at its likeliest.
+        return fitted.log_likelihood + 0.5 * (n - p) * np.log(fitted.sigma**2 / sigma2) - 0.5 * fitted.rss / sigma2
+
+    others = system.ratios * np.array([3.0, 0.4])
+    assert peer(system.ratios) - peer(others) == pytest.approx(ours(system.ratios) - ours(others), rel=1e-8)
+    ratio = cpu_seconds(lambda: peer(others), 9) / cpu_seconds(lambda: ours(others), 9)
+    print(f"\n{n} readings, {p} fixed effects: statsmodels KalmanFilter.loglike / ours = {ratio:.1f}")
 
 
 def test_cost_grows_with_the_number_of_readings(rng: np.random.Generator) -> None:

@@ -18,6 +18,7 @@ import imagecodecs
 import numpy as np
 import psutil
 import pytest
+import xarray as xr
 
 from tests.thermography.fields.test_still import simulated
 from tests.thermography.plan_scene import GRID, SC660, START, Scene, registered
@@ -126,6 +127,22 @@ def test_still_table_file_to_cycle_fields(film: Path, registration) -> None:
         f"against flirpy Seq to temperature ({median_of(60 / peer)} frames/s): {median_of(peer / 60 * FRAMES / ours)} x; "
         f"against summing the mapped file ({median_of(FRAMES / limit)} frames/s): {median_of(limit / ours)}, "
         f"without set-up {median_of(limit / (ours - start))}; {processor_line(ours_cpu, peer_cpu)}"
+    )
+
+
+def test_file_to_cycle_fields_against_means_by_xarray(film: Path, registration) -> None:
+    """The peer only takes the means of pictures that are in memory as float32; ours opens, decodes, registers and calibrates them."""
+    bounds, frames = bounds_of(FRAMES, 2), 100
+    pictures = xr.DataArray(np.full((frames, 480, 640), 300.0, np.float32), dims=("time", "y", "x"))
+    pictures = pictures.assign_coords(cycle=("time", np.arange(frames) * 2 // frames))
+
+    def reduce() -> None:
+        reduce_frames(index_frames([film])[0], registration, GRID, bounds)
+
+    ours, peer = take_turns(reduce, lambda: pictures.groupby("cycle").mean(), rounds=5)[0]
+    print(
+        f"\nfile to cycle fields {median_of(FRAMES / ours)} frames/s, xarray groupby.mean of pictures in memory "
+        f"{median_of(frames / peer)} frames/s: {median_of(peer / frames * FRAMES / ours)} x"
     )
 
 
