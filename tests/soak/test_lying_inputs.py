@@ -1,4 +1,4 @@
-"""Inputs that lie lead to no confident wrong answer: every lie in three campaigns of the twin, one at a time.
+"""Inputs that lie lead to no confident wrong answer: every lie in every campaign of `tests.soak.lies.campaigns`, one at a time.
 
 ``THERMOFUSE_LIES=<file>`` names a file of rows that is kept and continued, as ``python -m tests.soak.lies --out <file>`` writes it.
 """

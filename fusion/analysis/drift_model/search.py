@@ -785,13 +785,15 @@ def collect_candidates(
 def kept_on_disk(candidates: Iterable[Candidate]) -> Iterator[Candidate]:
     """Yield the same candidates, their columns in temporary files where many are large: those of a long test fill the memory."""
     held: list[Candidate] = []
+    size = 0
     for candidate in candidates:
         held.append(candidate)
-        dense = {k: one.columns for k, one in enumerate(held) if isinstance(one.columns, np.ndarray)}
-        if sum(columns.nbytes for columns in dense.values()) > IN_MEMORY_BYTES:
+        size += candidate.columns.nbytes if isinstance(candidate.columns, np.ndarray) else 0
+        if size > IN_MEMORY_BYTES:
+            dense = {k: one.columns for k, one in enumerate(held) if isinstance(one.columns, np.ndarray)}
             stored = dict(zip(dense, copy_to_disk(list(dense.values())), strict=True))
             yield from (replace(one, columns=stored[k]) if k in stored else one for k, one in enumerate(held))
-            held = []
+            held, size = [], 0
     yield from held
 
 

@@ -1,4 +1,6 @@
-"""The campaigns that the lies are planted into: one that is complete, one with an undeclared effect, one with an anomalous target."""
+"""The campaigns that the lies are planted into: one that is complete, one with an undeclared effect, one with an anomalous target, one
+seen by an uncooled camera, one under a load that is switched, whose reversal drifts.
+"""
 
 from __future__ import annotations
 
@@ -35,6 +37,12 @@ RECIPES = {
         )
     ),
     "anomaly": _SMALL.vary(anomaly=(AnomalyRecipe(ANOMALOUS_TARGET, "structural", amplitude_um=0.8),)),
+    "uncooled": _SMALL.vary(
+        campaign={"seed": 2}, camera={"netd_K": 0.08, "ffc_step_K": 0.03}, laser={"noise_um": 0.35}
+    ),
+    "reversal": _SMALL.vary(
+        campaign={"seed": 3}, duty={"kind": "switched"}, effect=(EffectRecipe("reversal_drift", 0.8),)
+    ),
 }
 
 
