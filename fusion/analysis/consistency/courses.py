@@ -334,11 +334,14 @@ def _scale_jumps(load: Array) -> Iterator[tuple[int, float]]:
 
 
 def _share_and_per_cent(load: Array, start: int) -> bool:
-    """Whether a load is 0 to 1 on one side of a jump and up to some hundred on the other; flags and numbers of programs are whole."""
+    """Whether a load is 0 to 1 on one side of a jump and up to some hundred on the other; flags and numbers of programs are whole, and not
+    all of them a hundred times as large at once.
+    """
     sides = sorted((load[:start], load[start:]), key=lambda side: float(np.nanmax(np.abs(side))))
     share, other = (side[np.isfinite(side)] for side in sides)
-    fractional = bool(np.any(share != np.rint(share)))
-    shares = fractional and share.min() >= 0.0 and share.max() <= 1.0
+    levels = np.unique(share)
+    same_levels = levels.size > 1 and bool(np.isin(other, 100.0 * levels).all())
+    shares = (same_levels or bool(np.any(share != np.rint(share)))) and share.min() >= 0.0 and share.max() <= 1.0
     return bool(shares and other.min() >= 0.0 and 0.01 * _PER_CENT < other.max() <= _PER_CENT)
 
 

@@ -125,10 +125,12 @@ def loads(values: np.ndarray, units: str = "1") -> xr.Dataset:
     return xr.Dataset({"duty": changed})
 
 
+@pytest.mark.parametrize("switched", [False, True])
 @pytest.mark.parametrize("from_middle", [100.0, 0.01])
-def test_a_share_that_becomes_per_cent_is_doubted(from_middle: float) -> None:
+def test_a_share_that_becomes_per_cent_is_doubted(from_middle: float, switched: bool) -> None:
     test = recorded()
     duty = test.drivers["duty"].values.astype(float)
+    duty = (duty > np.median(duty)).astype(float) if switched else duty
     half = np.arange(duty.size) >= duty.size // 2
     log = loads(np.where(half, from_middle, 1.0) * duty * (1.0 if from_middle > 1.0 else 100.0))
     (check,) = check_load_scale(thin_fields(test.fields), log, file="drivers.csv")
@@ -238,7 +240,7 @@ def test_a_load_that_drives_the_table_a_staircase_and_a_constant_one_are_loads()
     assert check_load_kind(constant, file="drivers.csv") == check_load_course(field, None, file="drivers.csv") == []
 
 
-@pytest.mark.parametrize(("before", "after"), [(0.01, 0.9), (1.0, 57.0)])
+@pytest.mark.parametrize(("before", "after"), [(0.01, 0.9), (1.0, 57.0), (1.0, 100.0)])
 def test_a_small_share_before_a_large_one_and_numbers_of_programs_are_no_per_cent(before: float, after: float) -> None:
     test = recorded()
     log = loads(np.where(np.arange(test.drivers.sizes["time"]) < 60, before, after))
