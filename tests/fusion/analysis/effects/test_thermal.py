@@ -178,8 +178,15 @@ def test_a_reversal_moves_both_directions_apart_by_the_state():
     np.testing.assert_allclose(
         candidate.columns[:, 0], np.where(readings.sign > 0, 0.5, -0.5) * readings.seconds / 30.0
     )
+
+
+def test_in_a_test_of_one_approach_a_reversal_that_drifts_is_a_common_drift_and_tried_beside_the_others():
+    readings = campaign(both_directions=False)
     assert REVERSAL_DRIFT.needs(readings) is None
-    assert REVERSAL_DRIFT.needs(campaign(both_directions=False)) == "only one direction of approach was measured"
+    candidates, states = list(REVERSAL_DRIFT.candidates(readings, {}, None)), list(thermal_states(readings, None))
+    assert len(candidates) == len(states) > 0
+    for candidate, (state, _) in zip(candidates, states, strict=True):
+        np.testing.assert_array_equal(candidate.columns[:, 0], 0.5 * state)
 
 
 def test_a_pitch_error_is_a_wave_along_the_axis_times_a_state():
