@@ -237,8 +237,12 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     # Single values that were typed with more digits do not make the resolution of the others.
     step_um = float(np.median(least[np.isfinite(least)]))
     random_um = np.array([random_part_um(values[:, [site]]) for site in range(values.shape[1])])
-    # Where rounding makes the scatter, readings repeat; so does the reading at which the laser is zeroed.
+    # Where rounding makes the scatter, readings repeat; so does the reading at which the laser is zeroed, but not those of several targets.
     scatters = np.nan_to_num(random_um) > step_um
+    if scatters.any():
+        limited = _at_a_limit(values, deviations.sizes["target"])
+        random_um[limited] = np.median(random_um[scatters])
+        scatters |= limited
     some = np.round(values[:, scatters], 6)
     found, counts = np.unique(some[np.isfinite(some)], return_counts=True)
     if not counts.size:
@@ -471,14 +475,32 @@ def _levels(values: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.nan_to_num(changes))])
 
 
-def _zeroed_cycles(deviations: xr.Dataset) -> Check:
-    """A reading that is the same in every cycle, where all others scatter, was set to that value."""
-    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
-    shares = np.zeros(values.shape[1])
+def _held_values(values: Array) -> tuple[Array, Array]:
+    """The most frequent reading of every site (cycle, site), and the share of the cycles that hold it; zero where too few are read."""
+    held, shares = np.full(values.shape[1], np.nan), np.zeros(values.shape[1])
     for site, column in enumerate(values.T):
         present = column[np.isfinite(column)]
         if present.size >= _LEAST_SIDE:
-            shares[site] = np.unique(present, return_counts=True)[1].max() / present.size
+            found, counts = np.unique(present, return_counts=True)
+            held[site], shares[site] = found[np.argmax(counts)], counts.max() / present.size
+    return held, shares
+
+
+def _at_a_limit(values: Array, targets: int) -> NDArray[np.bool_]:
+    """Sites (cycle, site) that hold the largest or smallest reading of all in nearly every cycle, as those of another target do."""
+    held, shares = _held_values(values)
+    marked = np.zeros(held.size, bool)
+    for limit in (np.nanmin(values), np.nanmax(values)):
+        there = (shares >= _ZEROED_SHARE) & (held == limit)
+        marked |= there if np.unique(np.flatnonzero(there) % targets).size > 1 else False
+    return marked
+
+
+def _zeroed_cycles(deviations: xr.Dataset) -> Check:
+    """A reading that is the same in every cycle, where all others scatter, was set to that value."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    _, shares = _held_values(values)
+    shares[_at_a_limit(values, deviations.sizes["target"])] = 0.0
     site = int(np.argmax(shares))
     direction, target = np.unravel_index(site, deviations["deviation"].shape[1:])
     return judge(

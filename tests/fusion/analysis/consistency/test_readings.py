@@ -262,6 +262,16 @@ def test_a_jump_of_some_targets_or_a_small_slip_is_no_new_datum() -> None:
     assert not failed(some) and not failed(small)
 
 
+def test_targets_that_are_always_at_the_limit_are_clipped_and_not_zeroed() -> None:
+    deviations = sound()
+    values = deviations["deviation"].values
+    # The two highest targets of both approaches, in every cycle.
+    limit = float(np.sort(values.min(axis=(0, 1)))[-2])
+    named = failed(deviations.assign(deviation=deviations["deviation"].copy(data=np.minimum(values, limit))))
+    assert f"{limit:g} µm, the largest" in named["repeated_value"].evidence
+    assert "zeroed_cycles" not in named
+
+
 def test_a_laser_that_is_zeroed_in_every_cycle_is_named() -> None:
     deviations = sound()
     zeroed = deviations["deviation"] - deviations["deviation"].isel(direction=0, target=0, drop=True)
