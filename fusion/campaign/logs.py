@@ -449,7 +449,7 @@ def _times(
     column = frame[headings[0]] if len(headings) == 1 else frame[list(headings)].astype(str).agg(" ".join, axis=1)
     seconds = numbers_in(column) if record.time_format is None else np.full(len(frame), np.nan)
     zones: dict[str, int] = {}
-    if np.isfinite(seconds).mean() > 0.5:
+    if np.isfinite(seconds).sum() > 0.5 * len(frame):
         unit = record.time_unit or rows.units.get(headings[0], "") or name_and_unit(headings[0])[1]
         if not unit:
             raise TableError(

@@ -157,13 +157,13 @@ def report_of(folder: Path) -> str:
 
 
 def _is_provenance(content: Any) -> bool:
-    """Whether JSON holds what a report tells of a run's origin: its inputs, versions and parameters."""
-    if not isinstance(content, dict):
+    """Whether JSON holds what a report tells of a run's origin: its times and command, inputs, versions and parameters."""
+    needed = {"started": str, "finished": str, "command": list, "versions": dict, "parameters": dict}
+    if not (isinstance(content, dict) and all(isinstance(content.get(key), kind) for key, kind in needed.items())):
         return False
-    parts = [content.get(key) for key in ("inputs", "versions", "parameters")]
-    if not (all(isinstance(part, dict) for part in parts) and isinstance(content["parameters"].get("campaign"), dict)):
-        return False
-    return is_file_list(content["inputs"])
+    tables = content["parameters"]
+    complete = "campaign" in tables and all(isinstance(table, dict) for table in tables.values())
+    return complete and "thermofuse" in content["versions"] and is_file_list(content.get("inputs"))
 
 
 # A report on paper: printed to PDF by an installed browser.

@@ -1,5 +1,6 @@
 """report.html in a headless chromium: offline, readable on a phone, the map answers; the page of two sessions; printing."""
 
+import json
 import re
 import shutil
 import stat
@@ -162,9 +163,13 @@ def test_it_is_made_anew_from_its_products(made_anew, report, tmp_path):
     shutil.copy(report.parent / "results.json", tmp_path / "results.json")
     with pytest.raises(ProductsError, match=r"provenance\.json is missing; run the campaign again"):
         report_of(tmp_path)
-    no_input = '{"inputs": {"laser.csv": -1}, "versions": {}, "parameters": {"campaign": {}}}'
-    for text in ("null", "[]", '{"inputs": {}, "versions": {}, "parameters": {"campaign": 5}}', no_input):
-        (tmp_path / "provenance.json").write_text(text)
+    whole = json.loads((report.parent / "provenance.json").read_text(encoding="utf-8"))
+    damaged = [
+        None, [], *({key: value for key, value in whole.items() if key != lost} for lost in ("started", "finished", "command", "inputs")),
+        {**whole, "versions": {}}, {**whole, "parameters": {"campaign": 5}}, {**whole, "inputs": {"laser.csv": -1}},
+    ]  # fmt: skip
+    for content in damaged:
+        (tmp_path / "provenance.json").write_text(json.dumps(content))
         with pytest.raises(ProductsError, match=r"provenance\.json: not the provenance of a run; run the campaign"):
             report_of(tmp_path)
 
