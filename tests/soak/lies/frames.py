@@ -319,6 +319,8 @@ LIES = (
         "window put before the camera in the middle",
         WINDOW,
         pixels(range(HALF, CYCLES + 1), lambda counts: 0.85 * counts + 0.15 * counts_of(24.0)),
+        # On a table near its temperature a window shifts the whole picture: the camera reads that much too high or low from there on.
+        describes=frozenset({"camera_offset"}),
     ),
     Lie(
         "lens out of focus from the middle on",
