@@ -1176,8 +1176,7 @@ def report_steps(
     averaged = average_over_drifts(state.model) if held_out else state.model
     steps: list[AddedEffect] = []
     for place, asked in enumerate(held_out):
-        beside = next((step.effect for step in steps if step.withheld), "")
-        steps.append(_added_effect(state, place, wrong.get(place), asked, averaged, beside))
+        steps.append(_added_effect(state, place, wrong.get(place), asked, averaged, steps))
     return steps
 
 
@@ -1187,7 +1186,7 @@ def _added_effect(
     wrong: Decision | None,
     asked: Answer | None,
     averaged: ModelFit,
-    beside: str,
+    earlier: Sequence[AddedEffect],
 ) -> AddedEffect:
     model, term, step = state.model, state.added[place], state.steps[place]
     event_s = term.candidate.event_s
@@ -1207,9 +1206,10 @@ def _added_effect(
     if wrong is not None:
         answer = replace(answer, against=wrong.sentence)
     size_um, is_smooth = _size(model, term), model.fit.system.order == 2
+    beside = next((one.effect for one in earlier if one.withheld), "")
     reasons = (
         withheld_for(step, size_um=size_um, drift_um=wandering_um(model.fit), is_smooth=is_smooth, beside=beside),
-        _withheld_as_misfit(state, place, size_um),
+        _withheld_as_misfit(state, place, size_um, earlier),
         _withheld_as_counterbalance(model, size_um),
         answer.other_size(where) if answer.is_of_other_size else "",
         _withheld_as_superfluous(model, term),
@@ -1238,13 +1238,16 @@ _MISFIT_SHARE = 0.3
 _ONE_PATTERN = 0.9
 
 
-def _withheld_as_misfit(state: LoopState[ModelFit], place: int, size_um: float) -> str:
-    """Why an effect has no name: it is what the shape of a larger slow effect of the same pattern may miss."""
+def _withheld_as_misfit(state: LoopState[ModelFit], place: int, size_um: float, earlier: Sequence[AddedEffect]) -> str:
+    """Why an effect has no name: it is what the shape of a larger slow effect of the same pattern may miss, at most a share where that one
+    has a name.
+    """
     model, own = state.model, _pattern(state.model, state.added[place])
-    for term in state.added[:place]:
+    for term, step in zip(state.added[:place], earlier, strict=True):
         is_slow = "time_constant_min" in term.candidate.parameters
         other_um = _size(model, term) if is_slow else 0.0
-        if size_um < _MISFIT_SHARE * other_um and abs(own @ _pattern(model, term)) > _ONE_PATTERN:
+        share = 1.0 if step.withheld else _MISFIT_SHARE
+        if size_um < share * other_um and abs(own @ _pattern(model, term)) > _ONE_PATTERN:
             larger = term.effect.replace("_", " ")
             return f"its {size_um:.2g} µm may be what the course of {larger} ({other_um:.2g} µm, of the same pattern) misses"
     return ""

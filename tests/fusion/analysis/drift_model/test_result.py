@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -787,8 +788,11 @@ def test_a_trend_may_be_a_part_of_a_walk_and_what_follows_a_load_may_not():
     assert withheld_for(trend, size_um=0.4, drift_um=0.19) == withheld_for(following, size_um=0.4, drift_um=0.2) == ""
 
 
-@pytest.mark.parametrize(("weight", "size", "withheld"), [(1.0, 0.25, True), (1.0, 0.6, False), (-1.0, 0.25, False)])
-def test_what_the_course_of_a_larger_effect_of_the_same_pattern_may_miss_has_no_name(weight, size, withheld):
+@pytest.mark.parametrize(
+    ("weight", "size", "of_larger", "withheld"),
+    [(1.0, 0.25, "", True), (1.0, 0.6, "", False), (-1.0, 0.25, "", False), (1.0, 0.6, "why", True), (1.0, 1.3, "why", False)],
+)  # fmt: skip
+def test_what_the_course_of_a_larger_effect_of_the_same_pattern_may_miss_has_no_name(weight, size, of_larger, withheld):
     slow = 1.0 - np.exp(-BARE.seconds / 200.0)
     other = np.sin(BARE.seconds / 60.0) * np.where(BARE.sign > 0, 1.0, weight)
     lag = term(slow / slow.std(), "a", parameters={"time_constant_min": 3.0})
@@ -804,7 +808,8 @@ def test_what_the_course_of_a_larger_effect_of_the_same_pattern_may_miss_has_no_
         )
         for one in model.terms
     )
-    said = _withheld_as_misfit(LoopState(model, steps=steps), 1, _size(model, model.terms[1]))
+    larger = [SimpleNamespace(withheld=of_larger)]
+    said = _withheld_as_misfit(LoopState(model, steps=steps), 1, _size(model, model.terms[1]), larger)
     assert bool(said) == withheld and ("the course of a" in said) == withheld
 
 
