@@ -145,7 +145,7 @@ def _unit_change(values: Array) -> tuple[int, float]:
         return 0, 1.0
     window = np.lib.stride_tricks.sliding_window_view(values, _UNIT_SIDE, axis=0)
     noise = np.median(np.abs(np.diff(window, 2, axis=-1)), axis=(1, 2, 3)) / (special.ndtri(0.75) * np.sqrt(6.0))
-    shape = np.sqrt((_bent(window.mean(axis=-1)) ** 2).mean(axis=(1, 2)))
+    shape = np.sqrt((_bent(window.mean(axis=-1), np.arange(window.shape[-2], dtype=float)) ** 2).mean(axis=(1, 2)))
     # A mean over the window shows a shape where that is large against its noise.
     clear = shape > _SHAPE_CLEAR * noise / np.sqrt(_UNIT_SIDE)
     before, after = slice(None, -_UNIT_SIDE), slice(_UNIT_SIDE, None)
@@ -312,27 +312,35 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
     first, end = _stretches(len(passes))
     inside = (totals[end] - totals[first]) / (end - first)[:, None, None]
     others = (totals[-1] - totals[end] + totals[first]) / (len(passes) - end + first)[:, None, None]
-    # Squares of the differences as read, late, and early, (3, stretches, approaches).
+    # Squares of the differences as read, late, and early, (3, stretches): of each approach between its ends, of both, and of the whole way
+    # there and back, where the first reading of a pass becomes the last one of the pass before.
+    along = np.arange(passes.shape[2], dtype=float)
     profiles = (others[..., 1:-1], others[..., :-2], others[..., 2:])
-    squares = np.stack([(_bent(inside[..., 1:-1] - one) ** 2).sum(axis=-1) for one in profiles])
+    squares = np.stack([(_bent(inside[..., 1:-1] - one, along[1:-1]) ** 2).sum(axis=-1) for one in profiles])
+    within = passes.shape[2] - 4
+    tried = [
+        (squares[..., k], within, f" in {name} approach" if names.size > 1 else "") for k, name in enumerate(names)
+    ]
+    if names.size > 1:
+        tried.append((squares.sum(axis=-1), names.size * within, ""))
+        way, there_and_back = np.concatenate([along, along[::-1]]), others.reshape(len(others), -1)
+        shifted = (np.roll(there_and_back, late, axis=1) for late in (0, 1, -1))
+        left = [_bent(inside.reshape(len(inside), -1) - one, way) for one in shifted]
+        tried.append((np.sum(np.square(left), axis=-1), way.size - 2, ""))
     noise_um = max(random_part_um(values), _rounding_um(values))
     error_um = noise_um * np.sqrt(1.0 / (end - first) + 1.0 / (len(passes) - end + first))
-    # A trigger is missed in one approach alone, or in both.
-    groups = [[k] for k in range(names.size)] + [list(range(names.size))] * (names.size > 1)
     found = []
-    for group in groups:
-        freedom = len(group) * (passes.shape[2] - 4)
-        as_read, late, early = np.maximum(np.sqrt(squares[..., group].sum(axis=-1) / freedom), error_um)
+    for differences, freedom, where in tried:
+        as_read, late, early = np.maximum(np.sqrt(differences / freedom), error_um)
         place = int(np.argmax(as_read / error_um))
-        left = min(late[place], early[place])
-        # Share of the volume of all changes as large that lies as near to a shift by one target; a line of each approach is fitted.
-        p = 2.0 * len(groups) * (left / as_read[place]) ** freedom
-        found.append((p, as_read[place], left, place, late[place] < early[place], group))
-    p, as_read_um, left_um, place, is_late, group = min(found, key=lambda one: one[0])
+        left_um = min(late[place], early[place])
+        # Share of the volume of all changes as large that lies as near to a shift by one target; a line is fitted.
+        p = 2.0 * len(tried) * (left_um / as_read[place]) ** freedom
+        found.append((p, as_read[place], left_um, place, late[place] < early[place], where))
+    p, as_read_um, left_um, place, is_late, one_way = min(found, key=lambda one: one[0])
     since = f"From cycle {cycles[first[place]]} on"
     if end[place] < len(passes):
         since = f"In cycles {cycles[first[place]]} to {cycles[end[place] - 1]}, against all others,"
-    one_way = "" if len(group) == names.size else f" in {names[group[0]]} approach"
     return judge(
         "missed_trigger",
         as_read_um,
@@ -355,9 +363,9 @@ def _stretches(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.concatenate([onward, first[within]]), np.concatenate([np.full(onward.size, count), end[within]])
 
 
-def _bent(profiles: Array) -> Array:
-    """What a straight line leaves of each profile (..., target), um."""
-    base, _ = np.linalg.qr(np.vander(np.arange(profiles.shape[-1], dtype=float), 2))
+def _bent(profiles: Array, along: Array) -> Array:
+    """What a straight line along the targets leaves of each profile (..., reading), um."""
+    base, _ = np.linalg.qr(np.vander(along, 2))
     return np.asarray(profiles - (profiles @ base) @ base.T)
 
 
