@@ -152,7 +152,7 @@ def test_a_missed_trigger_is_named_with_its_first_cycle(late: int) -> None:
 
 
 def test_a_trigger_missed_on_a_straight_axis_is_named_by_the_ends_of_its_passes() -> None:
-    """A shift of a straight line is a shift of its level, but for the first reading of a pass, which is the last one of the other approach."""
+    """A shift of a straight line is one of its level, but for the first reading of a pass, which is the last one of the other approach."""
     noise = np.random.default_rng(6).normal(0.0, 0.2, (40, 2, TARGETS))
     passes = noise + np.array([3.0, -3.0])[:, None] + 0.5 * np.stack([np.arange(TARGETS), np.arange(TARGETS)[::-1]])
     passes[18:] = np.roll(passes.ravel(), 1).reshape(passes.shape)[18:]
