@@ -194,8 +194,10 @@ def _without_memory(z: Array) -> Array:
     differs more between positions.
     """
     series = z.reshape(z.shape[0], -1).T
-    memory = memory_of_each(np.nan_to_num(series))
-    white = memory.innovations(np.nan_to_num(series)) / np.sqrt(memory.innovation_share)
+    # The noise of a cell without scatter is no number either.
+    known = np.where(np.isfinite(series), series, 0.0)
+    memory = memory_of_each(known)
+    white = memory.innovations(known) / np.sqrt(memory.innovation_share)
     return np.where(np.isfinite(z), white.T.reshape(z.shape), np.nan)
 
 

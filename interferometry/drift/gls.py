@@ -679,12 +679,13 @@ def _lag_one_by_memory(series: int, cycles: int) -> Array:
 
 
 def _lag_one(values: Array) -> float:
-    """Median correlation of successive values of series (series, cycles) beside their leading patterns."""
+    """Median correlation of successive values of series (series, cycles) beside their leading patterns; 0 where these are all there is."""
     u, s, vt = np.linalg.svd(values - values.mean(axis=1, keepdims=True), full_matrices=False)
     s[:_COMMON_PATTERNS] = 0.0
     own = (u * s) @ vt
     squares = (own**2).sum(axis=1)
-    return float(np.median((own[:, 1:] * own[:, :-1]).sum(axis=1)[squares > 0] / squares[squares > 0]))
+    own, squares = own[squares > 0], squares[squares > 0]
+    return float(np.median((own[:, 1:] * own[:, :-1]).sum(axis=1) / squares)) if squares.size else 0.0
 
 
 def typical_memory(values: Array) -> Autoregression:

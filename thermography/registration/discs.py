@@ -130,10 +130,11 @@ def locate_disc(
     blur_mm = 1.5 * float(np.linalg.norm(to_mm, 2))
     centre = np.asarray(predicted_px, float)
     for _ in range(12):
-        left, top = np.round(centre).astype(int) - half
-        right, bottom = np.round(centre).astype(int) + half + 1
-        if left < 0 or top < 0 or right > temperature.shape[1] or bottom > temperature.shape[0]:
+        # A place that is projected to infinity is no whole number.
+        first, last = np.round(centre) - half, np.round(centre) + half
+        if not ((first >= 0).all() and (last < temperature.shape[::-1]).all()):
             return "lies at the edge of the frame"
+        (left, top), (right, bottom) = first.astype(int), last.astype(int) + 1
         columns, rows = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
         offsets = np.stack([columns - centre[0], rows - centre[1]], axis=-1)
         plan_mm = offsets @ to_mm.T + (fiducial.x_mm, fiducial.y_mm)

@@ -138,7 +138,8 @@ def _lateness(name: str, evidence: Sequence[Evidence]) -> list[int]:
 
 def _of_times(recordings: Sequence[Recording]) -> Iterator[Evidence]:
     """What the times alone say: recordings that begin and end together, and those that do not cover the readings."""
-    for one, other in combinations(recordings, 2):
+    # A recording of one moment has no ends.
+    for one, other in combinations([each for each in recordings if each.sorted.size > 1], 2):
         ends = (other.sorted[[0, -1]] - one.sorted[[0, -1]]) / np.timedelta64(1, "s")
         quarters = round(float(ends.mean()) / QUARTER_S)
         steps = [float(np.median(np.diff(times.sorted) / np.timedelta64(1, "s"))) for times in (one, other)]

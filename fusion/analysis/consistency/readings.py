@@ -335,7 +335,7 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
         place = int(np.argmax(as_read / error_um))
         left_um = min(late[place], early[place])
         # Share of the volume of all changes as large that lies as near to a shift by one target; a line is fitted.
-        p = 2.0 * len(tried) * (left_um / as_read[place]) ** freedom
+        p = 2.0 * len(tried) * min(left_um / as_read[place], 1.0) ** freedom
         found.append((p, as_read[place], left_um, place, late[place] < early[place], where))
     p, as_read_um, left_um, place, is_late, one_way = min(found, key=lambda one: one[0])
     since = f"From cycle {cycles[first[place]]} on"

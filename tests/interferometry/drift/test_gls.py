@@ -393,6 +393,8 @@ def test_independent_sites_have_no_memory_and_few_sites_are_not_asked(rng):
     assert all(memory_of_each(rng.normal(size=(32, 50))).weights.size == 0 for _ in range(10))
     together = np.outer(rng.normal(size=32), np.sin(np.arange(50) / 5.0))
     assert memory_of_each(rng.normal(size=(32, 50)) + together).weights.size == 0
+    # Series of which nothing is left beside what all do together have no memory of their own.
+    assert memory_of_each(np.zeros((32, 50))).weights.size == 0
     assert memory_of_each(with_memory(rng.normal(size=(50, 6)), 0.6).T).weights.size == 0
 
 

@@ -62,7 +62,8 @@ def test_reasons_why_a_disc_is_not_located(rng):
     disc, centre = Fiducial("F1", 50.0, 30.0, 16.0), np.array([100.0, 60.0])
     plain = 22.0 + rng.normal(0, 0.05, (120, 200))
     assert locate_disc(plain, disc, SMALL_GRID, centre, JACOBIAN).startswith("has no contrast (")
-    assert locate_disc(plain, disc, SMALL_GRID, np.array([5.0, 60.0]), JACOBIAN) == "lies at the edge of the frame"
+    for place in ((5.0, 60.0), (np.nan, 60.0), (np.inf, 60.0), (1e300, 60.0)):
+        assert locate_disc(plain, disc, SMALL_GRID, np.array(place), JACOBIAN) == "lies at the edge of the frame"
     off = locate_disc(draw(centre, 16.0), disc, SMALL_GRID, centre + np.array([12.0, 0.0]), JACOBIAN)
     assert off == "no disc within 3.0 px of where it should be"
     tiny = Fiducial("F1", 50.0, 30.0, 1.0)

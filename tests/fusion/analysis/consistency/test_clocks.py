@@ -73,6 +73,8 @@ def test_two_recordings_have_no_majority() -> None:
     assert "laser.csv is taken as 1 h early or environment.csv is taken as 1 h late" in checks["clocks"].evidence
     assert all(check.passed for check in check_clocks([laser, environment]))
     assert check_clocks([laser]) == []
+    moment = Recording("drivers", "drivers.csv", laser.sorted[:1], "drivers")
+    assert check_clocks([laser, moment]) == [], "one row has no ends to begin and end with"
 
 
 def test_two_against_two_are_not_accused() -> None:
