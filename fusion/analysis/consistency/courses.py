@@ -334,8 +334,8 @@ def _scale_jumps(load: Array) -> Iterator[tuple[int, float]]:
 
 
 def _share_and_per_cent(load: Array, start: int) -> bool:
-    """Whether a load is 0 to 1 on one side of a jump and up to some hundred on the other; flags and numbers of programs are whole, and not
-    all of them a hundred times as large at once.
+    """Whether a load is 0 to 1 on one side of a jump and up to some hundred on the other; flags and numbers of programs are whole, and
+    their levels do not all grow a hundredfold at once.
     """
     sides = sorted((load[:start], load[start:]), key=lambda side: float(np.nanmax(np.abs(side))))
     share, other = (side[np.isfinite(side)] for side in sides)

@@ -240,7 +240,7 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     # Where rounding makes the scatter, readings repeat; so does the reading at which the laser is zeroed, but not those of several targets.
     scatters = np.nan_to_num(random_um) > step_um
     if scatters.any():
-        limited = _at_a_limit(values, deviations.sizes["target"])
+        limited = _at_a_limit(values, *_held_values(values), deviations.sizes["target"])
         random_um[limited] = np.median(random_um[scatters])
         scatters |= limited
     some = np.round(values[:, scatters], 6)
@@ -494,21 +494,21 @@ def _held_values(values: Array) -> tuple[Array, Array]:
     return held, shares
 
 
-def _at_a_limit(values: Array, targets: int) -> NDArray[np.bool_]:
+def _at_a_limit(values: Array, held: Array, shares: Array, targets: int) -> NDArray[np.bool_]:
     """Sites (cycle, site) that hold the largest or smallest reading of all in nearly every cycle, as those of another target do."""
-    held, shares = _held_values(values)
     marked = np.zeros(held.size, bool)
     for limit in (np.nanmin(values), np.nanmax(values)):
         there = (shares >= _ZEROED_SHARE) & (held == limit)
-        marked |= there if np.unique(np.flatnonzero(there) % targets).size > 1 else False
+        if np.unique(np.flatnonzero(there) % targets).size > 1:
+            marked |= there
     return marked
 
 
 def _zeroed_cycles(deviations: xr.Dataset) -> Check:
     """A reading that is the same in every cycle, where all others scatter, was set to that value."""
     values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
-    _, shares = _held_values(values)
-    shares[_at_a_limit(values, deviations.sizes["target"])] = 0.0
+    held, shares = _held_values(values)
+    shares[_at_a_limit(values, held, shares, deviations.sizes["target"])] = 0.0
     site = int(np.argmax(shares))
     direction, target = np.unravel_index(site, deviations["deviation"].shape[1:])
     return judge(
