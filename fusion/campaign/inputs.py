@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion
 
 from fusion.analysis.alignment.align import (
     AlignmentError,
@@ -65,10 +65,23 @@ from thermography.registration.plan import Fiducial, PlanGrid, Polygon, PolygonE
 from thermography.registration.projection import Lens, read_lens
 from thermography.registration.register import picture_grid
 
+_ZERO_CELSIUS_K = 273.15
+#: Camera parameters that a campaign file may override.
+OVERRIDABLE = (
+    "emissivity", "reflected_temperature_K", "atmospheric_temperature_K", "relative_humidity", "object_distance_m", "window_transmission",
+    "window_temperature_K",
+)  # fmt: skip
+
+
+def overridden_parameters(table: ThermographyTable) -> dict[str, float]:
+    """Return the camera parameters that the campaign file overrides, where temperatures are in degC."""
+    stated = {name: getattr(table, name.replace("_K", "_degC")) for name in OVERRIDABLE}
+    given = {name: value for name, value in stated.items() if value is not None}
+    return {name: value + _ZERO_CELSIUS_K if name.endswith("_K") else value for name, value in given.items()}
+
+
 # Files of temperatures of other cameras in a campaign: what ``[thermography.stack]`` says of them, and what it leaves
 # open.
-
-_ZERO_CELSIUS_K = 273.15
 
 
 def stack_options(campaign: Campaign) -> StackOptions:
@@ -653,7 +666,7 @@ def _raise_if_regions_unusable(source: CameraInputs) -> None:
             shares = Polygon(f"region {region.name}", np.array(region.corners)).cell_shares(grid.x_mm, grid.y_mm)
         except PolygonError as error:
             raise SourceError(f"{where}: {error}; the plan is {grid.width_mm:g} x {grid.height_mm:g} mm") from error
-        if not binary_erosion(shares == 1.0, np.ones((3, 3)), border_value=1).any():
+        if not scipy.ndimage.binary_erosion(shares == 1.0, np.ones((3, 3)), border_value=1).any():
             raise SourceError(
                 f"{where}: region {region.name}: no cell lies inside and away from its edge, where the lens blurs both surfaces; give a "
                 f"larger region, at least three cells of {grid.cell_size_mm:g} mm wide, or smaller cells"

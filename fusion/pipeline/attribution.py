@@ -19,7 +19,7 @@ from fusion.analysis.attribution.correlate import (
 from fusion.analysis.attribution.duty import randomisation_test
 from fusion.analysis.attribution.modes import Region, cluster_cells, disc
 from fusion.analysis.attribution.sensors import SensorChoice, choose_sensors
-from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.campaign.inputs import Source
 from fusion.pipeline.drift_model import place_scale_u, scaled
 from fusion.pipeline.positioning import average_cycles
@@ -156,7 +156,7 @@ def _duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
         load = duty.sel(source=name)
         drift = {"value": float(load["sensitivity"]), "u": float(load["sensitivity_u"])}
         constants = [float(load["time_constant"]), float(load["second_time_constant"])]
-        tested = {"cause": bool(load["p_value"] <= LEVEL), "p_value": float(load["p_value"])}
+        tested = {"cause": bool(load["p_value"] <= ATTRIBUTION_LEVEL), "p_value": float(load["p_value"])}
         found.append({"name": str(name), **tested, "drift_at_full_duty_um": drift, "time_constants_s": constants})
     return found
 
@@ -235,9 +235,9 @@ def _driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.
     if maps.attrs["verdict"] != "attributable":
         return []
     driven = np.zeros(fused.sizes["target"], bool)
-    if float(best["p_value"]) <= LEVEL:
+    if float(best["p_value"]) <= ATTRIBUTION_LEVEL:
         driven |= fused["position"].values != 0 if best["channel"] == "proportional" else True
     single = maps.children["target_regions"].to_dataset().sel(region=region)
-    followers = single["series_target"].values[(single["p_value"] <= LEVEL).values]
+    followers = single["series_target"].values[(single["p_value"] <= ATTRIBUTION_LEVEL).values]
     driven |= np.isin(fused["target"].values, followers)
     return fused["target"].values[driven].astype(int).tolist()

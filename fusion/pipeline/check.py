@@ -19,7 +19,6 @@ from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
 from fusion.campaign.logs import NO_START, read_drivers
 from fusion.messages import BAD_INPUT
-from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import check_source
 from fusion.pipeline.inspect import Recording, time_bars
 from fusion.results.progress import counted
@@ -121,7 +120,10 @@ def check_campaign(path: Path) -> CampaignCheck:
 
 def _check_record(campaign: Campaign) -> CampaignCheck:
     """Check a campaign whose data are a record."""
-    source = record_stage.read_source(campaign)
+    # The model of a record loads for longer than a laser is read.
+    from fusion.pipeline.record import read_source as read_record
+
+    source = read_record(campaign)
     runs, table = len(campaign.record_paths()), source.health.table
     content = (
         f"record: {counted(runs, 'run')}, {counted(table.sizes['sensor'], 'temperature')}, "

@@ -44,8 +44,7 @@ from fusion.analysis.consistency.logs import (
 from fusion.analysis.consistency.model import check_coefficients
 from fusion.analysis.consistency.readings import check_readings, check_signs
 from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source, is_rotary
-from fusion.pipeline.thermal import overridden_parameters
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source, is_rotary, overridden_parameters
 from thermography.io.other_cameras import TemperatureFrame
 
 

@@ -13,6 +13,7 @@ from fusion.analysis.alignment.align import AxisGeometry, add_sensor_line, align
 from fusion.analysis.consistency.camera import find_gaps, gap_words, in_gaps
 from fusion.analysis.consistency.readings import find_gross_readings
 from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose
+from fusion.analysis.levels import POSITION_LEVEL
 from fusion.campaign.inputs import LaserInputs, Source, lacks_course
 from fusion.campaign.recompensation import material_by_cycle
 from fusion.campaign.time_zones import utc
@@ -230,9 +231,8 @@ def _outside_notices(fused: xr.Dataset) -> Iterator[Notice]:
 
 # Positions that stand out from what the model explains, and their cause.
 
-#: Probability of any false anomaly in a whole test: a run states effects (0.025) and a remainder (0.01) as well, and all together may be
-#: false in 0.05. A rare kind reaches it with so many permutations.
-_LEVEL, _PERMUTATIONS = 0.015, 999
+#: A rare kind reaches the level with so many permutations.
+_PERMUTATIONS = 999
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.
     left = (fused["deviation"] - explained).values
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=left))
     # Scatter that is only unequal, as it naturally is, makes no position an anomaly; one that stands out does.
-    found = detect_anomalies(cleaned, estimate_drift(cleaned), level=_LEVEL, permutations=_PERMUTATIONS)
+    found = detect_anomalies(cleaned, estimate_drift(cleaned), level=POSITION_LEVEL, permutations=_PERMUTATIONS)
     anomalies = [anomaly for anomaly in found if anomaly.stands_out]
     diagnoses = diagnose(fused.assign(deviation=fused["deviation"].copy(data=left)), anomalies)
     return [DiagnosedPosition(*both) for both in zip(anomalies, diagnoses, strict=True)]

@@ -12,15 +12,22 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import optimize
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.logs import rise_share_u
 from fusion.campaign.config import RegionTable, ThermographyTable, relative_name
-from fusion.campaign.inputs import CameraInputs, Source, SourceError, frames_notices
+from fusion.campaign.inputs import (
+    OVERRIDABLE,
+    CameraInputs,
+    Source,
+    SourceError,
+    frames_notices,
+    overridden_parameters,
+)
 from fusion.campaign.time_zones import utc
 from fusion.common import Array
 from fusion.results.progress import Report, counted, listed
@@ -235,7 +242,7 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
     if room.shape[1]:
         # Discs reflect the room, whose surfaces change by no more than its air.
         room = room - room[0]
-        left = left - room @ optimize.lsq_linear(room, left, (0.0, 1.0)).x
+        left = left - room @ scipy.optimize.lsq_linear(room, left, (0.0, 1.0)).x
         left -= left[0]
     # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
     zero_u_K = np.interp(np.arange(len(source.frames)), shown.index, np.abs(left)) / np.sqrt(3.0)
@@ -349,23 +356,11 @@ def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameRefe
 # Radiometry of a campaign: parameters and their uncertainties, surfaces with an emissivity of their own, total
 # uncertainty.
 
-#: Camera parameters that a campaign file may override.
-_OVERRIDABLE = (
-    "emissivity", "reflected_temperature_K", "atmospheric_temperature_K", "relative_humidity", "object_distance_m", "window_transmission",
-    "window_temperature_K",
-)  # fmt: skip
 #: Attribute of `InputUncertainty` -> attribute of ``[thermography]`` that states it, with _u before the unit.
 _STATED = {
     name: re.sub("(_K|_m|)$", r"_u\1", name, count=1)
-    for name in (*_OVERRIDABLE, "camera_offset_K", "camera_scale", "camera_drift_K")
+    for name in (*OVERRIDABLE, "camera_offset_K", "camera_scale", "camera_drift_K")
 }
-
-
-def overridden_parameters(table: ThermographyTable) -> dict[str, float]:
-    """Return the camera parameters that the campaign file overrides, where temperatures are in degC."""
-    stated = {name: getattr(table, name.replace("_K", "_degC")) for name in _OVERRIDABLE}
-    given = {name: value for name, value in stated.items() if value is not None}
-    return {name: value + ZERO_CELSIUS_K if name.endswith("_K") else value for name, value in given.items()}
 
 
 def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:

@@ -14,12 +14,11 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import RegionTable, relative_name
-from fusion.campaign.inputs import CameraInputs, LaserInputs, frames_notices, picture_region
+from fusion.campaign.inputs import CameraInputs, LaserInputs, frames_notices, overridden_parameters, picture_region
 from fusion.campaign.time_zones import utc
 from fusion.pipeline.thermal import (
     PIXEL_FRAMES,
     counter,
-    overridden_parameters,
     pixel_notices,
     register_campaign,
     repeat_notices,

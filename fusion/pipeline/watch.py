@@ -19,11 +19,10 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AlignmentError, cycle_bounds
 from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import counted, plan_grid, stack_options
+from fusion.campaign.inputs import counted, overridden_parameters, plan_grid, stack_options
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.common import Array
 from fusion.pipeline.positioning import insufficient_for_model
-from fusion.pipeline.thermal import overridden_parameters
 from fusion.report.numbers import number
 from interferometry.common import InterferometryError
 from interferometry.deviations import build_deviations

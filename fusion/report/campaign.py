@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from fusion.analysis.attribution.significance import CHECKS, LEVEL
-from fusion.analysis.diagnosis.residual import LEVEL as REMAINDER_LEVEL
-from fusion.analysis.drift_model.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
+from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS, ENTRY_LEVEL, REMAINDER_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
 from fusion.report.conclusions import first_screen, headline, next_steps, sharpen
 from fusion.report.numbers import (
     alike,
@@ -103,7 +101,7 @@ def describe_correlation(
         "warm_up_share": float(maps["warm_up_share"]),
         "courses": int(maps.children["clusters"]["cluster"].max()),
         "condition": float(maps.children["clusters"]["condition"]),
-        "level": LEVEL,
+        "level": ATTRIBUTION_LEVEL,
         "camera": _camera_prediction(maps.children["sensors"].to_dataset()),
         "sensors": [
             (added, losses[at] > min(losses[:at], default=np.inf)) for at, added in enumerate(correlation.sensors.sets)
@@ -113,7 +111,7 @@ def describe_correlation(
 
 def passes(p: float | None) -> bool:
     """Return whether a family-wise p-value is significant."""
-    return p is not None and p <= LEVEL
+    return p is not None and p <= ATTRIBUTION_LEVEL
 
 
 class _OtherMode(NamedTuple):
@@ -185,7 +183,10 @@ def leading_region(maps: xr.DataTree) -> str:
 def _region_targets(maps: xr.DataTree) -> list[tuple[str, list[str], int]]:
     """Return the regions that single targets follow: name, those targets, and the number of targets tested."""
     p = maps.children["target_regions"].to_dataset()["p_value"]
-    passed = {str(region): p["series"].values[(p.sel(region=region) <= LEVEL).values] for region in p["region"].values}
+    passed = {
+        str(region): p["series"].values[(p.sel(region=region) <= ATTRIBUTION_LEVEL).values]
+        for region in p["region"].values
+    }
     return [(region, [*map(str, names)], p.sizes["series"]) for region, names in passed.items() if names.size]
 
 
@@ -543,7 +544,7 @@ _RESTS_ON: dict[str, Figures] = {
 }  # fmt: skip
 _SIGNS = {"positive": "+", "negative": "−"}
 _LEVELS = {
-    "search": SEARCH_LEVEL, "second": SECOND_LEVEL, "entry": ENTRY_LEVEL, "remainder": REMAINDER_LEVEL, "attribution": LEVEL,
+    "search": SEARCH_LEVEL, "second": SECOND_LEVEL, "entry": ENTRY_LEVEL, "remainder": REMAINDER_LEVEL, "attribution": ATTRIBUTION_LEVEL,
 }  # fmt: skip
 #: Actions in the summary; all remedies stand with what was left out.
 MOST_STEPS = 6

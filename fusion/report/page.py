@@ -12,12 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
-from fusion.analysis.attribution.significance import LEVEL
-from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
+from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import FusionError
 from fusion.report.campaign import describe_campaign
 from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
@@ -28,6 +27,9 @@ from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results, read_results
 from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically, write_text
+
+if TYPE_CHECKING:
+    from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -287,7 +289,7 @@ def describe_sources(comparison: SessionComparison, sessions: Sequence[str]) -> 
         found = zip(source.p_value, comparison.least_p, *of_sessions, strict=True)
         where = f"{place(source.x_mm, source.y_mm)}, {CHANNELS.get(source.channel, source.channel)}"
         shown = tuple(say("session_source", *one) for one in found)
-        verdict = say("source_verdict", source, sessions, near, LEVEL)
+        verdict = say("source_verdict", source, sessions, near, ATTRIBUTION_LEVEL)
         described.append(SourceWords(names[_key(source)], where, shown, verdict))
     return described
 

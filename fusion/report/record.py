@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.analysis.alignment.sensor_health import describe_fault
-from fusion.analysis.drift_model.record import ENTRY_LEVEL
+from fusion.analysis.levels import RECORD_ENTRY_LEVEL
 from fusion.report.campaign import DECIDED_BEFORE, MOST_STEPS, errors_table, refused_effects, steps_table
 from fusion.report.conclusions import first_screen, headline, next_steps
 from fusion.report.numbers import duration, join, moment
@@ -84,7 +84,7 @@ def describe_record(results: Results, record: xr.Dataset, provenance: Mapping[st
         "error_keys": _ERRORS,
         "refused": refused_effects(loop),
         "chained_means": {name: _mean_chained(loop, name) for name in _ERRORS},
-        "levels": {"entry": ENTRY_LEVEL},
+        "levels": {"entry": RECORD_ENTRY_LEVEL},
         "decided_before": DECIDED_BEFORE,
     }
 

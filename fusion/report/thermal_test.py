@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rich.table
 
-from fusion.analysis.drift_model.verification import ChannelVerdict
 from fusion.report.numbers import measured, number, print_unit, small
 from fusion.report.wording import Table, Words, print_table, quantity, table
 from fusion.results.thermal_test import ThermalDistortion, ThermalTest
+
+if TYPE_CHECKING:
+    from fusion.analysis.drift_model.verification import ChannelVerdict
 
 _PERIODS = ("first_hour", "whole", "last_hour", "change")
 _TITLES = ("first 60 min", "whole test", "last 60 min", "last − first")

@@ -26,9 +26,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy import linalg, optimize, special
+from scipy import linalg, special
 from scipy.linalg import lapack
 
 from interferometry.common import Array
@@ -271,7 +272,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
     step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
     simplex = np.vstack([guess, guess + np.diag(step)])
-    optimum = optimize.minimize(
+    optimum = scipy.optimize.minimize(
         lambda log_ratio: -_solve(replace(searched, ratios=ratios(log_ratio)), few).log_likelihood,
         guess,
         method="Nelder-Mead",
@@ -348,7 +349,7 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     components = system.ratios.size
     guess = np.r_[with_same_mean(likely), np.log10(first_s), likely]
     limits = np.log10(span * np.array(_SETTLING_LIMITS))
-    optimum = optimize.minimize(
+    optimum = scipy.optimize.minimize(
         lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]),
         guess,
         method="Nelder-Mead",
@@ -416,7 +417,7 @@ def _fit_memory(fit: DriftFit) -> DriftFit:
     if max(likely) < constant:
         return fit
     step = np.r_[np.where(drift > high - 1.0, -1.0, 1.0), 0.1 if guess[-2] > 0.5 else 0.2, 0.3]
-    optimum = optimize.minimize(
+    optimum = scipy.optimize.minimize(
         lambda x: -likelihood(x),
         guess,
         method="Nelder-Mead",

@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import xarray as xr
-from scipy import optimize, special
+from scipy import special
 
 from interferometry.common import Array, InterferometryError, check_dataset
 
@@ -206,7 +207,7 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | Non
     grid = np.linspace(math.log(length / 100), math.log(length * 20), 120)
     nearest = grid[int(np.argmin([sum_of_squares(log_tau) for log_tau in grid]))]
     step = grid[1] - grid[0]
-    best = optimize.minimize_scalar(sum_of_squares, bounds=(nearest - step, nearest + step), method="bounded")
+    best = scipy.optimize.minimize_scalar(sum_of_squares, bounds=(nearest - step, nearest + step), method="bounded")
     lowest, coefficients, residual = solve(float(best.x))
     correlation = float((residual[1:] * residual[:-1]).sum() / max(float((residual**2).sum()), 1e-300))
     independent = max(seconds.size * (1 - max(correlation, 0.0)) / (1 + max(correlation, 0.0)), 5.0)
@@ -223,7 +224,7 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | Non
         """Return where the sum of squares crosses the limit between the best time constant and an end of the search."""
         if sum_of_squares(end) <= limit:
             return end
-        return float(optimize.brentq(lambda log_tau: sum_of_squares(log_tau) - limit, float(best.x), end))
+        return float(scipy.optimize.brentq(lambda log_tau: sum_of_squares(log_tau) - limit, float(best.x), end))
 
     low, top = math.exp(confidence_limit(grid[0])), confidence_limit(grid[-1])
     high = math.inf if top == grid[-1] else math.exp(top)

@@ -1,12 +1,12 @@
 """ISO 230-2: accuracy and repeatability of positioning, over any window of cycles, with the uncertainty budget of each quantity.
 
-Evaluation (:mod:`interferometry.iso230.evaluation`), the inputs of the budget (:mod:`interferometry.iso230.uncertainty`) and the
-uncertainty
+Evaluation (:mod:`interferometry.iso230.evaluation`), the inputs of the budget (:mod:`interferometry.iso230.budget`) and the uncertainty
 (:mod:`interferometry.iso230.uncertainty`)::
 
     result = evaluate_iso230(deviations, cycles=[1, 2, 3, 4, 5], budget=Iso230Budget(device_ppm=0.1))
 """
 
+from interferometry.iso230.budget import CONTRIBUTIONS, SAMPLING, Iso230Budget
 from interferometry.iso230.evaluation import (
     QUANTITIES,
     STANDARD_CYCLES,
@@ -15,7 +15,6 @@ from interferometry.iso230.evaluation import (
     evaluate_windows,
     settled_window,
 )
-from interferometry.iso230.uncertainty import CONTRIBUTIONS, SAMPLING, Iso230Budget
 
 __all__ = [
     "CONTRIBUTIONS",

@@ -1,143 +1,16 @@
-"""Uncertainty of the quantities of ISO 230-2: each as an uncertain number that carries its correlations, and its budget."""
+"""Uncertainty of the quantities of ISO 230-2: each as an uncertain number that carries its correlations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
 
 import GTC
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from interferometry.common import InterferometryError
+from interferometry.iso230.budget import CONTRIBUTIONS, Iso230Budget
+from interferometry.iso230.evaluation import AXIS, ONE_WAY, axis_quantities
 
-# The uncertainty budget of a positioning test: its inputs, and what is assumed where nothing is stated.
-
-#: Contributions to the uncertainty, in the order of the budget. The last two are the sampling, by which a few cycles stand for the axis:
-#: scatter of the readings, and that the largest of noisy values is too large.
-CONTRIBUTIONS = (
-    "device",
-    "alignment",
-    "material_temperature",
-    "expansion_coefficient",
-    "environmental_variation",
-    "sampling",
-    "extremes",
-)
-SAMPLING = ("sampling", "extremes")
-
-
-@dataclass(frozen=True)
-class Iso230Budget:
-    """Contributions to the uncertainty besides the scatter of the readings (ISO 230-2:2014 Annex A, ISO/TR 230-9).
-
-    All are standard uncertainties (k = 1). Those that scale with length act over the distance between the positions that decide a
-    quantity. The defaults are assumptions for a workshop; a laboratory that knows better states its own.
-
-    Attributes
-    ----------
-    device_ppm : float
-        Laser with its compensation for the air, ppm. Assumed: 0.25 ppm, a laser with weather station that is stated as 0.5 ppm at k = 2.
-    alignment_ppm : float
-        Cosine error, ppm; a beam 1 mrad off reads 0.5 ppm short. Assumed: 0.3 ppm, limits of 1 mrad with a rectangular distribution.
-    material_temperature_K : float
-        Of the temperature that the compensation took for that of the measured length, K: accuracy of the probe and of its place.
-        Assumed: 0.3 K.
-    expansion_coefficient_ppm_per_K : float
-        Of the expansion coefficient that the compensation used, ppm/K. Assumed: 2 ppm/K, a steel or cast iron of unknown grade.
-    difference_from_20_degC_K : float
-        Difference of the material temperature from 20 degC, K (no uncertainty: it scales that of the coefficient). Assumed: 10 K,
-        an axis that has warmed in a workshop of 15 to 25 degC: what is not measured must not make the uncertainty smaller.
-    nominal_expansion_ppm_per_K : float
-        The coefficient itself, ppm/K (no uncertainty: it scales that of the temperature). Assumed: 11.7 ppm/K, steel.
-    environmental_variation_um : float or None
-        Environmental variation error (EVE) during one evaluation, um; that of a drift test of range E is E / sqrt 12. None: the
-        standard deviation of the drift that the joint estimate finds within the window, where there is one.
-
-    Raises
-    ------
-    InterferometryError
-        A standard uncertainty is negative.
-
-    Notes
-    -----
-    docs/method/iso230.md derives the assumptions and states how often the intervals cover the truth.
-
-    Examples
-    --------
-    >>> Iso230Budget(device_ppm=0.1, environmental_variation_um=0.4).material_temperature_K
-    0.3
-    """
-
-    device_ppm: float = 0.25
-    alignment_ppm: float = 0.3
-    material_temperature_K: float = 0.3
-    expansion_coefficient_ppm_per_K: float = 2.0
-    difference_from_20_degC_K: float = 10.0
-    nominal_expansion_ppm_per_K: float = 11.7
-    environmental_variation_um: float | None = None
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name.split("_")[0] not in ("difference", "nominal") and value is not None and value < 0:
-                raise InterferometryError(f"{field.name}={value} is negative; a standard uncertainty is 0 or more")
-
-    @property
-    def is_scatter_alone(self) -> bool:
-        """Whether instrument, alignment and material contribute nothing."""
-        of_material = self.material_temperature_K or self.expansion_coefficient_ppm_per_K
-        return not (self.device_ppm or self.alignment_ppm or of_material)
-
-
-#: No error of instrument, alignment or material, as for a rotary axis: the budget is one of lengths.
-SCATTER_ALONE = Iso230Budget(
-    device_ppm=0.0, alignment_ppm=0.0, material_temperature_K=0.0, expansion_coefficient_ppm_per_K=0.0
-)
-
-
-# The quantities of ISO 230-2:2014, clause 3, from mean deviations and their standard deviations.
-
-Array = NDArray[np.float64]
-
-
-def target_quantities(mean: Array, s: Array) -> tuple[Array, Array, Array]:
-    """Return mean bidirectional deviation, reversal error B_i and bidirectional repeatability R_i of every position."""
-    positive, negative = mean[..., 0, :], mean[..., 1, :]
-    s_positive, s_negative = s[..., 0, :], s[..., 1, :]
-    reversal = positive - negative
-    wide = np.fmax(2 * s_positive + 2 * s_negative + np.abs(reversal), np.fmax(4 * s_positive, 4 * s_negative))
-    return (positive + negative) / 2, reversal, np.where(np.isnan(reversal), np.nan, wide)
-
-
-def axis_quantities(mean: Array, s: Array) -> dict[str, Array]:
-    """Return the quantities of the axis: B, R, E, M and A of both directions, and R, E and A of each."""
-    both, reversal, repeatability = target_quantities(mean, s)
-    bidirectional = np.isfinite(reversal).any(axis=-1)
-    upper, lower = mean + 2 * s, mean - 2 * s
-    cells = (-2, -1)
-    return {
-        "B": _largest(np.abs(reversal)),
-        "R": _largest(repeatability),
-        "E": np.where(bidirectional, _largest(mean, cells) + _largest(-mean, cells), np.nan),
-        "M": _largest(both) + _largest(-both),
-        "A": np.where(bidirectional, _largest(upper, cells) + _largest(-lower, cells), np.nan),
-        "R_unidirectional": _largest(4 * s),
-        "E_unidirectional": _largest(mean) + _largest(-mean),
-        "A_unidirectional": _largest(upper) + _largest(-lower),
-    }
-
-
-def _largest(values: Array, axes: int | tuple[int, ...] = -1) -> Array:
-    """Return the largest finite value along axes, NaN where there is none."""
-    return np.asarray(np.fmax.reduce(values, axis=axes), dtype=float)
-
-
-#: Quantities of the axis that have an uncertainty: reversal error, bidirectional repeatability, bidirectional systematic positioning
-#: error, mean bidirectional positioning error, bidirectional accuracy, signed mean of the reversal errors.
-AXIS = ("B", "R", "E", "M", "A", "mean_reversal")
-ONE_WAY = ("R_unidirectional", "E_unidirectional", "A_unidirectional")
 #: Contributions to a quantity that was not measured.
 _UNKNOWN = [np.nan] * len(CONTRIBUTIONS)
 #: Tests that are drawn to see by how much the largest of noisy values is too large: enough to know it to a tenth of itself.

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from thermography.common import MAD_TO_SIGMA, Array
 from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
@@ -194,7 +194,7 @@ class CyclePart:
 
 def pixel_noise(image: Array, used: NDArray[np.bool_]) -> float:
     """Standard deviation of white noise in an image, insensitive to smooth fields."""
-    return noise_of_differences(image, ndimage.binary_erosion(used, np.ones((3, 3))))
+    return noise_of_differences(image, scipy.ndimage.binary_erosion(used, np.ones((3, 3))))
 
 
 def noise_of_differences(image: Array, interior: NDArray[np.bool_]) -> float:
@@ -352,10 +352,10 @@ def _gradient_variance(fields_K: Array, covariance: Array, grid: PlanGrid) -> Ar
     for cycle, (field_K, cells) in enumerate(zip(fields_K, seen, strict=True)):
         if cells.any():
             if cycle == 0 or not seen[cycle - 1].any() or (cells != seen[cycle - 1]).any():
-                nearest = ndimage.distance_transform_edt(~cells, return_distances=False, return_indices=True)
+                nearest = scipy.ndimage.distance_transform_edt(~cells, return_distances=False, return_indices=True)
             filled[cycle] = field_K[tuple(nearest)]
     # Smoothed over neighbouring cells, so that their noise is not taken for a gradient.
-    smooth = ndimage.gaussian_filter(filled, (0, 1, 1), mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter(filled, (0, 1, 1), mode="nearest")
     down, across = np.gradient(smooth, grid.cell_size_mm, axis=(1, 2))
     xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     return np.where(seen, across * (across * xx + 2 * down * xy) + down * down * yy, np.nan)

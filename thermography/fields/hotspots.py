@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 from skimage import measure, morphology
 
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
@@ -116,8 +116,8 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
 def _smooth_seen(values: Array, width_cells: float) -> Array:
     """Gaussian mean over seen cells, (y, x); NaN cells have no weight and remain NaN (normalised convolution)."""
     seen = np.isfinite(values)
-    total = ndimage.gaussian_filter(np.where(seen, values, 0.0), width_cells, mode="constant")
-    weight = ndimage.gaussian_filter(seen.astype(float), width_cells, mode="constant")
+    total = scipy.ndimage.gaussian_filter(np.where(seen, values, 0.0), width_cells, mode="constant")
+    weight = scipy.ndimage.gaussian_filter(seen.astype(float), width_cells, mode="constant")
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(seen, total / weight, np.nan)
 
@@ -132,7 +132,9 @@ def _hotspot(
     zones = measure.label((field >= field[place] - prominence / 2) & seen, connectivity=1)
     zone = zones == zones[place]
     rows, columns = np.nonzero(zone)
-    outside = ~ndimage.binary_erosion(np.pad(ndimage.binary_fill_holes(seen), 1), np.ones((3, 3)))[1:-1, 1:-1]
+    outside = ~scipy.ndimage.binary_erosion(np.pad(scipy.ndimage.binary_fill_holes(seen), 1), np.ones((3, 3)))[
+        1:-1, 1:-1
+    ]
     column, row, peak = _vertex(values, field, place)
     left, lower = float(x[columns].min() - cell / 2), float(y[rows].min() - cell / 2)
     right, upper = float(x[columns].max() + cell / 2), float(y[rows].max() + cell / 2)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import cv2
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
@@ -414,7 +414,7 @@ def compare_discs(frames: Sequence[FrameReference], registration: Registration) 
     if share > _DULL:
         return None
     added = (disc - max(share, 0.0) * table) / (1.0 - max(share, 0.0))
-    smooth = ndimage.uniform_filter1d(_beside(added), _SMOOTHED, axis=0, mode="nearest")
+    smooth = scipy.ndimage.uniform_filter1d(_beside(added), _SMOOTHED, axis=0, mode="nearest")
     scores, sizes, places = np.linalg.svd(smooth, full_matrices=False)
     return DiscCourses(
         index,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import PARTLY_SEEN_BELOW, SURFACE_EDGE, annotate, rate, reference_cycle
@@ -86,10 +86,12 @@ def find_surfaces(
         share = region.outline.cell_shares(x_mm, y_mm)
         owner[share == 1.0] = number
         mixed = np.where(share == 1.0, False, mixed | (share > 0.0))
-    spread = ndimage.maximum_filter(owner, 3, mode="nearest") != ndimage.minimum_filter(owner, 3, mode="nearest")
+    spread = scipy.ndimage.maximum_filter(owner, 3, mode="nearest") != scipy.ndimage.minimum_filter(
+        owner, 3, mode="nearest"
+    )
     edge = mixed | spread
     # A partly seen cell was moved to its centre along a gradient that its neighbours across the edge take part in.
-    edge |= ndimage.binary_dilation(edge, np.ones((3, 3))) & (fields["coverage"].values < PARTLY_SEEN_BELOW)
+    edge |= scipy.ndimage.binary_dilation(edge, np.ones((3, 3))) & (fields["coverage"].values < PARTLY_SEEN_BELOW)
     surfaces = [Surface("", emissivity, emissivity_u, (owner == 0) & ~edge)]
     for number, region in enumerate(regions, start=1):
         cells = (owner == number) & ~edge
@@ -147,7 +149,7 @@ def measure_emissivity(
 ) -> EmissivityEstimate:
     """Estimate the emissivity of a region from two cycles in which a contact sensor has measured its temperature."""
     inside = outline.cell_shares(fields["x"].values, fields["y"].values) == 1.0
-    inside = ndimage.binary_erosion(inside, np.ones((3, 3)))
+    inside = scipy.ndimage.binary_erosion(inside, np.ones((3, 3)))
     known = []
     for cycle, celsius, celsius_u in states:
         if cycle not in fields["cycle"].values:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg, ndimage, optimize, special
+from scipy import linalg, special
 
 from thermography.common import MAD_TO_SIGMA, Array
 
@@ -41,8 +42,8 @@ class CameraFlag:
 def find_repeats(repeated: NDArray[np.bool_], time: NDArray[np.datetime64]) -> list[CameraFlag]:
     """Find frames that were written twice and intervals in which the camera output was frozen."""
     flags = []
-    labels, count = ndimage.label(repeated)
-    for (run,) in ndimage.find_objects(labels)[:count]:
+    labels, count = scipy.ndimage.label(repeated)
+    for (run,) in scipy.ndimage.find_objects(labels)[:count]:
         length = run.stop - run.start
         frozen = length > _MAX_REPEATS
         text = f"{length} {'frame repeats' if length == 1 else 'frames repeat'} the counts of frame {run.start - 1}"
@@ -327,7 +328,7 @@ def _fit(change: Array, design: Array, seconds: Array) -> _Fit:
         factor, _, _, information, squares = whiten(logit)
         return float(2.0 * np.log(factor[0]).sum() + np.linalg.slogdet(information)[1] + freedom * np.log(squares))
 
-    best = optimize.minimize_scalar(deviance, bounds=(-8.0, 8.0), method="bounded", options={"xatol": 0.05}).x
+    best = scipy.optimize.minimize_scalar(deviance, bounds=(-8.0, 8.0), method="bounded", options={"xatol": 0.05}).x
     factor, weighted, values, information, squares = whiten(float(best))
     scale = squares / freedom
     unit = np.linalg.inv(information)

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 
 from thermography.common import Array, ThermographyError
 
@@ -237,7 +237,7 @@ class _Motion:
             parameters[2] = max(parameters[2], _LEAST_FEED_MM_S)
             return np.nan_to_num(self.residual(parameters), nan=0.0)
 
-        solution = least_squares(
+        solution = scipy.optimize.least_squares(
             residuals,
             start[free] / scale[free],
             loss="soft_l1",

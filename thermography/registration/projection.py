@@ -21,9 +21,9 @@ from xml.etree import ElementTree
 import cv2
 import numba
 import numpy as np
+import scipy
 import yaml
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from thermography.common import Array, ThermographyError
 
@@ -373,7 +373,7 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
         weighted = (residuals_px / observations.u_px[:, None]).ravel()
         return np.concatenate([weighted, parameters[8:] / LENS_SPREAD[:coefficients]])
 
-    return unpack(least_squares(residuals, pack(start), method="lm", xtol=1e-9, ftol=1e-9).x)
+    return unpack(scipy.optimize.least_squares(residuals, pack(start), method="lm", xtol=1e-9, ftol=1e-9).x)
 
 
 def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from fusion.analysis.alignment.reflections import find_switching_patch, seen_throughout
 from fusion.analysis.alignment.sensor_health import SensorFault
@@ -300,7 +300,7 @@ class MeasuredLine:
 
     def _sample_some(self, frames: Array) -> Array:
         place = [self._row, self._column]
-        samples = np.stack([ndimage.map_coordinates(frame, place, order=1, mode="nearest") for frame in frames])
+        samples = np.stack([scipy.ndimage.map_coordinates(frame, place, order=1, mode="nearest") for frame in frames])
         samples[:, self._outside] = np.nan
         valid = np.isfinite(samples)
         number = valid.sum(axis=1)

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.attribution.drift_channels import (
@@ -41,15 +41,14 @@ from fusion.analysis.attribution.modes import (
     region_courses,
 )
 from fusion.analysis.attribution.significance import (
-    CHECKS,
     LAGS_S,
-    LEVEL,
     AttributionResult,
     FamilyTest,
     FieldSeries,
     evaluate_candidates,
     screen,
 )
+from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array, FusionError
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart, Sensitivity
@@ -68,7 +67,7 @@ def piece_with_peak(strength: Array, inside: NDArray[np.bool_]) -> NDArray[np.bo
 
 def _pieces(strength: Array, inside: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[tuple[np.intp, ...]]]:
     """The connected piece of cells with the strongest one, and the strongest cell of every other piece."""
-    labels, count = ndimage.label(inside, np.ones((3, 3)))
+    labels, count = scipy.ndimage.label(inside, np.ones((3, 3)))
     leading = labels[np.unravel_index(int(strength.argmax()), strength.shape)]
     others = (np.where(labels == label, strength, -np.inf) for label in range(1, count + 1) if label != leading)
     return labels == leading, [np.unravel_index(int(other.argmax()), strength.shape) for other in others]
@@ -341,7 +340,7 @@ class _Session:
 
     def quantities(self, name: str, test: FamilyTest) -> _Quantities:
         """What the test found per channel and column."""
-        verdict = np.where(test.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
+        verdict = np.where(test.p_value <= ATTRIBUTION_LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
         if self.excitation.warm_up_only:
             verdict = np.full_like(verdict, NOT_SEPARABLE)
         naive = [_naive_correlation(channel, self.candidates.sets[name]) for channel in self.series]
@@ -364,9 +363,11 @@ class _Session:
         count = modes.values.shape[1]
         p_value = np.full((len(test.names), count), np.nan)
         ratio = test.statistic / test.threshold[:, None]
-        channel, leader = np.unravel_index(int(np.where(test.p_value <= LEVEL, ratio, -1.0).argmax()), ratio.shape)
+        channel, leader = np.unravel_index(
+            int(np.where(test.p_value <= ATTRIBUTION_LEVEL, ratio, -1.0).argmax()), ratio.shape
+        )
         others = np.flatnonzero(np.arange(count) != leader)
-        if test.p_value[channel, leader] <= LEVEL and others.size and not self.excitation.warm_up_only:
+        if test.p_value[channel, leader] <= ATTRIBUTION_LEVEL and others.size and not self.excitation.warm_up_only:
             lag_s = self.lags_s[int(test.lag_index[channel, leader])]
             given = respond(modes.values[:, [leader]], modes.seconds, time_constant_s=lag_s)
             rest = {"modes": FieldSeries(modes.seconds, modes.values[:, others])}
@@ -426,7 +427,7 @@ def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.D
         "cells_false_alarm_rate": cells.false_alarm_rate,
         "warm_up_share": excitation.warm_up_share,
     }
-    passed = any((test.p_value <= LEVEL).any() for test in result.sets.values())
+    passed = any((test.p_value <= ATTRIBUTION_LEVEL).any() for test in result.sets.values())
     flag = NOT_SEPARABLE if excitation.warm_up_only else ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
     verdict = _FLAG_MEANINGS.split()[flag].replace("_", " ")
     return xr.Dataset(
@@ -453,7 +454,7 @@ def find_source(maps: xr.DataTree) -> SourcePart:
     """Return the leading candidate of a session, whether it passes or not."""
     leaders = {name: _leader(maps, name) for name in _KINDS if name == "cells" or name in maps.children}
     smallest = {name: float(leader["p_value"]) for name, leader in leaders.items()}
-    passed = [name for name, p in smallest.items() if p <= LEVEL]
+    passed = [name for name, p in smallest.items() if p <= ATTRIBUTION_LEVEL]
     chosen = passed[0] if passed else min(smallest, key=lambda name: smallest[name])
     best, kind = leaders[chosen], _KINDS[chosen]
     inside, others = _surroundings(maps, chosen, best)

@@ -22,7 +22,6 @@ from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.attribution.drift_channels import DriftSeries, clock_readings, reduce_channels
 from fusion.analysis.attribution.modes import level_and_trend
 from fusion.analysis.attribution.significance import (
-    LEVEL,
     NullBank,
     estimate_effects,
     likelihood_ratios,
@@ -30,6 +29,7 @@ from fusion.analysis.attribution.significance import (
     null_bank,
     whiten_series,
 )
+from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import Array, FusionError
 from interferometry.drift.kalman import drift_system
 
@@ -172,7 +172,7 @@ def randomisation_test(
             "sensitivity_u": (("source",), size_u, {"units": "um"}),
         },
         coords={"source": names},
-        attrs={"source": names[strongest] if p_value[strongest] <= LEVEL else "", "draws": draws},
+        attrs={"source": names[strongest] if p_value[strongest] <= ATTRIBUTION_LEVEL else "", "draws": draws},
     )
 
 
@@ -316,7 +316,7 @@ def _power(machine: Machine, hours: float, law: DutyLaw, rng: np.random.Generato
     columns = np.stack(
         [_drift_responses(machine, tau, law, fine, cycles, rng) for tau in machine.time_constants_s], axis=2
     )
-    threshold = special.chdtri(1, LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)))
+    threshold = special.chdtri(1, ATTRIBUTION_LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)))
     basis, _ = np.linalg.qr(trend)
     powers = []
     for k in range(_SCHEDULES):

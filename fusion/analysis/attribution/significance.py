@@ -25,6 +25,7 @@ from fusion.analysis.alignment.first_order_lag import lag_operators
 from fusion.analysis.attribution.drift_channels import DriftSeries, TargetSeries
 from fusion.analysis.attribution.modes import Excitation, nuisance_columns
 from fusion.analysis.drift_model.gains import side_by_side
+from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array
 from interferometry.drift.kalman import DriftSystem, Order, drift_system
 from thermography.fields.large_arrays import empty_array, give_back
@@ -317,10 +318,6 @@ def monte_carlo_p(statistic: Array | Array32, simulated: Array) -> Array:
 
 #: Time constants of the first-order lags between temperature and drift, s.
 LAGS_S = (0.0, 600.0, 1200.0, 2400.0, 3600.0, 5400.0)
-#: Number of simulated series on which the false alarm rate is measured.
-CHECKS = 199
-#: Family-wise level of the verdicts.
-LEVEL = 0.05
 #: Standard normal quantile of 0.8: an effect this many standard uncertainties above the threshold is detected with 80 % power.
 _POWER_80 = 0.8416
 #: Bins of the pooled null distribution of the statistic of one cell.
@@ -582,8 +579,8 @@ def _family_wise(statistics: Sequence[Array], maxima: Array, ease: Array) -> tup
     largest = np.sort(((maxima - middle[:, None]) / unit[:, None]).max(axis=0))
     scaled = zip(statistics, middle, unit, strict=True)
     p_values = [monte_carlo_p((values - centre) / step, largest) for values, centre, step in scaled]
-    # What passes exceeds all but the share LEVEL of the simulated series.
-    limit = largest[draws - max(int(np.floor(LEVEL * (draws + 1))), 1)]
+    # What passes exceeds all but the share ATTRIBUTION_LEVEL of the simulated series.
+    limit = largest[draws - max(int(np.floor(ATTRIBUTION_LEVEL * (draws + 1))), 1)]
     return p_values, middle + limit * unit
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fusion.analysis.attribution.correlate import ATTRIBUTABLE, NOT_ATTRIBUTABLE, NOT_SEPARABLE, find_source
-from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import Array, FusionError
 
 #: Places of the two sessions count as the same within this distance: half the width of the halo of a heat source.
@@ -119,7 +119,7 @@ class _Pair:
     @property
     def agree(self) -> NDArray[np.bool_]:
         """Where both sessions pass and are consistent, (y, x)."""
-        return np.asarray((self.p_value <= LEVEL) & self.consistent, bool)
+        return np.asarray((self.p_value <= ATTRIBUTION_LEVEL) & self.consistent, bool)
 
 
 def compare_sessions(first: xr.DataTree, second: xr.DataTree) -> SessionComparison:
@@ -238,8 +238,8 @@ def _sources_of(session: xr.DataTree) -> list[tuple[str, float, float, bool]]:
     order = ("channel", "mode")
     modes = session.children["modes"].to_dataset()
     ratio = (modes["statistic"] / modes["threshold"]).fillna(0.0).transpose(*order).values
-    passed = modes["p_value"].transpose(*order).values <= LEVEL
-    adds = modes["p_beside"].transpose(*order).fillna(0.0).values <= LEVEL
+    passed = modes["p_value"].transpose(*order).values <= ATTRIBUTION_LEVEL
+    adds = modes["p_beside"].transpose(*order).fillna(0.0).values <= ATTRIBUTION_LEVEL
     sources = []
     for k in np.flatnonzero(passed.any(axis=0)):
         best = int(np.where(passed[:, k], ratio[:, k], -1.0).argmax())
@@ -306,7 +306,7 @@ def _conclude(channel: str, pair: _Pair, separable: bool) -> ChannelAgreement:
         verdict, reason = "not separable", "both sessions are one warm-up each: switch the heat sources at random times"
     elif pair.agree.any():
         verdict, reason = "attributable", "both sessions find this place, with the same sign and size"
-    elif p_value <= LEVEL:
+    elif p_value <= ATTRIBUTION_LEVEL:
         verdict = "not attributable"
         sizes = f"{sensitivity[0]:+.2f} and {sensitivity[1]:+.2f} µm/K"
         reason = f"both sessions find a source near here, but not with the same place and size: {sizes}"

@@ -19,6 +19,7 @@ from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.drift_model.fit import ModelFit, unexplained_drift
 from fusion.analysis.drift_model.null_simulation import family_wise, rank_p_value
 from fusion.analysis.effects.events import off_the_cycle
+from fusion.analysis.levels import REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results.loop import ResidualPart
 from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
@@ -26,9 +27,6 @@ from thermography.fields.large_arrays import empty_arrays, give_back
 
 _PERMUTATIONS = 400
 _BLOCK = 5
-#: Probability of reporting a shape where none is left, over all statistics together: with that of an effect and of an anomalous position
-#: it adds up to the 0.05 of a whole run.
-LEVEL = 0.01
 #: An unexplained drift counts as a remainder from this share of a reading's noise on.
 DRIFT_SHARE = 0.5
 
@@ -82,7 +80,7 @@ class ResidualStructure:
     @property
     def is_tested(self) -> bool:
         """Whether a permutation test shows the shape; a drift counts by its size alone."""
-        return bool(self.shape) and self.p_value < LEVEL
+        return bool(self.shape) and self.p_value < REMAINDER_LEVEL
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def examine(
     along_time, along_sites, rms = _leading(residual[:, kept])
     named_sites = [sites[k] for k in kept]
     shape = ""
-    if test.p_value < LEVEL:
+    if test.p_value < REMAINDER_LEVEL:
         shape = f"{_time_words(cycles, along_time, readings)}; {_place_words(named_sites, along_sites)}"
     free = partial(_freed, readings)
     # The leading pattern at every reading; zero at sites that were set aside.

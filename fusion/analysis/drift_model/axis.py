@@ -97,6 +97,7 @@ from fusion.analysis.effects.effect import Candidate, Effect
 from fusion.analysis.effects.events import cycle_starts
 from fusion.analysis.effects.laser_and_camera import CAMERA_OFFSET, REFLECTED_SOURCE
 from fusion.analysis.effects.library import library
+from fusion.analysis.levels import SEARCH_LEVEL, SECOND_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
 from fusion.results.parts import Number
@@ -239,11 +240,6 @@ def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> s
 LEAST_CYCLES = 10
 #: Log-likelihood below that of the best up to which a candidate is asked where else the coefficients would lie.
 _ABOUT_AS_WELL = 10.0
-#: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, and the
-#: second look. Every effect that is found opens the search again with the same probability, and a campaign may lack two: half of the 5 %
-#: that a wrong name may have.
-SEARCH_LEVEL, SECOND_LEVEL = 0.02, 0.005
-ENTRY_LEVEL = SEARCH_LEVEL + SECOND_LEVEL
 
 AxisState = LoopState[ModelFit]
 

@@ -28,7 +28,7 @@ from fusion.analysis.alignment.sensor_health import (
     examine_sensors,
     is_implausible,
 )
-from fusion.analysis.diagnosis.residual import LEVEL, PermutationTest, ResidualStructure, permutation_test
+from fusion.analysis.diagnosis.residual import PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
 from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems, unexplained_drift
 from fusion.analysis.drift_model.gains import by_width, profile_gains
@@ -75,6 +75,7 @@ from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.events import periods_min
 from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
+from fusion.analysis.levels import RECORD_ENTRY_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results import loop as schema
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
@@ -732,9 +733,6 @@ def one_switching_share(driver: Array) -> float:
     return float(between.max() / max(float(((driver - driver.mean()) ** 2).sum()), 1e-300))
 
 
-#: Probability of adding an effect where only drift and noise act. A drift that wanders at random is a stand-in for what a real machine
-#: does, and its sensors are late, so the probability is smaller than along an axis: that of an error of three standard deviations.
-ENTRY_LEVEL = 0.001
 #: An effect must bring the error of predicting later parts down to this share of what it was, or it only follows chance.
 MAX_ERROR_RATIO_TO_ENTER = 0.98
 #: An event may make that error larger by this factor: chance, not harm.
@@ -746,7 +744,7 @@ class RecordProblem(Problem[RecordFit]):
     """A record, the blocks of it that may be used, and the library, for :mod:`fusion.analysis.drift_model.search`."""
 
     effects: Mapping[str, Effect]
-    entry_level = ENTRY_LEVEL
+    entry_level = RECORD_ENTRY_LEVEL
 
     def __init__(
         self,
@@ -779,7 +777,7 @@ class RecordProblem(Problem[RecordFit]):
         draws = simulate_channels(model, self.rng, draws=DRAWS)
         gains = channel_gains(model, [candidate for candidates in families.values() for candidate in candidates], draws)
         scores, decisions = score_effects(
-            families, gains, level=ENTRY_LEVEL, is_admissible=RecordGrounds(model).is_admissible
+            families, gains, level=RECORD_ENTRY_LEVEL, is_admissible=RecordGrounds(model).is_admissible
         )
         return Round(tuple(scores), (*faults, *decisions), start)
 
@@ -935,7 +933,7 @@ def examine(model: RecordFit, hold_out_rmse: Array, rng: np.random.Generator) ->
     switched = record.switched()
     test = _test(innovations, switched, rng)
     share = hold_out_rmse**2 / np.nanvar(record.displacement, axis=0)
-    words = _shapes(test, innovations, record, rng) if test.p_value < LEVEL else []
+    words = _shapes(test, innovations, record, rng) if test.p_value < REMAINDER_LEVEL else []
     error_um, noise_um = float(np.sqrt(known_mean(hold_out_rmse**2))), float(np.sqrt(np.mean(model.sigma**2)))
     if exceeds_noise(error_um, noise_um, RESIDUAL_SHARE):
         words.append(
@@ -967,25 +965,25 @@ def _repeats(innovations: Array, record: Record, rng: np.random.Generator) -> bo
         return float((shifted.sum(axis=0) ** 2).sum())
 
     drawn = [alike(rng.integers(0, length, len(runs))) for _ in range(_ALIKE_DRAWS)]
-    return rank_p_value(alike(np.zeros(len(runs), int)), np.array(drawn)) < LEVEL
+    return rank_p_value(alike(np.zeros(len(runs), int)), np.array(drawn)) < REMAINDER_LEVEL
 
 
 def _shapes(test: PermutationTest, innovations: Array, record: Record, rng: np.random.Generator) -> list[str]:
     """What a significant test shows, in words."""
     if _repeats(innovations, record, rng):
         return [_REPEATED]
-    if test.p_values[_RHYTHM] >= LEVEL:
+    if test.p_values[_RHYTHM] >= REMAINDER_LEVEL:
         return [_WORDS[test.strongest]]
     frequency, left, share = _without_wave(innovations)
     longest = max(np.diff([*record.first, innovations.shape[0]]))
     if frequency * longest < _LEAST_WAVES:
         # No run shows it twice.
-        return [_WORDS.get(test.strongest, _WORDS[_COURSE]) if test.p_values[_COURSE] < LEVEL else _SLOW]
+        return [_WORDS.get(test.strongest, _WORDS[_COURSE]) if test.p_values[_COURSE] < REMAINDER_LEVEL else _SLOW]
     rest = _test(left, record.switched(), rng)
-    if share < _RHYTHM_SHARE and rest.p_values[_COURSE] < LEVEL:
+    if share < _RHYTHM_SHARE and rest.p_values[_COURSE] < REMAINDER_LEVEL:
         return [_WORDS[_COURSE if test.strongest == _RHYTHM else test.strongest]]
     words = [f"a rhythm of about {record.block_s / 60.0 / frequency:.0f} min"]
-    return [*words, _WORDS[rest.strongest]] if rest.p_value < LEVEL and rest.strongest in _WORDS else words
+    return [*words, _WORDS[rest.strongest]] if rest.p_value < REMAINDER_LEVEL and rest.strongest in _WORDS else words
 
 
 def _without_wave(innovations: Array) -> tuple[float, Array, float]:
@@ -1136,7 +1134,7 @@ class RecordResult:
         return verdict(
             named=any(self._kept),
             left=remains or not all(self._kept),
-            tested=bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested,
+            tested=bool(self.state.unnamed(RECORD_ENTRY_LEVEL)) or self.remainder.is_tested,
             skill=has_skill(final, *plain, self.noise_um, RESIDUAL_SHARE),
             separable=self.separable(here),
         )
@@ -1186,7 +1184,7 @@ class RecordResult:
             separable=self.separable(self.hold_out),
             wandering_um=self.wandering_um,
             left_out_of_forecast=tuple(self.state.steps[place].effect for place in sorted(self.away)),
-            unconfirmed_effects=self.state.unnamed(ENTRY_LEVEL),
+            unconfirmed_effects=self.state.unnamed(RECORD_ENTRY_LEVEL),
             unexplained=schema.RecordUnexplained(
                 shape=shape,
                 rms_um=size if shape else 0.0,

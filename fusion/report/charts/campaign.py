@@ -10,7 +10,7 @@ from typing import Any
 
 import xarray as xr
 
-from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.report.campaign import leading_region
 from fusion.report.charts import model, plan, readings
 from fusion.report.charts.embedded import Drawn
@@ -157,7 +157,7 @@ def _correlation_charts(fused: xr.DataTree, channel: str, least_p: float | None)
     charts = {"clusters": model.plot_clusters(maps.children["clusters"].to_dataset())}
     if bool((cells["p_value"].sel(channel=channel) <= model.LEAST_SHOWN).any()):
         charts["significance"] = model.plot_significance(cells, channel)
-    if bool((cells["p_value"].sel(channel=channel) <= LEVEL).any()):
+    if bool((cells["p_value"].sel(channel=channel) <= ATTRIBUTION_LEVEL).any()):
         charts["sensitivity"] = model.plot_sensitivity(cells, channel)
     if "modes" in maps.children:
         modes = maps.children["modes"].to_dataset()

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from bokeh import palettes
 from bokeh.models import FixedTicker, LinearColorMapper
 from bokeh.plotting import figure
-from scipy import ndimage
 
-from fusion.analysis.attribution.significance import LEVEL
+from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.report.charts.plan import Extent, add_cells, extent_of, new_plan
 from fusion.report.charts.style import (
     BEFORE,
@@ -67,7 +67,7 @@ def plot_sensitivity(maps: xr.Dataset, channel: str) -> Chart:
     """Draw the sensitivity of one part of the drift to every cell; cells whose family-wise p is above 0.05 are hatched."""
     chosen, extent = maps.sel(channel=channel), extent_of(maps)
     values, p = chosen["sensitivity"].values, chosen["p_value"].fillna(1.0).values
-    passed = p <= LEVEL
+    passed = p <= ATTRIBUTION_LEVEL
     limit = float(np.nanmax(np.abs(values[passed]))) if passed.any() else 1.0
     mapper = LinearColorMapper(palette(DIVERGING), low=-limit, high=limit, nan_color="rgba(0, 0, 0, 0)")
     drawn = new_plan(extent, title=CHANNELS.get(channel, channel))
@@ -92,7 +92,7 @@ def plot_significance(maps: xr.Dataset, channel: str) -> Chart:
     blank = step == len(_P_STEPS)
     add_cells(drawn, np.where(blank, np.nan, step + 0.5), extent, mapper, [("family-wise p", "@p{0.000}")], p=p)
     _add_steps(drawn, mapper, "family-wise p", _P_NAMES)
-    return Chart(drawn, _where(maps, p <= LEVEL, p, ""), _cell_columns(maps, **{"family-wise p": p}))
+    return Chart(drawn, _where(maps, p <= ATTRIBUTION_LEVEL, p, ""), _cell_columns(maps, **{"family-wise p": p}))
 
 
 def _add_steps(drawn: figure, mapper: LinearColorMapper, label: str, names: dict[float, str]) -> None:
@@ -115,7 +115,7 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None 
     """Draw the pattern of a thermal mode, relative to the cell marked by a cross, with its p-value and lag in one part of the drift."""
     one, extent = modes.sel(mode=mode), extent_of(modes)
     p, lag = (float(one[name].sel(channel=channel)) for name in ("p_value", "lag"))
-    significant = p <= LEVEL
+    significant = p <= ATTRIBUTION_LEVEL
     title = f"mode {mode}: {'significant, ' if significant else ''}p {p_cell(p, least_p)}, lag {duration(lag)}"
     drawn = new_plan(extent, title=title)
     mapper = LinearColorMapper(palette("PuOr_r"), low=-1.0, high=1.0, nan_color="#e1e5e7")
@@ -160,7 +160,7 @@ def _label_places(clusters: xr.Dataset, count: int) -> list[tuple[int, float, fl
     found: list[tuple[int, float, float]] = []
     sizes = np.bincount(group.ravel(), minlength=count + 1)
     for one in sorted(range(1, count + 1), key=lambda number: -sizes[number]):
-        depth = ndimage.distance_transform_edt(np.pad(group == one, 1))[1:-1, 1:-1]
+        depth = scipy.ndimage.distance_transform_edt(np.pad(group == one, 1))[1:-1, 1:-1]
         row, column = np.unravel_index(np.argmax(depth), depth.shape)
         place = (float(x[column]), float(y[row]))
         if all(np.hypot(place[0] - other[1], place[1] - other[2]) >= _LEAST_MM for other in found):
@@ -175,7 +175,7 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
     drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region), zero=True)
     place = position.sel(target=chosen["series_target"].values).values.astype(float)
     value, half = chosen["sensitivity"].values, 2 * chosen["sensitivity_u"].values
-    side, passed = chosen["series_direction"].values, chosen["p_value"].values <= LEVEL
+    side, passed = chosen["series_direction"].values, chosen["p_value"].values <= ATTRIBUTION_LEVEL
     for shift, direction in ((-0.1, "positive"), (0.1, "negative")):
         for rows, words in ((passed, "p ≤ 0.05"), (~passed, "p > 0.05")):
             here = rows & (side == direction)

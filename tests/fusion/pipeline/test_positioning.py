@@ -8,8 +8,7 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.diagnosis.diagnose import Diagnosis
-from fusion.analysis.diagnosis.residual import LEVEL
-from fusion.analysis.drift_model.axis import ENTRY_LEVEL
+from fusion.analysis.levels import ENTRY_LEVEL, REMAINDER_LEVEL
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import Source, read_source
 from fusion.pipeline import positioning as module
@@ -209,7 +208,7 @@ def test_what_the_model_explains_is_taken_out_before_positions_are_judged(monkey
         judged.append(cleaned["deviation"])
         assert drift == "drift of what is left"
         # Whatever a run may state of a campaign in which nothing is missing: an effect, a remainder or an anomaly.
-        assert level + ENTRY_LEVEL + LEVEL == pytest.approx(0.05)
+        assert level + ENTRY_LEVEL + REMAINDER_LEVEL == pytest.approx(0.05)
         # The rarest kind has a tenth of the probability, and must reach it.
         assert permutations + 1 >= 10 / level
         return [anomaly(1), anomaly(2, stands_out=False), anomaly(3)]

@@ -13,13 +13,12 @@ import xarray as xr
 from compliance_checker.runner import CheckSuite
 
 from fusion.campaign.config import ThermographyTable, load_campaign
-from fusion.campaign.inputs import SourceError, read_source
+from fusion.campaign.inputs import SourceError, overridden_parameters, read_source
 from fusion.pipeline.consistency import check_plan
 from fusion.pipeline.thermal import (
     camera_corrected,
     clock_notices,
     complete_fields,
-    overridden_parameters,
     pixel_notices,
     reduce_thermography,
     stated_uncertainty,

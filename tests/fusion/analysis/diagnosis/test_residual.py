@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from fusion.analysis.diagnosis import residual as module
-from fusion.analysis.diagnosis.residual import LEVEL, Remainder, ResidualTests, examine, examine_residual
+from fusion.analysis.diagnosis.residual import Remainder, ResidualTests, examine, examine_residual
 from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
 from fusion.analysis.effects.library import library
+from fusion.analysis.levels import REMAINDER_LEVEL
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.loop_bench import DECLARED, readings_of
 
@@ -39,13 +40,13 @@ def remainder_of(model: ModelFit, **options) -> Remainder:
 
 def test_complete_model_leaves_no_pattern(complete):
     remainder = remainder_of(complete)
-    assert remainder.p_value > LEVEL
+    assert remainder.p_value > REMAINDER_LEVEL
     assert (remainder.shape, remainder.rms_um) == ("", 0.0)
 
 
 def test_planted_pattern_is_found_where_it_acts(switched):
     switching = remainder_of(switched)
-    assert switching.p_value < LEVEL
+    assert switching.p_value < REMAINDER_LEVEL
     assert "negative direction only" in switching.shape
     weight = dict(zip(switching.sites, np.abs(switching.along_sites), strict=True))
     assert min(weight[(target, "negative")] for target in range(9, 13)) > 0.5
@@ -72,7 +73,7 @@ def test_sites_that_are_set_aside_are_not_tested(switched):
     aside = tuple((target, "negative") for target in range(9, 13))
     remainder = remainder_of(switched, set_aside=aside)
     assert not set(aside) & set(remainder.sites)
-    assert remainder.p_value > LEVEL
+    assert remainder.p_value > REMAINDER_LEVEL
 
 
 def test_statistics_of_patterns_that_are_known():
@@ -197,10 +198,10 @@ def test_a_drift_of_several_channels_is_told_by_its_number(monkeypatch):
 
 def test_a_shape_is_tested_below_the_level_alone():
     shown = Remainder(
-        LEVEL, {}, "one step", 1.0, np.arange(2), np.zeros(2), [], np.zeros(0), np.zeros(4), lambda given: given
+        REMAINDER_LEVEL, {}, "one step", 1.0, np.arange(2), np.zeros(2), [], np.zeros(0), np.zeros(4), lambda given: given
     )
     assert not shown.is_tested
-    assert replace(shown, p_value=0.99 * LEVEL).is_tested
+    assert replace(shown, p_value=0.99 * REMAINDER_LEVEL).is_tested
     assert not replace(shown, p_value=0.0, shape="").is_tested
 
 

@@ -1,0 +1,21 @@
+"""Probabilities at which a run states what is not there: every level that a reader is told, in one place.
+
+A run may state effects, a remainder and positions that stand out: ENTRY + REMAINDER + POSITION are the 0.05 of a whole run.
+"""
+
+#: Family-wise, of the verdicts on drift and field.
+ATTRIBUTION_LEVEL = 0.05
+#: Number of simulated series on which the false alarm rate of these verdicts is measured.
+CHECKS = 199
+#: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, and the
+#: second look. Every effect that is found opens the search again with the same probability, and a campaign may lack two: half of the 5 %
+#: that a wrong name may have.
+SEARCH_LEVEL, SECOND_LEVEL = 0.02, 0.005
+ENTRY_LEVEL = SEARCH_LEVEL + SECOND_LEVEL
+#: The same on a record, where only drift and noise act. A drift that wanders at random is a stand-in for what a real machine does, and
+#: its sensors are late, so the probability is smaller than along an axis: that of an error of three standard deviations.
+RECORD_ENTRY_LEVEL = 0.001
+#: Of reporting a shape where none is left, over all statistics together.
+REMAINDER_LEVEL = 0.01
+#: Of any position that is said to stand out.
+POSITION_LEVEL = 0.015
