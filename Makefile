@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
+# The tests start the program a hundred times; without its bytecode each would compile all of it.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
 

@@ -284,7 +284,7 @@ def _find_steps(change: Array, regressors: Array, seconds: Array) -> tuple[list[
     outlying = np.abs(residual) > _OUTLYING * MAD_TO_SIGMA * np.median(np.abs(residual))
     most = int(_MOST_STEPS * (len(change) - regressors.shape[1]))
     places = np.flatnonzero(outlying).tolist() if np.count_nonzero(outlying) <= most else []
-    fit = _fit(change, _with_steps(regressors, places), seconds)
+    fit = _fit(change, regressors, places, seconds)
     for _ in range(2 * len(change)):
         limit = fit.limit
         first = regressors.shape[1]
@@ -297,47 +297,60 @@ def _find_steps(change: Array, regressors: Array, seconds: Array) -> tuple[list[
             places = sorted([*places, int(shocks.argmax())])
         else:
             break
-        fit = _fit(change, _with_steps(regressors, places), seconds)
+        fit = _fit(change, regressors, places, seconds)
     return places, fit
 
 
-def _with_steps(regressors: Array, places: list[int]) -> Array:
-    """Regressors with a column for every step."""
-    columns = np.zeros((len(regressors), len(places)))
-    columns[places, np.arange(len(places))] = 1.0
-    return np.column_stack([regressors, columns])
+def _fit(change: Array, regressors: Array, places: list[int], seconds: Array) -> _Fit:
+    """Fit regressors, and a step at every place, with the share of the white noise by restricted maximum likelihood."""
+    n = len(change)
+    freedom = n - regressors.shape[1] - len(places)
 
-
-def _fit(change: Array, design: Array, seconds: Array) -> _Fit:
-    """Fit with the share of the white noise by restricted maximum likelihood."""
-    freedom = len(change) - design.shape[1]
-
-    def whiten(logit: float) -> tuple[Array, Array, Array, Array, float]:
+    def factorised(logit: float, kept: NDArray[np.intp]) -> Array:
+        """Cholesky factor of the covariance of some changes, as bands."""
         white = 1.0 / (1.0 + np.exp(-logit))
-        bands = np.zeros((2, len(change)))
-        bands[0] = (1.0 - white) * seconds / seconds.mean() + 2.0 * white
-        bands[1, :-1] = -white
-        factor = linalg.cholesky_banded(bands, lower=True)
-        solved = linalg.cho_solve_banded((factor, True), np.column_stack([change, design]))
-        information = design.T @ solved[:, 1:]
-        values = np.linalg.solve(information, design.T @ solved[:, 0])
-        squares = max(float(change @ solved[:, 0] - values @ (design.T @ solved[:, 0])), np.finfo(float).tiny)
-        return factor, solved[:, 0] - solved[:, 1:] @ values, values, information, squares
+        bands = np.zeros((2, kept.size))
+        bands[0] = (1.0 - white) * seconds[kept] / seconds.mean() + 2.0 * white
+        bands[1, :-1] = -white * (np.diff(kept) == 1)
+        return np.asarray(linalg.cholesky_banded(bands, lower=True))
+
+    # A change with a step of its own tells nothing of the others: without it the likelihood is the same, and has fewer columns.
+    ordinary = np.delete(np.arange(n), places)
+    level, columns = change[ordinary], regressors[ordinary]
 
     def deviance(logit: float) -> float:
-        factor, _, _, information, squares = whiten(logit)
+        factor = factorised(logit, ordinary)
+        _, information, squares, _ = _generalised(factor, level, columns)
         return float(2.0 * np.log(factor[0]).sum() + np.linalg.slogdet(information)[1] + freedom * np.log(squares))
 
     best = scipy.optimize.minimize_scalar(deviance, bounds=(-8.0, 8.0), method="bounded", options={"xatol": 0.05}).x
-    factor, weighted, values, information, squares = whiten(float(best))
-    scale = squares / freedom
-    unit = np.linalg.inv(information)
-    projected = linalg.cho_solve_banded((factor, True), design)
-    precision = np.diag(linalg.cho_solve_banded((factor, True), np.eye(len(change))))
-    precision = precision - np.einsum("ij,jk,ik->i", projected, unit, projected)
-    shocks = weighted / np.sqrt(np.maximum(precision, 1e-12) * scale)
-    limit = float(-special.stdtrit(freedom, _SIGNIFICANCE / (2 * len(change))))
+    steps = np.zeros((n, len(places)))
+    steps[places, np.arange(len(places))] = 1.0
+    factor, design = factorised(float(best), np.arange(n)), np.column_stack([regressors, steps])
+    values, information, squares, solved = _generalised(factor, change, design)
+    scale, unit, projected = squares / freedom, np.linalg.inv(information), solved[:, 1:]
+    precision = _diagonal_of_inverse(factor) - ((projected @ unit) * projected).sum(axis=1)
+    shocks = (solved[:, 0] - projected @ values) / np.sqrt(np.maximum(precision, 1e-12) * scale)
+    limit = float(-special.stdtrit(freedom, _SIGNIFICANCE / (2 * n)))
     return _Fit(values, unit * scale, shocks, freedom, limit)
+
+
+def _generalised(factor: Array, change: Array, design: Array) -> tuple[Array, Array, float, Array]:
+    """Values, information, sum of squares, and the inverse of the factorised covariance times change and design."""
+    solved = linalg.cho_solve_banded((factor, True), np.column_stack([change, design]))
+    information, moment = design.T @ solved[:, 1:], design.T @ solved[:, 0]
+    values = np.linalg.solve(information, moment)
+    squares = max(float(change @ solved[:, 0] - values @ moment), np.finfo(float).tiny)
+    return values, information, squares, solved
+
+
+def _diagonal_of_inverse(factor: Array) -> Array:
+    """Diagonal of the inverse of a tridiagonal matrix by its Cholesky factor, from the last row back (Takahashi et al. 1973)."""
+    diagonal = 1.0 / factor[0] ** 2
+    passed_on = (factor[1] / factor[0]) ** 2
+    for i in range(diagonal.size - 2, -1, -1):
+        diagonal[i] += passed_on[i] * diagonal[i + 1]
+    return np.asarray(diagonal)
 
 
 def _shared_by_table(series: LevelSeries, places: list[int], sizes: Array) -> NDArray[np.bool_]:
