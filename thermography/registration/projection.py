@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -363,17 +363,22 @@ def fit_homography(observations: DiscObservations, ideal: Projection) -> Project
 
 def fit_projection(observations: DiscObservations, start: Projection, coefficients: int) -> Projection:
     """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt)."""
-    centres_mm = observations.centres_mm
-    pack, unpack = _parameters(start, centres_mm, coefficients)
+    centres_mm, u_px = observations.centres_mm, observations.u_px[:, None]
+    chart = _Parameters.of(start, centres_mm, coefficients)
     # The perspective shift of the centroids hardly changes during the fit and is held fixed.
     shift = start.disc_centroids(centres_mm, observations.radii_mm) - start.to_sensor(centres_mm)
+    of_lens = np.eye(8 + coefficients)[8:] / LENS_SPREAD[:coefficients, None]
 
     def residuals(parameters: Array) -> Array:
-        residuals_px = unpack(parameters).to_sensor(centres_mm) + shift - observations.points_px
-        weighted = (residuals_px / observations.u_px[:, None]).ravel()
-        return np.concatenate([weighted, parameters[8:] / LENS_SPREAD[:coefficients]])
+        residuals_px = chart.unpack(parameters).to_sensor(centres_mm) + shift - observations.points_px
+        return np.concatenate([(residuals_px / u_px).ravel(), of_lens @ parameters])
 
-    return unpack(scipy.optimize.least_squares(residuals, pack(start), method="lm", xtol=1e-9, ftol=1e-9).x)
+    def jacobian(parameters: Array) -> Array:
+        weighted = chart.jacobian(parameters, centres_mm) / u_px[..., None]
+        return np.concatenate([weighted.reshape(-1, parameters.size), of_lens])
+
+    found = scipy.optimize.least_squares(residuals, chart.pack(start), jacobian, method="lm", xtol=1e-9, ftol=1e-9)
+    return chart.unpack(found.x)
 
 
 def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:
@@ -424,18 +429,8 @@ def prediction_errors_px(
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
     """Derivative of the sensor position by the fitted parameters, as a function of the plan point."""
-    pack, unpack = _parameters(projection, centres_mm, coefficients)
-    parameters = pack(projection)
-    steps = 1e-6 * np.maximum(np.abs(parameters), 1e-2)
-
-    def derivative(points_mm: Array) -> Array:
-        columns = []
-        for step, unit in zip(steps, np.eye(len(parameters)), strict=True):
-            plus, minus = unpack(parameters + step * unit), unpack(parameters - step * unit)
-            columns.append((plus.to_sensor(points_mm) - minus.to_sensor(points_mm)) / (2 * step))
-        return np.stack(columns, axis=-1)
-
-    return derivative
+    chart = _Parameters.of(projection, centres_mm, coefficients)
+    return partial(chart.jacobian, chart.pack(projection))
 
 
 def variance_factor(observations: DiscObservations, projection: Projection, coefficients: int) -> tuple[float, float]:
@@ -469,23 +464,59 @@ def _weighted_jacobian(observations: DiscObservations, projection: Projection, c
     return derivative / observations.u_px[:, None, None]
 
 
-def _parameters(
-    start: Projection, centres_mm: Array, coefficients: int
-) -> tuple[Callable[[Projection], Array], Callable[[Array], Projection]]:
-    """Well-conditioned parameters: eight homography entries between centred unit coordinates, then the distortion."""
-    middle, scale = centres_mm.mean(axis=0), float(np.abs(centres_mm - centres_mm.mean(axis=0)).max())
-    f, (cx, cy) = start.focal_length_px, start.principal_point_px
-    to_unit = np.linalg.inv(np.array([[scale, 0, middle[0]], [0, scale, middle[1]], [0, 0, 1]]))
-    to_pixels = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
+@dataclass(frozen=True)
+class _Parameters:
+    """Well-conditioned parameters: eight homography entries between centred unit coordinates, then the distortion.
 
-    def pack(projection: Projection) -> Array:
-        unit = np.linalg.inv(to_pixels) @ projection.plan_to_sensor @ np.linalg.inv(to_unit)
-        return np.concatenate([(unit / unit[2, 2]).ravel()[:8], projection.distortion[:coefficients]])
+    Attributes
+    ----------
+    start : what is not fitted
+    to_unit, to_pixels : (3, 3) from the plan, mm, to the unit coordinates, and from normalised coordinates to px
+    coefficients : number of distortion coefficients that are fitted
+    """
 
-    def unpack(parameters: Array) -> Projection:
-        unit = np.append(parameters[:8], 1.0).reshape(3, 3)
-        distortion = np.concatenate([parameters[8:], start.distortion[coefficients:]])
-        matrix = to_pixels @ unit @ to_unit
-        return replace(start, plan_to_sensor=matrix / matrix[2, 2], distortion=distortion)
+    start: Projection
+    to_unit: Array
+    to_pixels: Array
+    coefficients: int
 
-    return pack, unpack
+    @classmethod
+    def of(cls, start: Projection, centres_mm: Array, coefficients: int) -> _Parameters:
+        """Parameters for discs at these places, (n, 2) mm."""
+        middle = centres_mm.mean(axis=0)
+        scale = float(np.abs(centres_mm - middle).max())
+        f, (cx, cy) = start.focal_length_px, start.principal_point_px
+        to_unit = np.linalg.inv(np.array([[scale, 0, middle[0]], [0, scale, middle[1]], [0, 0, 1]]))
+        return cls(start, to_unit, np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), coefficients)
+
+    def pack(self, projection: Projection) -> Array:
+        """Parameters of a projection."""
+        unit = np.linalg.inv(self.to_pixels) @ projection.plan_to_sensor @ np.linalg.inv(self.to_unit)
+        return np.concatenate([(unit / unit[2, 2]).ravel()[:8], projection.distortion[: self.coefficients]])
+
+    def unpack(self, parameters: Array) -> Projection:
+        """The projection with these parameters."""
+        matrix = self.to_pixels @ np.append(parameters[:8], 1.0).reshape(3, 3) @ self.to_unit
+        distortion = np.concatenate([parameters[8:], self.start.distortion[self.coefficients :]])
+        return replace(self.start, plan_to_sensor=matrix / matrix[2, 2], distortion=distortion)
+
+    def jacobian(self, parameters: Array, points_mm: Array) -> Array:
+        """Derivative of the sensor position by the parameters at plan points (..., 2) mm, (..., 2, parameters), px."""
+        k1, k2, p1, p2 = np.concatenate([parameters[8:], self.start.distortion[self.coefficients :]])
+        unit = np.concatenate([points_mm, np.ones_like(points_mm[..., :1])], axis=-1) @ self.to_unit.T
+        mapped = unit @ np.append(parameters[:8], 1.0).reshape(3, 3).T
+        u, v = mapped[..., 0] / mapped[..., 2], mapped[..., 1] / mapped[..., 2]
+        by_row, nothing = unit / mapped[..., 2:], np.zeros_like(unit)
+        of_u = np.concatenate([by_row, nothing, -u[..., None] * by_row[..., :2]], axis=-1)
+        of_v = np.concatenate([nothing, by_row, -v[..., None] * by_row[..., :2]], axis=-1)
+        r2 = u * u + v * v
+        radial, steeper = 1 + r2 * (k1 + k2 * r2), 2 * (k1 + 2 * k2 * r2)
+        crossed = steeper * u * v + 2 * (p1 * u + p2 * v)
+        by_u = np.stack([radial + steeper * u * u + 2 * p1 * v + 6 * p2 * u, crossed], axis=-1)
+        by_v = np.stack([crossed, radial + steeper * v * v + 6 * p1 * v + 2 * p2 * u], axis=-1)
+        of_lens = np.stack(
+            [u * r2, u * r2 * r2, 2 * u * v, r2 + 2 * u * u, v * r2, v * r2 * r2, r2 + 2 * v * v, 2 * u * v], axis=-1
+        )
+        of_lens = of_lens.reshape(*u.shape, 2, 4)[..., : self.coefficients]
+        of_homography = by_u[..., None] * of_u[..., None, :] + by_v[..., None] * of_v[..., None, :]
+        return np.asarray(self.start.focal_length_px * np.concatenate([of_homography, of_lens], axis=-1))
