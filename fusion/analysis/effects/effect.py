@@ -88,7 +88,9 @@ class Separable:
     def __getitem__(self, index: Any) -> Array:
         """As of an array; some readings, a slice or an array of them, are multiplied out alone."""
         rows, *columns = index if isinstance(index, tuple) else (index,)
-        here = np.stack([course[rows] for course in self.courses], axis=-1) * self.weights[self.place[rows]]
+        here = self.weights.take(self.place[rows], axis=0).astype(float, copy=False)
+        for column, course in enumerate(self.courses):
+            here[..., column] *= course[rows]
         return np.asarray(here[..., columns[0]] if columns else here)
 
 
