@@ -14,7 +14,6 @@ import pytest
 from pydantic import BaseModel
 
 import thermofuse
-from fusion.results.parts import DescribedSchema
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("thermography", "interferometry", "fusion")
@@ -51,10 +50,6 @@ def test_described_parameters_are_those_of_an_underlined_section():
     assert described_parameters(inspect.cleandoc(text.replace("    ----------\n", ""))) == set()
 
 
-def keys_of(model):
-    return model.model_json_schema(schema_generator=DescribedSchema)["properties"].values()
-
-
 @pytest.mark.parametrize(("package", "name"), PUBLIC)
 def test_a_public_name_is_documented_for_a_user(package, name):
     thing = getattr(importlib.import_module(package), name)
@@ -62,7 +57,9 @@ def test_a_public_name_is_documented_for_a_user(package, name):
     assert text, f"{package}.{name} has no docstring"
     if inspect.isclass(thing):
         # An error has a message, a record has attributes with units, a model describes each field beside it.
-        described = issubclass(thing, BaseModel) and all("description" in key for key in keys_of(thing))
+        described = issubclass(thing, BaseModel) and all(
+            "description" in key for key in thing.model_json_schema()["properties"].values()
+        )
         assert issubclass(thing, Exception) or "Attributes" in text or "Parameters" in text or described
         return
     signature = inspect.signature(thing)

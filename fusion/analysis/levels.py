@@ -1,4 +1,4 @@
-"""Probabilities at which a run states what is not there: every level that a reader is told, in one place.
+"""Probabilities at which a run states what is not there.
 
 A run may state effects, a remainder and positions that stand out: ENTRY + REMAINDER + POSITION are the 0.05 of a whole run.
 """

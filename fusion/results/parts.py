@@ -14,9 +14,9 @@ from textwrap import dedent
 from typing import Annotated, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core.core_schema import ModelSchema
+from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 Number = float | None
 
@@ -34,26 +34,26 @@ class ResultPart(BaseModel):
         arbitrary_types_allowed=True,
     )
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Describe every key by the text below its field.
 
-class DescribedSchema(GenerateJsonSchema):
-    """JSON Schema in which every key is described by the text below its field.
-
-    pydantic would read these texts out of the source whenever a model is imported, a tenth of a second of every command.
-    """
-
-    def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
-        """Describe the keys of one model."""
-        described, model = super().model_schema(schema), schema["cls"]
-        for one in reversed(model.__mro__):
+        pydantic itself would read these texts out of the source whenever a model is imported, a tenth of a second of every command.
+        """
+        schema = handler(core_schema)
+        properties = handler.resolve_ref_schema(schema).get("properties", {})
+        for one in cls.__mro__:
             for name, text in _texts_below(one).items() if issubclass(one, ResultPart) else ():
-                key = model.model_fields[name].serialization_alias or name
-                described["properties"][key].setdefault("description", text)
-        return described
+                properties[cls.model_fields[name].serialization_alias or name].setdefault("description", text)
+        return schema
 
 
 def _texts_below(model: type) -> dict[str, str]:
-    """The text below each field of a model, from its source."""
-    (tree,) = ast.parse(dedent(getsource(model))).body
+    """The text below each field of a model, from its source; none where that is not installed."""
+    try:
+        (tree,) = ast.parse(dedent(getsource(model))).body
+    except OSError:
+        return {}
     assert isinstance(tree, ast.ClassDef)
     return {
         field.target.id: cleandoc(below.value.value)

@@ -30,7 +30,6 @@ from fusion.results.axis import (
 from fusion.results.loop import AxisLoop, RecordLoop
 from fusion.results.parts import (
     ContactSensorPart,
-    DescribedSchema,
     FieldPart,
     InputsPart,
     Number,
@@ -337,8 +336,7 @@ def results_schema() -> dict[str, Any]:
     >>> schema["title"], schema["required"]
     ('thermofuse results', ['schema', 'campaign', 'warnings'])
     """
-    made = Results.model_json_schema(schema_generator=DescribedSchema)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **made}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Results.model_json_schema()}
 
 
 @dataclass(frozen=True)

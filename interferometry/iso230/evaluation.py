@@ -8,7 +8,8 @@ deviation, B_i reversal error at a position, R_i repeatability at a position; of
 bidirectional repeatability R, bidirectional systematic positioning error E, mean bidirectional positioning error M, bidirectional
 accuracy A.
 
-In this order: the evaluation of one window; windows along a test and which of them is the most settled; the quantities as numbers.
+In this order: the evaluation of one window; windows along a test and which of them is the most settled; other standards; the quantities as
+numbers.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ program are timed by the clock, each in a process of its own. A row that one of 
 from __future__ import annotations
 
 import argparse
+import compileall
 import os
 import re
 import resource
@@ -28,6 +29,25 @@ ATTRIBUTION = "tests/benchmarks/test_speed_attribution.py"
 #: The row of a run with which every kernel is compiled.
 FIRST = "demo's `run`, first of an installation, s"
 _NUMBER = r"([\d.]+(?:e-?\d+)?)"
+#: A test of two hours with small pictures.
+SMALL = """\
+[campaign]
+seed = 36
+
+[test]
+cycles = 36
+targets = 9
+spacing_mm = 37.5
+
+[camera]
+columns = 320
+rows = 240
+focal_px = 765.0
+
+[[effect]]
+name = "unseen_heat_source"
+amplitude_um = 0.8
+"""
 
 
 @dataclass(frozen=True)
@@ -152,23 +172,31 @@ def commands(trees: Sequence[Path], turns: int) -> Iterator[str]:
         "`inspect` of one radiometric JPEG, s": (lambda folder: ["inspect", str(frames_of(folder))], "0.65"),
         "`check` of the demo, s": (lambda folder: ["check", campaign_of(folder)], "1"),
         "demo's `run`, s": (lambda folder: ["run", campaign_of(folder), "--out", str(folder / "results")], "4"),
+        "`run` of 36 cycles, 9 targets, pictures of 320 x 240, s": (
+            lambda folder: ["run", str(folder / "small" / "campaign.toml"), "--out", str(folder / "of_small")], "3"
+        ),
         "`--resume` of the finished run, s": (
             lambda folder: ["run", campaign_of(folder), "--out", str(folder / "results"), "--resume"], "2.05"
         ),
         "`report` made anew, s": (lambda folder: ["report", str(folder / "results")], "1.5 and loading"),
     }  # fmt: skip
     folders = [HERE / "build" / "speeds" / name for name in ("before", "now")]
+    small = HERE / "build" / "speeds" / "small.toml"
+    small.parent.mkdir(parents=True, exist_ok=True)
+    small.write_text(SMALL, encoding="utf-8")
     for tree, folder in zip(trees, folders, strict=True):
+        for package in ("thermofuse", "fusion", "thermography", "interferometry"):
+            compileall.compile_dir(tree / package, quiet=1)
         shutil.rmtree(folder, ignore_errors=True)
-        recipe = HERE / "fusion" / "twin" / "recipes" / "demo.toml"
-        timed(tree, ["simulate", str(recipe), "--out", str(folder / "campaign")], compiled=folder / "of_twin")
+        for recipe, name in ((HERE / "fusion" / "twin" / "recipes" / "demo.toml", "campaign"), (small, "small")):
+            timed(tree, ["simulate", str(recipe), "--out", str(folder / name)], compiled=folder / "of_twin")
     for work, (arguments, aim) in works.items():
         seconds: list[list[tuple[float, float]]] = [[], []]
         # The first turn of each compiles, and fills the page cache: it is what is asked for once, and left out otherwise.
         for turn in range(1 if work == FIRST else turns + 1):
             for tree, folder, kept in zip(trees, folders, seconds, strict=True):
                 if "--out" in (asked := arguments(folder)) and "--resume" not in asked:
-                    shutil.rmtree(folder / "results", ignore_errors=True)
+                    shutil.rmtree(asked[asked.index("--out") + 1], ignore_errors=True)
                 spent = timed(tree, asked, compiled=folder / "kernels")
                 if turn or work == FIRST:
                     kept.append(spent)
