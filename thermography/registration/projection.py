@@ -364,21 +364,23 @@ def fit_homography(observations: DiscObservations, ideal: Projection) -> Project
 def fit_projection(observations: DiscObservations, start: Projection, coefficients: int) -> Projection:
     """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt)."""
     centres_mm, u_px = observations.centres_mm, observations.u_px[:, None]
-    chart = _Parameters.of(start, centres_mm, coefficients)
+    parametrisation = _Parametrisation.of(start, centres_mm, coefficients)
     # The perspective shift of the centroids hardly changes during the fit and is held fixed.
     shift = start.disc_centroids(centres_mm, observations.radii_mm) - start.to_sensor(centres_mm)
     of_lens = np.eye(8 + coefficients)[8:] / LENS_SPREAD[:coefficients, None]
 
     def residuals(parameters: Array) -> Array:
-        residuals_px = chart.unpack(parameters).to_sensor(centres_mm) + shift - observations.points_px
+        residuals_px = parametrisation.unpack(parameters).to_sensor(centres_mm) + shift - observations.points_px
         return np.concatenate([(residuals_px / u_px).ravel(), of_lens @ parameters])
 
     def jacobian(parameters: Array) -> Array:
-        weighted = chart.jacobian(parameters, centres_mm) / u_px[..., None]
+        weighted = parametrisation.jacobian(parameters, centres_mm) / u_px[..., None]
         return np.concatenate([weighted.reshape(-1, parameters.size), of_lens])
 
-    found = scipy.optimize.least_squares(residuals, chart.pack(start), jacobian, method="lm", xtol=1e-9, ftol=1e-9)
-    return chart.unpack(found.x)
+    found = scipy.optimize.least_squares(
+        residuals, parametrisation.pack(start), jacobian, method="lm", xtol=1e-9, ftol=1e-9
+    )
+    return parametrisation.unpack(found.x)
 
 
 def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:
@@ -429,8 +431,8 @@ def prediction_errors_px(
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
     """Derivative of the sensor position by the fitted parameters, as a function of the plan point."""
-    chart = _Parameters.of(projection, centres_mm, coefficients)
-    return partial(chart.jacobian, chart.pack(projection))
+    parametrisation = _Parametrisation.of(projection, centres_mm, coefficients)
+    return partial(parametrisation.jacobian, parametrisation.pack(projection))
 
 
 def variance_factor(observations: DiscObservations, projection: Projection, coefficients: int) -> tuple[float, float]:
@@ -465,7 +467,7 @@ def _weighted_jacobian(observations: DiscObservations, projection: Projection, c
 
 
 @dataclass(frozen=True)
-class _Parameters:
+class _Parametrisation:
     """Well-conditioned parameters: eight homography entries between centred unit coordinates, then the distortion.
 
     Attributes
@@ -481,7 +483,7 @@ class _Parameters:
     coefficients: int
 
     @classmethod
-    def of(cls, start: Projection, centres_mm: Array, coefficients: int) -> _Parameters:
+    def of(cls, start: Projection, centres_mm: Array, coefficients: int) -> _Parametrisation:
         """Parameters for discs at these places, (n, 2) mm."""
         middle = centres_mm.mean(axis=0)
         scale = float(np.abs(centres_mm - middle).max())

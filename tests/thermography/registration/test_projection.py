@@ -11,7 +11,7 @@ from thermography.registration.projection import (
     Lens,
     LensError,
     Projection,
-    _Parameters,
+    _Parametrisation,
     fit_homography,
     fit_projection,
     leave_one_out_mm,
@@ -43,15 +43,19 @@ def test_distortion_is_that_of_opencv_and_can_be_undone():
 
 @pytest.mark.parametrize("coefficients", [0, 1, 2, 4])
 def test_the_derivative_by_the_parameters_is_that_of_the_projection(coefficients):
-    chart = _Parameters.of(BENT, PLAN, coefficients)
-    parameters, step = chart.pack(BENT), 1e-6
+    parametrisation = _Parametrisation.of(BENT, PLAN, coefficients)
+    parameters, step = parametrisation.pack(BENT), 1e-6
     by_differences = [
-        (chart.unpack(parameters + part).to_sensor(PLAN) - chart.unpack(parameters - part).to_sensor(PLAN)) / (2 * step)
+        (
+            parametrisation.unpack(parameters + part).to_sensor(PLAN)
+            - parametrisation.unpack(parameters - part).to_sensor(PLAN)
+        )
+        / (2 * step)
         for part in step * np.eye(8 + coefficients)
     ]
     # Rounding of a position of some hundred pixels, 1e-13 px, over the step.
-    np.testing.assert_allclose(chart.jacobian(parameters, PLAN), np.stack(by_differences, axis=-1), atol=1e-5)
-    np.testing.assert_allclose(chart.unpack(parameters).to_sensor(PLAN), BENT.to_sensor(PLAN), atol=1e-9)
+    np.testing.assert_allclose(parametrisation.jacobian(parameters, PLAN), np.stack(by_differences, axis=-1), atol=1e-5)
+    np.testing.assert_allclose(parametrisation.unpack(parameters).to_sensor(PLAN), BENT.to_sensor(PLAN), atol=1e-9)
 
 
 def test_a_point_is_located_where_it_was_projected_from():
