@@ -10,6 +10,8 @@ from thermography.radiometry.camera import (
     NOISY,
     OFFSET,
     LevelSeries,
+    _diagonal_of_inverse,
+    _fit,
     estimate_correction,
     find_bad_pixels,
     find_repeats,
@@ -115,6 +117,23 @@ def test_few_frames_correct_nothing(frames):
     found = estimate_correction(series)
     assert not found.corrects and found.steps == ()
     np.testing.assert_allclose(found.u_K, np.abs(series.background - series.background[0]) / np.sqrt(3))
+
+
+def test_a_change_with_a_step_of_its_own_tells_nothing_of_the_others(rng):
+    seconds, regressors, places = rng.choice([5.0, 120.0], 60), rng.normal(size=(60, 2)), [7, 8, 40]
+    change = regressors @ [0.3, -0.2] + 0.02 * rng.normal(size=60) * np.sqrt(seconds / 60.0)
+    moved = change.copy()
+    moved[places] += [5.0, -3.0, 0.7]
+    fit, other = (_fit(each, regressors, places, seconds) for each in (change, moved))
+    np.testing.assert_allclose(other.values - fit.values, [0, 0, 5.0, -3.0, 0.7], atol=1e-9)
+    np.testing.assert_allclose(other.covariance, fit.covariance, rtol=1e-9)
+    np.testing.assert_allclose(np.delete(other.shocks, places), np.delete(fit.shocks, places), atol=1e-9)
+
+
+def test_the_diagonal_of_an_inverse_is_that_of_the_dense_matrix(rng):
+    lower = np.stack([rng.uniform(1.0, 2.0, 40), rng.uniform(-0.9, 0.9, 40)])
+    factor = np.diag(lower[0]) + np.diag(lower[1, :-1], -1)
+    np.testing.assert_allclose(_diagonal_of_inverse(lower), np.diag(np.linalg.inv(factor @ factor.T)), rtol=1e-10)
 
 
 def test_a_frozen_camera_and_missing_sensors_are_no_faults():
