@@ -12,7 +12,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.consistency.camera import zero_share
+from fusion.analysis.consistency.camera import mean_rise, zero_share
 from fusion.analysis.consistency.model import compare_lines, with_line, withhold_names
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
@@ -77,7 +77,7 @@ def hidden_by_zero(loop: Mapping[str, Any], fields: xr.Dataset, position_mm: np.
     A zero that swings as the table warms makes the rise another course, so that a coefficient is too small and what it lacks is left as
     drift: at most that drift per kelvin, in the share that the zero has of the rise.
     """
-    rise = fields["temperature_rise"].mean(("y", "x")).values
+    rise = mean_rise(fields)
     swing_K, drift = max(float(np.nanstd(rise)), 1e-3), loop["residual_drift"]
     metres = 1e-3 * max(float(np.sqrt(np.mean(position_mm**2))), 1.0)
     share = zero_share(fields)

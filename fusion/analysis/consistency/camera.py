@@ -556,11 +556,17 @@ def check_picture(fields: xr.Dataset) -> list[Check]:
     ]
 
 
+def mean_rise(fields: xr.Dataset) -> Array:
+    """Mean rise of the cells that each cycle shows, (cycle,), K; of a long test not all fields are in memory at once."""
+    rise = fields["temperature_rise"]
+    return np.concatenate([rise[some].mean(("y", "x")).values for some in piece_slices(rise.shape)])
+
+
 def zero_share(fields: xr.Dataset) -> float:
     """Uncertainty of the camera's zero, which changes as slowly as the table warms, as a share of the mean rise; over all cycles."""
     if "camera_correction_u" not in fields:
         return 0.0
-    rise, zero_u = fields["temperature_rise"].mean(("y", "x")).values, fields["camera_correction_u"].values
+    rise, zero_u = mean_rise(fields), fields["camera_correction_u"].values
     known = np.isfinite(rise) & np.isfinite(zero_u)
     return float(np.sqrt((zero_u[known] ** 2).sum() / max((rise[known] ** 2).sum(), np.finfo(float).tiny)))
 
