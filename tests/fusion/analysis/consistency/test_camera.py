@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from fusion.analysis.consistency.camera import (
     check_registration,
     find_gaps,
     gap_words,
+    mean_rise,
     zero_share,
 )
 from fusion.analysis.consistency.checks import CODES, Check
@@ -450,3 +452,22 @@ def test_a_zero_that_may_be_more_than_a_third_of_the_rise_is_doubted(zero_u_K: f
 def test_a_picture_that_no_disc_confirms_is_not_verified() -> None:
     (picture,) = check_picture(xr.Dataset(attrs={"discs": json.dumps({"untested": "the table moves"})}))
     assert picture.passed and not picture.verified and "(the table moves)" in picture.evidence and picture.remedy
+
+
+def test_the_mean_rise_of_a_long_test_takes_no_memory_of_all_its_fields(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    rise = rng.normal(2.0, 1.0, (600, 90, 100)).astype(np.float32)
+    rise[:, :10] = np.nan
+    rise[7] = np.nan
+    xr.Dataset({"temperature_rise": (("cycle", "y", "x"), rise)}).to_netcdf(tmp_path / "fields.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "fields.nc", engine="h5netcdf") as fields:
+        mean_rise(fields.isel(cycle=slice(2)))
+        tracemalloc.start()
+        means = mean_rise(fields)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    # A piece is 4 MB in double precision; the fields are 22 MB, and their mean at once takes them twice.
+    assert peak < rise.nbytes / 2
+    np.testing.assert_allclose(np.delete(means, 7), np.delete(rise, 7, axis=0)[:, 10:].mean((1, 2)), rtol=1e-5)
+    assert np.isnan(means[7])
