@@ -198,7 +198,16 @@ def test_a_drift_of_several_channels_is_told_by_its_number(monkeypatch):
 
 def test_a_shape_is_tested_below_the_level_alone():
     shown = Remainder(
-        REMAINDER_LEVEL, {}, "one step", 1.0, np.arange(2), np.zeros(2), [], np.zeros(0), np.zeros(4), lambda given: given
+        REMAINDER_LEVEL,
+        {},
+        "one step",
+        1.0,
+        np.arange(2),
+        np.zeros(2),
+        [],
+        np.zeros(0),
+        np.zeros(4),
+        lambda given: given,
     )
     assert not shown.is_tested
     assert replace(shown, p_value=0.99 * REMAINDER_LEVEL).is_tested
