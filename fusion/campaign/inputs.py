@@ -55,7 +55,7 @@ from interferometry.io.faults import BadReading
 from interferometry.io.readings import read_deviations, read_environment
 from interferometry.io.tables import DateOrder, parse_time, read_table
 from interferometry.iso230 import STANDARD_CYCLES
-from thermography.common import ThermographyError
+from thermography.common import ZERO_CELSIUS_K, ThermographyError
 from thermography.io.frame import FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
 from thermography.io.region import Region as PictureRegion
@@ -65,7 +65,6 @@ from thermography.registration.plan import Fiducial, PlanGrid, Polygon, PolygonE
 from thermography.registration.projection import Lens, read_lens
 from thermography.registration.register import picture_grid
 
-_ZERO_CELSIUS_K = 273.15
 #: Camera parameters that a campaign file may override.
 OVERRIDABLE = (
     "emissivity", "reflected_temperature_K", "atmospheric_temperature_K", "relative_humidity", "object_distance_m", "window_transmission",
@@ -77,7 +76,7 @@ def overridden_parameters(table: ThermographyTable) -> dict[str, float]:
     """Return the camera parameters that the campaign file overrides, where temperatures are in degC."""
     stated = {name: getattr(table, name.replace("_K", "_degC")) for name in OVERRIDABLE}
     given = {name: value for name, value in stated.items() if value is not None}
-    return {name: value + _ZERO_CELSIUS_K if name.endswith("_K") else value for name, value in given.items()}
+    return {name: value + ZERO_CELSIUS_K if name.endswith("_K") else value for name, value in given.items()}
 
 
 # Files of temperatures of other cameras in a campaign: what ``[thermography.stack]`` says of them, and what it leaves
@@ -99,7 +98,7 @@ def stack_options(campaign: Campaign) -> StackOptions:
         start=None if table.start is None else _instant(campaign.path, table.start, table.time_zone),
         emissivity=table.emissivity,
         needs_time=needs_time,
-        reflected_temperature_K=None if reflected is None else reflected + _ZERO_CELSIUS_K,
+        reflected_temperature_K=None if reflected is None else reflected + ZERO_CELSIUS_K,
     )
 
 

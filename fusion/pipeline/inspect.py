@@ -23,7 +23,7 @@ from fusion.results.folder import MANIFEST
 from fusion.results.progress import counted, left_out_notices, listed
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
-from thermography.common import ThermographyError
+from thermography.common import ZERO_CELSIUS_K, ThermographyError
 from thermography.evaluation import tabulate_regions
 from thermography.inspection import (
     check_series,
@@ -36,7 +36,6 @@ from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
 from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader, name_unread
 from thermography.io.sequence import camera_names
-from thermography.radiometry.planck import ZERO_CELSIUS_K
 from thermography.registration.plan import read_fiducials
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from fusion.common import Array
 from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
 from fusion.results.store import check
-from thermography.common import FIELDS, ThermographyError
+from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
 from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
 from thermography.fields.large_arrays import in_pieces, piece_slices
 from thermography.fields.moving import reduce_moving_frames
@@ -71,7 +71,7 @@ from thermography.radiometry.camera import (
     hold_constant,
     room_temperatures,
 )
-from thermography.radiometry.planck import ZERO_CELSIUS_K, Overrides, calibrate, override, signal_slope
+from thermography.radiometry.planck import Overrides, calibrate, override, signal_slope
 from thermography.radiometry.uncertainty import InputUncertainty, common_contributions, rise_scale_contributions
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.plan import Polygon

@@ -20,22 +20,18 @@ from itertools import compress
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import special
 
-from interferometry.common import InterferometryError, check_dataset
+from interferometry.common import Array, InterferometryError, check_dataset
 from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
 from interferometry.deviations import DIRECTIONS
 from interferometry.iso230.budget import CONTRIBUTIONS, SCATTER_ALONE, Iso230Budget
 
-Array = NDArray[np.float64]
-
 #: Quantities of the axis: reversal error, bidirectional repeatability, bidirectional systematic positioning error, mean bidirectional
 #: positioning error, bidirectional accuracy.
 QUANTITIES = ("B", "R", "E", "M", "A")
-#: Quantities of the axis that have an uncertainty: reversal error, bidirectional repeatability, bidirectional systematic positioning
-#: error, mean bidirectional positioning error, bidirectional accuracy, signed mean of the reversal errors.
-AXIS = ("B", "R", "E", "M", "A", "mean_reversal")
+#: What has an uncertainty: these, the signed mean of the reversal errors, and quantities of one direction.
+AXIS = (*QUANTITIES, "mean_reversal")
 ONE_WAY = ("R_unidirectional", "E_unidirectional", "A_unidirectional")
 STANDARD_CYCLES = 5
 #: Windows of a long test that are evaluated before their results become one.

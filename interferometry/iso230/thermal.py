@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from interferometry.common import Array
 
 HOUR_S = 3600.0
 #: Readings are averaged over this time, s.

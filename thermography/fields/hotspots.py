@@ -132,9 +132,8 @@ def _hotspot(
     zones = measure.label((field >= field[place] - prominence / 2) & seen, connectivity=1)
     zone = zones == zones[place]
     rows, columns = np.nonzero(zone)
-    outside = ~scipy.ndimage.binary_erosion(np.pad(scipy.ndimage.binary_fill_holes(seen), 1), np.ones((3, 3)))[
-        1:-1, 1:-1
-    ]
+    filled = np.pad(scipy.ndimage.binary_fill_holes(seen), 1)
+    outside = ~scipy.ndimage.binary_erosion(filled, np.ones((3, 3)))[1:-1, 1:-1]
     column, row, peak = _vertex(values, field, place)
     left, lower = float(x[columns].min() - cell / 2), float(y[rows].min() - cell / 2)
     right, upper = float(x[columns].max() + cell / 2), float(y[rows].max() + cell / 2)

@@ -86,9 +86,8 @@ def find_surfaces(
         share = region.outline.cell_shares(x_mm, y_mm)
         owner[share == 1.0] = number
         mixed = np.where(share == 1.0, False, mixed | (share > 0.0))
-    spread = scipy.ndimage.maximum_filter(owner, 3, mode="nearest") != scipy.ndimage.minimum_filter(
-        owner, 3, mode="nearest"
-    )
+    largest = scipy.ndimage.maximum_filter(owner, 3, mode="nearest")
+    spread = largest != scipy.ndimage.minimum_filter(owner, 3, mode="nearest")
     edge = mixed | spread
     # A partly seen cell was moved to its centre along a gradient that its neighbours across the edge take part in.
     edge |= scipy.ndimage.binary_dilation(edge, np.ones((3, 3))) & (fields["coverage"].values < PARTLY_SEEN_BELOW)

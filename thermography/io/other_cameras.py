@@ -33,18 +33,17 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import xarray as xr
 
-from thermography.common import ThermographyError
+from thermography.common import ZERO_CELSIUS_K, ThermographyError
 from thermography.io.flir import FlirReader, index_files
 from thermography.io.frame import CalibratedRange, CameraParameters, FrameReference, RejectedFrame
 from thermography.io.hdf5 import MOST_OBJECTS, hdf5_fault
 from thermography.io.sequence import FrameList, FrameTable
 
-_ZERO_CELSIUS_K = 273.15
 #: Planck's constant B of a camera for 7.5 to 13 um, K.
 _PLANCK_B = 1500.0
 #: Highest temperature of the scale, degC, and its count.
 _HIGHEST_DEGC, _HIGHEST_COUNT = 160.0, 65_000.0
-_PLANCK_R1 = _HIGHEST_COUNT * (np.exp(_PLANCK_B / (_HIGHEST_DEGC + _ZERO_CELSIUS_K)) - 1.0)
+_PLANCK_R1 = _HIGHEST_COUNT * (np.exp(_PLANCK_B / (_HIGHEST_DEGC + ZERO_CELSIUS_K)) - 1.0)
 #: Parts of a time in the name of a file: directive of strptime -> digits.
 _DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "M": 2, "S": 2, "j": 3}
 #: Most pixels of a frame; a damaged header may claim more.
@@ -220,7 +219,7 @@ class TemperatureFrame(FrameReference):
             )
         # A damaged value may be beyond any temperature, or none; its counts say so.
         with np.errstate(over="ignore", invalid="ignore"):
-            return values * self.options.scale + self.options.offset - (_ZERO_CELSIUS_K if self.unit == "K" else 0.0)
+            return values * self.options.scale + self.options.offset - (ZERO_CELSIUS_K if self.unit == "K" else 0.0)
 
     def read_counts(self) -> NDArray[np.uint16]:
         """Read the temperatures as counts of the black-body scale, (row, column) uint16; 0 where there is none."""
@@ -238,7 +237,7 @@ def encode(temperature_degC: NDArray[np.floating], parameters: CameraParameters)
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             return p.planck_r1 / np.expm1(p.planck_b / np.asarray(kelvin, np.float64))
 
-    kelvin = np.asarray(temperature_degC, np.float64) + _ZERO_CELSIUS_K
+    kelvin = np.asarray(temperature_degC, np.float64) + ZERO_CELSIUS_K
     counts = p.emissivity * signal(kelvin) + (1.0 - p.emissivity) * signal(p.reflected_temperature_K)
     counts = np.where(kelvin > 0.0, np.nan_to_num(counts, nan=0.0), 0.0)
     return np.clip(np.rint(counts), 0, 65_535).astype(np.uint16)
@@ -621,7 +620,7 @@ def _heading(path: Path) -> str:
 def _kelvin(value: str, unit: str) -> float:
     """Return a temperature of a heading, in C, F or K, in K."""
     number = float(value.replace(",", "."))
-    return {"K": number, "C": number + _ZERO_CELSIUS_K, "F": (number - 32.0) / 1.8 + _ZERO_CELSIUS_K}[unit.upper()]
+    return {"K": number, "C": number + ZERO_CELSIUS_K, "F": (number - 32.0) / 1.8 + ZERO_CELSIUS_K}[unit.upper()]
 
 
 def _plain_shape(content: bytes) -> tuple[int, int] | None:

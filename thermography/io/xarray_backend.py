@@ -19,11 +19,12 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
+from thermography.common import ZERO_CELSIUS_K
 from thermography.io.flir import FlirFrameReference, index_frames, read_measurement_regions, read_visible_picture
 from thermography.io.frame import CameraParameters, FlirFormatError
 from thermography.io.region import Region
 from thermography.io.sequence import FrameList, call_by_threads, frame_times, usable_threads
-from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
+from thermography.radiometry.planck import RadiometryError, calibrate, override
 
 _UNITS = {"object_distance_m": "m", "planck_b": "K", "atmosphere_x": "1"}
 #: Camera parameter -> (name in a Dataset, units).

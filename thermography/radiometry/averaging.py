@@ -13,9 +13,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import Array
+from thermography.common import ZERO_CELSIUS_K, Array
 from thermography.io.frame import CameraParameters
-from thermography.radiometry.planck import ZERO_CELSIUS_K, count_line
+from thermography.radiometry.planck import count_line
 
 #: Where averaging counts may err by more than this, the frames are calibrated one by one.
 AVERAGING_LIMIT_K = 0.5e-3

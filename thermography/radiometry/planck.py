@@ -22,10 +22,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermography.common import Array, ThermographyError
+from thermography.common import ZERO_CELSIUS_K, Array, ThermographyError
 from thermography.io.frame import CameraParameters, FrameHeader
 
-ZERO_CELSIUS_K = 273.15
 #: FLIR's model of the air may exceed 1 a little where its constants were fitted to another path.
 _MOST_TRANSMISSION = 1.01
 

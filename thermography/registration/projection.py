@@ -498,15 +498,20 @@ class _Parametrisation:
 
     def unpack(self, parameters: Array) -> Projection:
         """The projection with these parameters."""
-        matrix = self.to_pixels @ np.append(parameters[:8], 1.0).reshape(3, 3) @ self.to_unit
-        distortion = np.concatenate([parameters[8:], self.start.distortion[self.coefficients :]])
+        homography, distortion = self._split(parameters)
+        matrix = self.to_pixels @ homography @ self.to_unit
         return replace(self.start, plan_to_sensor=matrix / matrix[2, 2], distortion=distortion)
+
+    def _split(self, parameters: Array) -> tuple[Array, Array]:
+        """Homography (3, 3) from unit to normalised coordinates, and distortion (4,)."""
+        distortion = np.concatenate([parameters[8:], self.start.distortion[self.coefficients :]])
+        return np.append(parameters[:8], 1.0).reshape(3, 3), distortion
 
     def jacobian(self, parameters: Array, points_mm: Array) -> Array:
         """Derivative of the sensor position by the parameters at plan points (..., 2) mm, (..., 2, parameters), px."""
-        k1, k2, p1, p2 = np.concatenate([parameters[8:], self.start.distortion[self.coefficients :]])
+        homography, (k1, k2, p1, p2) = self._split(parameters)
         unit = np.concatenate([points_mm, np.ones_like(points_mm[..., :1])], axis=-1) @ self.to_unit.T
-        mapped = unit @ np.append(parameters[:8], 1.0).reshape(3, 3).T
+        mapped = unit @ homography.T
         u, v = mapped[..., 0] / mapped[..., 2], mapped[..., 1] / mapped[..., 2]
         by_row, nothing = unit / mapped[..., 2:], np.zeros_like(unit)
         of_u = np.concatenate([by_row, nothing, -u[..., None] * by_row[..., :2]], axis=-1)

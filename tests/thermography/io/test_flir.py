@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from tests.thermography.flir_mutations import HEADER, PARAMETERS, SETTINGS, TIME, fuzz, jpeg, patch, sequence
 from tests.thermography.flir_mutations import frame as simulate
+from thermography.common import ZERO_CELSIUS_K
 from thermography.io import sequence as by_threads
 from thermography.io.flir import (
     FlirFrameReference,
@@ -32,7 +33,7 @@ from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
 from thermography.io.other_cameras import index_recordings
 from thermography.io.region import Region
-from thermography.radiometry.planck import ZERO_CELSIUS_K, calibrate, override
+from thermography.radiometry.planck import calibrate, override
 
 SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
 T1030_CSQ = "gtatters__Thermimage/inst/extdata/SampleCSQ.csq"
