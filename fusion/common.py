@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import metadata
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args, get_type_hints
 
 if TYPE_CHECKING:
@@ -46,6 +46,20 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             installed[name] = "not installed"
     return installed
+
+
+def place_within(folder: Path, name: str) -> Path | None:
+    """Return the place of what a file names within a folder; None where the name leads out of it, on any system or by a symbolic link.
+
+    Names out of results, downloads and listings become paths here alone: whoever made the file may have meant other folders.
+    """
+    if "\0" in name or "\\" in name or PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive:
+        return None
+    path = folder / name
+    try:
+        return path if folder.resolve() in path.resolve().parents else None
+    except (OSError, RuntimeError, ValueError):  # A link to itself, a name that no system can hold.
+        return None
 
 
 # TOML files that a user writes: read into tables, and their faults as sentences with line, key, value and remedy (pydantic finds them).

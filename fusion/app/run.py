@@ -10,7 +10,8 @@ import panel as pn
 from fusion.app import parts as ui
 from fusion.app.runs import RUNS, RunError, RunProcess, is_begun
 from fusion.messages import ExitCode
-from fusion.results.store import finished_stages, noted_messages, read_json_object
+from fusion.pipeline.stages import noted_campaign
+from fusion.results.store import finished_stages, noted_messages
 
 _INTERVAL_MS = 500
 
@@ -53,7 +54,7 @@ class RunScreen:
         results = ui.allowed_path(self._state.root, self._results.value)
         if not campaign.is_file():
             raise ui.PathError(f"{campaign}: no such file; the screen Set up writes it")
-        other = campaign_of(results)
+        other = noted_campaign(results)
         if other is not None and other.parent != campaign.parent:
             raise ui.PathError(
                 f"{results} holds the results of {other}; name another results folder, they would be replaced"
@@ -120,15 +121,6 @@ class RunScreen:
 def failed(run: RunProcess) -> ui.Parts:
     """Return what a run that ended with a fault said."""
     return ui.faults("\n".join(run.messages) or "The run ended without a word.")
-
-
-def campaign_of(results: Path) -> Path | None:
-    """Return the campaign file of a finished run; None where it is not noted, or is no longer there."""
-    try:
-        campaign = (results / read_json_object(results / "provenance.json")["campaign_file"]).resolve()
-        return campaign if campaign.is_file() else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def stages_markup(run: RunProcess) -> str:

@@ -17,14 +17,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote, urljoin, urlsplit
 
 import filelock
 
 from fusion.campaign.values import FILE_KEYS
-from fusion.common import FusionError, TomlError, read_toml
+from fusion.common import FusionError, TomlError, place_within, read_toml
 from fusion.results.progress import Report, silent
 from fusion.results.store import file_sha256, read_json_object, write_json
 from interferometry.common import InterferometryError
@@ -120,7 +120,11 @@ def _fetch(address: str, names_in: Callable[[Path], list[str]], report: Report) 
     path = store.folder / name
     with store.open() as stamps:
         sizes = store.fetch({name: store.stamp(name)}, stamps, report)
-        found = store.find(names_in(path))
+        names = names_in(path)
+        for one in names:
+            if is_address(one) or place_within(store.folder, one) is None:
+                raise RemoteError(f'{address}: "{one}" is outside the folder of the campaign file; put the file there')
+        found = store.find(names)
         sizes += store.fetch(found, stamps, report)
         for stale in stamps.keys() - found.keys() - {name}:
             (store.folder / stale).unlink(missing_ok=True)
@@ -173,9 +177,6 @@ def _file_names(campaign: Path, address: str) -> list[str]:
             for part in key.split("."):
                 value = value.get(part) if isinstance(value, dict) else None
             names += [value] if isinstance(value, str) else [one for one in value or () if isinstance(one, str)]
-    for name in names:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or is_address(name) or "\\" in name:
-            raise RemoteError(f'{address}: "{name}" is outside the folder of the campaign file; put the file there')
     return names
 
 
@@ -195,6 +196,9 @@ class _Store:
         with filelock.FileLock(self.folder / ".lock"):
             noted = read_json_object(path).get("files")
             stamps = noted if isinstance(noted, dict) else {}
+            for name in stamps:
+                if place_within(self.folder, name) is None:
+                    raise RemoteError(f"{path}: {name!r} leads out of {self.folder}; remove this folder of the cache")
             try:
                 yield stamps
             finally:
@@ -244,7 +248,7 @@ class _Store:
         web = self.base.startswith("http")
         base = self.base if web else self.base.split("://", 1)[1]
         name = unquote(address.removeprefix(f"{base}/")) if web else address.removeprefix(f"{base}/")
-        if not address.startswith(f"{base}/") or ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
+        if not address.startswith(f"{base}/") or place_within(self.folder, name) is None:
             raise RemoteError(f"{self.base}: lists {address}, which is outside it; name the files one by one")
         return name
 

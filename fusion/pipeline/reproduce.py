@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from fusion.campaign.config import load_campaign
 from fusion.common import versions
 from fusion.pipeline.remote import fetched_campaign, is_address
 from fusion.pipeline.run import run_campaign
-from fusion.pipeline.stages import hash_files
+from fusion.pipeline.stages import hash_files, noted_campaign
 from fusion.results.progress import Report, silent
 from fusion.results.results import ResultsError, in_this_schema
 from fusion.results.store import is_file_list
@@ -107,11 +106,8 @@ def _read_provenance(results: Path) -> dict[str, Any]:
 
 def _campaign_of(results: Path, provenance: Mapping[str, Any]) -> Path:
     """Return the campaign file where the run found it."""
-    place = provenance.get("campaign_file")
-    # A name that is too long for a file is an error of the system.
-    with suppress(OSError):
-        if isinstance(place, str) and (path := results / place).is_file():
-            return path
+    if (path := noted_campaign(results)) is not None:
+        return path
     address = provenance.get("campaign_address")
     if isinstance(address, str):
         raise ResultsError(

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from fusion.analysis.effects.effect import GROUP, describe_code, plugins
 from fusion.campaign.config import Campaign
-from fusion.common import versions
+from fusion.common import place_within, versions
 from fusion.pipeline.workers import Worker
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, read_results
@@ -190,6 +190,16 @@ def _place_from(folder: Path, campaign: Path) -> str | None:
     except ValueError:  # another drive
         return None
     return way.as_posix() if way.parts.count("..") <= 1 and len(way.parts) <= 3 else None
+
+
+def noted_campaign(folder: Path) -> Path | None:
+    """Return the campaign file where the run of a results folder found it; None where it is not noted, or no longer there."""
+    place, folder = read_json_object(folder / "provenance.json").get("campaign_file"), folder.resolve()
+    path = place_within(folder.parent, f"{folder.name}/{place}") if isinstance(place, str) else None
+    # A name that is too long for a file is an error of the system.
+    with suppress(OSError):
+        return path.resolve() if path is not None and path.is_file() else None
+    return None
 
 
 def _without_folder(argument: str) -> str:

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
 
 import filelock
 
+from fusion.common import place_within
 from fusion.results.store import OutputError, is_text, read_json_object, write_json
 from thermography.io.files import PARTIAL, finished_path
 
@@ -40,6 +42,7 @@ def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
     content = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
     if content and not (folder / _HOLDER).exists():
         _refuse_strange(folder, content, resume=resume)
+    _refuse_leading_out(folder)
     with _locked(folder):
         if content:
             _refuse_strange(folder, content, resume=resume)
@@ -56,6 +59,7 @@ def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
 def claim(folder: Path, *names: str) -> None:
     """Enter files in the manifest of a folder before they are written, or replaced by a newer version."""
     written = read_manifest(folder)
+    _require_within(folder, names, folder)
     strange = [name for name in names if name not in written and (folder / name).exists()]
     if strange:
         raise OutputError(
@@ -104,7 +108,27 @@ def read_manifest(folder: Path) -> dict[str, str]:
         raise OutputError(
             f"{folder / MANIFEST} is not the manifest of a results folder; name another folder with --out"
         )
+    _require_within(folder, written, folder / MANIFEST)
     return {str(name): str(version) for name, version in written.items()}
+
+
+def _require_within(folder: Path, names: Iterable[str], source: Path) -> None:
+    """Refuse a name of a results folder that leads out of it."""
+    for name in names:
+        if place_within(folder, name) is None:
+            raise OutputError(
+                f"{source}: {name!r} leads out of the results folder; nothing was changed: name another folder with --out, and ask who "
+                "made this one"
+            )
+
+
+def _refuse_leading_out(folder: Path) -> None:
+    """Refuse a folder whose manifest, or a link among what the stages keep, leads out of it, before anything is written through it."""
+    stages = folder / _STAGES
+    _require_within(
+        folder, (path.relative_to(folder).as_posix() for path in chain([stages], stages.rglob("*"))), folder
+    )
+    read_manifest(folder)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from fusion.common import FusionError
+from fusion.common import FusionError, place_within
 from interferometry.common import DEVIATIONS, DIRECTIONS
 from thermography.common import FIELDS
 from thermography.fields.large_arrays import IN_MEMORY_BYTES, in_pieces
@@ -259,10 +259,14 @@ class StageStamps:
         stamp = self._stamps.get(stage)
         if stamp is None or stamp["key"] != key:
             return False
-        return all(
-            (self._folder / name).is_file() and file_sha256(self._folder / name) == sha
-            for name, sha in stamp["files"].items()
-        )
+        return all(self._holds(name, sha) for name, sha in stamp["files"].items())
+
+    def _holds(self, name: str, sha: str) -> bool:
+        """Tell whether a file of a stage is as it was written."""
+        path = place_within(self._folder, name)
+        if path is None:
+            raise OutputError(f"{self._path}: {name!r} leads out of the results folder; name another folder with --out")
+        return path.is_file() and file_sha256(path) == sha
 
     def note(self, stage: str) -> Any:
         """Return what was noted when `stage` was recorded."""

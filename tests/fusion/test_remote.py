@@ -206,7 +206,7 @@ def test_a_connection_that_breaks_is_tried_again_and_then_named(shelf, cache):
     assert not [path for path in mirror.folder.iterdir() if path.name.startswith("environment")]
 
 
-def test_what_is_not_there_or_may_not_be_read_is_named(shelf, tmp_path):
+def test_what_is_not_there_or_may_not_be_read_is_named(shelf, cache):
     server, day = shelf
     with pytest.raises(RemoteError, match=r"/day%201/nothing.toml: there is no such file or bucket; check the address"):
         fetch_campaign(f"{server}/day%201/nothing.toml")
@@ -217,6 +217,13 @@ def test_what_is_not_there_or_may_not_be_read_is_named(shelf, tmp_path):
     (day / "outside.toml").write_text('[plan]\nfiducials = "../../secret.csv"\n')
     with pytest.raises(RemoteError, match=r'outside.toml: "../../secret.csv" is outside the folder of the campaign'):
         fetch_campaign(f"{server}/day%201/outside.toml")
+    # What was noted of an earlier download removes nothing outside it.
+    mirror, secret = fetch_file(f"{server}/day%201/campaign.toml"), cache / "secret.csv"
+    secret.write_text("precious")
+    (mirror.folder / ".origin.json").write_text(json.dumps({"files": {"../secret.csv": {}}}))
+    with pytest.raises(RemoteError, match=r"\.origin\.json: '\.\./secret\.csv' leads out"):
+        fetch_file(f"{server}/day%201/campaign.toml")
+    assert secret.read_text() == "precious"
 
 
 def test_a_server_is_followed_on_itself_only(shelf):

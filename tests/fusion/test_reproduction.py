@@ -79,7 +79,11 @@ def test_a_folder_without_a_run_or_its_campaign_is_refused(finished: Path, tmp_p
     elsewhere = shutil.copytree(finished, tmp_path / "elsewhere" / "results")
     with pytest.raises(ResultsError, match="name it with --campaign"):
         reproduce(elsewhere)
-    for place in ("../" * 5000, "x" * 5000, "a\0b", 5, None):
+    shutil.copy(finished.parent / "campaign.toml", tmp_path)
+    # Two folders up, by a link or by its parts, is none of what a run notes.
+    (elsewhere / "link.toml").symlink_to(tmp_path / "campaign.toml")
+    outside = ("../../campaign.toml", str(tmp_path / "campaign.toml"), "link.toml")
+    for place in (*outside, "../" * 5000, "x" * 5000, "a\0b", 5, None):
         provenance = json.loads((finished / "provenance.json").read_text())
         (elsewhere / "provenance.json").write_text(json.dumps({**provenance, "campaign_file": place}))
         with pytest.raises(ResultsError, match="name it with --campaign"):

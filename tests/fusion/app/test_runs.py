@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import pytest
 
 from fusion.app.parts import state_of
-from fusion.app.run import campaign_of
 from fusion.app.run_child import main, write_progress
 from fusion.app.runs import RUNS, Progress, RunError, Runs, is_begun
 from fusion.messages import ExitCode
+from fusion.pipeline.stages import noted_campaign
 
 pytestmark = pytest.mark.long
 
@@ -171,7 +171,7 @@ def test_results_of_another_campaign_are_not_replaced(app, new_page):
     kept = shutil.copytree(app[1] / "results", app[1] / "kept")
     provenance = json.loads((kept / "provenance.json").read_text(encoding="utf-8"))
     (kept / "provenance.json").write_text(json.dumps(provenance | {"campaign_file": "../campaign.toml"}))
-    assert campaign_of(kept) == (app[1] / "campaign.toml").resolve() and campaign_of(app[1]) is None
+    assert noted_campaign(kept) == (app[1] / "campaign.toml").resolve() and noted_campaign(app[1]) is None
     page.get_by_label("Campaign file").fill("below/campaign.toml")
     page.get_by_label("Results folder").fill("kept")
     page.get_by_label("Results folder").press("Tab")

@@ -14,8 +14,8 @@ import filelock
 import pytest
 
 from fusion.pipeline.run import run_campaign
-from fusion.results.folder import MANIFEST, claim, claim_file, open_folder, read_manifest
-from fusion.results.store import OutputError, write_text
+from fusion.results.folder import MANIFEST, claim, claim_file, discard, open_folder, read_manifest
+from fusion.results.store import OutputError, StageStamps, file_sha256, write_json, write_text
 
 
 def refusal(folder: Path, *, resume: bool = False) -> str:
@@ -61,6 +61,60 @@ def test_the_manifest_of_somebody_else_is_not_replaced(tmp_path: Path, text: str
     with pytest.raises(OutputError, match=f"{MANIFEST} is not the manifest"):
         claim(tmp_path, "results.json")
     assert (tmp_path / MANIFEST).read_text() == text
+
+
+LEADING_OUT = (
+    "maps/../../victim/file.txt", "{above}/victim/file.txt", "away/file.txt", "file", "loop/file.txt", "..", ".", "",
+    "../results-2/file.txt", "C:/file.txt", "C:file.txt", "//host/share/file.txt", "maps\\..\\..\\victim\\file.txt", "maps/a\0b",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LEADING_OUT)
+def test_a_name_that_leads_out_of_a_results_folder_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    """In the manifest, in the stamps and where a product is to be written; by its parts, by a link in the folder, on Windows."""
+    folder, victim = tmp_path / "results", tmp_path / "victim"
+    victim.mkdir()
+    (victim / "file.txt").write_text("precious")
+    folder.mkdir()
+    (folder / "away").symlink_to(victim)
+    (folder / "file").symlink_to(victim / "file.txt")
+    (folder / "loop").symlink_to(folder / "loop")
+    name = name.format(above=tmp_path)
+    with pytest.raises(OutputError) as claimed:
+        claim(folder, "results.json", name)
+    write_json(folder / MANIFEST, {"software": "thermofuse", "written": {name: "1", "results.json": "1"}})
+    with pytest.raises(OutputError) as discarded:
+        discard(folder, name)
+    (folder / ".stages").mkdir()
+    told = refusal(folder, resume=True)
+    stamp = {"key": "x", "files": {name: file_sha256(victim / "file.txt")}}
+    stamps = write_json(folder / ".stages" / "stamps.json", {"report": stamp})
+    with pytest.raises(OutputError) as stamped:
+        StageStamps(folder).done("report", "x")
+    assert all(repr(name) in one for one in (told, *(str(error.value) for error in (claimed, discarded, stamped))))
+    assert (victim / "file.txt").read_text() == "precious" and [*(folder / ".stages").iterdir()] == [stamps]
+
+
+@pytest.mark.parametrize("link", [".stages", ".stages/lock", ".stages/cycles_0123", "maps"])
+def test_a_run_writes_through_no_link_that_leads_out(tmp_path: Path, link: str) -> None:
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / ".report.partial.html").touch()
+    folder = tmp_path / "results"
+    (folder / link).parent.mkdir(parents=True)
+    write_json(folder / MANIFEST, {"software": "thermofuse", "written": {}})
+    (folder / link).symlink_to(victim)
+    with pytest.raises(OutputError) as error, open_folder(folder, resume=True):
+        claim(folder, "maps/cycle_0001.exr")
+    assert link in str(error.value) and [*victim.iterdir()] == [victim / ".report.partial.html"]
+
+
+def test_a_results_folder_may_itself_be_a_link(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "results").symlink_to(tmp_path / "disk")
+    with open_folder(tmp_path / "results", resume=False) as folder:
+        claim(folder, "maps/cycle_0001.exr")
+    assert set(read_manifest(tmp_path / "disk")) == {"maps/cycle_0001.exr"}
 
 
 def test_a_folder_that_is_no_text_is_refused(tmp_path: Path) -> None:
