@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -162,9 +163,11 @@ def export_frames(
 
     paths = Counter(frame.path for frame in read)
     names = Counter(path.name for path in paths)
+    # As many folders in the name as tell all files apart.
+    depth = next(n for n in count(1) if len({path.parts[-n:] for path in paths}) == len(paths))
     pictures = [one for one in wanted if one in _OF_FRAME]
     for frame in read if pictures else ():
-        name = frame.path.name if names[frame.path.name] == 1 else f"{frame.path.parent.name}_{frame.path.name}"
+        name = frame.path.name if names[frame.path.name] == 1 else "_".join(frame.path.parts[-depth:])
         name += f"_{frame.index:05d}" if paths[frame.path] > 1 else ""
         picture = calibrated(frame)
         for one in pictures:

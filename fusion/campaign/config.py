@@ -880,11 +880,11 @@ def campaign_schema() -> dict[str, Any]:
 
 
 def relative_name(path: Path, folder: Path) -> str:
-    """Return `path` as seen from `folder`, with forward slashes, or its bare name where it lies elsewhere."""
+    """Return the name of a file of a campaign, another one for every file: its path as seen from the folder, with forward slashes."""
     try:
-        return path.relative_to(folder).as_posix()
-    except ValueError:
-        return path.name
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # another drive
+        return path.as_posix()
 
 
 def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = None) -> Campaign:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ def stack_options(campaign: Campaign) -> StackOptions:
     return StackOptions(
         **{name: getattr(table, name) for name in same},
         unit=table.unit or "",
-        times=None if table.times is None else _read_times(campaign.resolve(table.times), table),
+        times=None if table.times is None else _read_times(campaign, table, campaign.resolve(table.times)),
         start=None if table.start is None else _instant(campaign.path, table.start, table.time_zone),
         emissivity=table.emissivity,
         needs_time=needs_time,
@@ -110,19 +110,39 @@ def _instant(path: Path, text: str, zone: str, order: DateOrder | None = None) -
     return time if given else to_utc(path, time.astype("datetime64[us]").item(), zone)
 
 
-def _read_times(path: Path, table: StackTable) -> dict[tuple[str, int], np.datetime64]:
-    """Return UTC by file name and frame from a table with the columns file, time and, for files of several frames, frame (from 0)."""
+def _read_times(campaign: Campaign, table: StackTable, path: Path) -> dict[tuple[Path, int], np.datetime64]:
+    """Return UTC by file and frame from a table with the columns file, time and, for files of several frames, frame (from 0).
+
+    A file is written with as much of its path as tells it from the others; lines of files that the campaign does not name are not used.
+    """
+    by_name: dict[str, list[Path]] = {}
+    for frame in campaign.frame_paths():
+        by_name.setdefault(frame.name, []).append(frame)
     read = read_table(path, ("file", "time"))
     rows = [(line, fields) for line, fields in read.records() if fields is not None]
     order = DateOrder.of(path, [(line, fields["time"]) for line, fields in rows])
-    times: dict[tuple[str, int], np.datetime64] = {}
+    times: dict[tuple[Path, int], np.datetime64] = {}
     for line, fields in rows:
         index = fields.get("frame", "0") or "0"
         if not index.isdecimal():
             raise CampaignError(
                 f"{path}, line {line}: frame {index!r} is not a whole number; frames of a file are counted from 0"
             )
-        times[Path(fields["file"]).name, int(index)] = _instant(path, fields["time"], table.time_zone, order)
+        written = PurePath(fields["file"].replace("\\", "/"))
+        parts = tuple(part for part in written.parts if part != "..")
+        meant = [frame for frame in by_name.get(written.name, ()) if frame.parts[-len(parts) :] == parts]
+        if len(meant) > 1:
+            named = [relative_name(frame, campaign.folder) for frame in meant]
+            raise CampaignError(
+                f"{path}, line {line}: {fields['file']!r} may be any of {len(meant)} files ({listed(named)}); write it with its folder, as "
+                f"{named[0]}"
+            )
+        for frame in meant:
+            if (frame, int(index)) in times:
+                raise CampaignError(
+                    f"{path}, line {line}: a second time for frame {index} of {relative_name(frame, campaign.folder)}; leave one of them"
+                )
+            times[frame, int(index)] = _instant(path, fields["time"], table.time_zone, order)
     return times
 
 
@@ -745,7 +765,10 @@ def read_record(campaign: Campaign) -> xr.Dataset:
         return read_run(campaign, paths[0])
     tables = {path: read_run(campaign, path) for path in paths}
     _refuse_different_columns(tables)
-    refuse_mixed_zones({path.name: table for path, table in tables.items()}, source=str(campaign.path))
+    # A name that occurs twice is given with its folder.
+    names = Counter(path.name for path in tables)
+    named = {path: path.name if names[path.name] == 1 else relative_name(path, campaign.folder) for path in tables}
+    refuse_mixed_zones({named[path]: table for path, table in tables.items()}, source=str(campaign.path))
     ordered = dict(sorted(tables.items(), key=lambda item: item[1]["time"].values[0]))
     overlaps = _overlaps(ordered)
     # Times without a date that overlap: every run counts from its own zero, and nothing says when that was.
@@ -765,15 +788,13 @@ def read_record(campaign: Campaign) -> xr.Dataset:
         table.assign_coords(run=("time", np.full(table.sizes["time"], k))) for k, table in enumerate(tables.values())
     ]
     joined = xr.concat(numbered, "time", data_vars="minimal", coords="minimal", compat="override", join="exact")
-    # A name that occurs twice is given with its folder.
-    names = [path.name for path in tables]
-    runs = [path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}" for path in tables]
+    runs = [named[path] for path in tables]
     listed_of = {
         name: json.dumps([one for table in tables.values() for one in json.loads(table.attrs[name])])
         for name in ("left_out", "held")
     }
     return joined.assign_attrs(
-        source=", ".join(path.name for path in tables),
+        source=", ".join(runs),
         **listed_of,
         runs=json.dumps(runs),
         test=json.dumps([number for number, path in enumerate(tables) if path in test]),

@@ -410,12 +410,13 @@ def _remarks(deviations: xr.Dataset) -> tuple[str, ...]:
 def files_of_run(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of the files that were measured, as the provenance of a run holds it, and that of its results, by name."""
     origin = read_json_object(folder / "provenance.json")
-    inputs, parameters = origin.get("inputs"), origin.get("parameters")
-    tables = [parameters.get(name) for name in ("interferometry", "record")] if isinstance(parameters, dict) else []
-    values = [value for table in tables if isinstance(table, dict) for value in table.values()]
-    stated = {str(name) for value in values for name in (value if isinstance(value, list) else [value])}
+    inputs, readings, parameters = origin.get("inputs"), origin.get("readings"), origin.get("parameters")
+    if not isinstance(readings, list):  # Earlier versions wrote no such list: what the campaign file names.
+        tables = [parameters.get(name) for name in ("interferometry", "record")] if isinstance(parameters, dict) else []
+        values = [value for table in tables if isinstance(table, dict) for value in table.values()]
+        readings = [name for value in values for name in (value if isinstance(value, list) else [value])]
     known: dict[str, Any] = inputs if is_file_list(inputs) else {}
-    measured = {name: str(item["sha256"]) for name, item in known.items() if name in stated}
+    measured = {name: str(item["sha256"]) for name, item in known.items() if name in readings}
     return {**measured, **hashed({"results.json": folder / "results.json"})}
 
 

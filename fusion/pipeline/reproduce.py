@@ -120,6 +120,9 @@ def _campaign_of(results: Path, provenance: Mapping[str, Any]) -> Path:
 
 def _compare_inputs(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     """Yield a line for every input that is missing, new or changed."""
+    # Earlier versions named a file outside the folder of the campaign without its folders.
+    bare = {Path(name).name: name for name in now if name not in before}
+    before = {bare.get(name, name) if name not in now else name: one for name, one in before.items()}
     for name in sorted({*before, *now}):
         if name not in now:
             yield f"{_cut(name)}: was an input of the run and is none now"

@@ -138,18 +138,24 @@ def note_changes(before: Mapping[str, FileState], after: Mapping[str, FileState]
 
 
 def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse a results folder that holds the results of another campaign: a run that goes on there would replace them."""
+    """Refuse a results folder that holds the results of another campaign: a run that goes on there would replace them.
+
+    One of the same recordings, by a campaign file that is still there, replaces them with a warning: so one changed file after the other
+    is tried on what is kept.
+    """
     known = read_json_object(folder / "provenance.json")
     here, there = _place_from(folder, campaign.path), known.get("campaign_file")
     if not is_file_list(known.get("inputs")) or not isinstance(there, str) or here in (None, there):
         return
     tables = ("thermography", "interferometry", "record")
     recordings = {inputs[name]["sha256"] for table in tables for name in campaign.files_of(table) if name in inputs}
-    if recordings & {one["sha256"] for one in known["inputs"].values()}:
-        return
     stated = known.get("parameters")
     about = stated.get("campaign") if isinstance(stated, dict) else None
     named = f'"{about.get("title")}", {there}' if isinstance(about, dict) else there
+    if recordings & {one["sha256"] for one in known["inputs"].values()}:
+        if noted_campaign(folder) is not None:
+            _log.warning("%s held the results of %s, which those of %s replace", folder, named, campaign.path)
+        return
     raise OutputError(
         f"{folder} holds the results of another campaign ({named}), which --resume would replace by those of "
         f'{campaign.path} ("{campaign.campaign.title}"); name another folder with --out, or remove this one first'
@@ -179,6 +185,7 @@ def describe_run(
         "stage_seconds": {name: round(value, 2) for name, value in seconds.items()},
         "parameters": campaign.model_dump(mode="json", exclude={"path"}, exclude_none=True),
         "inputs": dict(inputs),
+        "readings": [*campaign.files_of("interferometry"), *campaign.files_of("record")],
         "products": hash_files(named),
     }
 

@@ -15,6 +15,7 @@ from fusion.pipeline import reproduce as module
 from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.stages import hash_files
 from fusion.results.results import ResultsError
+from tests.fusion.campaign_parts import change
 
 
 @pytest.fixture
@@ -49,6 +50,19 @@ def test_equal_and_different_results_are_told(finished: Path, monkeypatch: pytes
     found = reproduce(finished)
     assert not found.equal
     assert found.lines == ("different: 2 values of results.json", "a: 2, was 1", 'b[1].c: "y", was "x"')
+
+
+def test_files_elsewhere_that_an_earlier_version_named_without_folders_are_known(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laser = finished.parent / "laser.csv"
+    shutil.move(laser, finished.parent.parent)
+    change(finished.parent / "campaign.toml", '"laser.csv"', '"../laser.csv"')
+    provenance = json.loads((finished / "provenance.json").read_text())
+    provenance["inputs"] |= hash_files({"campaign.toml": finished.parent / "campaign.toml"})
+    (finished / "provenance.json").write_text(json.dumps(provenance))
+    monkeypatch.setattr(module, "run_campaign", giving((finished / "results.json").read_text()))
+    assert reproduce(finished).equal
 
 
 def test_other_versions_are_named_beside_the_outcome(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:

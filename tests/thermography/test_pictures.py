@@ -26,6 +26,16 @@ def test_exported_temperatures_read_back(tmp_path):
     np.testing.assert_allclose(text.read_temperature(), celsius, atol=0.0006)
 
 
+def test_pictures_of_one_name_are_told_apart_by_as_many_folders_as_it_takes(tmp_path):
+    for above in ("d1", "d2"):
+        (tmp_path / above / "x").mkdir(parents=True)
+        sequence(tmp_path / above / "x" / "a.seq", frames=1)
+    sequence(tmp_path / "b.seq", frames=1)
+    frames = [one for path in sorted(tmp_path.rglob("*.seq")) for one in index_frames([path])[0]]
+    written = export_frames(frames, tmp_path / "out", ["csv"])
+    assert {path.name for path in written} == {"b.seq.csv", "d1_x_a.seq.csv", "d2_x_a.seq.csv"}
+
+
 def test_a_picture_begins_with_the_first_pixel_and_marks_what_is_beyond_the_range():
     counts = frame(48, 64).counts.copy()
     counts[10, 20] = 65535

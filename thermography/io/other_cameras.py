@@ -70,8 +70,8 @@ class StackOptions:
         Name of the variable of a NetCDF or Zarr file; None for the only one with three dimensions.
     time_in_name : str or None
         Pattern of the time in the names of the files, with the directives %Y %m %d %H %M %S %f %j of strptime.
-    times : mapping of (str, int) to datetime64, or None
-        UTC by name of the file and index of the frame in it, from 0.
+    times : mapping of (Path, int) to datetime64, or None
+        UTC by path of the file, as it is read, and index of the frame in it, from 0.
     start : datetime64 or None
         UTC of the first frame of every file; with `interval_s`.
     interval_s : float or None
@@ -100,7 +100,7 @@ class StackOptions:
     offset: float = 0.0
     variable: str | None = None
     time_in_name: str | None = None
-    times: Mapping[tuple[str, int], np.datetime64] | None = None
+    times: Mapping[tuple[Path, int], np.datetime64] | None = None
     start: np.datetime64 | None = None
     interval_s: float | None = None
     time_zone: str = "UTC"
@@ -247,7 +247,7 @@ def _times(path: Path, contents: StackContents, options: StackOptions) -> list[n
     """Return the time of every frame of a file, UTC, from what is stated; else from the file itself."""
     count = contents.frames
     if options.times is not None:
-        times = [options.times.get((path.name, index), np.datetime64("NaT", "ns")) for index in range(count)]
+        times = [options.times.get((path, index), np.datetime64("NaT", "ns")) for index in range(count)]
         if all(np.isnat(time) for time in times):
             raise StackError(f"{path}: the table of times has no line for it; add one per frame: file,frame,time")
         return times

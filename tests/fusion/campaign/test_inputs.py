@@ -11,6 +11,7 @@ import pytest
 
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import (
+    CameraInputs,
     LaserInputs,
     Source,
     SourceError,
@@ -213,6 +214,28 @@ def test_the_frames_are_those_of_the_camera(campaign_folder: Path, stack_folder:
         assert ours == pytest.approx(calibrate(frames[i].read_counts(), frames[i].parameters), abs=2.6e-3)
     codes = {notice.code for notice in source.notices}
     assert {"camera_accuracy_assumed", "stack_emissivity_unknown"} <= codes
+
+
+def test_times_of_files_of_one_name_are_those_of_their_folders(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / "IR_1.npy", np.full((48, 64), 20.0) + np.arange(64))
+    (tmp_path / "campaign.toml").write_text(
+        '[campaign]\ntitle = "T"\n[thermography]\nframes = ["*/*.npy"]\n[thermography.stack]\nunit = "degC"\ntimes = "times.csv"\n'
+    )
+
+    def times(*rows: str) -> list[str]:
+        (tmp_path / "times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
+        source = read_source(load_campaign(tmp_path / "campaign.toml"))
+        assert isinstance(source, CameraInputs)
+        return [f"{frame.path.parent.name} {str(frame.time)[11:16]}" for frame in source.frames]
+
+    for first in ("a/IR_1.npy", r"..\a\IR_1.npy", str(tmp_path / "a" / "IR_1.npy")):
+        assert times(f"{first},2026-03-09T07:00Z", "b/IR_1.npy,2026-03-09T06:30Z") == ["b 06:30", "a 07:00"]
+    with pytest.raises(CampaignError, match=r"times\.csv, line 2: 'IR_1\.npy' may be any of 2 files .* as a/IR_1\.npy"):
+        times("IR_1.npy,2026-03-09T07:00Z")
+    with pytest.raises(CampaignError, match=r"times\.csv, line 3: a second time for frame 0 of a/IR_1\.npy"):
+        times("a/IR_1.npy,2026-03-09T07:00Z", "a/IR_1.npy,2026-03-09T07:00Z")
 
 
 def test_a_stated_camera_needs_no_notice(stack_folder: Path) -> None:

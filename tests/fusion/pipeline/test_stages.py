@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 
 from fusion.campaign.config import load_campaign
+from fusion.pipeline.iso230 import files_of_run
 from fusion.pipeline.run import run_stages
 from fusion.pipeline.stages import (
     FileState,
@@ -25,13 +26,15 @@ from fusion.pipeline.stages import (
     kept_results,
     note_changes,
     refuse_other_campaign,
+    stamp_run,
 )
 from fusion.pipeline.workers import Worker
 from fusion.report.charts.embedded import Drawn
 from fusion.results.progress import Report, silent
-from fusion.results.results import Notice, Outcome
-from fusion.results.store import OutputError, StageStamps, write_json
+from fusion.results.results import Notice, Outcome, assemble
+from fusion.results.store import OutputError, StageStamps, file_sha256, write_json
 from tests.fusion.campaign_parts import change as change_text
+from tests.fusion.campaign_parts import write_laser
 
 
 class Counting:
@@ -172,7 +175,7 @@ def test_a_run_is_described_without_a_folder(campaign_folder, monkeypatch):
     assert run["products"] == hash_files({"laser.csv": products[0]})
 
 
-def test_the_results_of_another_campaign_are_not_replaced(copied):
+def test_the_results_of_another_campaign_are_not_replaced(copied, caplog):
     folder, own = copied / "results", load_campaign(copied / "campaign.toml")
     hashed = hash_files(own.input_files())
     refuse_other_campaign(folder, own, hashed)
@@ -181,6 +184,8 @@ def test_the_results_of_another_campaign_are_not_replaced(copied):
     other = load_campaign(shutil.copy(own.path, copied / "other.toml"))
     # A copy of the campaign file is for the same recordings; the same campaign file is for recordings that have grown.
     refuse_other_campaign(folder, other, hash_files(other.input_files()))
+    (warned,) = caplog.messages
+    assert all(told in warned for told in (str(folder), f'"{own.campaign.title}", ../campaign.toml', str(other.path)))
     for path in (own.resolve("laser.csv"), own.resolve("environment.csv"), *own.frame_paths()):
         path.write_bytes(path.read_bytes() + b"\n")
     refuse_other_campaign(folder, own, hash_files(own.input_files()))
@@ -260,6 +265,33 @@ def test_a_run_is_whole_only_as_long_as_nothing_changed(change, results_folder, 
     assert kept_results(load_campaign(copied / "campaign.toml"), out) is not None
     CHANGES[change](copied, out)
     assert kept_results(load_campaign(copied / "campaign.toml"), out) is None
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_inputs_of_one_name_in_two_folders_are_two_inputs(linked, tmp_path):
+    """As data on a share: stamps, provenance and sheet hold every one of them, and a change of either ends what was kept."""
+    job, named = write_laser(tmp_path / "job", 2, 2).parent, {"laser": "../laser/1.csv", "env": "../env/1.csv"}
+    for name in named:
+        (tmp_path / name).mkdir()
+    shutil.move(job / "laser.csv", tmp_path / "laser" / "1.csv")
+    logged = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent\n2026-03-09T06:30:00Z,20,1013,50\n"
+    (tmp_path / "env" / "1.csv").write_text(logged)
+    if linked:
+        for name, path in named.items():
+            (job / f"{name}.csv").symlink_to(path)
+    written = [f"{name}.csv" for name in named] if linked else [*named.values()]
+    path = change_text(job / "campaign.toml", '"laser.csv"', '"{}"\nenvironment = "{}"'.format(*written))
+    campaign, out = load_campaign(path), job / "results"
+    assert list(campaign.input_files()) == ["campaign.toml", *named.values()]
+    inputs = hash_files(campaign.input_files())
+    assert all(inputs[name]["sha256"] == file_sha256(job / name) for name in named.values())
+    write_json(out / "provenance.json", describe_run(campaign, inputs, out, started=STARTED, seconds={}))
+    assert files_of_run(out) == {name: inputs[name]["sha256"] for name in named.values()}
+    stamp_run(StageStamps(out), campaign, inputs, [])
+    write_json(out / "results.json", assemble("Size", {}, []).as_json())
+    assert kept_results(campaign, out) is not None
+    other_digit(tmp_path / "laser" / "1.csv")
+    assert kept_results(campaign, out) is None
 
 
 def test_a_run_of_another_version_or_none_is_not_whole(results_folder, campaign_folder, tmp_path, monkeypatch):

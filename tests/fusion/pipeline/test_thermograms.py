@@ -71,6 +71,22 @@ def test_two_pictures_give_their_difference(tmp_path, scene):
     assert (place["column_px"], place["row_px"], place["file"]) == (column, row, "A645sc_1.jpg")
 
 
+def test_pictures_of_one_name_in_two_folders_are_told_apart(tmp_path, scene):
+    """Cameras number from 1 in every folder: the thermogram that is shown is that of the hottest picture."""
+    for folder, warmer in (("d1", 1.0), ("d2", 3.0)):
+        write(tmp_path / folder, [scene + warmer, scene], start=START + np.timedelta64(warmer > 2.0, "D"))
+    (tmp_path / "job").mkdir()
+    path = write(tmp_path / "job", [])
+    path.write_text(path.read_text().replace('["*.jpg"]', '["../d1/*.jpg", "../d2/*.jpg"]'))
+    names = [f"../{folder}/A645sc_{k}.jpg" for folder in ("d1", "d2") for k in (0, 1)]
+    assert list(load_campaign(path).input_files()) == ["campaign.toml", *names]
+    dataset, part, regions, _ = evaluated(path)
+    assert dataset["source"].values.tolist() == names
+    highest = regions["whole picture"]["maximum_degC"]["value"]
+    assert highest == pytest.approx(scene.max() + 3.0, abs=0.02) and part["indicated_degC"] == highest
+    assert dataset.attrs["hottest"] == regions["whole picture"]["maximum_at"]["file"] == "../d2/A645sc_0.jpg"
+
+
 REGIONS = """
 [[thermography.region]]
 name = "part"

@@ -283,7 +283,7 @@ def test_times_from_the_name_a_table_or_a_start(tmp_path):
         frames(tmp_path, options, name="b.npy")
     with pytest.raises(StackError, match=r"20261025_023000.npy: .* occurs twice or not at all in Europe/Vienna"):
         frames(tmp_path, options, name="20261025_023000.npy")
-    listed = {("IR_20260309_063000.npy", 1): TIMES[0]}
+    listed = {(tmp_path / "IR_20260309_063000.npy", 1): TIMES[0]}
     assert frames(tmp_path, StackOptions(unit="degC", times=listed), count=2) == ["2026-03-09T06:30:00.000", "NaT"]
     with pytest.raises(StackError, match=r"the table of times has no line for it; add one per frame"):
         frames(tmp_path, StackOptions(unit="degC", times=listed), name="c.npy")
