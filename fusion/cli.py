@@ -532,7 +532,11 @@ def iso230(
         ),
     ],
     cycles: Annotated[
-        str | None, Option(help="Window, for example 1-5; left out: the most settled five cycles.")
+        str | None,
+        Option(
+            help="Window, for example 1-5; left out: the five cycles with the least drift in the second half of the test, "
+            "in windows laid back from the last whole cycle."
+        ),
     ] = None,
     out: Annotated[Path | None, Option(help="Write the sheet to sign: sheet.html, sheet.pdf, or sheet.docx.")] = None,
     as_json: Annotated[bool, Option("--json", help="Print everything as JSON.")] = False,

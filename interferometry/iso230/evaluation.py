@@ -8,7 +8,7 @@ deviation, B_i reversal error at a position, R_i repeatability at a position; of
 bidirectional repeatability R, bidirectional systematic positioning error E, mean bidirectional positioning error M, bidirectional
 accuracy A.
 
-In this order: the evaluation of one window; windows along a test and which of them is the most settled; other standards; the quantities as
+In this order: the evaluation of one window; windows along a test and which of them is quoted; other standards; the quantities as
 numbers.
 """
 
@@ -171,9 +171,13 @@ def evaluate_windows(
     drift: xr.DataArray | None = None,
     material_degC: xr.DataArray | None = None,
 ) -> xr.Dataset:
-    """Evaluate windows of a few cycles along a long test, and the whole test as the last window."""
+    """Evaluate windows of a few cycles laid back from the last whole one, the first cycles, and the whole test as the last window."""
     numbers = deviations["cycle"].values.tolist()
-    windows = [numbers[start : start + length] for start in range(0, len(numbers) - length + 1, length)]
+    read = deviations["deviation"].count(("direction", "target")).values
+    # A test that was broken off ends with a part of a cycle.
+    end = int(np.flatnonzero(read >= np.median(read))[-1]) + 1
+    starts = sorted({0, *range(end - length, -1, -length)}) if len(numbers) >= length else []
+    windows = [numbers[start : start + length] for start in starts]
     repeated = [(deviations["deviation"].sel(cycle=window).count("cycle") >= 2).any() for window in windows]
     windows = [*compress(windows, repeated), numbers]
     parts, names = [], []
@@ -202,7 +206,7 @@ def _of_the_axis(result: xr.Dataset) -> xr.Dataset:
 
 
 def settled_window(windows: xr.Dataset) -> int:
-    """Return which window of a test shows the warmed-up axis: in its second half, the one in which the drift varied least."""
+    """Return which window is quoted: of those whose middle is in the second half of the test, the one in which the drift varied least."""
     several = windows.sizes["window"] - 1
     if several < 1:
         return 0

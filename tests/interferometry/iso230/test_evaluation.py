@@ -136,11 +136,34 @@ def test_one_cycle_has_what_needs_no_standard_deviation(rng):
 def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng):
     short = evaluate_windows(test_made(rng.normal(0, 1, (4, 2, 4))))
     assert short["window"].values.tolist() == ["cycles 1 to 4 (4 cycles, not the 5 of the standard's acceptance test)"]
-    # Two cycles beyond two windows make no window of their own.
-    assert evaluate_windows(test_made(rng.normal(0, 1, (12, 2, 4)))).sizes["window"] == 3
     x = rng.normal(0, 1, (15, 2, 4))
     x[5:10] = np.nan
     assert evaluate_windows(test_made(x))["window"].values[:2].tolist() == ["cycles 1 to 5", "cycles 11 to 15"]
+
+
+@pytest.mark.parametrize(
+    ("cycles", "windows"),
+    [
+        (5, [(1, 5)]),
+        *((cycles, [(1, 5), (cycles - 4, cycles)]) for cycles in range(6, 11)),
+        (12, [(1, 5), (3, 7), (8, 12)]),
+        (14, [(1, 5), (5, 9), (10, 14)]),
+    ],
+)
+def test_windows_reach_the_last_cycle_and_a_warm_up_is_quoted_by_them(rng, cycles, windows):
+    test = test_made(rng.normal(0, 0.5, (cycles, 2, 4)))
+    drift = xr.zeros_like(test["deviation"]) + 20.0 * xr.DataArray(np.exp(-np.arange(cycles) / 3.0), dims="cycle")
+    found = evaluate_windows(test.assign(deviation=test["deviation"] + drift), drift=drift)
+    spans = list(zip(found["first_cycle"].values.tolist(), found["last_cycle"].values.tolist(), strict=True))
+    assert spans == [*windows, (1, cycles)]
+    assert settled_window(found) == settled_window(evaluate_windows(test)) == len(windows) - 1
+
+
+def test_a_last_cycle_that_was_broken_off_is_in_no_window_of_a_longer_test(rng):
+    x = rng.normal(0, 0.5, (14, 2, 4))
+    x[13, 1] = x[13, 0, 2:] = np.nan
+    assert evaluate_windows(test_made(x))["last_cycle"].values.tolist() == [5, 8, 13, 14]
+    assert evaluate_windows(test_made(x[9:]))["last_cycle"].values.tolist() == [5, 5]
 
 
 def test_windows_that_are_evaluated_some_at_a_time_are_those_of_all_at_once(rng, monkeypatch):
@@ -148,7 +171,7 @@ def test_windows_that_are_evaluated_some_at_a_time_are_those_of_all_at_once(rng,
     together = evaluate_windows(test)
     monkeypatch.setattr(evaluation_module, "_WINDOWS_AT_ONCE", 2)
     xr.testing.assert_identical(evaluate_windows(test), together)
-    assert together.sizes["window"] == 6
+    assert together.sizes["window"] == 7
 
 
 def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng):
