@@ -485,7 +485,7 @@ def hold_against(pair: PairComparison, prediction: TablePrediction, applied: Pat
         )
     found = []
     for symbol, predicted in prediction.predicted_um.items():
-        first, second = (getattr(part.settled or part, f"{symbol}_um") for part in (one, other))
+        first, second = (getattr(part, f"{symbol}_um") for part in (one, other))
         if second.value is None or second.u is None or predicted.value is None or predicted.u is None:
             continue
         shares = {name: contributions((one, other), name, symbol) for name in _OF_INSTRUMENTS}
@@ -640,7 +640,7 @@ def _standard(
         lacks.append("ISO 230-2: the values belong to the targets of a test, and the campaigns have different ones.")
         return
     for symbol in _ISO230:
-        first, second = (getattr(part.settled or part, f"{symbol}_um") for part in (one, other))
+        first, second = (getattr(part, f"{symbol}_um") for part in (one, other))
         if None in (first.value, second.value, first.u, second.u):
             lacks.append(f"ISO 230-2, {symbol}: not measured with its uncertainty in both campaigns.")
             continue
@@ -650,10 +650,7 @@ def _standard(
 
 def contributions(parts: Sequence[Iso230Part], name: str, symbol: str) -> list[float]:
     """Return what an input of the budget contributes to the uncertainty of a quantity in every test, um."""
-    budgets = [
-        {row.contributor: row for row in window.contributions} if (window := part.settled or part.first) else {}
-        for part in parts
-    ]
+    budgets = [{row.contributor: row for row in part.contributions} for part in parts]
     return [float(getattr(budget.get(name), f"{symbol}_um", None) or 0.0) for budget in budgets]
 
 

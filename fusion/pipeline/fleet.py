@@ -137,7 +137,7 @@ class Row:
     axis : str
         As the campaign file names it.
     A_um, A_u_um and so on : float or None, um
-        Values by ISO 230-2 of the most settled window, each with its standard uncertainty.
+        Values by ISO 230-2 of the quoted window, each with its standard uncertainty.
     machine, serial, date : str
         As the campaign file names them, and the day of the first reading.
     decision : str
@@ -220,11 +220,7 @@ def with_findings(row: Row, folder: Path) -> Row:
     drift = _largest_drift(results)
     test = results.iso230
     # The columns are lengths.
-    values = (
-        {}
-        if test is None or test.unit != "um"
-        else {name: getattr(test.settled or test, f"{name}_um") for name in ISO230_TERMS}
-    )
+    values = {} if test is None or test.unit != "um" else {name: getattr(test, f"{name}_um") for name in ISO230_TERMS}
     conditions = conditions_of(results)
     stated = read_json_object(folder / "provenance.json").get("parameters", {}).get("report", {})
     decided = [one.decision for one in test.tolerances] if test else []

@@ -1,4 +1,4 @@
-"""Evaluation of a test by ISO 230-2: windows of cycles, and the most settled of them with its budget."""
+"""Evaluation of a test by ISO 230-2: windows of cycles, and the one that is quoted with its budget."""
 
 from __future__ import annotations
 
@@ -47,8 +47,11 @@ from interferometry.iso230 import (
 )
 from interferometry.iso230.conditions import check_conditions
 
-_RULE = f"of the windows of {STANDARD_CYCLES} cycles in the second half of the test, the one with the least drift by the joint estimate"
-_RULE_WITHOUT_DRIFT = f"the last window of {STANDARD_CYCLES} cycles, as no drift could be estimated"
+_RULE = (
+    f"of the windows of {STANDARD_CYCLES} cycles, laid back from the last whole cycle, whose middle is in the second half of the test, the "
+    "one with the least drift by the joint estimate"
+)
+_RULE_WITHOUT_DRIFT = f"the last window of {STANDARD_CYCLES} whole cycles, as no drift could be estimated"
 _RULE_ONE = "the only window of the test"
 _AXIS = (*QUANTITIES, "mean_reversal")
 #: Unit of each input, and the field of `interferometry.iso230.Iso230Budget` that holds it.
@@ -107,11 +110,7 @@ def evaluate_standard(
     # What was measured beside the readings tells where two inputs of the budget come from.
     part_of = partial(_window_part, budget=budget, drift=drift is not None, material=material_degC is not None)
     part = {
-        "unit": first["A"].attrs["units"],
-        "window": first.attrs["window"],
-        **{f"{name}_um": _quantity(first, name) for name in _AXIS},
-        "B_of_scatter_um": float(first["B_of_scatter"]),
-        "settled": part_of(settled, quoted),
+        **part_of(settled, quoted),
         "settled_rule": rule,
         "first": part_of(first, blocks[0]),
         "range_um": {
@@ -198,15 +197,15 @@ _OF_LENGTHS = ("Travel of the axis", "Lead of the screw", "Feed", "Expansion coe
 def complete_sheet(
     part: Mapping[str, Any], dataset: xr.Dataset, *, campaign: Campaign | None, environment: xr.Dataset | None
 ) -> dict[str, Any]:
-    """Return the part ``iso230`` of the results with tolerances, conditions and other standards of its settled window."""
-    cycles = part["settled"]["cycles"]
+    """Return the part ``iso230`` of the results with tolerances, conditions and other standards of the quoted window."""
+    cycles = part["cycles"]
     report = ReportTable() if campaign is None else campaign.report
     limits = (AcceptanceTable() if campaign is None else campaign.acceptance).limits()
     settling = estimate_settling(dataset, group(dataset, "drift")) if has(dataset, "drift") else None
     checks = check_conditions(dataset, cycles=cycles, lead_mm=report.screw_lead_mm, settling=settling)
     return {
         **part,
-        "tolerances": [row for symbol, limit in limits.items() for row in _judge(part["settled"], symbol, limit)],
+        "tolerances": [row for symbol, limit in limits.items() for row in _judge(part, symbol, limit)],
         "checks": [asdict(check) for check in checks],
         "conditions": [
             {"name": name, "text": text} for name, text in _conditions(dataset, report, campaign, environment).items()
@@ -217,13 +216,13 @@ def complete_sheet(
     }
 
 
-def _judge(settled: Mapping[str, Any], symbol: str, limit: float) -> list[dict[str, Any]]:
+def _judge(part: Mapping[str, Any], symbol: str, limit: float) -> list[dict[str, Any]]:
     """Judge a quantity, each direction by itself where it is unidirectional."""
     if symbol.endswith("_unidirectional"):
         short = symbol.removesuffix("_unidirectional")
-        found = {f"{short}{arrow}": settled[direction][f"{short}_um"] for direction, arrow in _ARROWS.items()}
+        found = {f"{short}{arrow}": part[direction][f"{short}_um"] for direction, arrow in _ARROWS.items()}
     else:
-        found = {symbol: settled[f"{symbol}_um"]}
+        found = {symbol: part[f"{symbol}_um"]}
     rows = []
     for name, quantity in found.items():
         value, expanded = quantity["value"], 2 * quantity["u"]
@@ -352,7 +351,7 @@ class StandardTest:
     part : Iso230Part
         Values; those that need a standard deviation are null of a test of one cycle.
     dataset : Dataset
-        Readings, with the group ``settled``.
+        Readings; the group ``settled`` holds the quoted window.
     remarks : tuple of str
         What was left out or assumed when the file was read.
     files : dict of str to str
@@ -395,7 +394,7 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
             f'--cycles "{cycles}": {folder} holds the windows of its run; name the campaign file or the file of readings instead'
         )
     results = read_results(folder)
-    if results.iso230 is None or results.iso230.settled is None:
+    if results.iso230 is None or not results.iso230.cycles:
         raise CampaignError(
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )

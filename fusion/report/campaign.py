@@ -48,14 +48,13 @@ from fusion.report.wording import (
     in_words,
     parameters,
     quantity,
-    quoted_window,
     randomised_causes,
     say,
     table,
     untouched,
     with_values,
 )
-from fusion.results.axis import CorrelationPart, Evidence, Iso230Part, Iso230Window, PlacePart
+from fusion.results.axis import CorrelationPart, Evidence, Iso230Direction, Iso230Part, Iso230Window, PlacePart
 from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RunnerUp, StepPart
 from fusion.results.parts import Figures
 from fusion.results.results import Results
@@ -213,36 +212,31 @@ _NAMED = 8
 
 def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict[str, Any]:
     """Return the tables of the section on ISO 230-2, as page and terminal show them."""
-    shown, unit = part.settled, print_unit(part.unit)
-    tables: dict[str, Any] = dict.fromkeys(("positions", "budget"))
-    if shown is None:
-        rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
-        axis = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
-        return {**tables, "quoted": part, "axis": axis, "missing": "", "sharper": None, "scatter_um": None}
-    if dataset is not None and has(dataset, "settled"):
-        tables["positions"] = _iso230_positions_table(group(dataset, "settled"), dataset["position"], unit)
+    unit = print_unit(part.unit)
+    targets = None if dataset is None or not has(dataset, "settled") else group(dataset, "settled")
     return {
-        **tables,
-        "quoted": shown,
-        "axis": _values_table(part, shown, unit),
+        "positions": None
+        if dataset is None or targets is None
+        else _iso230_positions_table(targets, dataset["position"], unit),
+        "axis": _values_table(part, unit),
         # Of one cycle nothing is known of the uncertainty.
-        "budget": _budget_table(shown, unit) if len(shown.cycles) > 1 else None,
+        "budget": _budget_table(part, unit) if len(part.cycles) > 1 else None,
         "sharper": sharpen(part),
         "scatter_um": _scatter_um(part, dataset),
-        "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
+        "missing": "" if dataset is None or not part.cycles else missing_sentence(dataset, part.cycles),
     }
 
 
 def _scatter_um(part: Iso230Part, dataset: xr.Dataset | None) -> float | None:
     """Return the median scatter of the readings without drift, of a test whose first window stands beside the quoted one."""
-    if dataset is None or not has(dataset, "drift") or not _is_beside_first(part):
+    if dataset is None or not has(dataset, "drift") or _other_first(part) is None:
         return None
     return float(group(dataset, "drift")["scatter"].median())
 
 
-def _is_beside_first(part: Iso230Part) -> bool:
-    """Return whether the quoted window is another than the first."""
-    return part.first is not None and part.settled is not None and part.first.window != part.settled.window
+def _other_first(part: Iso230Part) -> Iso230Window | None:
+    """Return the first window where it is another than the quoted one."""
+    return part.first if part.first is not None and part.first.window != part.window else None
 
 
 def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
@@ -303,18 +297,19 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
 
 
 def values_to_sign(part: Iso230Part) -> Table:
-    """Return the axis values of the settled window, and of each direction what has a tolerance, with their decisions."""
-    shown, unit = quoted_window(part), print_unit(part.unit)
+    """Return the axis values of the quoted window, and of each direction what has a tolerance, with their decisions."""
+    unit = print_unit(part.unit)
     judged = {one.quantity: [f"{one.limit_um:g}", one.decision] for one in part.tolerances}
-    found = [(f"{term}", symbol, shown) for symbol, term in ISO230_TERMS.items()]
-    if isinstance(shown, Iso230Window):
-        one_way = bool(approach_of(shown))
-        found += [
-            (f"{term}{arrow}", f"{symbol}{arrow}", getattr(shown, direction))
+    one_way = bool(approach_of(part))
+    found: list[tuple[str, str, Iso230Window | Iso230Direction]] = [
+        *((term, symbol, part) for symbol, term in ISO230_TERMS.items()),
+        *(
+            (f"{term}{arrow}", f"{symbol}{arrow}", getattr(part, direction))
             for symbol, term in ONE_WAY_TERMS.items()
             for direction, arrow in ARROWS.items()
             if one_way or f"{symbol}{arrow}" in judged
-        ]
+        ),
+    ]
     rows = []
     for term, symbol, values in found:
         value = getattr(values, f"{symbol[0]}_um")
@@ -326,9 +321,9 @@ def values_to_sign(part: Iso230Part) -> Table:
     return table([Words("Quantity of the axis"), f"{value} / {unit}", *titles], rows)
 
 
-def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
-    """Return the axis values of the settled window with their decisions, those of the first one and their range over the windows."""
-    several = _is_beside_first(part)
+def _values_table(part: Iso230Part, unit: str) -> Table:
+    """Return the axis values of the quoted window with their decisions, those of the first one and their range over the windows."""
+    first = _other_first(part)
     judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
     rows = []
 
@@ -338,21 +333,20 @@ def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
 
     for symbol, term in ISO230_TERMS.items():
         found = part.range_um.get(symbol)
-        first = quantity(getattr(part, f"{symbol}_um"))
         spread = "–" if found is None else f"{number(found.lowest)} to {number(found.highest)}"
-        value = quantity(getattr(shown, f"{symbol}_um"))
-        add(term, symbol, value, *([first, spread] if several else []), marked=True)
+        beside = [quantity(getattr(first, f"{symbol}_um")), spread] if first else []
+        add(term, symbol, quantity(getattr(part, f"{symbol}_um")), *beside, marked=True)
         for direction, arrow in ARROWS.items():
             if symbol not in ONE_WAY_TERMS:
                 continue
-            of_shown = quantity(getattr(getattr(shown, direction), f"{symbol}_um"))
-            of_first = quantity(getattr(getattr(part.first, direction), f"{symbol}_um")) if part.first else "–"
-            add(f"{ONE_WAY_TERMS[symbol]}{arrow}", f"{symbol}{arrow}", of_shown, *([of_first, "–"] if several else []))
-    mean = quantity(shown.mean_reversal_um)
-    add("Mean reversal error, with its sign", "", mean, *([quantity(part.mean_reversal_um), "–"] if several else []))
-    columns = [f"{shown.window} / {unit}", *([f"Tolerance / {unit}", Words("Decision")] if judged else [])]
-    if several:
-        columns += [f"First window, {part.window} / {unit}", f"Range over windows without overlap / {unit}"]
+            beside = [quantity(getattr(getattr(first, direction), f"{symbol}_um")), "–"] if first else []
+            value = quantity(getattr(getattr(part, direction), f"{symbol}_um"))
+            add(f"{ONE_WAY_TERMS[symbol]}{arrow}", f"{symbol}{arrow}", value, *beside)
+    beside = [quantity(first.mean_reversal_um), "–"] if first else []
+    add("Mean reversal error, with its sign", "", quantity(part.mean_reversal_um), *beside)
+    columns = [f"{part.window} / {unit}", *([f"Tolerance / {unit}", Words("Decision")] if judged else [])]
+    if first:
+        columns += [f"First window, {first.window} / {unit}", f"Range over the windows / {unit}"]
     return table([Words("Quantity of the axis (± U, k = 2)"), *columns], rows)
 
 

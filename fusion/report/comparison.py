@@ -29,7 +29,6 @@ from fusion.report.wording import (
     effect_words,
     iso230_values,
     quantity,
-    quoted_window,
     say,
     table,
 )
@@ -252,9 +251,8 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
         added = join([effect_words(step.effect).name for step in results.loop.named])
         figures["effects that were missing"] = added or "none shown"
     if results.iso230 is not None:
-        window = quoted_window(results.iso230)
-        figures["ISO 230-2 window"] = window.window
-        figures |= {f"{symbol} by ISO 230-2": value for symbol, value in iso230_values(window).items()}
+        figures["ISO 230-2 window"] = results.iso230.window
+        figures |= {f"{symbol} by ISO 230-2": value for symbol, value in iso230_values(results.iso230).items()}
         for one in results.iso230.tolerances:
             limit = f"at most {number(one.limit_um)} {print_unit(results.iso230.unit)}"
             figures[f"{one.quantity} {limit}"] = one.decision
@@ -311,7 +309,7 @@ def _values_as_left(pair: PairComparison) -> Table:
     any_judged = bool(judged[0] or judged[1])
     rows = []
     for symbol, term in ISO230_TERMS.items():
-        both = ["–" if part is None else quantity(getattr(quoted_window(part), f"{symbol}_um")) for part in parts]
+        both = ["–" if part is None else quantity(getattr(part, f"{symbol}_um")) for part in parts]
         change = changes.get(symbol)
         cells = [
             term,

@@ -152,15 +152,15 @@ class Sharper(NamedTuple):
 
 def sharpen(iso: Iso230Part | None) -> Sharper | None:
     """Return what the uncertainty of the quoted A mostly is, and by how much a stated input would shrink it (k = 2); None without one."""
-    if iso is None or iso.settled is None:
+    if iso is None or not iso.contributions:
         return None
-    side = approach_of(iso.settled)
-    found = (getattr(iso.settled, side) if side else iso.settled).A_um
+    side = approach_of(iso)
+    found = (getattr(iso, side) if side else iso).A_um
     if not found.u:
         return None
     terms = {
         one.contributor: (one, (one.unidirectional_um.get(f"A_{side}") if side else one.A_um) or 0.0)
-        for one in iso.settled.contributions
+        for one in iso.contributions
     }
     largest, term = max(terms.values(), key=lambda each: each[1])
     symbol = f"A{ARROWS[side]}" if side else "A"
@@ -180,7 +180,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
             told = told._replace(line=line, sharper_um=expanded, decision=decision)
     if not told.line and told.contributor in _OF_SCATTER:
         halved = sum(terms[name][1] ** 2 for name in _OF_SCATTER if name in terms) * (1.0 - 1.0 / _MORE_CYCLES)
-        told = told._replace(sharper_um=2 * (found.u**2 - halved) ** 0.5, cycles=_MORE_CYCLES * len(iso.settled.cycles))
+        told = told._replace(sharper_um=2 * (found.u**2 - halved) ** 0.5, cycles=_MORE_CYCLES * len(iso.cycles))
     return told
 
 

@@ -90,7 +90,7 @@ def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], ve
         title=title,
         standard="Accuracy and repeatability of positioning by ISO 230-2:2014",
         stated=Stated.of(part.conditions, _CONVENTION),
-        caption=f"Values of {(part.settled or part).window}",
+        caption=f"Values of {part.window}",
         values=values_to_sign(part),
         requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
         files=files,
@@ -228,7 +228,7 @@ def iso230_tables(
     """Return the tables of a test for the terminal: all of them, or the values of the axis as the sheet has them."""
     described = describe_iso230(part, dataset)
     shown: list[tuple[str, Table | None]] = [
-        (f"{title}, {described['quoted'].window}", values_to_sign(part) if axis_alone else described["axis"])
+        (f"{title}, {part.window}", values_to_sign(part) if axis_alone else described["axis"])
     ]
     if not axis_alone:
         shown += [("per target position", described["positions"]), ("uncertainty budget", described["budget"])]

@@ -37,7 +37,7 @@ from fusion.report.numbers import (
     small,
     upper_first,
 )
-from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Iso230Window
+from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
 from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.progress import counted
@@ -332,7 +332,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, quoted_window, randomised_causes,
+        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, randomised_causes,
         worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
@@ -355,24 +355,19 @@ def say(name: str, *facts: Any) -> str:
     return " ".join(sentences(name, *facts))
 
 
-def quoted_window(iso: Iso230Part) -> Iso230Part | Iso230Window:
-    """Return the window whose values are quoted: the most settled one, the first of results that hold no other."""
-    return iso if iso.settled is None else iso.settled
-
-
-def iso230_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
+def iso230_values(iso: Iso230Window) -> dict[str, str]:
     """Return the axis values with their expanded uncertainty (k = 2) by symbol, with their unit."""
     return {symbol: quantity(getattr(iso, f"{symbol}_um"), print_unit(iso.unit)) for symbol in ISO230_TERMS}
 
 
-def approach_of(iso: Iso230Part | Iso230Window) -> str:
+def approach_of(iso: Iso230Window) -> str:
     """Return the only direction of approach that a window holds, "positive" or "negative"; empty where it holds both."""
-    if not isinstance(iso, Iso230Window) or iso.E_um.value is not None:
+    if iso.E_um.value is not None:
         return ""
     return next((side for side in ("positive", "negative") if getattr(iso, side).E_um.value is not None), "")
 
 
-def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
+def quoted_values(iso: Iso230Window) -> dict[str, str]:
     """Return the axis values to quote with their expanded uncertainty (k = 2) by symbol: A, R and B, of one approach A and R.
 
     Of one cycle, which has neither A nor R, they are E, M and B, of one approach E.

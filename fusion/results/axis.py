@@ -263,13 +263,15 @@ class Iso230Direction(ResultPart):
     """Unidirectional systematic positioning error, um."""
 
 
-class Iso230Values(ResultPart):
-    """Axis values by ISO 230-2:2014, clause 3, of one window of cycles."""
+class Iso230Window(ResultPart):
+    """Axis values by ISO 230-2:2014, clause 3, of one window of cycles, with their uncertainty budget."""
 
     unit: Literal["um", "arcsec"] = "um"
     """Unit of all values here: of a rotary axis arcsec, in the fields whose names end in ``_um`` too."""
     window: str
     """Cycles that were evaluated."""
+    cycles: tuple[int, ...]
+    """Numbers of these cycles; empty in results of versions that did not write them."""
     B_um: Quantity
     """Reversal error B of the axis, um."""
     R_um: Quantity
@@ -285,12 +287,6 @@ class Iso230Values(ResultPart):
     B_of_scatter_um: Number
     """B that scatter alone gives in half of such tests of an axis without reversal error, um."""
 
-
-class Iso230Window(Iso230Values):
-    """Axis values of one window of cycles, with their uncertainty budget."""
-
-    cycles: tuple[int, ...]
-    """Numbers of these cycles."""
     positive: Iso230Direction
     """Values of the approach in positive direction."""
     negative: Iso230Direction
@@ -311,25 +307,23 @@ class Iso230Range(ResultPart):
     """Largest value, um."""
 
 
-class Iso230Part(Iso230Values):
-    """Axis values by ISO 230-2:2014; those at this level belong to the first window of cycles, which may be a cold start."""
+class Iso230Part(Iso230Window):
+    """Axis values by ISO 230-2:2014; those at this level are the values to quote, of the window that shows the warmed-up axis."""
 
-    settled: Iso230Window | None = None
-    """The most settled window of the second half of the test, which shows the warmed-up axis: the values to quote."""
     settled_rule: str = ""
     """How that window was chosen."""
     first: Iso230Window | None = None
-    """The first window, with its budget."""
+    """The first window, which may be a cold start."""
     range_um: Mapping[str, Iso230Range] = Field(default_factory=dict)
     """Range of A, R, E, M and B over all windows of the standard's number of cycles, um."""
     tolerances: tuple[Iso230Tolerance, ...] = ()
-    """The settled window against the tolerances that the campaign states."""
+    """The quoted window against the tolerances that the campaign states."""
     checks: tuple[Iso230Check, ...] = ()
     """Conditions that the standard asks of a test."""
     conditions: tuple[Iso230Condition, ...] = ()
     """Conditions of the test as they were stated or logged."""
     other_standards: tuple[OtherEvaluation, ...] = ()
-    """The settled window by other standards."""
+    """The quoted window by other standards."""
 
 
 class NeighboursPart(ResultPart):

@@ -231,7 +231,7 @@ class Iso230Tolerance(ResultPart):
     limit_um: float
     """Tolerance, um."""
     value_um: Number
-    """Value in the settled window, um."""
+    """Value in the quoted window, um."""
     expanded_u_um: Number
     """Its expanded uncertainty (k = 2), um."""
     decision: Decision | Literal["not measured"]
@@ -259,7 +259,7 @@ class Iso230Condition(ResultPart):
 
 
 class OtherEvaluation(ResultPart):
-    """A quantity of the settled window by another standard."""
+    """A quantity of the quoted window by another standard."""
 
     standard: str
     """Which standard."""

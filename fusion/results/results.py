@@ -47,7 +47,7 @@ from fusion.results.thermal_test import ThermalTest
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 #: Parts that earlier versions wrote in pixels where a camera measured alone; every picture is evaluated instead.
 _OF_A_PICTURE = ("registration", "camera", "radiometry", "field", "hotspots")
 #: Keys of schema 2 and earlier that have another name now.
@@ -84,6 +84,15 @@ RENAMED_TESTS = {
     "rhythm": "periodicity",
     "slow pattern": "slow_pattern",
 }
+_UNKNOWN_APPROACH = {f"{name}_um": {"value": None, "u": None} for name in "ARE"}
+#: What the first results by ISO 230-2 lack, which hold one window without its budget.
+_WITHOUT_BUDGET: dict[str, Any] = {
+    "cycles": [],
+    "positive": _UNKNOWN_APPROACH,
+    "negative": _UNKNOWN_APPROACH,
+    "u_without_sampling_um": {},
+    "contributions": [],
+}
 #: Objects whose keys are names of a campaign: fiducials and channels.
 _NAMED_BY_THE_CAMPAIGN = ("leave_one_out_mm", "channels", "rms_by_channel_um")
 #: Faults of a file of which the first is named: each one that is written out takes a kilobyte.
@@ -119,7 +128,7 @@ class Results(ResultPart):
 
     model_config = ConfigDict(title="thermofuse results")
 
-    schema_version: Literal[3] = Field(alias="schema")
+    schema_version: Literal[4] = Field(alias="schema")
     """Version of this layout."""
     campaign: str
     """Title of the campaign."""
@@ -279,7 +288,18 @@ def in_this_schema(content: Any) -> Any:
         content = {name: part for name, part in content.items() if name not in _OF_A_PICTURE}
     if not isinstance(content, dict) or content.get("schema") not in range(1, SCHEMA_VERSION):
         return content
-    return {**_renamed(content), "schema": SCHEMA_VERSION}
+    renamed = {**_renamed(content), "schema": SCHEMA_VERSION}
+    if isinstance(iso230 := renamed.get("iso230"), dict):
+        renamed["iso230"] = _quoted_on_top(iso230)
+    return renamed
+
+
+def _quoted_on_top(iso230: dict[str, Any]) -> dict[str, Any]:
+    """Return the part ``iso230`` of schema 3 and earlier, whose top is the first window, with the quoted window at its top."""
+    quoted = iso230.get("settled") or iso230.get("first") or _WITHOUT_BUDGET
+    if not isinstance(quoted, dict):
+        return iso230
+    return {name: value for name, value in iso230.items() if name != "settled"} | quoted
 
 
 def _renamed(part: Any, key: str = "") -> Any:

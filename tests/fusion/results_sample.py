@@ -105,9 +105,9 @@ PARTS: dict[str, Any] = {
     },
     "alignment": {"clock_offset_s": {"value": 0.0, "u": None}},
     "iso230": {
-        "window": "cycles 1 to 5",
-        **AXIS_VALUES,
-        "settled": {**WINDOW, "window": "cycles 6 to 10", "cycles": [6, 7, 8, 9, 10]},
+        **WINDOW,
+        "window": "cycles 6 to 10",
+        "cycles": [6, 7, 8, 9, 10],
         "settled_rule": "the only window of the test",
         "first": {**WINDOW, "window": "cycles 1 to 5", "cycles": [1, 2, 3, 4, 5]},
         "range_um": {name: {"lowest": 0.5, "highest": 1.5} for name in "BREMA"},

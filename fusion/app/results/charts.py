@@ -50,7 +50,6 @@ from fusion.report.wording import (
     conditional,
     effect_words,
     iso230_values,
-    quoted_window,
     say,
 )
 from fusion.results.axis import AnomalyPart
@@ -144,16 +143,15 @@ def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui
     part = products.results.iso230
     if part is None:
         return []
-    window = quoted_window(part)
-    values = ", ".join(f"{symbol} = {value}" for symbol, value in iso230_values(window).items())
+    values = ", ".join(f"{symbol} = {value}" for symbol, value in iso230_values(part).items())
     parts: ui.Parts = [
         ui.heading("ISO 230-2", level=3),
-        ui.paragraph(f"{window.window[:1].upper()}{window.window[1:]}: {values} (k = 2)."),
+        ui.paragraph(f"{part.window[:1].upper()}{part.window[1:]}: {values} (k = 2)."),
     ]
     if has(read, "settled"):
         chart = readings.plot_test(group(read, "settled"), read["position"])
         linker.link(chart.figure, x=POSITION)
-        parts.append(shown(chart, f"Means ± 2 s of both approaches, {window.window}."))
+        parts.append(shown(chart, f"Means ± 2 s of both approaches, {part.window}."))
     windows = group(read, "iso")
     both = read["deviation"].notnull().any(("cycle", "target")).values.all()
     if both and windows.sizes.get("window", 0) > 1 and np.isfinite(windows["A"].values).any():

@@ -227,7 +227,7 @@ def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
     parts, dates = [part for part, _ in dated], np.array([first for _, first in dated], "datetime64[s]")
     trends = []
     for name in "ARB":
-        found = [getattr(part.settled or part, f"{name}_um") for part in parts]
+        found = [getattr(part, f"{name}_um") for part in parts]
         values, u = (np.array([getattr(one, key) for one in found], float) for key in ("value", "u"))
         shares = [np.array(contributions(parts, one, name)) for one in common_to_all(pairs)]
         own = u**2 - sum(2.0 * share * share.mean() - share.mean() ** 2 for share in shares)

@@ -344,7 +344,7 @@ def _table_texts(
 def _prediction_text(run: _Run, profile: Profile, table: ErrorTable, control: Control, file: str) -> str:
     """Return what a test with the table is predicted to show, for ``thermofuse compare --applied``."""
     iso = run.results.iso230
-    cycles = len(iso.settled.cycles) if iso is not None and iso.settled is not None else STANDARD_CYCLES
+    cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
     prediction = TablePrediction(
         table=file,
         campaign=run.results.campaign,

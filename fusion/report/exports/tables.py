@@ -22,7 +22,7 @@ from openpyxl.utils import get_column_letter
 
 from fusion.report.numbers import print_unit
 from fusion.report.terminal import summary_rows
-from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters, quoted_window
+from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters
 from fusion.results.loop import RecordLoop
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
@@ -67,8 +67,8 @@ def axis_tables(results: Results, deviations: xr.Dataset) -> dict[str, pd.DataFr
 def _judged_table(results: Results) -> pd.DataFrame:
     """Return the values to quote with the decision on each that has a tolerance."""
     assert results.iso230 is not None
-    window, limits = quoted_window(results.iso230), {one.quantity: one for one in results.iso230.tolerances}
-    unit = results.iso230.unit
+    window, limits = results.iso230, {one.quantity: one for one in results.iso230.tolerances}
+    unit = window.unit
     rows = []
     for name in ISO230_TERMS:
         found, limit = getattr(window, f"{name}_um"), limits.get(name)
@@ -121,7 +121,7 @@ def iso230_axis_table(deviations: xr.Dataset) -> pd.DataFrame:
 
 def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFrame:
     """Return mean, standard deviation, reversal and repeatability per target in the window whose values are quoted, um."""
-    name = "" if results.iso230 is None else quoted_window(results.iso230).window
+    name = "" if results.iso230 is None else results.iso230.window
     window = _cycles_of(name, deviations)
     evaluated = iso230.evaluate_iso230(deviations, cycles=window)
     columns = {"position_mm": deviations["position"]}

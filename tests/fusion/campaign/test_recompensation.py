@@ -144,9 +144,7 @@ def test_a_campaign_with_the_camera_as_thermometer(copied: Path, results_folder:
     plain = evaluate_interferometry(recorded)
     # The camera's temperature enters E and A along the axis, but cancels where both directions meet at one place.
     seen, logged = (
-        {entry["contributor"]: entry for entry in outcome.parts["iso230"]["settled"]["contributions"]}[
-            "material_temperature"
-        ]
+        {entry["contributor"]: entry for entry in outcome.parts["iso230"]["contributions"]}["material_temperature"]
         for outcome in (found, plain)
     )
     assert seen["origin"] == "from the camera" and logged["origin"] == "assumed"

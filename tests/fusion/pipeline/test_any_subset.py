@@ -279,7 +279,7 @@ def test_a_test_without_a_course_has_the_values_of_the_command_and_no_drift(tmp_
         change(path.with_name("laser.csv"), name, other)
     results = run_campaign(path, tmp_path / "results")
     alone = read_test(path.with_name("laser.csv"), None)
-    left_out = {"conditions", "contributions", "settled", "first"}
+    left_out = {"conditions", "contributions", "first"}
     assert results.iso230.model_dump(exclude=left_out) == alone.part.model_dump(exclude=left_out)
     assert results.iso230.unit == ("arcsec" if renamed else "um")
     assert results.drift is results.neighbours is results.loop is results.anomalies is None

@@ -202,8 +202,8 @@ def test_a_row_says_what_the_results_say(whole, results_folder):
     assert whole.drift_u_um in results.drift.range_u_um
     assert (whole.anomalies, whole.warnings) == (len(results.anomalies), len(results.warnings))
     assert whole.report == "a/report.html"
-    settled = results.iso230.settled
-    assert (whole.A_um, whole.A_u_um, whole.B_um) == (settled.A_um.value, settled.A_um.u, settled.B_um.value)
+    quoted = results.iso230
+    assert (whole.A_um, whole.A_u_um, whole.B_um) == (quoted.A_um.value, quoted.A_um.u, quoted.B_um.value)
     told = {column.heading: shown(whole, column) for column in (*FINDINGS, *RUNS)}
     assert (told["campaign"], told["axis"]) == ("a", "X")
     assert "±" in told["drift / µm"] and "±" in told["A / µm"]

@@ -34,29 +34,28 @@ def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
     drift = estimate_drift(deviations)["drift"]
     windows, settled, found = evaluate_standard(deviations, ASSUMED, drift=drift, material_degC=None)
     part = Iso230Part.model_validate(found)
-    assert (part.window, part.first.window) == ("cycles 1 to 5", "cycles 1 to 5")
-    assert part.A_um == part.first.A_um
-    assert min(part.settled.cycles) > 20 and len(part.settled.cycles) == 5
-    assert part.settled.R_um.value < part.first.R_um.value
+    assert part.first.window == "cycles 1 to 5" and part.first.cycles == (1, 2, 3, 4, 5)
+    assert min(part.cycles) > 20 and len(part.cycles) == 5
+    assert part.R_um.value < part.first.R_um.value
     assert part.range_um["R"].highest == float(windows["R"][:-1].max())
     assert "least drift" in part.settled_rule
-    assert float(settled["A"]) == part.settled.A_um.value
-    for window in (part.first, part.settled):
+    assert float(settled["A"]) == part.A_um.value
+    for window in (part.first, part):
         for name in (*"AREMB", "mean_reversal"):
             squares = sum(getattr(entry, f"{name}_um") ** 2 for entry in window.contributions)
             total = window.mean_reversal_um if name == "mean_reversal" else getattr(window, f"{name}_um")
             assert np.sqrt(squares) == pytest.approx(total.u)
             assert window.u_without_sampling_um[name] < total.u
-    origins = {entry.contributor: entry.origin for entry in part.settled.contributions}
+    origins = {entry.contributor: entry.origin for entry in part.contributions}
     assert origins["expansion_coefficient"] == "assumed; material at an assumed 10 K from 20 \u00b0C"
 
 
 def test_without_times_no_environmental_variation_is_claimed():
     deviations, _ = simulate(np.random.default_rng(2), cycles=4)
     _, _, found = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
-    part = Iso230Part.model_validate({**found, "settled": None, "first": None})
+    part = Iso230Part.model_validate({**found, "first": None})
     assert part.settled_rule == "the only window of the test"
-    entry = next(row for row in found["settled"]["contributions"] if row["contributor"] == "environmental_variation")
+    entry = next(row for row in found["contributions"] if row["contributor"] == "environmental_variation")
     assert np.isnan(entry["u"]) and entry["origin"] == "not known, not contained"
 
 
@@ -125,24 +124,24 @@ def test_the_date_of_the_test_is_that_of_its_readings():
 def test_a_file_of_readings(tmp_path):
     file = write_laser(tmp_path / "test", 6, 5).with_name("laser.csv")
     found = read_test(file, "2-6")
-    assert found.part.settled.cycles == (2, 3, 4, 5, 6) and found.part.settled_rule == ""
+    assert found.part.cycles == (2, 3, 4, 5, 6) and found.part.settled_rule == ""
     axis = evaluate_iso230(read_deviations(file), cycles=[2, 3, 4, 5, 6])
     for symbol in "AREMB":
-        assert getattr(found.part.settled, f"{symbol}_um").value == pytest.approx(float(axis[symbol]))
-    assert {entry.origin for entry in found.part.settled.contributions[:3]} == {"assumed"}
+        assert getattr(found.part, f"{symbol}_um").value == pytest.approx(float(axis[symbol]))
+    assert {entry.origin for entry in found.part.contributions[:3]} == {"assumed"}
 
 
 def test_a_campaign_of_the_laser_alone_brings_its_budget_and_tolerances(tmp_path):
     stated = '[interferometry.uncertainty]\ndevice = "2 ppm"\n[acceptance]\nA = "1 m"\n'
     found = read_test(without(write_laser(tmp_path / "test", 6, 5), added=stated), None)
     assert found.title == "Size"
-    assert found.part.settled.contributions[0].origin == "stated"
+    assert found.part.contributions[0].origin == "stated"
     assert [row.decision for row in found.part.tolerances] == ["pass"]
 
 
 def test_the_results_of_a_run_hold_their_own_window(results_folder):
     found = read_test(results_folder, None)
-    assert float(found.dataset["settled_A"]) == pytest.approx(found.part.settled.A_um.value)
+    assert float(found.dataset["settled_A"]) == pytest.approx(found.part.A_um.value)
     with pytest.raises(CampaignError, match="holds the windows of its run"):
         read_test(results_folder, "1-5")
     with pytest.raises(ResultsError, match=r"there is no results\.json"):

@@ -144,7 +144,7 @@ def test_the_sheet_states_whose_axis_it_was_what_was_done_and_the_decisions(tmp_
             **copy.deepcopy(PARTS["iso230"]), "conditions": [{"name": name, "text": text} for name, text in stated.items()],
             "tolerances": [judged],
         }  # fmt: skip
-        whole["settled"]["A_um"] = {"value": a_um, "u": 0.1}
+        whole["A_um"] = {"value": a_um, "u": 0.1}
         return whole
 
     readings = readings_of(31)
@@ -221,7 +221,7 @@ def test_bars_of_a_trend_leave_out_what_all_tests_have_in_common(tmp_path):
         shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
         whole = copy.deepcopy(PARTS["iso230"])
         whole["conditions"] = [{"name": "Expansion coefficient", "text": "11.7 ppm/K"}]
-        whole["settled"] |= {"A_um": {"value": 9.0, "u": 5.0}, "contributions": [{**row, "A_um": 4.0, **shares}]}
+        whole |= {"A_um": {"value": 9.0, "u": 5.0}, "contributions": [{**row, "A_um": 4.0, **shares}]}
         return whole
 
     folders = []
@@ -237,7 +237,7 @@ def test_a_last_value_outside_its_limits_leads_the_document(tmp_path):
     folders = []
     for k, a_um in enumerate([9.0, 9.2, 9.1, 9.3, 9.0, 9.2, 9.1, 9.3, 12.0]):
         whole = copy.deepcopy(PARTS["iso230"])
-        whole["settled"]["A_um"] = {"value": a_um, "u": 5.0}
+        whole["A_um"] = {"value": a_um, "u": 5.0}
         time = {"first": f"2026-0{k + 1}-01T00:00:00Z", "last": f"2026-0{k + 1}-01T02:00:00Z", "zone": "UTC"}
         folders.append(write_results(tmp_path / str(k), readings_of(31), iso230=whole, time=time))
     page = render_comparison(compare_campaigns(folders))

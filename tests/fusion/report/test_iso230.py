@@ -28,6 +28,7 @@ from fusion.report.sheet import (
 )
 from fusion.report.wording import say
 from fusion.results.axis import Iso230Part
+from fusion.results.results import Results, in_this_schema
 from fusion.results.store import joined, plain
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from interferometry.drift.estimate import estimate_drift
@@ -35,6 +36,7 @@ from tests.browser import CHROMIUM
 from tests.fusion.campaign_parts import without
 from tests.fusion.pipeline.test_iso230 import ASSUMED
 from tests.fusion.report.page_tables import tables_of
+from tests.fusion.results_sample import AXIS_VALUES
 from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 
@@ -122,7 +124,7 @@ def test_the_sums_of_the_budget_are_those_of_its_rows(test_sheet):
 
 def test_json_and_csv_hold_full_precision(test_sheet):
     told = iso230_json(*test_sheet)
-    assert told["settled"]["A_um"]["value"] == pytest.approx(by_hand(X)["A"], rel=1e-12)
+    assert told["A_um"]["value"] == pytest.approx(by_hand(X)["A"], rel=1e-12)
     rows = list(csv.DictReader(io.StringIO(iso230_csv(test_sheet[1]))))
     assert [float(row["mean_positive_um"]) for row in rows] == pytest.approx(X[:, 0].mean(axis=0))
     assert [float(row["B_i_um"]) for row in rows] == pytest.approx(X[:, 0].mean(axis=0) - X[:, 1].mean(axis=0))
@@ -188,7 +190,7 @@ def test_the_budget_of_one_approach_has_its_own_quantities():
         without, whole = (as_number(row.cells[column]) for row in budget.rows[7:])
         assert without == pytest.approx(2 * math.hypot(*shares[:5]), rel=0.06, abs=1e-3)
         assert whole == pytest.approx(2 * math.hypot(*shares), rel=0.06)
-        assert whole == pytest.approx(2 * getattr(found.settled.negative, f"{symbol}_um").u, rel=0.06)
+        assert whole == pytest.approx(2 * getattr(found.negative, f"{symbol}_um").u, rel=0.06)
     assert iso230_tables(found, dataset, title="A")[2].columns[3].header == "A\u2193 / \u00b5m"
 
 
@@ -225,7 +227,7 @@ def test_the_scatter_without_drift_stands_beside_two_windows_alone(part):
     dataset = joined(readings, drift=estimate_drift(readings))
     told = describe_iso230(part, dataset)
     assert told["scatter_um"] == pytest.approx(float(estimate_drift(readings)["scatter"].median()))
-    alone = part.model_copy(update={"settled": part.first})
+    alone = part.model_copy(update={"first": part})
     assert describe_iso230(alone, dataset)["scatter_um"] is None
 
 
@@ -233,7 +235,7 @@ def test_more_cycles_are_named_where_scatter_is_the_largest_term():
     found = sharpen(evaluated(20.0 * X)[0])
     assert found.contributor == "sampling" and found.cycles == 20 and not found.line
     (part, _) = evaluated(20.0 * X)
-    terms = {one.contributor: one.A_um or 0.0 for one in part.settled.contributions}
+    terms = {one.contributor: one.A_um or 0.0 for one in part.contributions}
     halved = {name: u / 2 if name in ("sampling", "extremes") else u for name, u in terms.items()}
     assert found.sharper_um == pytest.approx(2 * math.hypot(*halved.values()), rel=1e-6)
     assert "20 cycles of the axis in the same thermal state would give U(A) of about" in say("sharper", found)
@@ -255,9 +257,9 @@ def part():
 def test_the_settled_window_stands_with_the_first_one(part):
     told = describe_iso230(part)
     titles = told["axis"].titles
-    assert titles[1].startswith(part.settled.window)
+    assert titles[1].startswith(part.window)
     assert titles[2].startswith("First window, cycles 1 to 5")
-    assert titles[3].startswith("Range over windows without overlap")
+    assert titles[3].startswith("Range over the windows")
     ranges = [row.cells[3] for row in told["axis"].rows]
     assert " to " in ranges[0] and ranges[1] == ranges[2] == ranges[-1] == "\u2013"
     terms = [row.cells[0] for row in told["axis"].rows]
@@ -272,26 +274,27 @@ def test_the_settled_window_stands_with_the_first_one(part):
 def test_the_budget_ends_with_both_sums(part):
     rows = describe_iso230(part)["budget"].rows
     assert [row.cells[0] for row in rows[-2:]] == ["U (k = 2) without the sampling of the cycles", "U (k = 2)"]
-    assert float(rows[-1].cells[3]) == pytest.approx(2 * part.settled.A_um.u, rel=0.06)
+    assert float(rows[-1].cells[3]) == pytest.approx(2 * part.A_um.u, rel=0.06)
 
 
 def test_what_is_assumed_and_what_is_missing_is_said(part):
-    sentence = say("iso230_uncertainty", part.settled)
+    sentence = say("iso230_uncertainty", part)
     assert "laser with its air compensation 0.25 ppm (assumed)" in sentence
     assert "can be stated under [interferometry.uncertainty]" in sentence
     assert "does not contain the environmental variation" not in sentence
     unknown = [
         entry.model_copy(update={"u": None}) if entry.contributor == "environmental_variation" else entry
-        for entry in part.settled.contributions
+        for entry in part.contributions
     ]
-    sentence = say("iso230_uncertainty", part.settled.model_copy(update={"contributions": tuple(unknown)}))
+    sentence = say("iso230_uncertainty", part.model_copy(update={"contributions": tuple(unknown)}))
     assert "U does not contain the environmental variation" in sentence
 
 
 def test_results_of_an_older_run_show_their_only_window(part):
-    told = describe_iso230(part.model_copy(update={"settled": None}))
-    assert told["budget"] is None and told["quoted"].window == "cycles 1 to 5"
-    assert len(told["axis"].rows) == 5
+    document = {"schema": 2, "campaign": "A", "warnings": [], "iso230": AXIS_VALUES | {"window": "cycles 1 to 5"}}
+    told = describe_iso230(Results.model_validate(in_this_schema(document)).iso230)
+    assert told["budget"] is None and told["axis"].titles[1].startswith("cycles 1 to 5")
+    assert [row.cells[0][-1] for row in told["axis"].rows[:5]] == list("AREMB")
 
 
 @pytest.fixture(scope="module")

@@ -105,10 +105,8 @@ def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
     assert wording.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, – and warm up"
 
 
-ISO = Iso230Part(
-    window="cycles 1 to 5",
-    B_of_scatter_um=None,
-    **{f"{name}_um": Quantity(value=9.9017, u=1.378) for name in (*"BREMA", "mean_reversal")},
+ISO = Iso230Part.model_validate(
+    PARTS["iso230"] | {f"{name}_um": {"value": 9.9017, "u": 1.378} for name in (*"BREMA", "mean_reversal")}
 )
 
 
@@ -295,7 +293,9 @@ def axis_of(a_um: float, m_um: float, decision: str) -> Iso230Part:
     values = {"A": a_um, "R": 55.0, "B": 33.0, "M": m_um, "E": 100.0}
     told = {f"{name}_um": Quantity(value=value, u=6.5) for name, value in values.items()}
     judged = Iso230Tolerance.model_construct(quantity="A", decision=decision)
-    return Iso230Part.model_construct(**told, unit="um", window="cycles 1 to 5", tolerances=(judged,), checks=())
+    return Iso230Part.model_construct(
+        **told, unit="um", window="cycles 1 to 5", tolerances=(judged,), checks=(), contributions=()
+    )
 
 
 def test_an_axis_that_fails_by_its_mean_deviation_is_to_be_compensated_first():

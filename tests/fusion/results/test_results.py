@@ -35,7 +35,7 @@ def test_a_full_document_keeps_the_schema_and_the_order_of_the_design() -> None:
 
 @pytest.mark.parametrize("parts", [PARTS, {"loop": RECORD_LOOP}], ids=["instruments", "record"])
 def test_every_value_comes_back(parts: dict[str, Any]) -> None:
-    document = {"schema": 3, "campaign": "A", "warnings": [], **parts}
+    document = {"schema": 4, "campaign": "A", "warnings": [], **parts}
     assert assemble("A", parts, []).as_json() == document
     assert isinstance(assemble("A", parts, []).loop, AxisLoop if "drift" in parts else RecordLoop)
     validator().validate(document)
@@ -107,14 +107,14 @@ def test_a_number_that_is_not_determined_is_null_and_a_key_that_does_not_apply_a
 def test_results_that_cannot_be_read_name_file_and_remedy(tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match=r"no results.json in it; name the results folder of a finished run"):
         read_results(tmp_path)
-    (tmp_path / "results.json").write_text('{"schema": 3, "campaign": "A", "warnings": [], "colour": "red"}')
+    (tmp_path / "results.json").write_text('{"schema": 4, "campaign": "A", "warnings": [], "colour": "red"}')
     with pytest.raises(ResultsError, match=r"results.json: not the results of this version .*; run the campaign again"):
         read_results(tmp_path)
 
 
 @pytest.mark.parametrize(("loop", "kind"), [(PARTS["loop"], "axis"), (RECORD_LOOP, "record")])
 def test_one_wrong_value_is_one_fault_with_its_place(tmp_path: Path, loop: dict[str, Any], kind: str) -> None:
-    document = {"schema": 3, "campaign": "A", "warnings": [], "loop": {**loop, "verdict": "perfect"}}
+    document = {"schema": 4, "campaign": "A", "warnings": [], "loop": {**loop, "verdict": "perfect"}}
     with pytest.raises(ValidationError) as caught:
         Results.model_validate(document)
     assert [fault["loc"] for fault in caught.value.errors()] == [("loop", kind, "verdict")]
@@ -143,7 +143,7 @@ def test_several_faults_are_counted_after_the_first(tmp_path: Path) -> None:
 
 def test_very_many_faults_are_counted_alone_and_long_places_are_cut(tmp_path: Path) -> None:
     """Written out, each of a million faults would take a kilobyte."""
-    document = {"schema": 3, "campaign": "A", "warnings": [1] * 2_000}
+    document = {"schema": 4, "campaign": "A", "warnings": [1] * 2_000}
     (tmp_path / "results.json").write_text(json.dumps(document))
     with pytest.raises(ResultsError, match=r"\(2000 values are invalid\); run the campaign again"):
         read_results(tmp_path)
@@ -160,7 +160,7 @@ def test_very_many_faults_are_counted_alone_and_long_places_are_cut(tmp_path: Pa
 def test_times_and_zones_that_are_none_are_refused(tmp_path: Path, key: str, value: str) -> None:
     """The report writes times of day in that zone."""
     time = {"first": "2026-03-09T06:30:00Z", "last": "2026-03-09T16:30:00Z", "zone": "Europe/Berlin"}
-    document = {"schema": 3, "campaign": "A", "warnings": [], "time": time}
+    document = {"schema": 4, "campaign": "A", "warnings": [], "time": time}
     assert Results.model_validate(document).time is not None
     (tmp_path / "results.json").write_text(json.dumps({**document, "time": {**time, key: value}}))
     with pytest.raises(ResultsError, match=rf"\(time\.{key}: "):
@@ -168,25 +168,31 @@ def test_times_and_zones_that_are_none_are_refused(tmp_path: Path, key: str, val
 
 
 @pytest.mark.parametrize("kind", ["axis", "record"])
-@pytest.mark.parametrize("schema", [1, 2])
+@pytest.mark.parametrize("schema", [1, 2, 3])
 def test_an_older_schema_is_read_under_the_names_of_this_one(tmp_path: Path, kind: str, schema: int) -> None:
-    """The samples hold every renamed key; a fiducial and a channel that are named like one keep their name."""
+    """The samples hold every renamed key; a fiducial and a channel named like one keep their name; the quoted window comes to the top."""
     document = json.loads(Path(__file__).with_name(f"schema_2_{kind}.json").read_text(encoding="utf-8"))
+    if kind == "axis":
+        document["iso230"]["settled"]["A_um"]["value"] = 15.4
     (tmp_path / "results.json").write_text(json.dumps({**document, "schema": schema}))
     results = read_results(tmp_path)
     validator().validate(results.as_json())
-    assert results.schema_version == 3 and results.loop is not None
+    assert results.schema_version == 4 and results.loop is not None
     if isinstance(results.loop, RecordLoop):
         assert set(results.loop.channels) == {"nuisance"}
         assert set(results.loop.unexplained.p_values) == {"autocorrelation", "periodicity", "switching"}
         return
     assert results.registration is not None and set(results.registration.leave_one_out_mm) == {"nearest"}
+    assert (
+        results.iso230 is not None and results.iso230.window == "cycles 6 to 10" and results.iso230.A_um.value == 15.4
+    )
+    assert results.iso230.first is not None and results.iso230.first.A_um.value == 1.0
     assert "single_target" in results.loop.residual_tests.final.p_values
     assert set(results.loop.unconfirmed_effects) == set(results.loop.not_admitted) == {"dead_path"}
     assert results.correlation is not None and results.correlation.sensors.block_length_s == 3717.0
 
 
 def test_a_schema_of_the_future_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "results.json").write_text(json.dumps({"schema": 4, "campaign": "A", "warnings": []}))
-    with pytest.raises(ResultsError, match="schema: Input should be 3"):
+    (tmp_path / "results.json").write_text(json.dumps({"schema": 5, "campaign": "A", "warnings": []}))
+    with pytest.raises(ResultsError, match="schema: Input should be 4"):
         read_results(tmp_path)

@@ -409,7 +409,7 @@ def test_iso230_values_are_those_of_the_standard(small_run):
 
 def test_positions_are_of_the_window_that_the_results_state(small_run):
     deviations, results = read_dataset(small_run / "deviations.nc"), read_results(small_run)
-    assert results.iso230.settled.window == "cycles 6 to 10"
+    assert results.iso230.window == "cycles 6 to 10"
     positions = tables.iso230_position_table(deviations, results)
     assert (positions["count_positive"] == 5).all()
     np.testing.assert_allclose(positions["mean_positive_um"], deviations["deviation"].values[5:10, 0].mean(axis=0))
@@ -447,7 +447,7 @@ def test_the_workbook_reads_back(small_run, tmp_path):
     headings = [cell.value for cell in book["A R E M B"][1]]
     assert headings == ["quantity", "value / µm", "U (k = 2) / µm", "limit / µm", "decision"]
     quantity = next(row for row in book["A R E M B"].iter_rows(min_row=2) if row[0].value == "A")
-    window = results.iso230.settled
+    window = results.iso230
     assert [cell.value for cell in quantity[1:3]] == pytest.approx([window.A_um.value, 2 * window.A_um.u])
     assert quantity[1].number_format == "0.000" and quantity[4].value == results.iso230.tolerances[0].decision
     assert book["Conditions"].max_row == 1 + len(results.iso230.conditions)
