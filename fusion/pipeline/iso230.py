@@ -25,7 +25,7 @@ from fusion.campaign.inputs import DATED, is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.report.numbers import exact, moment
 from fusion.results.axis import Iso230Part
-from fusion.results.parts import decide
+from fusion.results.parts import decide, is_determined
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
 from fusion.results.store import file_sha256, group, has, is_file_list, joined, plain, read_json_object, read_product
@@ -225,8 +225,9 @@ def _judge(part: Mapping[str, Any], symbol: str, limit: float) -> list[dict[str,
         found = {symbol: part[f"{symbol}_um"]}
     rows = []
     for name, quantity in found.items():
-        value, expanded = quantity["value"], 2 * quantity["u"]
-        decision = decide(value, expanded, limit) if np.isfinite(value) else "not measured"
+        value, u = quantity["value"], quantity["u"]
+        expanded = 2 * u if is_determined(u) else None
+        decision = decide(value, expanded, limit)
         judged = {"limit_um": limit, "value_um": value, "expanded_u_um": expanded, "decision": decision}
         rows.append({"quantity": name, **judged})
     return rows

@@ -33,6 +33,7 @@ from interferometry.iso230.thermal import (
 
 #: Standard uncertainty of the sensitivity of a displacement sensor where none is stated: one percent of the reading.
 ASSUMED_CALIBRATION = 0.01
+_NEEDS = "a [record], or readings of a linear axis with their times in two cycles or more"
 #: Values of a course that are kept for its chart.
 _KEPT = 120
 DEFINITIONS = (
@@ -258,7 +259,7 @@ def read_thermal_tests(path: Path) -> StatedTests:
     if path.is_dir():
         results = read_results(path)
         if not results.iso230_3:
-            raise CampaignError(f"{path}: these results hold no test by ISO 230-3; run the campaign again")
+            raise CampaignError(f"{path}: these results hold no test by ISO 230-3, which needs {_NEEDS}")
         return StatedTests(results.campaign, results.iso230_3, files_of_run(path))
     if path.suffix != ".toml":
         raise CampaignError(
@@ -267,9 +268,7 @@ def read_thermal_tests(path: Path) -> StatedTests:
     campaign = load_campaign(path)
     found = thermal_tests(campaign)
     if not found:
-        raise CampaignError(
-            f"{path}: a test by ISO 230-3 needs a [record], or readings of a linear axis with their times in two cycles or more"
-        )
+        raise CampaignError(f"{path}: a test by ISO 230-3 needs {_NEEDS}")
     of = "interferometry" if campaign.record is None else "record"
     return StatedTests(campaign.campaign.title, found, hashed({path.name: path, **campaign.files_of(of)}))
 

@@ -176,7 +176,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
             )
             line = line.format(value=value) if value or "{value}" not in line else _STATED_WITHOUT_VALUE
             limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)
-            decision = "" if limit is None or found.value is None else decide(found.value, expanded, limit)
+            decision = "" if limit is None else decide(found.value, expanded, limit)
             told = told._replace(line=line, sharper_um=expanded, decision=decision)
     if not told.line and told.contributor in _OF_SCATTER:
         halved = sum(terms[name][1] ** 2 for name in _OF_SCATTER if name in terms) * (1.0 - 1.0 / _MORE_CYCLES)

@@ -7,11 +7,12 @@ that does not apply is never set, and absent.
 from __future__ import annotations
 
 import ast
+import math
 from datetime import datetime
 from inspect import cleandoc, getsource
 from itertools import pairwise
 from textwrap import dedent
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeGuard
 from zoneinfo import ZoneInfo
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler
@@ -213,11 +214,20 @@ class InputsPart(ResultPart):
 # other standards.
 
 
-Decision = Literal["pass", "fail", "not decided within the uncertainty"]
+Decision = Literal["pass", "fail", "not decided within the uncertainty", "not measured"]
 
 
-def decide(value: float, expanded_u: float, limit: float) -> Decision:
-    """Judge a quantity with its expanded uncertainty (k = 2) against its upper limit (ISO 14253-1)."""
+def is_determined(value: Number) -> TypeGuard[float]:
+    """Tell whether the data determine a number: where they do not, it is NaN in the analysis and None in a part."""
+    return value is not None and math.isfinite(value)
+
+
+def decide(value: Number, expanded_u: Number, limit: float) -> Decision:
+    """Judge a quantity with its expanded uncertainty (k = 2) against its upper limit (ISO 14253-1); undecided without an uncertainty."""
+    if not is_determined(value):
+        return "not measured"
+    if not is_determined(expanded_u):
+        return "not decided within the uncertainty"
     if value + expanded_u <= limit:
         return "pass"
     return "fail" if value - expanded_u > limit else "not decided within the uncertainty"
@@ -234,7 +244,7 @@ class Iso230Tolerance(ResultPart):
     """Value in the quoted window, um."""
     expanded_u_um: Number
     """Its expanded uncertainty (k = 2), um."""
-    decision: Decision | Literal["not measured"]
+    decision: Decision
     """By ISO 14253-1."""
 
 

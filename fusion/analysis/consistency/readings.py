@@ -301,7 +301,8 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
     sound = judge("missed_trigger", 0.0, 0.0, "The profile does not shift by a target in any cycles.")
     complete = np.isfinite(deviations["deviation"].values).all(axis=(1, 2))
     values, cycles = deviations["deviation"].values[complete], deviations["cycle"].values[complete]
-    if len(values) < 2 * _LEAST_SIDE or values.shape[2] < _LEAST_TARGETS:
+    noise_um = max(random_part_um(values), _rounding_um(values))
+    if len(values) < 2 * _LEAST_SIDE or values.shape[2] < _LEAST_TARGETS or not noise_um > 0.0:
         return sound
     # In the order of travel, so that a missed trigger shifts both approaches alike.
     order = np.argsort(deviations["position"].values)
@@ -327,7 +328,6 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
         shifted = (np.roll(there_and_back, late, axis=1) for late in (0, 1, -1))
         left = [_bent(inside.reshape(len(inside), -1) - one, way) for one in shifted]
         tried.append((np.sum(np.square(left), axis=-1), way.size - 2, ""))
-    noise_um = max(random_part_um(values), _rounding_um(values))
     error_um = noise_um * np.sqrt(1.0 / (end - first) + 1.0 / (len(passes) - end + first))
     found = []
     for differences, freedom, where in tried:

@@ -5,16 +5,20 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from fusion.analysis.alignment.align import AlignmentError
 from fusion.pipeline.check import check_campaign
+from fusion.pipeline.fleet import Row, with_findings
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import ExportError, export_results
+from fusion.report.page import report_of
+from fusion.report.sheet import describe_sheet, render_iso230
 from fusion.report.terminal import summary_rows
 from fusion.results.folder import claim, read_manifest
-from fusion.results.results import read_results
+from fusion.results.results import Results, read_results
 from fusion.results.store import read_dataset, read_tree
 from tests.fusion.campaign_parts import BOTH, change, keep_cycles, without, write_laser
 
@@ -145,6 +149,53 @@ def test_a_test_of_any_size_ends_with_what_it_can_carry(tmp_path, cycles, target
     assert ("standard_alone" in codes) == (cycles < 3)
     assert "readings_missing" not in codes
     assert "iso230" in sections(out) and ("loop" in sections(out)) == (cycles >= 12)
+
+
+#: A tolerance of every quantity that may have one, wide but for R.
+TOLERANCES = {"A": 99, "R": 0.01, "E": 99, "M": 99, "B": 99, **{f"{one}_unidirectional": 99 for one in "ARE"}}
+
+
+def published(path: Path, out: Path) -> Results:
+    """Run a campaign whose file states every tolerance; make its report again, its sheet, its tables and its row of a fleet."""
+    stated = "".join(f'{name} = "{limit} um"\n' for name, limit in TOLERANCES.items())
+    results = run_campaign(without(path, name="judged.toml", added=f"[acceptance]\n{stated}"), out)
+    assert 'id="iso230"' in report_of(out)
+    test = read_test(out, None)
+    sheet = describe_sheet(test.title, test.part, files=test.files, version="0")
+    assert render_iso230(sheet, test.part, test.dataset, remarks=test.remarks)
+    for form in ("csv", "xlsx"):
+        assert export_results(out, form, out.with_name(form)).files
+    assert with_findings(Row("judged", "finished"), out).decision
+    return results
+
+
+@pytest.mark.parametrize(
+    ("cycles", "targets", "directions"),
+    [(1, 5, BOTH), (1, 2, ("negative",)), (2, 2, BOTH), (5, 5, ("positive",))],
+)
+def test_what_a_test_does_not_measure_is_judged_as_not_measured(tmp_path, cycles, targets, directions):
+    results = published(write_laser(tmp_path / "campaign", cycles, targets, directions), tmp_path / "results")
+    judged = {row.quantity: row.decision for row in results.iso230.tolerances}
+    both, several = directions == BOTH, cycles > 1
+    decided = "pass" if several else "not decided within the uncertainty"
+    assert judged["B"] == judged["M"] == judged["E"] == (decided if both else "not measured")
+    assert judged["A"] == ("pass" if both and several else "not measured")
+    for side, arrow in (("positive", "↑"), ("negative", "↓")):
+        assert judged[f"E{arrow}"] == (decided if side in directions else "not measured")
+        assert judged[f"A{arrow}"] == ("pass" if side in directions and several else "not measured")
+
+
+@pytest.mark.parametrize("value", ["0", "10 * target", "10 * target + cycle"], ids=["zero", "repeated", "moved alike"])
+def test_readings_without_scatter_end_with_the_values_of_the_standard_and_their_notice(tmp_path, value):
+    path = write_laser(tmp_path / "campaign", 8, 5, BOTH)
+    table = pd.read_csv(path.with_name("laser.csv"))
+    table.assign(deviation_um=table.eval(value)).to_csv(path.with_name("laser.csv"), index=False)
+    results = published(path, tmp_path / "results")
+    assert [warning.code for warning in results.warnings].count("no_scatter") == 1
+    assert results.drift is None
+    assert "missed_trigger" not in [check.code for check in results.inputs.doubts]
+    page = (tmp_path / "results" / "report.html").read_text(encoding="utf-8")
+    assert "repeat exactly from cycle to cycle" in page and "times that of the differences" not in page
 
 
 @pytest.mark.slow
