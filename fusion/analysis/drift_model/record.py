@@ -818,10 +818,6 @@ class RecordProblem(Problem[RecordFit]):
         offered = candidates_of(self.effects[name], self.record, near)
         return [one for one in offered if (np.ptp(one.columns[self.train], axis=0) > 0.0).all()]
 
-    def near(self, name: str, model: RecordFit, chosen: Candidate) -> list[Candidate]:
-        """Candidates of an effect about one that was chosen, the chosen one where there is no other."""
-        return super().near(name, model, chosen) or [chosen]
-
 
 class ChainedResult(schema.ChainedPart):
     """One part of a record, predicted from all before it by a search that had not seen it."""

@@ -876,11 +876,11 @@ def refine(
 
 
 def _best_near(score: Score, near: Sequence[Candidate], gains: Callable[[Sequence[Candidate]], Gains]) -> Score:
-    """The same score with the best candidate of a neighbourhood, or with its own where none is better."""
+    """The same score with the best candidate of a neighbourhood, or with its own where none is better, or none near, as of an event
+    between two readings that are far apart.
+    """
     if not near:
-        raise SearchError(
-            f"effect {score.name!r} offers no candidate near one it offered before: {dict(score.best.parameters)}"
-        )
+        return replace(score, ranges=parameter_ranges(score.tried, score.best.parameters, score.gain))
     looked = gains(near)
     # More columns must be the better description by odds of 20 to 1.
     needed = TIE_GAIN * np.array([one.columns.shape[1] > score.best.columns.shape[1] for one in near])

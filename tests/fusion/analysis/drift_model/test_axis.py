@@ -67,6 +67,19 @@ def problem_of(*named: np.ndarray, effects: dict[str, Effect] | None = None) -> 
     return AxisProblem(readings, USED, {} if effects is None else effects, np.random.default_rng(1))
 
 
+def test_a_change_of_the_reversal_while_cycles_are_missing_is_found_within_the_gap():
+    whole = campaign(cycles=24)
+    gapped = whole.subset((whole.cycle < 9) | (whole.cycle > 14))
+    noise = 0.1 * np.random.default_rng(6).standard_normal(gapped.seconds.size)
+    readings = replace(gapped, response=noise + (gapped.cycle > 14) * gapped.sign)
+    problem = AxisProblem(
+        readings, readings.cycle <= 20, {"step_event": library()["step_event"]}, np.random.default_rng(1)
+    )
+    (found,) = problem.score(problem.start([])).scores
+    before, after = (readings.seconds[readings.cycle == cycle] for cycle in (8, 15))
+    assert found.best.parameters["shape"] == "reversal" and before[-1] < found.best.parameters["time_s"] <= after[0]
+
+
 def score(name: str, candidate: Candidate, **changes) -> Score:
     confirmation = Confirmation(True, Confirmed.LATER_CYCLES)
     return Score(name, candidate, **{"family_wise_p": 1e-3, "confirmation": confirmation, **changes})

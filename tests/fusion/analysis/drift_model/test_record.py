@@ -232,16 +232,6 @@ def test_candidates_that_never_move_in_training_are_not_offered():
     np.testing.assert_array_equal(candidate.columns[:, 0], WAVE)
 
 
-def test_a_closer_look_at_an_effect_without_parameters_stays_where_it_is():
-    def offer(readings, coefficients, near):
-        if near is None:
-            yield Candidate(WAVE[:, None], {"shape": "flat"}, ("um",))
-
-    problem = problem_of(small(), {"own": Effect("own", "", "", offer)})
-    chosen = Candidate(WAVE[:, None], {"shape": "flat"}, ("um",))
-    assert problem.near("own", None, chosen) == [chosen]
-
-
 def test_a_users_effect_is_only_held_against_the_switchings():
     def offer(readings, coefficients, near):
         yield Candidate(WAVE[:, None], {}, ("um",))

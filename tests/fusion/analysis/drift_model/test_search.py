@@ -445,10 +445,11 @@ def test_a_closer_look_does_not_move_to_what_the_model_holds_or_to_what_is_worse
     assert score.ranges == {"place": [None, 6.0]}
 
 
-def test_an_effect_without_neighbours_breaks_its_contract():
-    score = Score("own", candidate(3.0), gain=5.0)
-    with pytest.raises(SearchError, match=r"'own' offers no candidate near one it offered before: \{'place': 3.0\}"):
-        refine(score, lambda chosen: [], Landscape({}).gains)
+def test_a_candidate_without_neighbours_keeps_its_place():
+    chosen = candidate(3.0)
+    tried = [({"place": place}, gain) for place, gain in ((1.0, 1.0), (2.0, 4.9), (3.0, 5.0), (4.0, 1.0))]
+    score = refine(Score("own", chosen, gain=5.0, tried=tried), lambda chosen: [], Landscape({}).gains)
+    assert score.candidate is chosen and score.gain == 5.0 and score.ranges == {"place": [1.0, 4.0]}
 
 
 def test_candidates_are_of_one_kind_where_only_open_words_and_numbers_differ():
