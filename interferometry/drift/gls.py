@@ -27,12 +27,11 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 from scipy import linalg, special
 from scipy.linalg import lapack
 
-from interferometry.common import Array
+from interferometry.common import Array, njit
 from interferometry.drift import kalman
 from interferometry.drift.kalman import (
     MANY_COLUMNS,
@@ -497,7 +496,7 @@ def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[
     return state[m:], covariance[m:, m:], with_drift
 
 
-@njit(cache=True)
+@njit()
 def _filter_with_average(
     seconds: Array,
     loadings: Array,
@@ -543,7 +542,7 @@ def _filter_with_average(
     return state, covariance, predicted, gains
 
 
-@njit(cache=True)
+@njit()
 def _covariance_with_average(
     seconds: Array, loadings: Array, order: int, memory: Array, weights: Array, predicted: Array, gains: Array
 ) -> Array:

@@ -23,16 +23,15 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from interferometry.common import Array, InterferometryError
+from interferometry.common import Array, InterferometryError, njit
 
 #: Columns that are whitened together.
 _COLUMNS_AT_ONCE = 256
 
 
-@njit(cache=True)
+@njit()
 def predict_covariance(
     covariance: Array, order: int, ratios: Array, memory: Array, process_noise_scale: float, step: float
 ) -> None:
@@ -61,7 +60,7 @@ def predict_covariance(
             covariance[level, level] += ratio * step
 
 
-@njit(cache=True)
+@njit()
 def innovation_variance(
     covariance: Array, order: int, loadings: Array, k: int, memory: Array, variance: float, cross_covariance: Array
 ) -> float:
@@ -77,7 +76,7 @@ def innovation_variance(
     return total
 
 
-@njit(cache=True)
+@njit()
 def update_covariance(covariance: Array, cross_covariance: Array, innovation_variance: float) -> None:
     """Measurement update of the state covariance, in place: P = P - P Z' Z P / F (Durbin and Koopman 2012, eq. 4.24)."""
     m = covariance.shape[0]
@@ -87,7 +86,7 @@ def update_covariance(covariance: Array, cross_covariance: Array, innovation_var
             covariance[i, j] -= cross_covariance[i] * cross_covariance[j] * precision
 
 
-@njit(cache=True)
+@njit()
 def predict_state(state: Array, components: int, order: int, memory: Array, step: float) -> None:
     """Prediction step of the expected state of every column, in place: a = T a (Durbin and Koopman 2012, eq. 4.24)."""
     if memory.size:
@@ -101,7 +100,7 @@ def predict_state(state: Array, components: int, order: int, memory: Array, step
                 level[j] += step * rate[j]
 
 
-@njit(cache=True)
+@njit()
 def update_state(
     state: Array,
     order: int,
@@ -130,7 +129,7 @@ def update_state(
             expected[j] += gain * innovation[j]
 
 
-@njit(cache=True)
+@njit()
 def start_covariance(drift_states: int, memory: Array, others: int) -> Array:
     """Covariance of the state before the first reading: the drift starts at zero, the memory of the noise is stationary."""
     size = drift_states + (1 if memory.size else 0) + others
@@ -140,7 +139,7 @@ def start_covariance(drift_states: int, memory: Array, others: int) -> Array:
     return covariance
 
 
-@njit(cache=True)
+@njit()
 def filter_covariance(
     seconds: Array,
     loadings: Array,
@@ -177,7 +176,7 @@ def filter_covariance(
     return gains, innovation_variances, covariances
 
 
-@njit(cache=True)
+@njit()
 def filter_columns(
     seconds: Array, loadings: Array, order: int, memory: Array, gains: Array, columns: Array
 ) -> tuple[Array, Array]:
@@ -211,7 +210,7 @@ def filter_columns(
     return innovations, states
 
 
-@njit(cache=True)
+@njit()
 def whiten_rows(
     seconds: Array,
     loadings: Array,
@@ -254,7 +253,7 @@ def whiten_rows(
                 innovation[j] *= precision
 
 
-@njit(cache=True)
+@njit()
 def smooth(
     seconds: Array,
     loadings: Array,
@@ -334,7 +333,7 @@ def smooth(
     return levels, level_covariance, u, D
 
 
-@njit(cache=True)
+@njit()
 def _smooth_levels(order: int, covariance: Array, r: Array, N: Array, levels: Array, level_covariance: Array) -> None:
     """Turn a into a + P r and write P - P N P of one reading, at the levels, into the last two arguments (eq. 4.44)."""
     components, p = levels.shape
@@ -352,7 +351,7 @@ def _smooth_levels(order: int, covariance: Array, r: Array, N: Array, levels: Ar
                     level_covariance[c, e] -= row[i] * N[i, j] * other[j]
 
 
-@njit(cache=True)
+@njit()
 def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
     """Sweep a Gram matrix on every design column: least squares, its inverse and its determinant in one go."""
     swept = matrix.copy()

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from thermography.common import Array
+from thermography.common import Array, njit
 from thermography.fields.blocks import (
     BLOCK_FRAMES,
     NO_CYCLE,
@@ -126,7 +125,7 @@ class CellWeights(NamedTuple):
     weights: Array
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def weigh_pixels(points: Array, valid: Array, shift: Array, lens: Array, shape: tuple[int, int]) -> CellWeights:
     """Weigh the pixels around the points of every cell, each of which is interpolated between four pixels (bilinear)."""
     places, windows, pixels = _place_points(points, valid, shift, lens, shape)
@@ -155,7 +154,7 @@ def weigh_pixels(points: Array, valid: Array, shift: Array, lens: Array, shape: 
     return CellWeights(windows, weights)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _place_points(
     points: Array, valid: Array, shift: Array, lens: Array, shape: tuple[int, int]
 ) -> tuple[Array, Array, int]:
@@ -186,7 +185,7 @@ def _place_points(
     return places, windows, pixels
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def add_frame(counts: Array, calibration: Array, sampling: CellWeights, correction: float, sums: CellSums) -> None:
     """Average one frame over every cell that it shows, and add it to the sums."""
     frames, mean, squares = sums
@@ -208,7 +207,7 @@ def add_frame(counts: Array, calibration: Array, sampling: CellWeights, correcti
         squares[cell] += step * (temperature - mean[cell])
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _temperature_of_mean(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
     """Temperature of the mean count of a cell, degC; NaN where the counts of its pixels differ too much for that."""
     left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
@@ -222,7 +221,7 @@ def _temperature_of_mean(counts: Array, window: Array, weights: Array, calibrati
     return _calibrate(calibration, total) if high - low <= _NARROW_COUNTS else np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _mean_temperature(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
     """Mean of the temperatures of the pixels of a cell, degC."""
     left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
@@ -236,7 +235,7 @@ def _mean_temperature(counts: Array, window: Array, weights: Array, calibration:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _calibrate(calibration: Array, counts: float) -> float:
     """Temperature of counts that need not be whole numbers, degC."""
     low = min(int(counts), 65534)

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from thermography.common import Array, ThermographyError
+from thermography.common import Array, ThermographyError, njit
 from thermography.io.sequence import usable_threads
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
@@ -174,7 +173,7 @@ class _Pieces(NamedTuple):
     y: Array
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _cut_pixels(
     corners: Array, rows: tuple[int, int], discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -198,7 +197,7 @@ def _cut_pixels(
     return pieces.cell[:count], pieces.pixel[:count], area, pieces.x[:count] / area, pieces.y[:count] / area
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _pixel(corners: Array, row: int, column: int) -> _Pixel:
     """The parallelogram through the middles of a pixel's sides, from the plan positions of all corners of pixels."""
     x, across_x, down_x = _sides(corners, row, column, 0)
@@ -206,7 +205,7 @@ def _pixel(corners: Array, row: int, column: int) -> _Pixel:
     return _Pixel(x, y, across_x, across_y, down_x, down_y)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sides(corners: Array, row: int, column: int, k: int) -> tuple[float, float, float]:
     """Middle of a pixel and its sides along the row and the column, in coordinate `k`."""
     a, b = corners[row, column, k], corners[row, column + 1, k]
@@ -214,7 +213,7 @@ def _sides(corners: Array, row: int, column: int, k: int) -> tuple[float, float,
     return (a + b + c + d) / 4, (b - a + d - c) / 2, (c - a + d - b) / 2
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _on_disc(x: float, y: float, discs: Array, margin: float) -> bool:
     """Whether a point lies on a disc (x, y, radius) or nearer to it than a margin."""
     on_disc = False
@@ -223,7 +222,7 @@ def _on_disc(x: float, y: float, discs: Array, margin: float) -> bool:
     return on_disc
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _add_pixel(pieces: _Pieces, count: int, number: int, pixel: _Pixel, cells: tuple[int, int], cell_mm: float) -> int:
     """Add the pieces of one pixel after the first `count`; the new count."""
     part_area = abs(pixel.across_x * pixel.down_y - pixel.across_y * pixel.down_x) / _PARTS**2
@@ -246,7 +245,7 @@ def _add_pixel(pieces: _Pieces, count: int, number: int, pixel: _Pixel, cells: t
     return count
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _add_piece(pieces: _Pieces, first: int, count: int, cell: int, number: int, area: float, x: float, y: float) -> int:
     """Add an area at (x, y) to the entry of its cell among those from `first` on, which are the pixel's, or to a new one; the count."""
     entry = first
@@ -276,7 +275,7 @@ def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> sparse
     return sparse.csr_array((weights, (rows, columns)), shape=(seen.size, seen.size))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _centring_entries(
     chosen: Array, offset: Array, centres: Array, coverage: Array, shape: tuple[int, int], cell_mm: float
 ) -> tuple[Array, Array, Array]:
@@ -310,7 +309,7 @@ def _centring_entries(
     return rows[:count], columns[:count], weights[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _seen_neighbours(cell: int, coverage: Array, shape: tuple[int, int], around: Array) -> int:
     """Write the seen cells among the 3 x 3 around a cell, itself included, to `around`; their number."""
     y, x = cell // shape[1], cell % shape[1]

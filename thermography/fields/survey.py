@@ -11,12 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
+from thermography.common import MAD_TO_SIGMA, Array, ThermographyError, njit
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
 from thermography.radiometry.planck import (
@@ -209,7 +208,7 @@ class _Neighbours:
             del self._window[place]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _count_off(counts: Array, before: Array, after: Array, limit: int, shift: int, stretch: int) -> int:
     """Number of pixels beyond those of both other frames by more than the limit; flat images."""
     off = np.int32(0)
@@ -230,7 +229,7 @@ def _block_sums(image: Array, edge_px: int) -> Array:
     return _sum_blocks(kept.reshape(rows, edge_px, columns, edge_px))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sum_blocks(image: Array) -> Array:
     """Sum over the second and fourth dimension."""
     rows, height, columns, width = image.shape

@@ -12,11 +12,10 @@ from itertools import accumulate
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import numba
 import numpy as np
 import platformdirs
 
-from thermography.common import Array
+from thermography.common import Array, njit
 from thermography.io.fff_record import (
     CAMERA_RECORD,
     ENTRY_SIZE,
@@ -398,7 +397,7 @@ def _changes(rows: Array) -> Array:
     return np.flatnonzero(np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)]))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _check(
     rows: Array, layout: _Layout, length: int, stored: Array, numbers: Array
 ) -> int:  # pragma: no cover - compiled
@@ -436,7 +435,7 @@ def _check(
     return len(rows)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _u32(data: Array, place: int, big: bool) -> int:  # pragma: no cover - compiled
     """Unsigned 32-bit number."""
     a, b, c, d = np.int64(data[place]), np.int64(data[place + 1]), np.int64(data[place + 2]), np.int64(data[place + 3])

@@ -8,10 +8,9 @@ import threading
 
 import imagecodecs
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from thermography.common import Array, ThermographyError
+from thermography.common import Array, ThermographyError, njit
 
 #: Length of the signature, by which the samples were recognised.
 _SIGNATURE_BYTES = 8
@@ -73,7 +72,7 @@ def _image_data(data: bytes | memoryview, shape: tuple[int, int]) -> list[memory
         start = end
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _undo_filters(filtered: Array, out: Array) -> bool:  # pragma: no cover - compiled
     """Undo the filters of all lines, each (filter type + bytes), into bytes (row, 2 columns); return False for an unknown filter."""
     rows, width = out.shape
@@ -96,7 +95,7 @@ def _undo_filters(filtered: Array, out: Array) -> bool:  # pragma: no cover - co
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _undo_paeth(line: Array, above: Array, out: Array) -> None:  # pragma: no cover - compiled
     """Undo filter 4; the two bytes of a pixel depend on different ones, and are computed at a time."""
     left = other_left = corner = other_corner = np.int64(0)
@@ -108,7 +107,7 @@ def _undo_paeth(line: Array, above: Array, out: Array) -> None:  # pragma: no co
         corner, other_corner = up, other_up
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _paeth(left: np.int64, up: np.int64, corner: np.int64) -> np.int64:  # pragma: no cover - compiled
     """Of left, up and corner the nearest to left + up - corner; of equally near ones the left one, then the one above."""
     across, down = left - corner, up - corner

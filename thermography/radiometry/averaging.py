@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import ZERO_CELSIUS_K, Array
+from thermography.common import ZERO_CELSIUS_K, Array, njit
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import count_line
 
@@ -74,7 +73,7 @@ class Accumulator:
         return CountStatistics(self.frames, *(values.reshape(self.shape) for values in arrays))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add(
     counts: Array, first: Array, deviations: Array, squares: Array, far_squares: Array, lowest: Array, highest: Array
 ) -> None:
@@ -95,7 +94,7 @@ def _add(
                 _add_far(origin, a, b, c, d, deviations[tile], far_squares[tile])
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_limits(first: Array, a: Array, b: Array, c: Array, d: Array, lowest: Array, highest: Array) -> np.uint16:
     """Update smallest and largest counts; return the bitwise or of all deviations from the first frame."""
     reach = np.uint16(0)
@@ -107,7 +106,7 @@ def _add_limits(first: Array, a: Array, b: Array, c: Array, d: Array, lowest: Ar
     return reach
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: Array, squares: Array) -> None:
     """Add four frames whose deviations from the first are all below `_NEAR` in size."""
     # The difference of two unsigned counts wraps around where it is negative. Its lower 16 bits, read as int16, are the signed deviation
@@ -126,7 +125,7 @@ def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: 
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add_far(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: Array, squares: Array) -> None:
     """Add four frames with deviations of any size."""
     for i in range(len(first)):
@@ -136,7 +135,7 @@ def _add_far(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: A
             squares[i] += np.uint64(deviation * deviation)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _sums(frames: int, first: Array, deviations: Array, squares: Array, far_squares: Array) -> tuple[Array, Array]:
     """Return the sums of the counts and of their squares from those of the deviations."""
     total, all_squares = np.empty(len(first), np.uint64), np.empty(len(first), np.uint64)
@@ -198,7 +197,7 @@ def mean_temperature(
     return MeanTemperature(statistics.frames, mean.reshape(shape), variance.reshape(shape), bound.reshape(shape))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _mean_temperature(
     frames: int, total: Array, squares: Array, lowest: Array, highest: Array, curve: Array, evaluated: Array
 ) -> tuple[Array, Array, Array]:
@@ -241,7 +240,7 @@ def _mean_temperature(
     return mean, variance, bound
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _derivatives(counts: float, curve: Array) -> tuple[float, float, float]:
     """Return the temperature (degC) and its first two derivatives by the counts (K/count, K/count^2); NaN below any temperature."""
     a, b, f, gain, offset = curve
@@ -257,7 +256,7 @@ def _derivatives(counts: float, curve: Array) -> tuple[float, float, float]:
     return b * inverse_log - ZERO_CELSIUS_K, first / gain, second / gain**2
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _third_derivative(counts: float, curve: Array) -> float:
     """Return the third derivative of the temperature by the counts, K/count^3; its size falls as the counts rise."""
     a, b, f, gain, offset = curve

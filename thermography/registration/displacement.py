@@ -21,12 +21,11 @@ from dataclasses import dataclass, replace
 from itertools import compress
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from thermography.common import Array
+from thermography.common import Array, njit
 from thermography.registration.discs import LocatedDisc
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import Projection, parameter_jacobian
@@ -171,7 +170,7 @@ def _disc_weights(
     return int(low[1]), int(low[0]), weights.T.reshape(3, *columns.shape)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
     """Sum and first moments of the coverage of every disc, (frames, discs, 3)."""
     sums = np.zeros((len(counts), len(places), 3))
@@ -194,7 +193,7 @@ def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
     return sums
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(nogil=True, fastmath={"reassoc", "contract"})
 def _dot(a: Array, b: Array) -> np.float32:
     total = np.float32(0)
     for i in range(len(a)):

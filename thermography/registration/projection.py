@@ -19,13 +19,12 @@ from typing import Any
 from xml.etree import ElementTree
 
 import cv2
-import numba
 import numpy as np
 import scipy
 import yaml
 from numpy.typing import NDArray
 
-from thermography.common import Array, ThermographyError
+from thermography.common import Array, ThermographyError, njit
 
 # Intrinsic parameters of a lens from a calibration, and the file in which OpenCV writes them.
 
@@ -170,7 +169,7 @@ _RIM = np.exp(2j * np.pi * np.arange(24) / 24)
 _UNDISTORTION_STEPS, _UNDISTORTION_TOLERANCE = 40, 1e-11
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def project_point(x: float, y: float, lens: Array) -> tuple[float, float]:
     """Project one plan point to the sensor; for compiled loops."""
     w = lens[6] * x + lens[7] * y + lens[8]
@@ -180,7 +179,7 @@ def project_point(x: float, y: float, lens: Array) -> tuple[float, float]:
     return lens[10] + lens[9] * du, lens[11] + lens[9] * dv
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _distort(u: float, v: float, lens: Array) -> tuple[float, float]:
     """Distorted normalised coordinates."""
     r2 = u * u + v * v
@@ -191,7 +190,7 @@ def _distort(u: float, v: float, lens: Array) -> tuple[float, float]:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _project(points: Array, lens: Array) -> Array:
     """Sensor column and row of plan points, (n, 2)."""
     projected = np.empty(points.shape)
@@ -200,7 +199,7 @@ def _project(points: Array, lens: Array) -> Array:
     return projected
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _undistort_point(column: float, row: float, lens: Array) -> tuple[float, float]:
     """A sensor point, px, as a lens without distortion would show it, by fixed-point iteration."""
     u0, v0 = (column - lens[10]) / lens[9], (row - lens[11]) / lens[9]
@@ -213,7 +212,7 @@ def _undistort_point(column: float, row: float, lens: Array) -> tuple[float, flo
     return lens[10] + lens[9] * u, lens[11] + lens[9] * v
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def locate_point(column: float, row: float, lens: Array, sensor_to_plan: Array) -> tuple[float, float]:
     """Locate one sensor point on the plan; for compiled loops."""
     u, v = _undistort_point(column, row, lens)
@@ -222,7 +221,7 @@ def locate_point(column: float, row: float, lens: Array, sensor_to_plan: Array) 
     return (m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w, (m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _undistort(points: Array, lens: Array) -> Array:
     """Sensor points, (n, 2) px, as a lens without distortion would show them."""
     undistorted = np.empty(points.shape)
@@ -231,7 +230,7 @@ def _undistort(points: Array, lens: Array) -> Array:
     return undistorted
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _transform(points: Array, matrix: Array) -> Array:
     """Points, (n, 2), mapped by a homography (3, 3)."""
     mapped = np.empty(points.shape)

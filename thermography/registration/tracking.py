@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import Array
+from thermography.common import Array, njit
 from thermography.registration.plan import PlanGrid
 from thermography.registration.projection import locate_point, project_point
 from thermography.registration.register import Registration
@@ -157,7 +156,7 @@ def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Arr
     return TablePosition(mean, math.hypot(own, common), kept, own)
 
 
-@numba.njit(cache=True)
+@njit()
 def _discs_in_view(discs: Array, shift: Array, margin_px: Array, lens: Array, shape: tuple[int, int]) -> int:
     """Number of discs that lie far enough within the frame when the table is displaced."""
     inside = 0
@@ -168,7 +167,7 @@ def _discs_in_view(discs: Array, shift: Array, margin_px: Array, lens: Array, sh
     return inside
 
 
-@numba.njit(cache=True)
+@njit()
 def _agreement(shifts: Array) -> tuple[Array, float, int]:
     """Mean of the displacements, (n, 2) mm, without outliers; their standard deviation along either coordinate, and their number."""
     middle_x, middle_y = np.median(shifts[:, 0]), np.median(shifts[:, 1])
@@ -186,7 +185,7 @@ def _agreement(shifts: Array) -> tuple[Array, float, int]:
     return mean, np.sqrt(squares / max(2 * kept - 2, 1)), kept
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _coarse_scores(counts: Array, discs: Array, lens: Array, direction: Array, along: Array) -> Array:
     """Sum over the discs in view of their contrast, over the root of their number, for every displacement."""
     scores = np.zeros(len(along))
@@ -203,7 +202,7 @@ def _coarse_scores(counts: Array, discs: Array, lens: Array, direction: Array, a
     return scores
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _coarse_contrast(counts: Array, x: float, y: float, radius: float, lens: Array) -> float:
     """Mean of eight pixels within a disc minus mean of eight around it, counts; NaN where not all of them are in view."""
     rows, columns = counts.shape
@@ -223,7 +222,7 @@ def _coarse_contrast(counts: Array, x: float, y: float, radius: float, lens: Arr
     return (inside - ring) / _COARSE_POINTS
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _displacements(
     counts: Array, discs: Array, bias_px: Array, lens: Array, sensor_to_plan: Array, size: tuple[float, float], shift: Array
 ) -> Array:  # fmt: skip
@@ -238,7 +237,7 @@ def _displacements(
     return displacements[:located]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _locate_disc(
     counts: Array, disc: Array, shift: Array, lens: Array, size: tuple[float, float]
 ) -> tuple[float, float, bool]:
@@ -286,7 +285,7 @@ def _locate_disc(
     return column, row, near
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _patch_around(column: float, row: float, reach_mm: float, per_mm: tuple[float, float]) -> tuple[int, int, int, int]:
     """First and last column and row (left, top, right, bottom) of the pixels within some distance on the plan."""
     half_columns, half_rows = int(reach_mm * per_mm[0]) + 2, int(reach_mm * per_mm[1]) + 2
@@ -294,7 +293,7 @@ def _patch_around(column: float, row: float, reach_mm: float, per_mm: tuple[floa
     return left, top, left + 2 * half_columns, top + 2 * half_rows
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _contrast(
     counts: Array, patch: tuple[int, int, int, int], centre: tuple[float, float], to_mm: tuple[float, float, float, float],
     zones: tuple[float, float, float, float], disc: Array, size: tuple[float, float],
@@ -331,7 +330,7 @@ def _contrast(
     return plane, core_sum / core_n - (plane[0] + (plane[1] * core_c + plane[2] * core_r) / core_n), noise
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _moments(
     counts: Array, patch: tuple[int, int, int, int], centre: tuple[float, float], to_mm: tuple[float, float, float, float],
     rim: float, plane: Array, contrast: float,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from fusion.common import Array
+from interferometry.common import njit
 
 
-@njit(cache=True)
+@njit()
 def _respond(values: Array, seconds: Array, time_constant_s: float, start: Array) -> Array:
     # Element by element, here and in every kernel: an assignment of whole rows takes seconds to compile.
     response = np.empty_like(values)

@@ -17,7 +17,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -27,6 +26,7 @@ from fusion.analysis.attribution.modes import Excitation, nuisance_columns
 from fusion.analysis.drift_model.gains import side_by_side
 from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array
+from interferometry.common import njit
 from interferometry.drift.kalman import DriftSystem, Order, drift_system
 from thermography.fields.large_arrays import empty_array, give_back
 
@@ -71,7 +71,7 @@ class Whitening:
         return np.asarray(_invert_lower(white))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _invert_lower(lower: Array) -> Array:
     """Inverse of a lower triangular matrix; threaded BLAS is slower at this size."""
     n = lower.shape[0]
@@ -232,7 +232,7 @@ def _unit_regressors(project: Array32, regressors: Array32) -> tuple[Array32, Ar
     return white, np.where(useful, length, np.float32(0.0))
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz"})
+@njit(nogil=True, fastmath={"nnan", "ninf", "nsz"})
 def _take_best(products: Array32, penalised: Array32, penalty: np.float32, best: Array32) -> None:
     """Lower best (draws, columns) to the penalised residual squares of this grid point where they are smaller."""
     draws, columns = products.shape
@@ -242,7 +242,7 @@ def _take_best(products: Array32, penalised: Array32, penalty: np.float32, best:
             best[b, j] = min(best[b, j], whole - penalty * products[b, j] * products[b, j])
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz"})
+@njit(nogil=True, fastmath={"nnan", "ninf", "nsz"})
 def _log_ratio(null_score: Array32, best: Array32, freedom: float) -> None:
     """Turn best (draws, columns) into likelihood ratios in place; a regressor can only help, so the ratio is at least 0."""
     draws, columns = best.shape
@@ -621,7 +621,7 @@ class Screening:
     p_value: Array32
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "reassoc", "contract"})
+@njit(nogil=True, fastmath={"nnan", "ninf", "nsz", "reassoc", "contract"})
 def _largest(products: Array32, weight: Array32, largest: Array32) -> None:
     """Raise largest (rows,) to the rows' largest squared product (rows, columns) times the columns' weight."""
     rows, columns = products.shape
@@ -632,7 +632,7 @@ def _largest(products: Array32, weight: Array32, largest: Array32) -> None:
         largest[b] = best
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _keep_best(
     product: Array32,
     weight: Array32,
