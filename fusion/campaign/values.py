@@ -346,8 +346,10 @@ def _matches(folder: Path, pattern: str) -> list[Path]:
 
 
 def check_pattern(folder: Path, pattern: str) -> None:
-    """Refuse a pattern for which a whole disk would be searched."""
+    """Refuse a pattern that names no file, and one for which a whole disk would be searched."""
     parts = Path(pattern).parts
+    if not parts or parts == (Path(pattern).anchor,):
+        raise ValueError('names a folder; name the files in it, for example "thermal/*.jpg"')
     if len(parts) > _MAX_PARTS:
         raise ValueError(f"has more than {_MAX_PARTS} folders; name the files from a folder closer to them")
     if "**" not in parts:

@@ -70,6 +70,8 @@ _TABLE = "thermograms.csv"
 _DATASETS = ("thermograms", "fields", "deviations", "fusion", "sensors", "record")
 #: Fields above this size are not sent to a second process, which would hold them once more, bytes.
 _MOST_SENT = 200e6
+#: What is read before the first stage; a campaign lacks some of it.
+_READ = ("scheduler", "source", "camera", "laser", "alone", "record_source")
 #: What a run writes last.
 PAGES = ("results.json", "provenance.json", "report.html")
 
@@ -201,10 +203,19 @@ def run_stages(run: Run, stages: Mapping[str, Callable[..., Any]], made: dict[st
     """Run every stage for which there is what it needs, in their order; `made` holds what was read, and takes what they make.
 
     A stage takes what was read, or what earlier ones made, by the names of its parameters; it is left out where one without a default is
-    lacking, as of an instrument that a campaign does not have.
+    lacking, as of an instrument that a campaign does not have. A name that nothing before it makes is a fault of the program.
     """
+    needed = {
+        makes: [one for one in signature(stage).parameters.values() if one.name != "run"]
+        for makes, stage in stages.items()
+    }
+    known = {*_READ}
+    for makes, parameters in needed.items():
+        if unknown := {one.name for one in parameters} - known:
+            raise TypeError(f"the stage {makes} takes {', '.join(sorted(unknown))}, which nothing before it makes")
+        known.add(makes)
     for makes, stage in stages.items():
-        parameters = [one for one in signature(stage).parameters.values() if one.name != "run"]
+        parameters = needed[makes]
         if all(one.default is None or made.get(one.name) is not None for one in parameters):
             made[makes] = stage(run, **{one.name: made.get(one.name) for one in parameters})
 

@@ -127,6 +127,8 @@ BAD = [
     ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] "),
     ("[-1, 0]", '["left", 0]', ', line 20: plan.axis.direction = "left": this is a number without quotes'),
     ('["thermal/*.jpg"]', '"thermal/*.jpg"', ', line 6: thermography.frames = "thermal/*.jpg": this is a list'),
+    *(('"thermal/*.jpg"', f'"{name}"', f', line 6: thermography.frames = "{name}": names a folder; name the files')
+      for name in ("", ".", "/", "./", "/.")),
     ("*.jpg", "*.seq", ', line 6: thermography.frames = "thermal/*.seq": matches no file in {folder}'),
     ('"laser.csv"', '"lazer.csv"', ', line 23: interferometry.deviations = "lazer.csv": no such file {folder}/lazer.csv'),
     ('fiducials = "fiducials.csv"\n', "", ", line 13: [plan] lacks fiducials; add it"),

@@ -15,7 +15,7 @@ import xarray as xr
 
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.iso230 import files_of_run
-from fusion.pipeline.run import run_stages
+from fusion.pipeline.run import RUN, run_stages
 from fusion.pipeline.stages import (
     FileState,
     Run,
@@ -151,6 +151,20 @@ def test_a_stage_is_left_out_where_what_it_needs_is_lacking(new_run):
     run_stages(new_run(), stages, made)
     told = "of the laser"
     assert made == {"laser": "the laser", "deviations": told, "fused": None, "model": (told, None)}
+
+
+@pytest.mark.parametrize(
+    ("stage", "name"),
+    [(lambda run, laser, devations=None: 1, "devations"), (lambda run, laser, model: 1, "model")],
+    ids=["misspelt", "made later"],
+)
+def test_a_stage_that_takes_what_nothing_before_it_makes_is_a_fault_of_the_program(new_run, stage, name):
+    """And not one that a campaign does without."""
+    run_stages(new_run(), RUN, {})
+    made = {"laser": 1}
+    with pytest.raises(TypeError, match=f"the stage deviations takes {name}, which"):
+        run_stages(new_run(), {"fields": lambda run, laser: 1, "deviations": stage, "model": lambda run: 1}, made)
+    assert made == {"laser": 1}, "found before any stage is run"
 
 
 STARTED = datetime(2026, 3, 9, 6, 30, tzinfo=UTC)
