@@ -47,7 +47,7 @@ from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
 from fusion.campaign.values import matching_pipes, name_and_unit
 from fusion.common import FusionError
 from fusion.messages import naming
-from fusion.results.progress import counted, left_out_notices, listed
+from fusion.results.progress import clock_notices, counted, left_out_notices, listed
 from fusion.results.results import Notice
 from fusion.results.store import check
 from interferometry.common import DEVIATIONS
@@ -598,7 +598,7 @@ def _log_notices(source: Inputs) -> list[Notice]:
         notices.append(Notice("sensors_left_out", message, "Look at contact and cable."))
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
-            notices += left_out_notices(table, code)
+            notices += [*left_out_notices(table, code), *clock_notices(table)]
     return notices
 
 
@@ -791,7 +791,7 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     runs = [named[path] for path in tables]
     listed_of = {
         name: json.dumps([one for table in tables.values() for one in json.loads(table.attrs[name])])
-        for name in ("left_out", "held")
+        for name in ("left_out", "clock", "held")
     }
     return joined.assign_attrs(
         source=", ".join(runs),

@@ -38,6 +38,7 @@ from interferometry.io.tables import (
     parse_time,
     read_table,
     read_timed_rows,
+    where_clock_goes_back,
 )
 
 #: Warning of pandas about a line with more fields than the header.
@@ -147,7 +148,7 @@ def _laid_out(path: Path, layout: LoggedTable) -> DelimitedTable:
     """Return a table as a campaign file describes it, with the headings and times that it would have if it said everything itself."""
     rows = read_rows(path, sheet=layout.sheet, header=layout.header_rows, missing=layout.missing)
     named = layout.time or (() if layout.every_s is not None else ("time",))
-    time, reference, _ = _times(path, rows, layout, named)
+    time, reference, _ = read_times(path, rows, layout, named)
     zone = "" if reference == NO_ZONE else "Z"
     written = [f"{stamp}{zone}" for stamp in np.datetime_as_string(time, unit="us")]
     others = [str(name) for name in rows.frame.columns if name not in named]
@@ -186,17 +187,21 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
     lost = pd.Series(False, frame.index)
     if record.long is not None:
         # camonitor prints "*** Disconnected" or "*** Not connected (PV not found)" in place of a value, or of the time as well.
-        written = frame[frame.columns.intersection([*record.long.time, record.long.value])].astype(str)
+        written = frame[frame.columns.intersection([*record.long.time, record.long.value])].apply(stripped)
         lost = written.apply(lambda column: column.str.startswith("***")).any(axis=1)
         for heading in (record.long.channel, record.long.value):
             _find(path, heading, frame)
-    time, reference, left_out = _times(path, rows, record, record.time or (record.long.time if record.long else ()))
+    time, reference, left_out = read_times(path, rows, record, record.time or (record.long.time if record.long else ()))
     left_out = [*rows.left_out, *(line for line in left_out if not lost.get(line.line, False))]
     headings, held = [str(name) for name in frame.columns if name not in (record.time or ())], list[dict[str, Any]]()
     if record.long is not None:
-        of_lines = frame[record.long.channel].astype(str).str.strip()
+        of_lines = stripped(frame[record.long.channel])
         numbers = pd.Series(numbers_in(frame[record.long.value]), frame.index)
-        headings = sorted(of_lines[numbers.notna()].unique())
+        headings = sorted(of_lines[numbers.notna() & (of_lines != "")].unique())
+        left_out += [
+            RejectedLine(path.name, int(line), str(frame.at[line, record.long.value]), "is of no channel")
+            for line in frame.index[(of_lines == "") & ~np.isnat(time)]
+        ]
     columns = columns_of(path, headings, rows.units, record)
     if record.long is not None:
         stamps = pd.Series(time, frame.index)
@@ -207,6 +212,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         frame, time, held, without_number = _by_channel(path, frame, lines, lost, used, record.long)
         left_out += without_number
     keep = ~np.isnat(time)
+    goes_back = [] if record.long is not None else where_clock_goes_back(path, frame.index[keep], time[keep])
     order = np.argsort(time[keep], kind="stable")
 
     def block(role: str, unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
@@ -237,6 +243,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         attrs={
             "source": path.name,
             "left_out": json.dumps([asdict(line) for line in left_out]),
+            "clock": json.dumps([asdict(line) for line in goes_back]),
             "held": json.dumps(held),
         },
     )
@@ -339,22 +346,37 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
             index_col=False,
             on_bad_lines="warn",
             na_values=missing,
+            low_memory=False,  # in parts, a column could be numbers above and text below
         )
     if any("loss of data" in str(warning.message) for warning in caught):
         raise FusionError("the lines hold more fields than the header names; name every column")
-    # Lines are counted in the file.
-    frame.index += header.values
-    skipped = [fields for warning in caught for fields in _SKIPPED.findall(str(warning.message))]
+    skipped = {
+        int(line) - 2: (due, saw) for warning in caught for line, due, saw in _SKIPPED.findall(str(warning.message))
+    }
+    # Lines are counted in the file; a quoted field may go over several of them.
+    quoted = np.cumsum([0, *(line.count('"') for line in below)])[:-1] % 2 == 1
+    for begins in (np.full(len(below), True), ~quoted):
+        numbers = np.flatnonzero(begins)
+        blank = " \r\n" if delimiter == "\t" else None
+        held = [n for k, n in enumerate(numbers) if below[n].strip(blank) and k not in skipped]
+        if len(held) == len(frame):
+            break
+    else:
+        raise FusionError("quotation marks that open and do not close; remove them")
+    frame.index = pd.Index(np.array(held, int) + header.values)
     left_out = [
-        RejectedLine(path.name, int(line) + header.values - 2, f"{saw} fields", f"{due} were expected")
-        for line, due, saw in skipped
+        RejectedLine(path.name, int(numbers[k]) + header.values, f"{saw} fields", f"{due} were expected")
+        for k, (due, saw) in skipped.items()
     ]
     return _named(frame, fields_of(lines[header.units - 1], delimiter) if header.units else [], left_out)
 
 
 def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) -> Rows:
     """Return rows with the names of their columns, and their units, without the spaces around them."""
-    frame = frame.rename(columns=lambda name: str(name).strip())
+    names = pd.Series([str(name).strip() for name in frame.columns], dtype=object)
+    again = names.groupby(names).cumcount()
+    # A name that recurs is numbered, as pandas does before the spaces are gone.
+    frame.columns = pd.Index(names.where(again == 0, names + "." + again.astype(str)))
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
 
 
@@ -437,7 +459,21 @@ def _find(path: Path, heading: str, frame: pd.DataFrame) -> None:
         raise TableError(f'{path}: no column is named "{heading}"; the file has: {", ".join(frame.columns)}')
 
 
-def _times(
+def stripped(column: pd.Series) -> pd.Series:
+    """Return the texts of a column without the spaces around them, empty where a row has none."""
+    return column.astype(object).fillna("").astype(str).str.strip()
+
+
+def written_times(frame: pd.DataFrame, headings: Sequence[str]) -> pd.Series:
+    """Return the times as a table writes them, those of a date and a time of day joined; missing where one of the two is."""
+    if len(headings) == 1:
+        return frame[headings[0]]
+    parts = frame[list(headings)]
+    joined = pd.Series([" ".join(map(str, row)) for row in parts.itertuples(index=False)], frame.index, dtype=object)
+    return joined.where(parts.notna().all(axis=1))
+
+
+def read_times(
     path: Path, rows: Rows, record: LoggedTable, headings: Sequence[str]
 ) -> tuple[np.ndarray, str, list[RejectedLine]]:
     """Return times, NaT where a row has none, how they came to UTC in words, and the list of the rows without a time."""
@@ -446,7 +482,7 @@ def _times(
         _find(path, heading, frame)
     if record.every_s is not None:
         return _after_start(np.arange(len(frame)) * record.every_s, record, path)
-    column = frame[headings[0]] if len(headings) == 1 else frame[list(headings)].astype(str).agg(" ".join, axis=1)
+    column = written_times(frame, headings)
     seconds = numbers_in(column) if record.time_format is None else np.full(len(frame), np.nan)
     zones: dict[str, int] = {}
     if np.isfinite(seconds).sum() > 0.5 * len(frame):
@@ -472,11 +508,16 @@ def _times(
                 continue
             zones.setdefault(zone, int(column.index[at]))
         words = describe_time_zone(path, zones) if zones else ""
+    present, timed = column.notna().to_numpy(), ~np.isnat(time)
+    cells = frame[list(headings)]
     left_out = [
-        RejectedLine(path.name, int(column.index[at]), str(column.iloc[at]), "is not a time")
-        for at in np.flatnonzero(np.isnat(time))
+        RejectedLine(path.name, int(frame.index[at]), " ".join(map(str, cells.iloc[at].dropna())), "is not a time")
+        for at in np.flatnonzero(~timed)
     ]
-    raise_if_mostly_invalid(path, int((~np.isnat(time)).sum()), left_out)
+    # Rows without a time below the last one that has one are the end of a sheet, and no fault of its times.
+    below = int(np.flatnonzero(timed).max(initial=-1))
+    faulty = [line for line, at in zip(left_out, np.flatnonzero(~timed), strict=True) if present[at] or at < below]
+    raise_if_mostly_invalid(path, int(timed.sum()), faulty)
     return time, words, left_out
 
 
@@ -502,7 +543,7 @@ def _formatted_times(path: Path, column: pd.Series, record: LoggedTable) -> tupl
     except ValueError as error:
         raise TableError(f'{path}: time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
     if not set(re.findall(r"%-?([a-zA-Z])", form)) & set("dDjcxs"):
-        days = (times.diff() < pd.Timedelta(-12, "h")).cumsum()
+        days = (times.ffill().diff() < pd.Timedelta(-12, "h")).cumsum()
         elapsed = ((times - times.dt.normalize()) + pd.to_timedelta(days, unit="D")).dt.total_seconds()
         return _after_start(elapsed.to_numpy(), record, path)[0], "+0000"
     aware = times.dt.tz is not None

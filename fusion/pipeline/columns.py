@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,22 @@ import numpy as np
 import pandas as pd
 from pandas.tseries.api import guess_datetime_format
 
-from fusion.campaign.config import HeaderRows
-from fusion.campaign.logs import Rows, numbers_in, read_rows, text_lines
+from fusion.campaign.config import HeaderRows, LoggedTable
+from fusion.campaign.logs import Rows, numbers_in, read_rows, read_times, stripped, text_lines, written_times
 from fusion.campaign.values import is_unit, name_and_unit, role_of_unit, unit_name
 from fusion.common import FusionError
 from fusion.pipeline.inspect import column_unit, is_time
 from fusion.results.progress import listed
-from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError
+from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, RejectedLine
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
-from interferometry.io.tables import DateOrder, delimiter_of_values, fields_of, parse_time, read_heading
+from interferometry.io.tables import (
+    DateOrder,
+    delimiter_of_values,
+    fields_of,
+    parse_time,
+    read_heading,
+    where_clock_goes_back,
+)
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
@@ -119,13 +127,17 @@ class Column:
 
 @dataclass(frozen=True)
 class TableProposal:
-    """A logged table: keys of ``[record]`` that say how it is laid out, and its columns; `asked` are keys that the file does not tell."""
+    """A logged table: keys of ``[record]`` that say how it is laid out, and its columns; `asked` are keys that the file does not tell.
+
+    ``attrs`` lists the lines that are left out, and those at which the clock goes back, as the attributes of the record read from it.
+    """
 
     path: Path
     keys: dict[str, Any]
     columns: tuple[Column, ...]
     rows: int
     asked: dict[str, str] = field(default_factory=dict)
+    attrs: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, role: str) -> tuple[Column, ...]:
         """Return the columns of a role."""
@@ -224,7 +236,7 @@ def propose_table(path: Path) -> TableProposal:
     units = dict[str, str]()
     keys |= {} if "long" in keys else _long(rows, asked, units)
     if "long" in keys:
-        channels = frame.groupby(frame[keys["long"]["channel"]].astype(str).str.strip())
+        channels = frame.groupby(stripped(frame[keys["long"]["channel"]]).replace("", None))
         groups = {str(name): values[keys["long"]["value"]] for name, values in channels}
         columns, marks = _columns(groups, units)
         if all(column.remark == _BY_VALUES for column in columns if column.role == "temperature"):
@@ -240,7 +252,27 @@ def propose_table(path: Path) -> TableProposal:
             replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist") if one.remark == _COUNTS else one
             for one in columns
         ]
-    return TableProposal(path, keys | ({"missing": marks} if marks else {}), tuple(columns), len(frame), asked)
+    lines = _lines(path, rows, keys)
+    return TableProposal(
+        path,
+        keys | ({"missing": marks} if marks else {}),
+        tuple(columns),
+        len(frame) + len(rows.left_out) - len(lines.get("left_out", ())),
+        asked,
+        {name: json.dumps([asdict(line) for line in of_name]) for name, of_name in lines.items()},
+    )
+
+
+def _lines(path: Path, rows: Rows, keys: Mapping[str, Any]) -> dict[str, list[RejectedLine]]:
+    """Return the lines that a record leaves out, and those at which its clock goes back, by the attribute that holds them."""
+    headings = keys["long"]["time"] if "long" in keys else keys.get("time")
+    if headings is None:
+        return {"left_out": rows.left_out}
+    layout = LoggedTable.model_validate({key: value for key, value in keys.items() if key not in ("long", "time")})
+    time, _, without = read_times(path, rows, layout, [headings] if isinstance(headings, str) else headings)
+    keep = ~np.isnat(time)
+    back = [] if "long" in keys else where_clock_goes_back(path, rows.frame.index[keep], time[keep])
+    return {"left_out": [*rows.left_out, *without], "clock": back}
 
 
 def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
@@ -347,14 +379,15 @@ def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
 def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
     """Return the layout of a table with a line for every change: a time, a name that recurs, a number; add the units of its channels."""
     frame, keys, open_ = rows.frame, dict[str, Any](), dict[str, str]()
-    written = {name: frame[name].astype(str).str.strip() for name in frame if not pd.api.types.is_numeric_dtype(frame[name])}  # fmt: skip
+    written = {name: stripped(frame[name]) for name in frame if not pd.api.types.is_numeric_dtype(frame[name])}
     if not 3 <= len(frame.columns) <= _WIDEST_LONG or not written:
         return {}
     times = _times(rows, keys, open_)
     written = {name: texts for name, texts in written.items() if name not in times}
     numbers = {name for name in written if np.isfinite(numbers_in(frame[name])).mean() > 0.5}
-    of_units = [name for name in written if all(map(is_unit, written[name].unique()))]
-    names = {name: texts.nunique() for name, texts in written.items() if name not in (*numbers, *of_units)}
+    distinct = {name: set(texts) - {""} for name, texts in written.items()}
+    of_units = [name for name, texts in distinct.items() if texts and all(map(is_unit, texts))]
+    names = {name: len(texts) for name, texts in distinct.items() if name not in (*numbers, *of_units)}
     channel = max(names, key=names.__getitem__, default="")
     values = [name for name in frame if name not in (*times, *names, *of_units) and frame[name].nunique() > 1]
     values = [name for name in values if not _STATE.search(str(name))] or values
@@ -372,9 +405,13 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
 def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
     """Return the headings of the times; write into `keys` how they are to be read, and into `asked` what nothing tells."""
     frame = rows.frame
-    texts = [name for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name])]
+    samples = {name: _sample(frame[name]) for name in frame.columns}
+    # A line of text among numbers, as a footer or a second header is, leaves a column one of numbers.
+    texts = [
+        name for name in frame.columns if not _mostly(np.isfinite(numbers_in(pd.Series(samples[name], dtype=object))))
+    ]
     named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
-    days = [name for name in named if name in texts and _OF_DAY.fullmatch(str(frame[name].iloc[0]).strip())]
+    days = [name for name in named if name in texts and _mostly([_OF_DAY.fullmatch(text) for text in samples[name]])]
     named = [*(name for name in named if name not in days), *days]
     # A first column without a name that grows, and does not count rows, is the time.
     for name in [*named, *texts, *(["1"] if frame.columns[0] == "1" and not _counts(frame["1"]) else [])]:
@@ -386,10 +423,10 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
             if per:
                 keys["time_unit"] = per[1]
             elif {unit_name(rows.units.get(name, "")), column_unit(name)}.isdisjoint(_TIME_UNITS):
-                _place_times(frame[name].dropna().to_numpy(float), keys, asked)
+                _place_times(_finite(frame[name]), keys, asked)
             return (name,)
         for columns in ([name, *[two for two in days if two != name][:1]], [name]):
-            form = _clock(frame[columns].astype(str).agg(" ".join, axis=1))
+            form = _clock(_sample(written_times(frame, columns)))
             if form is not None:
                 asked |= {"time_format": form.pop("or")} if "or" in form else {}
                 keys |= {"time": columns if len(columns) > 1 else name} | form
@@ -403,13 +440,30 @@ def _is_time_name(heading: str, unit: str) -> bool:
     return is_time(heading) or unit_name(unit) in _TIME_UNITS or _TIME.match(heading.strip()) is not None
 
 
+def _sample(column: pd.Series) -> list[str]:
+    """Return some fifty texts of a column, from all of its rows that have one."""
+    texts = stripped(column.dropna())
+    texts = texts[texts != ""]
+    return texts.iloc[:: max(1, len(texts) // 50)].tolist()
+
+
+def _mostly(each: Sequence[object]) -> bool:
+    """Whether something holds for more than half, as a reader asks of the lines of a file."""
+    return sum(map(bool, each)) > len(each) / 2
+
+
+def _finite(column: pd.Series) -> np.ndarray:
+    numbers = numbers_in(column)
+    return numbers[np.isfinite(numbers)]
+
+
 def _grows(column: pd.Series) -> bool:
-    numbers = column.dropna().to_numpy(float)
+    numbers = _finite(column)
     return numbers.size > 1 and bool(numbers[-1] > numbers[0]) and float((np.diff(numbers) >= 0).mean()) > 0.98
 
 
 def _counts(column: pd.Series) -> bool:
-    return not pd.api.types.is_numeric_dtype(column) or bool((np.diff(column.dropna().to_numpy(float)) == 1.0).all())
+    return bool((np.diff(_finite(column)) == 1.0).all())
 
 
 def _place_times(numbers: np.ndarray, keys: dict[str, Any], asked: dict[str, str]) -> None:
@@ -425,30 +479,46 @@ def _place_times(numbers: np.ndarray, keys: dict[str, Any], asked: dict[str, str
     asked["time_unit"] = f"{_plain(float(numbers[0]))} to {_plain(float(numbers[-1]))}"
 
 
-def _clock(column: pd.Series) -> dict[str, str] | None:
+def _clock(texts: Sequence[str]) -> dict[str, str] | None:
     """Return the key that says how times are written, and another way that fits as well; none where they are read without it; None where
-    the texts are no times.
+    most of the texts are no times.
     """
-    texts = [text.strip() for text in column.iloc[:: max(1, len(column) // 50)]]
-    try:
+    with suppress(LaserFormatError):
         order = DateOrder.of(Path(), enumerate(texts))
-        for text in texts:
-            parse_time(text, order)
-        return {}
-    except (BadReading, LaserFormatError):
-        pass
+        if _mostly([_is_read(text, order) for text in texts]):
+            return {}
+    likely = [text for text in texts if re.search(r"\d[:_]?\d\d", text)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the day stands first
-        guessed = guess_datetime_format(texts[0])
-    spans = {}
-    for form in (guessed, *_FORMATS) if re.search(r"\d[:_]?\d\d", texts[0]) else ():
+        guessed = dict.fromkeys(form for form in map(guess_datetime_format, likely) if form)
+    read: dict[str, list[datetime]] = {}
+    for form in dict.fromkeys((*guessed, *_FORMATS)):
         # Day and month are told apart by the shorter test.
-        for written in (form, _SWAPPED.sub(r"%\3\2%\1", form)) if form else ():
-            with suppress(ValueError):
-                times = [datetime.strptime(text, written) for text in texts]
-                spans[written] = max(times) - min(times)
+        for written in (form, _SWAPPED.sub(r"%\3\2%\1", form)):
+            times = [time for text in likely if (time := _formatted(text, written)) is not None]
+            if len(times) > len(texts) / 2:
+                read[written] = times
+    most = max(map(len, read.values()), default=0)
+    spans = {form: max(times) - min(times) for form, times in read.items() if len(times) == most}
     shortest = [form for form in spans if spans[form] == min(spans.values())]
     return dict(zip(("time_format", "or"), shortest, strict=False)) if spans else None
+
+
+def _is_read(text: str, order: DateOrder) -> bool:
+    """Whether a text is a time that needs no format."""
+    try:
+        parse_time(text, order)
+    except BadReading:
+        return False
+    return True
+
+
+def _formatted(text: str, form: str) -> datetime | None:
+    """Return the time that a text is in a format, None where it is none."""
+    try:
+        return datetime.strptime(text, form)
+    except ValueError:
+        return None
 
 
 # What a column holds, and its unit.

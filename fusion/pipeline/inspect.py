@@ -20,7 +20,7 @@ from fusion.campaign.values import name_and_unit
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
-from fusion.results.progress import counted, left_out_notices, listed
+from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
 from thermography.common import ZERO_CELSIUS_K, ThermographyError
@@ -318,7 +318,7 @@ def _describe_record(found: Recognised) -> list[str]:
     time = (
         f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
     )
-    return [f"record, {counted(table.rows, 'row')}, {time}", *described]
+    return [f"record, {counted(table.rows, 'row')}, {time}", *described, *_warnings(table)]
 
 
 def _describe_fiducials(found: Recognised) -> list[str]:
@@ -400,8 +400,9 @@ def _zone(table: xr.Dataset) -> str:
     return f", {reference}" if reference else ""
 
 
-def _warnings(table: xr.Dataset) -> list[str]:
-    return [f"warning: {notice.message} {notice.remedy}" for notice in left_out_notices(table, "left_out")]
+def _warnings(table: Read) -> list[str]:
+    notices = [*left_out_notices(table, "left_out"), *clock_notices(table)]
+    return [f"warning: {notice.message} {notice.remedy}" for notice in notices]
 
 
 # What a folder holds for a campaign: frames by pattern, readings, logs, the plan, and what is not understood.

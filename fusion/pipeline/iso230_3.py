@@ -72,7 +72,9 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     remarks += [] if stated.kind else ["The kind of test is not stated; write kind under [thermal_test]."]
     channels = [str(one) for one in table["channel"].values]
     raw = table["displacement"].values
-    per_piece = max(1.0, AVERAGED_S / float(np.median(np.diff(elapsed)))) if elapsed.size > 1 else 1.0
+    # A clock that was set back gives readings of one time.
+    between = np.diff(np.unique(elapsed))
+    per_piece = max(1.0, AVERAGED_S / float(np.median(between))) if between.size else 1.0
     seconds, displacement = with_start(*average(elapsed, raw))
     temperature = with_start(*average(elapsed, table["temperature"].values))[1]
     share = (

@@ -25,7 +25,7 @@ from fusion.campaign.config import Campaign
 from fusion.campaign.inputs import DATED, pipe_notices, read_record
 from fusion.campaign.time_zones import lacks_zone
 from fusion.report.numbers import duration, number
-from fusion.results.progress import Report, counted, left_out_notices, listed
+from fusion.results.progress import Report, clock_notices, counted, left_out_notices, listed
 from fusion.results.results import Notice, Outcome
 
 
@@ -51,6 +51,7 @@ def read_source(campaign: Campaign) -> RecordSource:
         *_zone_notices(table),
         *_held_notices(table),
         *left_out_notices(table, "record_rows_left_out"),
+        *clock_notices(table),
         *_unread_notices(table),
     ]
     return RecordSource(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from threading import Event, Thread
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -22,8 +22,6 @@ from rich.progress import (
 )
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from fusion.results.results import Notice
 
 
@@ -33,22 +31,51 @@ if TYPE_CHECKING:
 _NAMED = 5
 
 
-def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
+class Read(Protocol):
+    """What was read of files, with the lists of their lines as JSON in its attributes."""
+
+    @property
+    def attrs(self) -> Mapping[Any, Any]:
+        """Its attributes by name."""
+        ...
+
+
+def left_out_notices(dataset: Read, code: str) -> list[Notice]:
     """Return one notice for each file that counts its rejected lines and lists the first of them."""
     from fusion.results.results import Notice  # loads numpy: progress is shown before
 
-    lines = json.loads(dataset.attrs.get("left_out", "[]"))
-    notices = []
-    for path in dict.fromkeys(item["path"] for item in lines):
-        named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines if item["path"] == path]
-        notices.append(
-            Notice(
-                code,
-                f"{counted(len(named), 'line')} of {path} left out: {listed(named)}.",
-                f"Correct these lines in {path} and run again; the estimates allow for the gaps.",
-            )
+    return [
+        Notice(
+            code,
+            f"{counted(len(named), 'line')} of {path} left out: {listed(named)}.",
+            f"Correct these lines in {path} and run again; the estimates allow for the gaps.",
         )
-    return notices
+        for path, named in _lines_by_file(dataset, "left_out")
+    ]
+
+
+def clock_notices(dataset: Read) -> list[Notice]:
+    """Return one notice for each file whose clock goes back, with the first lines at which it does."""
+    from fusion.results.results import Notice  # as above
+
+    return [
+        Notice(
+            "clock_goes_back",
+            f"The clock of {path} goes back {counted(len(named), 'time')}: {listed(named)}. The rows are sorted by their times.",
+            f"Correct the times of {path}, or give what was logged before and after in files of its own.",
+        )
+        for path, named in _lines_by_file(dataset, "clock")
+    ]
+
+
+def _lines_by_file(dataset: Read, name: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the name of every file and its lines in words, from the list of lines that an attribute holds."""
+    lines = json.loads(dataset.attrs.get(name, "[]"))
+    for path in dict.fromkeys(item["path"] for item in lines):
+        yield (
+            path,
+            [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines if item["path"] == path],
+        )
 
 
 def counted(number: int, noun: str) -> str:

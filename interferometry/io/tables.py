@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import codecs
 import csv
+import json
 import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from interferometry.io.faults import BadReading, LaserFormatError, LeftOut, Numerals, raise_if_mostly_invalid
+from interferometry.io.faults import (
+    BadReading,
+    LaserFormatError,
+    LeftOut,
+    Numerals,
+    RejectedLine,
+    raise_if_mostly_invalid,
+)
 from interferometry.io.spreadsheets import is_workbook, read_sheets
 
 # Dates and times of a whole file: ISO 8601 and the usual other orders, refused where the file does not settle the
@@ -564,6 +573,29 @@ def fields_of(line: str, delimiter: str) -> list[str]:
     return next(csv.reader([line.strip("\r\n")], delimiter=delimiter), []) if delimiter else line.split()
 
 
+def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.datetime64]) -> list[RejectedLine]:
+    """Return the lines whose time is before that of the line above, in a table with its newest line first after it."""
+    later = np.sign(np.diff(times).astype(np.int64))
+    against = np.flatnonzero(later * (1 if later.sum() >= 0 else -1) < 0)
+    word = "before" if later.sum() >= 0 else "after"
+    return [
+        RejectedLine(
+            path.name,
+            int(lines[at + 1]),
+            _written(times[at + 1]),
+            f"is {word} {_written(times[at])} of line {lines[at]}",
+        )
+        for at in against
+    ]
+
+
+def _written(time: np.datetime64) -> str:
+    """Return a time as a message writes it, in seconds where it counts from no date."""
+    if time < np.datetime64("1980"):
+        return f"{(time - np.datetime64('1970')) / np.timedelta64(1, 's'):.10g} s"
+    return str(time).removesuffix(".000000000").replace("T", " ")
+
+
 def read_timed_rows(
     table: DelimitedTable,
     variables: Mapping[str, Mapping[str, str]],
@@ -573,6 +605,7 @@ def read_timed_rows(
 ) -> xr.Dataset:
     """Read the rows of a table that has a column of times into a Dataset."""
     rows: dict[np.datetime64, list[float]] = {}
+    kept: dict[np.datetime64, int] = {}
     left_out = LeftOut(table.path)
     zones: dict[str, int] = {}
     order = DateOrder.of(table.path, [(line, fields[time]) for line, fields in table.records() if fields is not None])
@@ -584,14 +617,21 @@ def read_timed_rows(
             if instant in rows:
                 raise BadReading(fields[time], "occurs on an earlier line too, which is kept")
             rows[instant] = parse(fields)
+            kept[instant] = line
             zones.setdefault(zone, line)
     raise_if_mostly_invalid(table.path, len(rows), left_out.lines)
+    instants = np.array(list(rows), dtype="datetime64[ns]")
+    goes_back = where_clock_goes_back(table.path, [kept[instant] for instant in rows], instants)
     times = sorted(rows)
     values = np.array([rows[instant] for instant in times])
     dataset = xr.Dataset(
         {name: (("time",), values[:, column], dict(attrs)) for column, (name, attrs) in enumerate(variables.items())},
         coords={"time": np.array(times, dtype="datetime64[ns]")},
-        attrs={"source": table.path.name, "left_out": left_out.as_json()},
+        attrs={
+            "source": table.path.name,
+            "left_out": left_out.as_json(),
+            "clock": json.dumps([asdict(line) for line in goes_back]),
+        },
     )
     dataset["time"].attrs["reference"] = describe_time_zone(table.path, zones)
     return dataset

@@ -159,9 +159,10 @@ class Excursion:
 
 def lay_grid(seconds: Array, temperature: Array, drivers: Array | None) -> list[Grid] | None:
     """Lay a fine and a coarse grid, the fine one only where it is finer."""
-    step = float(np.median(np.diff(seconds)))
-    if step <= 0.0:
+    between = np.diff(np.unique(seconds))
+    if not between.size:
         return None
+    step = float(np.median(between))
     loads = np.empty((seconds.size, 0)) if drivers is None else np.nan_to_num(drivers)
     span = np.ptp(loads, axis=0)
     loads = (loads - loads.min(axis=0))[:, span > 0.0] / span[span > 0.0]

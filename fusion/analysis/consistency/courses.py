@@ -27,6 +27,8 @@ from interferometry.drift.kalman import DriftModelError
 
 #: Shifts of a log that are tried, s: three hours, as far as time zones of one country lie apart, in steps of two minutes.
 _LOG_SHIFTS_S = np.arange(-10_800.0, 10_801.0, 120.0)
+#: Minutes of a month: a log that is longer has an even grid of no more times than this, or than its rows.
+_MONTH_MIN = 43_200
 #: Delays of a log against the field that are no clock's, s: a sensor follows late; heat takes minutes from a source to the surface, and a
 #: source of another time constant than those tried looks early or late.
 _SENSOR_EARLY_S, _LOG_DELAY_S = 300.0, 900.0
@@ -211,10 +213,15 @@ def _loads(log: xr.Dataset | None, *, constant: bool = False) -> dict[str, Array
     }
 
 
+def _even(at: Array) -> Array:
+    """Even times from the first row of a log to its last, s: a minute apart, or as many as the log has rows or a month has minutes."""
+    return np.arange(at[0], at[-1] + 1.0, max(60.0, float(at[-1] - at[0]) / max(at.size, _MONTH_MIN)))
+
+
 def _between_rows(at: Array, load: Array) -> float:
     """Share of the variance of a quick source's response that differs between a load held from row to row and one interpolated."""
     known = np.isfinite(load)
-    grid = np.arange(at[0], at[-1] + 1.0, 60.0)
+    grid = _even(at)
     held = load[known][np.searchsorted(at[known], grid, side="right").clip(1) - 1]
     responses = respond(
         np.column_stack([np.interp(grid, at[known], load[known]), held]), grid, time_constant_s=_SOURCE_S[0]
@@ -232,7 +239,7 @@ def check_load_course(
     if field is None or log is None or not loads:
         return []
     at, rate = field.since_start(log["time"].values), _Rate.of(field)
-    grid = np.arange(at[0], at[-1] + 1.0, 60.0)
+    grid = _even(at)
     courses = {name: np.interp(grid, at[np.isfinite(load)], load[np.isfinite(load)]) for name, load in loads.items()}
     lefts = {name: _load_left(rate, grid, course) for name, course in courses.items()}
     name = min(lefts, key=lambda one: lefts[one])
@@ -407,7 +414,7 @@ class _Rate:
 
     def columns(self, at: Array, load: Array, shifts_s: NDArray[np.floating] = _LOG_SHIFTS_S) -> Array:
         """Unit responses to a load, (shifts, shapes, n), whitened and freed of the trend; zero where a load does not change."""
-        grid = np.arange(at[0], at[-1] + 1.0, 60.0)
+        grid = _even(at)
         finite = np.isfinite(load)
         steps = np.interp(grid, at[finite], load[finite])[:, None]
         shapes = [

@@ -381,8 +381,8 @@ def _periods_min(seconds: Array) -> Array:
     """Return the periods that are tested, min, longest first; of a test of some minutes the longest alone."""
     span = float(seconds[-1] - seconds[0]) / 60.0
     lowest, step = _FEWEST_OSCILLATIONS / span, 0.5 / span
-    highest = max(1.0 / _SHORTEST_MIN, lowest + 0.5 * step)
-    return np.asarray(1.0 / np.arange(lowest, highest, step, dtype=np.float64)[:_MOST_PERIODS])
+    highest = min(max(1.0 / _SHORTEST_MIN, lowest + 0.5 * step), lowest + (_MOST_PERIODS - 0.5) * step)
+    return np.asarray(1.0 / np.arange(lowest, highest, step, dtype=np.float64))
 
 
 def _waves(seconds: Array, periods_min: Array) -> list[NDArray[np.float32]]:

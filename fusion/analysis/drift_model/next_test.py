@@ -25,6 +25,8 @@ from fusion.results.loop import RecordLoop
 #: Lengths and mean times at one level that are tried.
 _HOURS = (4.0, 8.0, 12.0, 24.0)
 _HOLDS_MIN = (15.0, 30.0, 60.0, 120.0)
+#: Most rows of a proposed test, also after a record of milliseconds.
+_MOST_ROWS = 10_000
 #: The duty under which a prediction is judged: hours of it, and its mean time at one level.
 _JUDGED_H, _JUDGED_HOLD_MIN = 24.0, 60.0
 
@@ -70,13 +72,14 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
     rng = np.random.default_rng(seed)
 
     def under(hours: float, hold_min: float) -> tuple[Record, Array]:
-        seconds = np.asarray(record.block_s * np.arange(round(3600.0 * hours / record.block_s)), float)
+        step_s = max(record.block_s, 3600.0 * hours / _MOST_ROWS)
+        seconds = np.asarray(step_s * np.arange(round(3600.0 * hours / step_s)), float)
         law = DutyLaw(60.0 * hold_min, 15.0 * hold_min)
         # Rest, half and full: linear and quadratic heat differ.
         shares = {name: np.mean([law.course(seconds, rng) for _ in range(2)], axis=0) for name in record.drivers}
         drivers = {name: {power: share**power for power in EXPONENTS} for name, share in shares.items()}
         still = np.zeros((seconds.size, len(record.sensors)))
-        test = replace(record, seconds=seconds, drivers=drivers, temperature=still, first=(0,), runs=())
+        test = replace(record, seconds=seconds, block_s=step_s, drivers=drivers, temperature=still, first=(0,), runs=())
         test = replace(test, temperature=evaluate_columns(test, loads) @ per_load)
         return test, evaluate_columns(test, columns)
 

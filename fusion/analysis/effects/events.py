@@ -122,11 +122,13 @@ def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | No
 
 
 def periods_min(readings: Readings) -> Array:
-    """Periods that are tried: evenly spaced in frequency at half the resolution of the recording, from 3 min to a third of it."""
+    """Periods that are tried: evenly spaced in frequency at half the resolution of the recording, from 3 min to a third of it.
+
+    So many lines as there are readings hold all that these can tell, however long the pauses between them.
+    """
     span = _span_min(readings)
-    return np.asarray(
-        1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64))
-    )
+    highest = min(1.0 / _SHORTEST_MIN, (2.75 + 0.5 * readings.seconds.size) / span)
+    return np.asarray(1.0 / off_the_cycle(readings, np.arange(3.0 / span, highest, 0.5 / span, dtype=np.float64)))
 
 
 def _span_min(readings: Readings) -> float:

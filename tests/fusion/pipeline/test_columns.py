@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import openpyxl
 import pandas as pd
 import pytest
 import xarray as xr
@@ -17,6 +18,8 @@ from fusion.campaign.logs import TableError
 from fusion.pipeline.check import check_campaign
 from fusion.pipeline.columns import ColumnsError, propose_table
 from fusion.pipeline.draft import Asker, DraftError, write_campaign
+from fusion.results.progress import clock_notices
+from interferometry.io.faults import LaserFormatError
 
 #: Minutes, spindle, bearing [degC], nose [mm], speed [1/min]; two hours, a row every half minute.
 MINUTES = np.arange(240) / 2
@@ -329,3 +332,91 @@ def test_inches_mils_and_fahrenheit_are_read_from_headings_and_an_inlet_is_no_in
     assert record["displacement"].sel(channel="disp_Z_in")[-1] == pytest.approx(1e-5 * last * 25.4e3, abs=3e-3)
     assert record["displacement"].sel(channel="Y")[-1] == pytest.approx(1e-2 * last * 25.4, abs=3e-3)
     assert (record["time"].values[[0, -1]] == stamps.values[[0, -1]]).all()
+
+
+@pytest.mark.parametrize("layout", ["date and time", "klipper", "minutes without a unit", "times of day", "workbook"])
+def test_lines_without_a_time_are_left_out_and_named_wherever_they_stand(
+    tmp_path: Path, by_hand: xr.Dataset, layout: str
+) -> None:
+    """An empty time, a second header and a remark in the middle; empty rows and a footer at the end, as spreadsheets export them."""
+    of_dates = layout == "workbook"
+    text = "time,T1,T2,Z\n" + rows("{time:%Y-%m-%d %H:%M:%S},{t1},{t2},{z}") if of_dates else LAYOUTS[layout]
+    mark = ";" if layout == "times of day" else ","
+    head, *lines = text.splitlines()
+    if layout == "klipper":
+        before, head, *lines = text.splitlines()
+        text = text.removeprefix(f"{before}\n")
+    width = head.count(mark)
+    sample = lines[120].split(mark)
+    times = {"date and time": (0, 1), "klipper": (1,)}.get(layout, (0,))
+    empty = mark.join("" if k in times else value for k, value in enumerate(sample))
+    middle = [empty, head, f"Logger restarted{mark * width}"]
+    end = [*3 * [mark * width], f"Mean{mark * width}", "End of file"]
+    content = [head, *lines[:100], *middle, *lines[100:], *end]
+    expected = [102, 103, 104, *range(245, 250)]
+    if of_dates:
+        sheet = openpyxl.Workbook()
+        for line in content:
+            # What a spreadsheet calls empty may hold a space.
+            sheet.active.append(
+                [float(one) if one[:1].isdigit() and "-" not in one else one or " " for one in line.split(mark)]
+            )
+        sheet.save(tmp_path / "log.xlsx")
+        content_bytes = (tmp_path / "log.xlsx").read_bytes()
+    else:
+        content_bytes = "\n".join(content).encode("cp1252")
+    data = drafted(tmp_path / "folder", content_bytes, "log.txt", {"Unit of the times": "min"})
+    np.testing.assert_allclose(data["temperature"].values, by_hand["temperature"].values, atol=1e-9)
+    np.testing.assert_array_equal(np.diff(data["time"].values), np.diff(by_hand["time"].values))
+    assert [one["line"] for one in json.loads(data.attrs["left_out"])] == expected
+    proposed = propose_table(tmp_path / "folder" / "log.txt")
+    assert proposed.attrs["left_out"] == data.attrs["left_out"]
+    assert proposed.rows == 240
+
+
+def test_rows_without_a_time_below_the_last_one_refuse_no_table(tmp_path: Path) -> None:
+    """Two tables side by side, one of them three times as long."""
+    path = tmp_path / "log.csv"
+    path.write_text("time,T1,Z,other\n" + rows("{time:%Y-%m-%d %H:%M:%S},{t1},{z},1") + 720 * ",,,1\n")
+    proposed = propose_table(path)
+    assert (proposed.rows, len(json.loads(proposed.attrs["left_out"]))) == (240, 720)
+    # Above the last time they are a fault of the column of times.
+    path.write_text("time,T1,Z,other\n" + 720 * ",,,1\n" + rows("{time:%Y-%m-%d %H:%M:%S},{t1},{z},1"))
+    with pytest.raises(LaserFormatError, match="720 of 960 lines cannot be used"):
+        propose_table(path)
+
+
+@pytest.mark.parametrize(
+    ("back", "lines"),
+    [
+        ({}, []),
+        ({120: 0}, [122]),  # restarted: its second half has the times of the first
+        ({120: 116, 200: 150}, [122, 202]),  # set back twice
+        ("descending", []),
+        ("2000", [122]),
+    ],
+)
+def test_a_clock_that_goes_back_is_named_with_line_and_time(tmp_path: Path, back: object, lines: list[int]) -> None:
+    place = np.arange(240)
+    stamps = STAMPS.copy()
+    if isinstance(back, dict):
+        for at, to in back.items():
+            place[at:] = to + np.arange(240 - at)
+        stamps = STAMPS[place]
+    elif back == "descending":
+        stamps = STAMPS[::-1]
+    else:
+        stamps[120:] += np.datetime64("2000-01-01", "s") - STAMPS[0].astype("M8[s]")
+    written = "".join(
+        f"{str(at).replace('T', ' ')},{t1},{z}\n" for at, t1, z in zip(stamps, SPINDLE, NOSE, strict=True)
+    )
+    (tmp_path / "log.csv").write_text(f"time,T1 [degC],Z [mm]\n{written}")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    data = read_record(load_campaign(path))
+    named = json.loads(data.attrs["clock"])
+    assert [one["line"] for one in named] == lines
+    assert data.sizes["time"] == 240
+    assert (np.diff(data["time"].values).astype(int) >= 0).all()
+    assert propose_table(tmp_path / "log.csv").attrs["clock"] == data.attrs["clock"]
+    assert [notice.code for notice in clock_notices(data)] == ["clock_goes_back"] * bool(lines)
+    assert all(str(stamps[one["line"] - 2]).replace("T", " ") == one["value"] for one in named)

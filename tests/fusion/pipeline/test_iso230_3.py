@@ -77,6 +77,18 @@ def test_every_run_of_a_record_is_a_test():
     assert tests[0].distortions[0].last_hour.value is None, "the run is shorter than an hour"
 
 
+def test_a_clock_that_restarts_leaves_the_noise_of_readings_a_minute_apart():
+    """Two readings of every time: the mean of a minute has the noise that it has without the restart."""
+    once, twice = table(), table()
+    time = once["time"].values
+    twice = twice.assign_coords(time=np.repeat(time[: SAMPLES // 2], 2))
+    noise = [
+        next(one.u for one in evaluate_record_test(each, ThermalTestTable())[0].contributions if one.source == "noise")
+        for each in (once, twice)
+    ]
+    assert noise[0] == noise[1]
+
+
 def test_a_tilt_of_a_displacement_that_is_not_there_is_refused():
     stated = ThermalTestTable.model_validate({"tilts": {"A": {"channels": ["ch1", "Y2"], "distance": "100 mm"}}})
     with pytest.raises(CampaignError, match=r"names Y2; the displacements of the record are ch1, ch2"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.analysis.consistency import courses
 from fusion.analysis.consistency.checks import Severity, judge
 from fusion.analysis.consistency.clocks import QUARTERS, Recording, check_clocks, without_consequences
 from fusion.analysis.consistency.courses import (
@@ -240,6 +241,13 @@ def test_a_load_that_drives_the_table_a_staircase_and_a_constant_one_are_loads()
         assert len(checks) == 3 and all(check.passed for check in checks)
     constant = xr.Dataset({"duty": test.drivers["duty"].copy(data=np.ones(size))})
     assert check_load_kind(constant, file="drivers.csv") == check_load_course(field, None, file="drivers.csv") == []
+
+
+def test_an_even_grid_has_a_time_for_each_minute_of_a_log_but_no_more_than_a_month_has() -> None:
+    np.testing.assert_array_equal(courses._even(np.array([-30.0, 600.0])), np.arange(-30.0, 601.0, 60.0))
+    decades = courses._even(np.array([0.0, 7.8e8]))
+    assert decades.size == 30 * 24 * 60 + 1
+    assert decades[-1] == pytest.approx(7.8e8)
 
 
 @pytest.mark.parametrize(("before", "after"), [(0.01, 0.9), (1.0, 57.0), (1.0, 100.0)])

@@ -266,6 +266,8 @@ def test_periods_reach_from_half_the_test_to_three_minutes_in_halves_of_the_reso
     np.testing.assert_allclose(60.0 / periods, np.arange(2.0, 20.0, 0.5))
     np.testing.assert_allclose(module._periods_min(np.array([0.0, 240.0])), [2.0])
     assert module._periods_min(np.array([0.0, 1e6])).size == 300
+    # A clock that falls back by centuries: a grid cut afterwards would take 20 GB.
+    assert module._periods_min(np.array([0.0, 5e11])).size == 300
 
 
 def test_memory_shift_and_power_of_series_that_are_known():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,16 @@ def test_at_most_three_hundred_periods_are_tried_the_longest_first():
     candidates = list(PERIODIC_DISTURBANCE.candidates(readings, {}, None))
     assert len(candidates) == 600
     assert candidates[0].parameters["period_min"] == pytest.approx(span_min(readings) / 3.0)
+
+
+def test_no_more_periods_are_tried_than_there_are_readings():
+    """A clock that falls back to the year 2000 leaves a pause of decades, in which nothing was read."""
+    readings = campaign(cycles=10)
+    late = readings.seconds >= np.median(readings.seconds)
+    apart = replace(readings, seconds=readings.seconds + 7.8e8 * late)
+    periods = periods_min(apart)
+    assert 0 < periods.size <= readings.seconds.size
+    assert periods[0] == pytest.approx(span_min(apart) / 3.0)
 
 
 def test_a_closer_look_stays_within_half_a_line_and_within_the_search():
