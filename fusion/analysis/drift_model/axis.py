@@ -8,7 +8,7 @@ no held-out error any more.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
@@ -70,6 +70,7 @@ from fusion.analysis.drift_model.search import (
     Reason,
     Round,
     Score,
+    Step,
     Unseen,
     answers,
     blur,
@@ -310,22 +311,19 @@ def close_loop(
     left = examine_remainder(state.model, seed, set_aside)
     wrong = inconsistent_patterns(state.model, state.added, effects)
     steps = report_steps(state, wrong, problem.ask_hold_out(before, state))
-    # Effects that are contradicted must not move the coefficients of the declared ones.
-    contradicted = [place for place, step in enumerate(steps) if not step.keeps_name]
-    sure = fit_model(readings, state.kept(contradicted)) if contradicted else state.model
-    away = left_out_of_forecast(problem, before, contradicted)
+    away = left_out_of_forecast(problem, before, contradicted_places(steps))
     forecast = before.kept(away)
     final, plain = problem.hold_out_errors(forecast), plain_errors(readings, used)
     held = {name: missed[~used] for name, missed in plain.items()}
     errors = {"declared": problem.hold_out_errors(terms), "final": final, **held}
     result = LoopResult(
         declared=list(declared),
-        declared_coefficients=declared_coefficients(sure, len(terms), moved_by_rivals(problem, state, steps, sure)),
+        declared_coefficients=coefficients_beside(problem, state, steps),
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
         rmse_declared_um=state.errors_um[0],
         rmse_final_um=rmse(final),
-        left_out_of_forecast=tuple(steps[place].effect for place in sorted(away)),
+        away=frozenset(away),
         hold_out={
             name: error_interval(missed, readings.cycle[~used], np.random.default_rng(seed))
             for name, missed in errors.items()
@@ -627,25 +625,24 @@ def on_corrected_fields(
 ) -> LoopResult:
     """Fit the model again on fields from which the camera's errors have been taken out."""
     effects = library() if effects is None else effects
-    kept = [term for term in result.after.terms if term.effect not in errors]
-    terms = [recompute_term(term, readings, result.after.coefficients(), effects) for term in kept]
+    found, coefficients = result.state, result.after.coefficients()
+    corrected = [place for place, step in enumerate(found.steps) if step.effect in errors]
+    kept = [place for place in range(len(found.steps)) if place not in corrected]
+
+    def again(term: Term) -> Term:
+        return recompute_term(term, readings, coefficients, effects)
+
     used, _ = hold_out(readings)
     problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
-    model = fit_model(readings, terms)
-    late = {
-        id(term)
-        for term, step in zip(result.state.added, result.state.steps, strict=True)
-        if step.is_from_second_search
-    }
-    decided = [term for term, old in zip(terms, kept, strict=True) if id(old) not in late]
-    away = result.left_out_of_forecast
-    errors_um = problem.hold_out_errors(
-        [one for one in decided if one.effect not in away or one.effect in result.declared]
-    )
+    model = fit_model(readings, [again(term) for term in found.kept(corrected)])
+    steps = tuple(_with_tied(found.steps[place], result.steps[place].tied, again) for place in kept)
+    state = replace(found, model=model, steps=steps)
+    left_out = [at for at, place in enumerate(kept) if place in result.away or found.steps[place].is_from_second_search]
+    errors_um = problem.hold_out_errors(state.kept(left_out))
     interval = error_interval(errors_um, readings.cycle[~used], np.random.default_rng(seed))
     return replace(
         result,
-        declared_coefficients=declared_coefficients(model, len(result.declared)),
+        declared_coefficients=coefficients_beside(problem, state, [result.steps[place] for place in kept]),
         noise_floor_um=model.fit.sigma,
         rmse_final_um=interval.rmse_um,
         hold_out={**result.hold_out, "final": interval},
@@ -655,6 +652,15 @@ def on_corrected_fields(
         wandering_um=wandering_um(model.fit),
         after=model,
     )
+
+
+def _with_tied(step: Step, tied: Collection[str], again: Callable[[Term], Term]) -> Step:
+    """Return a step whose tied rivals are computed again."""
+    scores = (
+        replace(score, candidate=again(Term(score.name, score.best)).candidate) if score.name in tied else score
+        for score in step.round.scores
+    )
+    return replace(step, round=replace(step.round, scores=tuple(scores)))
 
 
 # Correction of the fields: errors of the camera that the loop found are taken out of the fields, and all is computed
@@ -978,8 +984,8 @@ class LoopResult:
         Structure that the final model leaves.
     residual_drift : ResidualDrift
         Size of the unexplained drift.
-    left_out_of_forecast : tuple of str
-        Added effects without which the final error is predicted.
+    away : frozenset of int
+        Places of the added effects without which the final error is predicted.
     wandering_um : float, um
         Root mean square of the unexplained drift, common part and stretch together.
     state : LoopState
@@ -1002,7 +1008,7 @@ class LoopResult:
     unnamed: Mapping[str, float]
     remainder: Remainder
     residual_drift: schema.ResidualDrift
-    left_out_of_forecast: tuple[str, ...]
+    away: frozenset[int]
     wandering_um: float
     state: LoopState[ModelFit]
     before: ModelFit
@@ -1105,7 +1111,7 @@ class LoopResult:
             separable=self.separable,
             wandering_um=self.wandering_um,
             tracking=self.tracking,
-            left_out_of_forecast=self.left_out_of_forecast,
+            left_out_of_forecast=tuple(self.steps[place].effect for place in sorted(self.away)),
             unexplained=self.unexplained,
             residual_drift=self.residual_drift,
             noise=_noise_of(self.after),
@@ -1329,6 +1335,20 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
     about = values - mean
     covariance = np.tensordot(weight, np.array([one[2] for one in found]), 1) + (about.T * weight) @ about
     return replace(model, fit=replace(fit, coefficients=mean, covariance=covariance))
+
+
+def contradicted_places(steps: Sequence[AddedEffect]) -> list[int]:
+    """Return the places of the added effects that the hold-out set contradicts."""
+    return [place for place, step in enumerate(steps) if not step.keeps_name]
+
+
+def coefficients_beside(
+    problem: AxisProblem, state: AxisState, steps: Sequence[AddedEffect]
+) -> list[schema.DeclaredCoefficient]:
+    """Coefficients of the declared effects beside the added ones; those that are contradicted must not move them."""
+    contradicted = contradicted_places(steps)
+    sure = fit_model(problem.readings, state.kept(contradicted)) if contradicted else state.model
+    return declared_coefficients(sure, len(state.declared), moved_by_rivals(problem, state, steps, sure))
 
 
 def moved_by_rivals(problem: AxisProblem, state: AxisState, steps: Sequence[AddedEffect], model: ModelFit) -> Array:

@@ -188,7 +188,37 @@ def test_an_effect_that_is_contradicted_moves_no_declared_coefficient_and_no_for
     told = axis.average_over_drifts(alone).coefficients()["own"]
     assert found.declared_coefficients[0].value == pytest.approx(told, rel=1e-9)
     assert found.after.coefficients()["own"] != pytest.approx(alone.coefficients()["own"], rel=1e-6)
-    assert found.left_out_of_forecast == ("other",) and found.rmse_final_um == found.rmse_declared_um
+    assert found.away == {0} and found.rmse_final_um == found.rmse_declared_um
+
+
+@pytest.mark.parametrize("told", [{"withheld": "it has no name"}, {"borne_out": "no"}, {"tied": ("rival",)}])
+def test_on_fields_of_which_nothing_is_corrected_the_same_is_found_again(monkeypatch, told):
+    """Of two added effects of one name the one that was left out of the forecast is left out again, and the other is not."""
+    waves = {float(turns): BARE.sign * np.sin(BARE.seconds / 40.0 / turns) for turns in (1, 3)}
+    offered = {turns: Candidate(wave[:, None], {"turns": turns}, ("um",)) for turns, wave in waves.items()}
+    own, rival = (Candidate(column[:, None], {}, ("um",)) for column in (WAVE, waves[1.0] + 0.1 * np.cos(BARE.seconds)))
+    effects = {
+        "own": Effect("own", "", "", lambda readings, coefficients, near: iter([own]), declarable=True),
+        "other": Effect("other", "", "", lambda readings, coefficients, near: iter(offered.values())),
+        "rival": Effect("rival", "", "", lambda readings, coefficients, near: iter([rival])),
+    }
+    report = axis.report_steps
+    monkeypatch.setattr(axis, "report_steps", lambda *found: [one.model_copy(update=told) for one in report(*found)])
+    problem = problem_of(WAVE, *waves.values())
+    found = axis.close_loop(problem.readings, ["own"], effects=effects)
+    again = axis.on_corrected_fields(found, problem.readings, (), effects=effects)
+    assert again.declared_coefficients == found.declared_coefficients
+    assert again.rmse_final_um == pytest.approx(found.rmse_final_um, rel=1e-9)
+
+    (step,) = found.state.steps
+    second = offered[4.0 - float(step.score.best.parameters["turns"])]
+    both = (step, replace(step, score=replace(step.score, candidate=second)))
+    model = fit_model(problem.readings, [*found.after.terms, Term("other", second)])
+    state = replace(found.state, model=model, steps=both)
+    twice = replace(found, state=state, after=model, steps=2 * found.steps, away=frozenset({0}))
+    forecast, neither = (problem.hold_out_error(state.kept(places)) for places in ([0], [0, 1]))
+    again = axis.on_corrected_fields(twice, problem.readings, (), effects=effects)
+    assert again.rmse_final_um == pytest.approx(forecast, rel=1e-6) != pytest.approx(neither, rel=1e-3)
 
 
 @pytest.mark.parametrize("withheld", ["", "its time constant is not determined"])

@@ -149,7 +149,7 @@ def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
         hold_out_errors={},
         skill=True,
         steps=report_steps(looped, {}, [None]),
-        left_out_of_forecast=(),
+        away=frozenset(),
         wandering_um=0.05,
         unnamed={},
         remainder=left,
