@@ -500,12 +500,13 @@ def hold_against(pair: PairComparison, prediction: TablePrediction, applied: Pat
 
 def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, same_setup: bool) -> PairComparison:
     """Compare one campaign with the reference; `pairs` campaigns share the family."""
-    if before.axis != after.axis:
-        reason = (
-            f"the axes differ ({before.axis or 'not stated'} and {after.axis or 'not stated'}): nothing is compared"
-        )
+    if before.axis and after.axis and before.axis != after.axis:
+        reason = f"the axes differ ({before.axis} and {after.axis}): nothing is compared"
         return PairComparison(before, after, (), None, (f"Everything: {reason}.",), 0)
     lacks: list[str] = []
+    if before.axis != after.axis:
+        stated, silent = (before, after) if before.axis else (after, before)
+        lacks.append(f"Axis: {stated.name} is of {stated.axis}, {silent.name} states none; taken as the same.")
     common = common_inputs(before, after, same_setup=same_setup)
     others = [*_scatters(before, after), *_coefficients(before, after, lacks)]
     standard = list(_standard(before, after, lacks, common))

@@ -105,6 +105,16 @@ def test_another_axis_and_a_record_say_why_nothing_is_compared(before: Path, tmp
     ]
 
 
+@pytest.mark.parametrize("axes", [("", "X"), ("X", "")])
+def test_an_axis_that_one_test_does_not_state_is_no_difference_and_is_said(
+    tmp_path: Path, axes: tuple[str, str]
+) -> None:
+    folders = [write_results(tmp_path / f"{k}", readings_of(31 + k), axis=axis) for k, axis in enumerate(axes)]
+    (pair,) = compare_campaigns(folders)
+    assert pair.profile is not None and {change.group for change in pair.changes} >= {"profile", "scatter", "ISO 230-2"}
+    assert [lack.split(":")[0] for lack in pair.not_compared] == ["Axis"]
+
+
 def test_one_folder_or_no_results_are_refused(before: Path, tmp_path: Path) -> None:
     with pytest.raises(ComparisonError, match=r"2 results folders are named, 1 of them different"):
         compare_campaigns([before, before])
