@@ -6,12 +6,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # The tests start the program a hundred times; without its bytecode each would compile all of it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
+.PHONY: demo test readme quick docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[app]"
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.run
@@ -36,6 +36,11 @@ lint: $(VENV)/.test
 # tests are not left to the end. One thread each for linear algebra: more would only wait for one another.
 test: lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
+
+# README's lines and Python and the cells of the tutorials, in a copy of the last commit with the environment that README's line makes.
+readme:
+	rm -rf build/readme && mkdir -p build/readme && git archive HEAD | tar -x -C build/readme
+	cd build/readme && $(PYTHON) tests/readme.py
 
 # What shows within a minute whether a change broke something; `make test` runs everything.
 quick: $(VENV)/.test

@@ -38,10 +38,7 @@ def new_axes(ax: Axes | None) -> Axes:
     """Return the given axes, or those of a new figure in the common style."""
     if ax is not None:
         return ax
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError as error:
-        raise InterferometryError("plots need the package matplotlib: pip install thermofuse[plot]") from error
+    import matplotlib.pyplot as plt
 
     with plt.rc_context(STYLE):
         return plt.subplots(figsize=(6.2, 3.6))[1]
@@ -93,7 +90,7 @@ def plot_deviations(
     Raises
     ------
     InterferometryError
-        ``deviations`` lack a variable of their contract, or matplotlib is not installed.
+        ``deviations`` lack a variable of their contract.
 
     Notes
     -----
@@ -142,7 +139,7 @@ def plot_position(
     Raises
     ------
     InterferometryError
-        There is no such target, a Dataset lacks a variable of its contract, or matplotlib is not installed.
+        There is no such target, or a Dataset lacks a variable of its contract.
 
     Notes
     -----
@@ -191,7 +188,7 @@ def plot_profile(deviations: xr.Dataset, estimated: xr.Dataset, ax: Axes | None 
     Raises
     ------
     InterferometryError
-        A Dataset lacks a variable of its contract, or matplotlib is not installed.
+        A Dataset lacks a variable of its contract.
 
     Notes
     -----
@@ -240,7 +237,7 @@ def plot_drift(
     Raises
     ------
     InterferometryError
-        A Dataset lacks a variable of its contract, or matplotlib is not installed.
+        A Dataset lacks a variable of its contract.
 
     Notes
     -----
@@ -319,7 +316,7 @@ def plot_scatter(deviations: xr.Dataset, estimated: xr.Dataset | None = None, ax
     Raises
     ------
     InterferometryError
-        A Dataset lacks a variable of its contract, there are fewer than two targets, or matplotlib is not installed.
+        A Dataset lacks a variable of its contract, or there are fewer than two targets.
 
     Notes
     -----
@@ -369,7 +366,7 @@ def plot_differences(deviations: xr.Dataset, ax: Axes | None = None) -> Axes:
     Raises
     ------
     InterferometryError
-        ``deviations`` lack a variable of their contract, hold fewer than two targets, or matplotlib is not installed.
+        ``deviations`` lack a variable of their contract, or hold fewer than two targets.
 
     Notes
     -----
@@ -416,7 +413,7 @@ def plot_reference_chart(
     Raises
     ------
     InterferometryError
-        ``deviations`` lack a variable of their contract, ``reference`` is unknown, or matplotlib is not installed.
+        ``deviations`` lack a variable of their contract, or ``reference`` is unknown.
 
     Notes
     -----

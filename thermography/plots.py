@@ -45,7 +45,7 @@ def plot_field(
     Raises
     ------
     ThermographyError
-        There is no such cycle or quantity, or matplotlib is not installed.
+        There is no such cycle or quantity.
 
     Notes
     -----
@@ -64,10 +64,7 @@ def plot_field(
     if number not in fields["cycle"].values:
         first, last = fields["cycle"].values[[0, -1]].tolist()
         raise ThermographyError(f"cycle={number} is none of the cycles {first} to {last}")
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError as error:
-        raise ThermographyError("plots need the package matplotlib: pip install thermofuse[plot]") from error
+    import matplotlib.pyplot as plt
 
     if ax is None:
         ax = plt.subplots(figsize=(7.0, 2.8), layout="constrained")[1]

@@ -13,7 +13,6 @@ import webbrowser
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -34,7 +33,6 @@ from tornado.web import OutputTransform, RequestHandler
 
 from fusion.app.parts import PathError, ReportHandler, State, note, schedule_update, state_of, switched
 from fusion.app.runs import RUNS
-from fusion.common import FusionError
 
 # Authentication: every request is checked here before any page, file or connection answers it.
 
@@ -259,16 +257,8 @@ AHEAD = (
 )  # fmt: skip
 
 
-class MissingExtraError(FusionError):
-    """The application was asked for without the packages that it needs."""
-
-
 def serve(root: Path, *, port: int = 0, open_browser: bool = False, say: Callable[[str], None] = print) -> None:
     """Serve the application until the process is told to stop."""
-    if find_spec("panel") is None:
-        raise MissingExtraError(
-            'thermofuse app needs the package panel, which is not installed; run: pip install "thermofuse[app]"'
-        )
     if not root.is_dir():
         raise PathError(f"{root}: no such folder; name the folder that holds the files of the measurement")
     server, address = build_server(root, port=port)

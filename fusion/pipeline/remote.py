@@ -354,7 +354,9 @@ def _file_system(base: str) -> Any:
             "http", skip_instance_cache=True, use_listings_cache=False, client_kwargs=options, encoded=True
         )
     except ImportError as error:
-        raise RemoteError(f"{base}: {error.name} is not installed; pip install thermofuse[remote]") from error
+        raise RemoteError(
+            f"{base}: the package {error.name} is not installed: install it beside thermofuse (pip install {error.name})"
+        ) from error
 
 
 async def _stay_on_the_server(session: Any, context: Any, answer: Any) -> None:

@@ -63,8 +63,6 @@ def plot_correlation(maps: xr.DataTree, ax: Axes | None = None, *, channel: str 
     ------
     FusionError
         There is no such channel.
-    InterferometryError
-        Matplotlib is not installed.
 
     Notes
     -----
@@ -103,11 +101,6 @@ def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) 
     Returns
     -------
     Axes
-
-    Raises
-    ------
-    InterferometryError
-        Matplotlib is not installed.
 
     Notes
     -----

@@ -26,7 +26,7 @@ from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
 from tests.fusion.campaign_parts import change, keep_cycles, without
 
-pytest.importorskip("aiohttp", reason="needs thermofuse[remote]")
+pytest.importorskip("aiohttp", reason="needs the extra remote")
 
 # Both clients leave their sockets to the garbage collector.
 pytestmark = [
@@ -281,7 +281,7 @@ def test_a_disk_that_is_too_small_is_refused_before_anything_is_fetched(shelf, m
 @pytest.fixture
 def bucket(campaign_folder, monkeypatch):
     """An S3 server of this machine with a campaign in a bucket; its address is in the environment, as users set it."""
-    pytest.importorskip("s3fs", reason="needs thermofuse[remote]")
+    pytest.importorskip("s3fs", reason="needs the extra remote")
     server_module = pytest.importorskip("moto.server", reason="needs moto")
     import boto3
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 
 import matplotlib as mpl
@@ -73,10 +72,3 @@ def test_plots_draw_into_given_axes(rng: np.random.Generator) -> None:
     deviations, _ = simulate(rng, cycles=5)
     _, ax = plt.subplots()
     assert plots.plot_deviations(deviations, ax) is ax
-
-
-def test_without_matplotlib_the_package_is_named(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    deviations, _ = simulate(rng, cycles=5)
-    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    with pytest.raises(InterferometryError, match=r"pip install thermofuse\[plot\]"):
-        plots.plot_differences(deviations)

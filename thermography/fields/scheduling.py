@@ -67,7 +67,9 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
     try:
         from distributed import Client
     except ImportError:
-        raise SchedulerError(f"scheduler {scheduler} needs dask.distributed: pip install thermofuse[cluster]") from None
+        raise SchedulerError(
+            f"scheduler {scheduler} needs the package distributed: install it beside thermofuse (pip install distributed)"
+        ) from None
     try:
         client = Client(scheduler, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:

@@ -1,6 +1,5 @@
 """The running server: what it refuses, what it sends with every answer, and what it says when it cannot start."""
 
-import importlib.util
 import shutil
 import socket
 import subprocess
@@ -9,11 +8,9 @@ from urllib.parse import urlsplit
 
 import pytest
 from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
-from typer.testing import CliRunner
 
 from fusion.app.parts import PathError, state_of
-from fusion.app.server import SCREENS, Credentials, MissingExtraError, offered, serve
-from fusion.cli import app as command
+from fusion.app.server import SCREENS, Credentials, offered, serve
 
 #: What opens the page, its connection, its scripts, and the data.
 STATIC = ("/static/js/bokeh.min.js", "/static/extensions/panel/panel.min.js")
@@ -65,16 +62,7 @@ def test_it_listens_on_this_machine_only(app):
         pass
 
 
-def test_without_the_extra_the_remedy_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr("fusion.app.server.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r'panel, which is not installed; run: pip install "thermofuse\[app\]"'):
-        serve(tmp_path)
-    answer = CliRunner().invoke(command, ["app", str(tmp_path)])
-    assert answer.exit_code == 2 and "pip install" in answer.output
-
-
 def test_a_folder_must_exist(tmp_path):
-    assert importlib.util.find_spec("panel")
     with pytest.raises(PathError, match="no such folder"):
         serve(tmp_path / "absent")
 
