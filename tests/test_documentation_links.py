@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from fusion.pipeline.remote import read_registry
+from tests.readme import measured_files
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Without those that are written from the code when the site is built.
@@ -117,9 +118,7 @@ def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
 
 @pytest.mark.parametrize("document", PAGES, ids=name_of)
 def test_every_measured_file_of_a_tutorial_is_listed(document):
-    _, _, head = document.read_text(encoding="utf-8").partition("measured_files:\n")
-    names = re.findall(r"^  - (.*)$", head.partition("---")[0], re.M)
-    assert set(names) <= set(read_registry())
+    assert set(measured_files(document.read_text(encoding="utf-8"))) <= set(read_registry())
 
 
 def test_every_page_and_test_cited_in_the_code_exists():

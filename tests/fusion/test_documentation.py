@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -25,6 +25,7 @@ from fusion.results.axis import CorrelationPart, SourcePart
 from fusion.results.results import Notice, assemble
 from fusion.twin.recipe_file import read_recipe
 from tests.fusion.results_sample import PARTS
+from tests.readme import blocks, try_page, typed_lines
 from thermography.io.other_cameras import FrameReader, StackOptions
 from thermography.registration.plan import read_fiducials
 
@@ -33,10 +34,6 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 START = (ROOT / "docs/start/index.md").read_text(encoding="utf-8")
 CAMPAIGN_FILE = (ROOT / "docs/reference/campaign-file.md").read_text(encoding="utf-8")
 TUTORIALS = ROOT / "docs/tutorials"
-
-
-def blocks(text: str, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
 def test_the_campaign_files_of_the_reference_load(tmp_path: Path) -> None:
@@ -64,51 +61,26 @@ def test_the_demo_of_the_start_page_has_the_rows_that_a_run_prints() -> None:
 
 def test_every_command_of_the_readme_exists() -> None:
     known = set(get_command(cli.app).commands)  # type: ignore[attr-defined]
-    typed = {line.split()[1] for line in readme_lines() if line.startswith(COMMAND)}
+    typed = {line.split()[1] for line in typed_lines(README) if line.startswith(".venv/bin/thermofuse ")}
     named = {words.split()[0] for words in re.findall(r"`([a-z0-9]+[^`\n/.]*)", README)}
     assert typed <= known and known <= typed | named
 
 
-#: The program as the README calls it.
-COMMAND = ".venv/bin/thermofuse"
-
-
-def readme_lines() -> list[str]:
-    """Return what the README tells a reader to type, without remarks."""
-    return [line.partition("   #")[0].strip() for line in "\n".join(blocks(README, "sh")).splitlines()]
-
-
-def run_lines(lines: list[str], folder: Path) -> None:
-    """Type lines in a folder, one after another, and run the Python of the page; of the application only the address is waited for."""
-    for line in lines:
-        if " app " in line:
-            with subprocess.Popen(line.split(), cwd=folder, stdout=subprocess.PIPE, text=True) as app:
-                assert app.stdout is not None
-                assert "http://127.0.0.1:" in app.stdout.readline()
-                app.terminate()
-            continue
-        done = subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True)
-        assert done.returncode == 0, (line, done.stdout[-2000:], done.stderr[-2000:])
-    (chain,) = blocks(README, "python")
-    done = subprocess.run([folder / ".venv/bin/python", "-c", chain], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
-@pytest.mark.chain
-def test_every_line_of_the_readme_that_installs_nothing_runs(tmp_path: Path) -> None:
-    (tmp_path / ".venv/bin").mkdir(parents=True)
-    for name, module in (("thermofuse", " -m fusion.cli"), ("python", "")):
-        script = f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}"{module} "$@"\n'
-        (tmp_path / ".venv/bin" / name).write_text(script, encoding="utf-8")
-        (tmp_path / ".venv/bin" / name).chmod(0o755)
-    run_lines([line for line in readme_lines() if "pip install" not in line and "make " not in line], tmp_path)
-
-
-@pytest.mark.slow
-def test_every_line_of_the_readme_runs_in_a_bare_environment(tmp_path: Path) -> None:
-    """On a copy of what is under version control; `make test` would run this test again."""
-    subprocess.run(["git", "checkout-index", "--all", f"--prefix={tmp_path}/"], cwd=ROOT, check=True)
-    run_lines([line for line in readme_lines() if line != "make test"], tmp_path)
+@pytest.mark.parametrize(
+    ("cell", "ran", "fault"),
+    [
+        (":tags: [remove-input]\nassert Path('a').read_text() == 'b\\n'\nvalue", 3, ""),
+        ("%%bash --no-raise-error\ntest $(cat a) = c", 3, ""),
+        ("%%bash\ntest $(cat a) = c\ntrue", 2, "CalledProcessError"),
+        ("absent", 2, "NameError"),
+    ],
+)
+def test_a_cell_of_a_tutorial_that_fails_is_noticed(tmp_path: Path, cell: str, ran: int, fault: str) -> None:
+    page = tmp_path / "page.md"
+    cells = ("from pathlib import Path\nvalue = 1", "%%writefile a\nb", cell)
+    page.write_text("".join(f"```{{code-cell}} ipython3\n{each}\n```\ntext\n" for each in cells))
+    tried = try_page(page, sys.executable, {**os.environ, "PYTHONPATH": str(ROOT)})
+    assert (tried.ran, fault in tried.fault, bool(tried.fault)) == (ran, True, bool(fault))
 
 
 def test_the_readme_is_short_and_its_pictures_are_small() -> None:
