@@ -89,17 +89,19 @@ def type_line(line: str, root: Path, environment: dict[str, str]) -> Tried:
     """Run a line in a shell; the application is stopped when it has said its address."""
     if " app " not in line:
         return Tried(line, 1, run(["bash", "-c", line], root, environment)[1])
-    with subprocess.Popen(line.split(), cwd=root, env=environment, stdout=subprocess.PIPE, text=True) as app:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(line.split(), cwd=root, env=environment, text=True, **pipes) as app:
         assert app.stdout is not None
         said = app.stdout.readline()
         app.terminate()
-    return Tried(line, 1, "" if "http://127.0.0.1:" in said else f"said {said!r} in place of an address")
+        rest = app.communicate()[0]
+    return Tried(line, 1, "" if "http://127.0.0.1:" in said else f"no address: {said}{rest}")
 
 
 def try_page(page: Path, python: str, environment: dict[str, str]) -> Tried:
-    """Run the cells of a tutorial in a process and an empty folder of their own."""
+    """Run the cells of a tutorial in a process and an empty folder of their own, with installed packages alone."""
     with tempfile.TemporaryDirectory() as folder:
-        said, fault = run([python, __file__, str(page)], Path(folder), environment)
+        said, fault = run([python, "-P", __file__, str(page)], Path(folder), environment)
     ran = re.findall(r"^ran \d+$", said, re.M)
     skipped = "".join(re.findall(rf"^{SKIPPED}.*$", said, re.M))
     return Tried(page.name, len(ran), fault or skipped)
@@ -122,8 +124,8 @@ def try_all(root: Path) -> Iterator[Tried]:
             yield type_line(line, root, environment)
     for block in blocks(readme, "python"):
         yield Tried("README.md, Python", 1, run([python, "-c", block], root, environment)[1])
+    pages = [page for page in sorted((root / "docs/tutorials").glob("*.md")) if page.stem != "index"]
     with ThreadPoolExecutor(2) as two:
-        pages = sorted((root / "docs/tutorials").glob("*.md"))
         yield from two.map(lambda page: try_page(page, python, environment), pages)
 
 
