@@ -1,6 +1,6 @@
 """Tutorials on measured files: where a file cannot be had, the page is built without being run, and says so.
 
-Such a page lists its files in its front matter, under their names in `fusion/pipeline/registry.csv`::
+Such a page lists its files in its front matter, under their names in `data/registry.csv`::
 
     measured_files:
       - gtatters__Thermimage/inst/extdata/IR_2412.jpg

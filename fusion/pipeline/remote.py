@@ -28,6 +28,7 @@ from fusion.common import FusionError, TomlError, place_within, read_toml
 from fusion.results.progress import Report, silent
 from fusion.results.store import file_sha256, read_json_object, write_json
 from interferometry.common import InterferometryError
+from thermofuse.resources import resource
 from thermography.common import ThermographyError
 from thermography.io.files import write_atomically
 
@@ -370,9 +371,9 @@ async def _stay_on_the_server(session: Any, context: Any, answer: Any) -> None:
         )
 
 
-# Public measured files: what `registry.csv` beside this module lists, fetched once and held to their SHA-256.
+# Public measured files: what `data/registry.csv` lists, fetched once and held to their SHA-256.
 
-REGISTRY = Path(__file__).with_name("registry.csv")
+REGISTRY = resource("registry.csv")
 #: Names a folder that holds the files under their registry names; then nothing is downloaded.
 FOLDER_VARIABLE = "THERMOFUSE_DATA"
 

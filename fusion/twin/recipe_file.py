@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from fusion.common import Place, TomlError, describe, first_faults, place_in, read_toml, suggest
 from fusion.twin.effects import EFFECTS
 from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError
+from thermofuse.resources import resource
 
 _RECIPE = TypeAdapter(Recipe)
 #: Effects that act on one instrument only and cannot be superposed.
@@ -75,7 +76,7 @@ def recipe_schema() -> dict[str, Any]:
 
 def packaged_recipe(name: str) -> Path:
     """Return the path of a recipe that comes with the package."""
-    folder = Path(__file__).parent / "recipes"
+    folder = resource("recipes")
     path = folder / f"{name}.toml"
     if not path.is_file():
         raise RecipeError(

@@ -188,7 +188,7 @@ def commands(trees: Sequence[Path], turns: int) -> Iterator[str]:
         for package in ("thermofuse", "fusion", "thermography", "interferometry"):
             compileall.compile_dir(tree / package, quiet=1)
         shutil.rmtree(folder, ignore_errors=True)
-        for recipe, name in ((HERE / "fusion" / "twin" / "recipes" / "demo.toml", "campaign"), (small, "small")):
+        for recipe, name in ((HERE / "data" / "recipes" / "demo.toml", "campaign"), (small, "small")):
             timed(tree, ["simulate", str(recipe), "--out", str(folder / name)], compiled=folder / "of_twin")
     for work, (arguments, aim) in works.items():
         seconds: list[list[tuple[float, float]]] = [[], []]

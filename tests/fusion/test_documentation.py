@@ -92,7 +92,7 @@ def test_the_readme_is_short_and_its_pictures_are_small() -> None:
 def test_the_demo_of_the_tutorial_is_the_demo() -> None:
     page = (TUTORIALS / "demo.md").read_text(encoding="utf-8")
     (recipe,) = re.findall(r"%%writefile demo.toml\n(.*?)```", page, flags=re.DOTALL)
-    assert tomllib.loads(recipe) == tomllib.loads((ROOT / "fusion/twin/recipes/demo.toml").read_text(encoding="utf-8"))
+    assert tomllib.loads(recipe) == tomllib.loads((ROOT / "data/recipes/demo.toml").read_text(encoding="utf-8"))
 
 
 def test_the_recipes_of_the_tutorials_are_valid(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_a_scatter_that_the_drift_hides_is_named_and_no_other(copied):
 
 
 def test_the_scatter_of_the_demo_is_determined_also_with_a_quieter_laser():
-    recipe = read_recipe(Path("fusion/twin/recipes/demo.toml"))
+    recipe = read_recipe(Path("data/recipes/demo.toml"))
     for noise_um in (recipe.laser.noise_um, 0.1):
         estimated = estimate_drift(deviations_of(simulate(recipe.vary(laser={"noise_um": noise_um}))))
         assert estimated.attrs["scatter_undetermined"] == 0

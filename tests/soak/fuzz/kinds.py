@@ -78,7 +78,7 @@ LENS = (
     "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
     "   data: [ 1530., 0., 320., 0., 1530., 240., 0., 0., 1. ]\ndistortion_coefficients: [ 0.1, 0., 0., 0., 0. ]\n"
 )
-RECIPE = Path("fusion/twin/recipes/demo.toml").read_text(encoding="utf-8")
+RECIPE = Path("data/recipes/demo.toml").read_text(encoding="utf-8")
 STACK = StackOptions(
     unit="degC", scale=0.04, offset=-273.15, start=np.datetime64("2026-03-09T06:30", "ns"), interval_s=1.0
 )
