@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -107,18 +108,39 @@ def try_page(page: Path, python: str, environment: dict[str, str]) -> Tried:
     return Tried(page.name, len(ran), fault or skipped)
 
 
+def try_wheel(root: Path, python: str, environment: dict[str, str]) -> Tried:
+    """Build the wheel: all of data/ is in it, and found there."""
+    unpacked = root / "wheel"
+    build = [python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(unpacked), "."]
+    if fault := run(build, root, environment)[1]:
+        return Tried("wheel", 0, fault)
+    (wheel,) = unpacked.glob("*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(unpacked)
+    kept, there = (
+        {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+        for folder in (root / "data", unpacked / "thermofuse/data")
+    )
+    find = [python, "-P", "-c", "from thermofuse.resources import resource; print(resource('registry.csv'))"]
+    found, fault = run(find, root, environment | {"PYTHONPATH": str(unpacked)})
+    if Path(found.strip()) != unpacked / "thermofuse/data/registry.csv":
+        fault += f"data/ is looked for at {found}"
+    return Tried("wheel", 1, fault + "".join(f"{name} is not in the wheel\n" for name in sorted(kept - there)))
+
+
 def try_all(root: Path) -> Iterator[Tried]:
-    """Try the lines of README, its Python and the tutorials; without an installation nothing else."""
+    """Try the lines of README, its Python, the wheel and the tutorials; without an installation nothing else."""
     readme = (root / "README.md").read_text(encoding="utf-8")
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
     install, *lines = typed_lines(readme)
     yield (installed := type_line(install, root, environment))
     if installed.fault:
         return
+    python = str(root / ".venv/bin/python")
+    yield try_wheel(root, python, environment)
     # Nobody's settings, caches or packages; tutorials call `thermofuse` by its name.
     environment |= {"HOME": tempfile.mkdtemp(dir=root), "MPLBACKEND": "agg"}
     environment["PATH"] = f"{root / '.venv/bin'}{os.pathsep}{environment['PATH']}"
-    python = str(root / ".venv/bin/python")
     for line in lines:
         if line not in LEFT_OUT:
             yield type_line(line, root, environment)
