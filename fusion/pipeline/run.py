@@ -252,6 +252,7 @@ def _begin_evaluation(run: Run, laser: LaserInputs, camera: CameraInputs) -> Cal
 
 def _reduce(run: Run, camera: CameraInputs, scheduler: str | None = None) -> xr.Dataset:
     """The fields of all cycles, or of windows of time where there is no laser."""
+    run.taken["fields"] = thermal.taken_from_laser(camera)
     compute = partial(thermal.reduce_thermography, camera, scheduler=scheduler, checkpoint=run.checkpoint("fields"))
     fields: xr.Dataset = run.stage("fields", compute)
     if is_large(fields):

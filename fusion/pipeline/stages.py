@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import logging
 import os
 import shutil
@@ -35,6 +36,7 @@ from fusion.results.store import (
     read_dataset,
     read_json_object,
     read_tree,
+    retitle,
     write_dataset,
 )
 from thermography.io.other_cameras import ENTRY_POINT_GROUP
@@ -228,7 +230,7 @@ class Stage:
     file : str
         Its product; what ends up in fusion.nc is kept apart while it may have to be resumed.
     tables : tuple of str
-        Tables of the campaign file that its result depends on, with the files that they name.
+        Tables of the campaign file that its result depends on, with the files that they name; see `Run.taken` for parts of another one.
     after : tuple of str
         Stages that its result depends on where the run made them before; it is computed again whenever one of them is.
     read : callable
@@ -242,11 +244,13 @@ class Stage:
     read: Callable[[Path], Any]
 
 
+#: Tables whose files may give times without their zone.
+_ZONED = {"interferometry", "sensors", "drivers", "record"}
 _CORRELATED = ("plan", "interferometry", "drivers")
 _MODELLED = ("plan", "interferometry", "sensors", "drivers", "model")
 STAGES = {
     "thermograms": Stage("thermograms", "thermograms.nc", ("thermography", "plan"), (), read_dataset),
-    "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan", "interferometry"), (), open_dataset),
+    "fields": Stage("thermal fields", "fields.nc", ("thermography", "plan"), (), open_dataset),
     "deviations": Stage("deviations", "deviations.nc", ("interferometry",), ("fields",), read_dataset),
     "correlation": Stage("correlation", ".stages/correlation.nc", _CORRELATED, ("fields", "deviations"), read_tree),
     "model": Stage("anomalies and closed loop", ".stages/model.nc", _MODELLED, ("fields", "deviations"), read_dataset),
@@ -298,6 +302,8 @@ class Run:
         What every stage depends on besides campaign and files, as it was at the start.
     drawn : list of callable
         Each waits for a part of the charts and returns it.
+    taken : dict
+        By stage, what its result depends on of tables that it does not list whole.
     parts, notices : dict, list
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
@@ -317,6 +323,7 @@ class Run:
     worker: Worker = field(default_factory=Worker)
     depends: tuple[Any, ...] = field(default_factory=dependencies)
     drawn: list[Callable[[], Drawn]] = field(default_factory=list)
+    taken: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, Any] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -352,10 +359,12 @@ class Run:
         self.drawn.append(self.worker.submit(work))
 
     def _kept(self, name: str) -> Outcome[Any]:
-        """Return what is kept of a stage."""
-        note = self.stamps.note(name)
+        """Return what is kept of a stage, under the title and the inputs of this run."""
+        note, path = self.stamps.note(name), self.folder / STAGES[name].file
         notices = tuple(Notice(**item) for item in note["notices"])
-        return Outcome(STAGES[name].read(self.folder / STAGES[name].file), note["parts"], notices)
+        if retitle(path, self._described):
+            self.stamps.renew(path)
+        return Outcome(STAGES[name].read(path), note["parts"], notices)
 
     def _finish(self, name: str, key: str, compute: Callable[[], tuple[Outcome[Any], float]] | None) -> Any:
         """Write and stamp what a stage computes in so many seconds, or read what is kept of it."""
@@ -386,8 +395,9 @@ class Run:
         stage = STAGES[name]
         settings = self.campaign.model_dump(mode="json", include=set(stage.tables))
         files = {file: self.inputs[file] for table in stage.tables for file in self.campaign.files_of(table)}
+        zone = self.campaign.campaign.time_zone if _ZONED & {*stage.tables} else None
         earlier = [self.keys[one] for one in stage.after if one in self.keys]
-        return digest(name, *self.depends, self.campaign.campaign.time_zone, settings, files, earlier)
+        return digest(name, *self.depends, zone, settings, files, self.taken.get(name), earlier)
 
     def checkpoint(self, name: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
@@ -400,5 +410,10 @@ class Run:
     def described(self, product: Product) -> Product:
         """Return a product with title, history and provenance."""
         history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
+        return annotate(product, history=history, **self._described)
+
+    @property
+    def _described(self) -> dict[str, str]:
+        """Title and provenance of this run, as every product carries them."""
         origin = {"software": "thermofuse", "versions": versions(), "inputs": dict(self.inputs)}
-        return annotate(product, title=self.campaign.campaign.title, history=history, provenance=origin)
+        return {"title": self.campaign.campaign.title, "provenance": json.dumps(origin, sort_keys=True)}

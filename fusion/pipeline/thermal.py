@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -563,6 +564,21 @@ _REGISTRATION_FRAMES = 5
 _CHECKPOINT_FRAMES = 2000
 #: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
 PIXEL_FRAMES = 24
+
+
+def taken_from_laser(source: CameraInputs) -> list[Any]:
+    """Return all that the fields depend on besides camera and plan: cycles, times and places of the readings, what was logged beside them.
+
+    The deviations, and what compensates them, are no part of it: they may change while the fields are kept.
+    """
+    arrays = {"bounds": source.cycles.bounds, "number": source.cycles.number}
+    stated: list[Any] = []
+    if isinstance(source, Source):
+        arrays |= {name: source.deviations[name].values for name in ("time", "position", "target")}
+        stated = [source.interferometry.material_sensor_mm, source.interferometry.feed_mm_per_min]
+    if source.environment is not None:
+        arrays |= {f"logged {name}": one.values for name, one in sorted(source.environment.variables.items())}
+    return [*stated, {name: sha256(values.tobytes()).hexdigest() for name, values in arrays.items()}]
 
 
 def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:

@@ -106,6 +106,24 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
     return write_atomically(path, write_groups)
 
 
+def retitle(path: Path, attributes: Mapping[str, str]) -> bool:
+    """Give a product other global attributes, the rest as it is, where it has not these already; tell whether it was written."""
+    import netCDF4
+
+    with refuse_damaged(path), netCDF4.Dataset(path) as file:
+        if all(getattr(file, name, None) == text for name, text in attributes.items()):
+            return False
+    _require_room(path, path.stat().st_size)
+
+    def write(temporary: Path) -> None:
+        shutil.copyfile(path, temporary)
+        with netCDF4.Dataset(temporary, "a") as file:
+            file.setncatts(attributes)
+
+    write_atomically(path, write)
+    return True
+
+
 def _require_room(path: Path, most_bytes: int) -> None:
     """Refuse to write where a disk is almost full: HDF5 ends the process when it cannot close a file for want of room."""
     folder = next(folder for folder in path.absolute().parents if folder.exists())
@@ -336,7 +354,7 @@ def noted_messages(folder: Path) -> list[dict[str, Any]]:
 GLOBAL_ATTRIBUTES = ("Conventions", "title", "history", "provenance")
 
 
-def annotate(product: Product, *, title: str, history: str, provenance: Mapping[str, Any]) -> Product:
+def annotate(product: Product, *, title: str, history: str, provenance: str) -> Product:
     """Return `product` with the global attributes of the CF conventions and a long name wherever none was given."""
     import xarray as xr
 
@@ -350,7 +368,7 @@ def annotate(product: Product, *, title: str, history: str, provenance: Mapping[
         "Conventions": "CF-1.11",
         "title": title,
         "history": history,
-        "provenance": json.dumps(provenance, sort_keys=True),
+        "provenance": provenance,
     }
     return described
 

@@ -5,17 +5,28 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import filelock
 import pytest
+import xarray as xr
 
 from fusion.pipeline.run import run_campaign
 from fusion.results.folder import MANIFEST, claim, claim_file, discard, open_folder, read_manifest
-from fusion.results.store import OutputError, StageStamps, file_sha256, write_json, write_text
+from fusion.results.store import (
+    OutputError,
+    StageStamps,
+    file_sha256,
+    read_json_object,
+    read_product,
+    write_json,
+    write_text,
+)
 
 
 def refusal(folder: Path, *, resume: bool = False) -> str:
@@ -196,3 +207,25 @@ def test_a_changed_campaign_computes_only_what_changed(
     kept = {label.removesuffix(" (kept)") for label in told if "(kept)" in label}
     assert kept == {"thermal fields", "deviations", "correlation"}
     assert results.loop is not None and results.loop.declared == ("axis_expansion",)
+
+
+@pytest.mark.chain
+def test_a_run_that_goes_on_after_other_readings_and_another_title_equals_a_fresh_one(
+    copied: Path, results_folder: Path, tmp_path: Path, no_charts: None
+) -> None:
+    """There and back: what compensates the readings reduces no frame again, and every product carries the title and inputs of its run."""
+    campaign, branch = copied / "campaign.toml", shutil.copytree(results_folder, tmp_path / "branch")
+    own = campaign.read_text(encoding="utf-8")
+    other = re.sub("dead_path = .*", 'dead_path = "300 mm"', own.replace("Small campaign", "Other title"))
+    for text, title in ((other, "Other title"), (own, "Small campaign")):
+        campaign.write_text(text, encoding="utf-8")
+        report = Mock()
+        run_campaign(campaign, branch, resume=True, report=report)
+        assert {call.args[0] for call in report.mock_calls if "(kept)" in call.args[0]} == {"thermal fields (kept)"}
+        inputs = read_json_object(branch / "provenance.json")["inputs"]
+        for name in ("fields", "deviations", "fusion"):
+            attributes = read_product(branch, name).attrs
+            assert attributes["title"] == title and json.loads(attributes["provenance"])["inputs"] == inputs
+    assert (branch / "results.json").read_bytes() == (results_folder / "results.json").read_bytes()
+    for name in ("fields", "deviations", "fusion"):
+        xr.testing.assert_equal(read_product(branch, name), read_product(results_folder, name))

@@ -339,7 +339,9 @@ def test_every_group_opens_by_itself_with_its_coordinates(tmp_path: Path) -> Non
     )
     modes = xr.Dataset({"lag": (("channel", "mode"), np.zeros((2, 1)))}, {"mode": [1]})
     correlation = xr.DataTree(maps, children={"modes": xr.DataTree(modes)})
-    tree = annotate(xr.DataTree(READINGS, children={"correlation": correlation}), title="x", history="y", provenance={})
+    tree = annotate(
+        xr.DataTree(READINGS, children={"correlation": correlation}), title="x", history="y", provenance="{}"
+    )
     path = write_dataset(tmp_path / "fusion.nc", tree)
     with xr.open_dataset(path, engine="h5netcdf") as root:
         xr.testing.assert_equal(root, READINGS)
