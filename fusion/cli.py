@@ -497,7 +497,8 @@ def inspect(
 ) -> None:
     """Print what files hold, with warnings about implausible content.
 
-    A series of frames is summed up. A file that cannot be used is named and does not stop the others; the exit code is then 2.
+    A series of frames is summed up. A file that cannot be used is named and does not stop the others; the exit code is 2 where it was named
+    here, or is of a known kind, or where nothing can be used.
     """
     from fusion.pipeline.inspect import inspect_paths, write_frames
 
@@ -518,7 +519,7 @@ def inspect(
             _print_lines([] if quiet or as_json else written)
         if as_json:
             print_json({"files": [one.as_json() for one in looked_into]}, with_address)
-        if any(one.fails for one in looked_into):
+        if any(one.fails for one in looked_into) or all(one.fault for one in looked_into):
             raise typer.Exit(ExitCode.BAD_INPUT)
 
 

@@ -100,10 +100,8 @@ def answering(console: Console, *, kept: Callable[[], str] = lambda: "") -> Iter
         raise
     except (FusionError, ThermographyError, InterferometryError) as error:
         say(str(error))
-    except MemoryError:
-        say(
-            "the memory of this machine does not suffice for the input; check which file is so large, or use a machine with more"
-        )
+    except MemoryError as error:
+        say(reported(error))
     except Exception as error:
         place = f"{error.filename}: " if isinstance(error, OSError) and error.filename is not None else ""
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
@@ -117,7 +115,7 @@ def answering(console: Console, *, kept: Callable[[], str] = lambda: "") -> Iter
         elif isinstance(error, OSError) and place:
             say(f"{place}{error.strerror}")
         else:
-            _report_fault(error, say)
+            say(reported(error))
             raise typer.Exit(ExitCode.FAULT) from None
     raise typer.Exit(ExitCode.BAD_INPUT) from None
 
@@ -200,10 +198,19 @@ def interrupt_ends_step() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def _report_fault(error: BaseException, say: Callable[[str], None]) -> None:
-    """Write the report of a fault of the program and name it."""
+def unforeseen(error: BaseException) -> str:
+    """Return what somebody is told of an error that nobody has foreseen: that it is one, its type and its place."""
     stack = traceback.extract_tb(error.__traceback__)
     place = f"{_module(stack[-1].filename)}, line {stack[-1].lineno}" if stack else "an unknown place"
+    return f"fault of the program, not of the input: {type(error).__name__} in {place}"
+
+
+def reported(error: BaseException) -> str:
+    """Return what somebody is told of an error that ended what was under way: its message, or the fault, of which a report is written."""
+    if isinstance(error, BAD_INPUT):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "the memory of this machine does not suffice for the input; check which file is so large, or use a machine with more"
     text = fault_report(error)
     name = f"thermofuse-fault-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.txt"
     for folder in (Path.cwd(), Path(tempfile.gettempdir())):
@@ -215,7 +222,7 @@ def _report_fault(error: BaseException, say: Callable[[str], None]) -> None:
         break
     else:
         advice = "and no folder is writable for a report of it"
-    say(f"fault of the program, not of the input: {type(error).__name__} in {place}; {advice}")
+    return f"{unforeseen(error)}; {advice}"
 
 
 def fault_report(error: BaseException) -> str:

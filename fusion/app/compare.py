@@ -112,13 +112,10 @@ class CompareScreen:
         if not others:
             self._found[:] = ui.faults("Choose at least one campaign to compare with the reference.")
             return
-        with ui.disabled_during(self._compare):
-            try:
-                folders, same = [self._reference.value, *others], bool(self._same.value)
-                pairs = await asyncio.to_thread(lambda: compare_campaigns(folders, same_setup=same))
-                ui.schedule_parts(self._found, comparison_parts(pairs))
-            except (FusionError, OSError) as error:
-                ui.schedule_parts(self._found, [ui.paragraph(str(error), kind="fault")])
+        with ui.disabled_during(self._compare), ui.telling(self._found):
+            folders, same = [self._reference.value, *others], bool(self._same.value)
+            pairs = await asyncio.to_thread(lambda: compare_campaigns(folders, same_setup=same))
+            ui.schedule_parts(self._found, comparison_parts(pairs))
 
 
 def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:

@@ -16,7 +16,7 @@ from fusion.app import parts as ui
 from fusion.app.results.charts import draw_cells, shown_if
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
-from fusion.messages import BAD_INPUT
+from fusion.messages import reported
 from fusion.pipeline.watch import Enough, LiveState, follow
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, palette, span_words
 from fusion.report.numbers import number
@@ -107,10 +107,8 @@ class LiveSession:
             for state in follow(self._campaign, poll_s=self._poll_s, wanted_u_um=self._wanted_u_um, stop=self._stop):
                 self.course.take(state)
                 self.version += 1
-        except BAD_INPUT as error:
-            self.fault = str(error)
         except Exception as error:  # the page must say that nothing is followed any more, whatever the reason
-            self.fault = f"fault of the program, not of the input: {type(error).__name__}; run the campaign when the test is over"
+            self.fault = reported(error)
         self.version += 1
 
 

@@ -15,7 +15,7 @@ from tornado.web import RequestHandler
 
 from fusion.app.runs import RUNS
 from fusion.common import FusionError
-from fusion.messages import printable
+from fusion.messages import printable, reported
 
 _ROLES = {"fault": ' role="alert"', "warning": ' role="status"', "done": ' role="status"'}
 
@@ -255,6 +255,15 @@ def schedule_parts(place: pn.Column, parts: Iterable[pn.viewable.Viewable]) -> N
     """Show parts in a place of the page, in order with all other changes."""
     shown = list(parts)
     schedule_update(lambda: place.param.update(objects=shown))
+
+
+@contextmanager
+def telling(place: pn.Column, before: Parts | None = None) -> Iterator[None]:
+    """Show below `before` why work that a page waits for did not come to its end, whatever the reason."""
+    try:
+        yield
+    except Exception as error:
+        schedule_parts(place, [*(before or []), *faults(reported(error))])
 
 
 @contextmanager

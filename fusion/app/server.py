@@ -31,7 +31,17 @@ from tornado.ioloop import IOLoop
 from tornado.netutil import bind_sockets
 from tornado.web import OutputTransform, RequestHandler
 
-from fusion.app.parts import PathError, ReportHandler, State, note, schedule_update, state_of, switched
+from fusion.app.parts import (
+    PathError,
+    ReportHandler,
+    State,
+    column,
+    note,
+    schedule_update,
+    state_of,
+    switched,
+    telling,
+)
 from fusion.app.runs import RUNS
 
 # Authentication: every request is checked here before any page, file or connection answers it.
@@ -228,9 +238,12 @@ def build_page(root: Path) -> Any:
         shown = {*bar.options, screen}
         bar.param.update(options=[name for name in SCREENS if name in shown], value=screen)
 
+    place = column(note(f"Folder {state.root}"))
+
     async def offer(*events: object) -> None:
-        shown = {*await asyncio.to_thread(offered, state), bar.value}
-        schedule_update(lambda: bar.param.update(options=[name for name in SCREENS if name in shown]))
+        with telling(place, [note(f"Folder {state.root}")]):
+            shown = {*await asyncio.to_thread(offered, state), bar.value}
+            schedule_update(lambda: bar.param.update(options=[name for name in SCREENS if name in shown]))
 
     bar.param.watch(lambda event: state.param.update(screen=event.new), "value")
     state.param.watch(lambda event: go(event.new), "screen")
@@ -240,7 +253,7 @@ def build_page(root: Path) -> Any:
     page.add_variable("style", (_TEMPLATES / "page.css").read_text(encoding="utf-8"))
     page.add_variable("watched", (_TEMPLATES / "page.js").read_text(encoding="utf-8"))
     page.add_panel("bar", bar)
-    page.add_panel("place", note(f"Folder {state.root}"))
+    page.add_panel("place", place)
     page.add_panel("content", content)
     return page
 

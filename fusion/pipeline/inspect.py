@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import csv
 import itertools
 import os
 from collections import Counter
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from fusion.campaign.values import name_and_unit
 from fusion.common import FusionError, TomlError, read_toml
+from fusion.messages import unforeseen
 from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
 from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
@@ -84,7 +84,25 @@ class Recognised:
 
 
 def recognise(path: Path) -> Recognised:
-    """Tell the kind of a file by its content."""
+    """Tell the kind of a file by its content; one on which a reader fails, in whatever way, is not understood and stops no other."""
+    try:
+        return _by_content(path)
+    except Exception as error:
+        kind, reason = _why_not(path, error)
+        return Recognised(path, kind, reason)
+
+
+def _why_not(path: Path, error: Exception) -> tuple[Kind, str]:
+    """Return the kind of a file that a reader failed on, and why in words: its own, or that nobody has foreseen it."""
+    if isinstance(error, OSError):
+        return Kind.UNREADABLE, str(error.strerror or error)
+    if isinstance(error, (FusionError, ThermographyError, InterferometryError)):
+        return Kind.UNKNOWN, str(error).removeprefix(str(path)).lstrip(":, ")
+    return Kind.UNKNOWN, f"{unforeseen(error)}; please report it with the file"
+
+
+def _by_content(path: Path) -> Recognised:
+    """Tell the kind of a file by its content; raise what its readers do not expect."""
     if path.is_symlink() and not path.exists():
         return Recognised(path, Kind.UNREADABLE, f"a link to {path.readlink()}, where there is no file")
     if path.exists() and not path.is_file():
@@ -227,9 +245,10 @@ def _text_start(path: Path) -> str | None:
 
 def _headings(text: str) -> tuple[str, ...]:
     """Return the fields of the first line that is neither empty nor a comment."""
+    from interferometry.io.tables import fields_of
+
     line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    delimiter = max(",;\t", key=line.count)
-    return tuple(name.strip() for name in next(csv.reader([line], delimiter=delimiter), []))
+    return tuple(name.strip() for name in fields_of(line, max(",;\t", key=line.count)))
 
 
 def _by_headings(headings: tuple[str, ...]) -> Kind | None:
@@ -576,27 +595,23 @@ def _files(paths: Sequence[Path]) -> list[Path]:
 
 def _inspect(path: Path, *, named: bool) -> Inspected:
     """Look into one file."""
-    kind = Kind.UNKNOWN
+    found = recognise(path)
+    if found.reason:
+        return Inspected(str(path), found.kind, fault=found.reason, named=named)
     try:
-        found = recognise(path)
-        kind = found.kind
-        if found.reason:
-            return Inspected(str(path), kind, fault=found.reason, named=named)
-
-        return Inspected(str(path), kind, tuple(describe_file(found)), named=named)
-    except (FusionError, ThermographyError, InterferometryError) as error:
-        fault = str(error).removeprefix(str(path)).lstrip(":, ")
-    except OSError as error:
-        kind, fault = Kind.UNREADABLE, str(error.strerror)
-    return Inspected(str(path), kind, fault=fault, named=named)
+        return Inspected(str(path), found.kind, tuple(describe_file(found)), named=named)
+    except Exception as error:
+        kind, fault = _why_not(path, error)
+        return Inspected(str(path), found.kind if kind is Kind.UNKNOWN else kind, fault=fault, named=named)
 
 
 def _inspect_series(paths: Sequence[Path], *, label: str) -> Inspected:
     """Sum up a series of thermal files."""
     try:
         return Inspected(label, Kind.FRAMES, tuple(describe_series(paths, label=label)))
-    except ThermographyError as error:
-        return Inspected(label, Kind.UNKNOWN, fault=str(error).removeprefix(f"{label}: "), named=False)
+    except Exception as error:
+        kind, fault = _why_not(Path(label), error)
+        return Inspected(label, kind, fault=fault, named=False)
 
 
 # What was recorded when, as bars of text on one time axis.

@@ -570,7 +570,12 @@ def delimiter_of_values(line: str) -> str:
 
 def fields_of(line: str, delimiter: str) -> list[str]:
     """Return the fields of one line of text."""
-    return next(csv.reader([line.strip("\r\n")], delimiter=delimiter), []) if delimiter else line.split()
+    if not delimiter:
+        return line.split()
+    try:
+        return next(csv.reader([line.strip("\r\n")], delimiter=delimiter), [])
+    except csv.Error as fault:
+        raise LaserFormatError(f"{fault}; the file is damaged or not a table, export it again") from None
 
 
 def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.datetime64]) -> list[RejectedLine]:

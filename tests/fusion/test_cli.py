@@ -153,6 +153,10 @@ def test_inspect_tells_what_files_hold(campaign_folder: Path, tmp_path: Path) ->
     told = json.loads(invoke("inspect", campaign_folder, "--json").output)["files"]
     assert len(told) == 6 and not any(one["fault"] for one in told)
     assert invoke("inspect", campaign_folder, "--quiet").output == ""
+    (tmp_path / "notes.txt").write_text("warm-up first\n")
+    assert invoke("inspect", tmp_path).exit_code == 2, "nothing in the folder can be used"
+    shutil.copy(campaign_folder / "laser.csv", tmp_path)
+    assert invoke("inspect", tmp_path).exit_code == 0, "a stray file stops no other"
 
 
 def test_init_asks_at_a_terminal_only(campaign_folder: Path, tmp_path: Path) -> None:

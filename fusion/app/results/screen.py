@@ -14,7 +14,6 @@ from fusion.app import parts as ui
 from fusion.app.results.charts import ThermalView, anomaly_cards, laser_charts, loop_steps, reading_hours
 from fusion.app.results.data import Linker, Products, Selection
 from fusion.common import FusionError, versions
-from fusion.messages import BAD_INPUT
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
@@ -100,14 +99,10 @@ def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:
         made = pn.widgets.Button(label=label)
 
         async def make(event: object) -> None:
-            with ui.disabled_during(made):
+            with ui.disabled_during(made), ui.telling(told):
                 ui.schedule_parts(told, [ui.note(f"Writing {name}, a PDF in half a minute ...")])
-                try:
-                    await asyncio.to_thread(_put, folder / name, write)
-                    link = ui.link(f"Save {name}", ui.report_link(state.root, folder, name))
-                    ui.schedule_parts(told, [link])
-                except BAD_INPUT as error:
-                    ui.schedule_parts(told, ui.faults(error))
+                await asyncio.to_thread(_put, folder / name, write)
+                ui.schedule_parts(told, [ui.link(f"Save {name}", ui.report_link(state.root, folder, name))])
 
         made.on_click(make)
         return made

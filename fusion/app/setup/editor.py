@@ -191,20 +191,17 @@ class CampaignEditor:
         """Write the campaign file and the list of fiducials, and check both."""
         if self._opened is None:
             return
-        with ui.disabled_during(self._save):
+        with ui.disabled_during(self._save), ui.telling(self._checked):
             ui.schedule_parts(self._checked, [])
-            try:
-                campaign = self._write(self._opened)
-                lacking = missing(campaign)
-                if lacking:
-                    told = ui.paragraph("Saved. Before it can run, fill in:", kind="warning")
-                    ui.schedule_parts(self._checked, [told, ui.bullets(lacking)])
-                    return
-                ui.schedule_parts(self._checked, [ui.note("Checking ...")])
-                checked = await asyncio.to_thread(check_campaign, campaign.path)
-                ui.schedule_update(lambda: self._ready(campaign.path, checked))
-            except BAD_INPUT as error:
-                ui.schedule_parts(self._checked, ui.faults(error))
+            campaign = self._write(self._opened)
+            lacking = missing(campaign)
+            if lacking:
+                told = ui.paragraph("Saved. Before it can run, fill in:", kind="warning")
+                ui.schedule_parts(self._checked, [told, ui.bullets(lacking)])
+                return
+            ui.schedule_parts(self._checked, [ui.note("Checking ...")])
+            checked = await asyncio.to_thread(check_campaign, campaign.path)
+            ui.schedule_update(lambda: self._ready(campaign.path, checked))
 
     def _ready(self, campaign: Path, checked: CampaignCheck) -> None:
         """Show the check of the saved file, and lead on to the run."""

@@ -42,19 +42,16 @@ class SetUpScreen:
         except ui.PathError as error:
             self._found[:] = ui.faults(error)
             return
-        with ui.disabled_during(self._look):
+        found: ui.Parts = []
+        with ui.disabled_during(self._look), ui.telling(self._found, found):
             ui.schedule_parts(self._dropped, [])
             ui.schedule_parts(self._below, [])
             ui.schedule_parts(self._found, [ui.note("Looking into the files ...")])
-            found: list[Any] = []
-            try:
-                found = await asyncio.to_thread(found_in_folder, folder)
-                ui.schedule_parts(self._found, [*found, ui.note("Reading the first frame and the recordings ...")])
-                opened = await asyncio.to_thread(_open, self._state.root, folder)
-                ui.schedule_parts(self._found, found)
-                ui.schedule_update(lambda: self._show(opened))
-            except BAD_INPUT as error:
-                ui.schedule_parts(self._found, [*found, ui.paragraph(str(error), kind="fault")])
+            found += await asyncio.to_thread(found_in_folder, folder)
+            ui.schedule_parts(self._found, [*found, ui.note("Reading the first frame and the recordings ...")])
+            opened = await asyncio.to_thread(_open, self._state.root, folder)
+            ui.schedule_parts(self._found, found)
+            ui.schedule_update(lambda: self._show(opened))
         ui.schedule_update(lambda: self._state.param.update(looked=self._state.looked + 1))
 
     def _show(self, opened: Opened) -> None:

@@ -25,6 +25,7 @@ from fusion.pipeline.inspect import (
     time_bars,
     write_frames,
 )
+from interferometry.io.faults import LaserFormatError
 from tests.thermography.flir_mutations import PARAMETERS, frame
 from thermography import inspection
 from thermography.common import ThermographyError
@@ -115,6 +116,46 @@ def test_the_files_of_a_campaign(campaign_folder):
     laser = described(campaign_folder / "laser.csv")
     assert "deviations, 24 cycles, 6 targets from 0 to 250 mm, 288 of 288 readings" in laser[0]
     assert laser[2].endswith("times recorded, UTC in the file")
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "reason"),
+    [
+        (ZeroDivisionError(), Kind.UNKNOWN, "ZeroDivisionError in "),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), Kind.UNKNOWN, "UnicodeDecodeError in "),
+        (MemoryError(), Kind.UNKNOWN, "MemoryError in "),
+        (LaserFormatError("log.csv: line 7 is cut"), Kind.UNKNOWN, "line 7 is cut"),
+        (PermissionError(13, "Permission denied"), Kind.UNREADABLE, "Permission denied"),
+    ],
+)
+def test_a_file_on_which_a_reader_fails_is_not_used_and_stops_no_other(tmp_path, monkeypatch, error, kind, reason):
+    """Whatever a reader raises: one place tells why, and what nobody has foreseen with its type and place."""
+    (tmp_path / "a.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n1,20,0\n")
+    (tmp_path / "b.csv").write_text("name,x_mm,y_mm\nmotor,0,0\nmotor,9,0\nmotor,9,9\n")
+
+    def fails(headings):
+        if any(name.startswith("t1") for name in headings):
+            raise error
+        return Kind.REGIONS
+
+    monkeypatch.setattr("fusion.pipeline.inspect._by_headings", fails)
+    # A table that one reader refuses may be one of another kind: here it is none.
+    monkeypatch.setattr("fusion.pipeline.inspect._logged_table", lambda path: None)
+    content = scan_folder(tmp_path)
+    assert [one.path.name for one in content.of(Kind.REGIONS)] == ["b.csv"]
+    (unused,) = content.unknown
+    assert (unused.path.name, unused.kind) == ("a.csv", kind) and reason in unused.reason
+    told = {one.label: one for one in inspect_paths([tmp_path])}
+    assert reason in told[str(tmp_path / "a.csv")].fault and not told[str(tmp_path / "b.csv")].fault
+
+
+def test_a_text_with_fields_longer_than_any_cell_is_no_table(tmp_path):
+    """Reports hold such lines: they stand beside the files of a measurement."""
+    (tmp_path / "page.html").write_text(f"<script>\nvar a = [1, '{'x' * 200_000}']\n</script>\n" * 3)
+    (tmp_path / "head.csv").write_text(f"time,'{'x' * 200_000}',b\n1,2,3\n")
+    for name in ("page.html", "head.csv"):
+        found = recognise(tmp_path / name)
+        assert found.kind is Kind.UNKNOWN and "fault of the program" not in found.reason, name
 
 
 def test_regions_lenses_recipes_and_records(tmp_path):

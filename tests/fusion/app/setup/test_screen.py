@@ -80,10 +80,25 @@ def test_saving_is_off_while_it_works_and_comes_back_whatever_fails(copied, monk
     assert "laser.csv: permission denied" in texts([screen.view])
     assert not screen.editor._save.disabled
     failing(ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
-        asyncio.run(screen.editor._on_save(None))
+    monkeypatch.chdir(copied)  # the report of the fault
+    asyncio.run(screen.editor._on_save(None))
+    assert "ZeroDivisionError in" in texts([screen.view])
     assert seen == [True, True]
     assert not screen.editor._save.disabled
+
+
+def test_a_folder_that_cannot_be_looked_into_is_told_with_the_place_of_the_fault(copied, monkeypatch):
+    screen = SetUpScreen(State(root=copied))
+    monkeypatch.chdir(copied)
+    for name in ("found_in_folder", "_open"):
+        with monkeypatch.context() as patched:
+            patched.setattr(f"fusion.app.setup.screen.{name}", lambda *paths: 1 / 0)
+            asyncio.run(screen.look())
+        shown = texts([screen.view])
+        assert "ZeroDivisionError in" in shown and "test_screen.py, line" in shown
+        assert ("What was recognised" in shown) == (name == "_open")
+        assert "..." not in shown.partition("What was recognised")[0]
+        assert not screen._look.disabled
 
 
 @pytest.fixture
