@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ from interferometry.iso230.evaluation import STANDARD_CYCLES
 LEAST_TARGETS, TARGETS_PER_METRE, LONGEST_TRAVEL_MM = 5, 5, 2000.0
 #: Travel of a rotary axis in deg up to which so many target positions are enough, and how many beyond.
 _ANGULAR_TARGETS, _MOST_ANGULAR_TARGETS = ((90.0, 3), (180.0, 5)), 8
+#: Decimals of a position, mm or deg: a tenth of a micrometre is that of the readers.
+_DIGITS = 4
 #: Spacings that differ by less than this share of their mean are equal.
 _EQUAL_SHARE = 1e-3
 #: A trend over the cycles with a smaller p-value is no scatter.
@@ -47,23 +50,28 @@ def check_conditions(
 
 
 def _targets(position: np.ndarray) -> ConditionCheck:
-    travel_m = 1e-3 * float(np.ptp(position))
-    required = max(LEAST_TARGETS, int(np.ceil(TARGETS_PER_METRE * travel_m)))
+    travel = _travelled(position)
+    required = max(LEAST_TARGETS, math.ceil(TARGETS_PER_METRE * travel / 1000.0))
     name = f"at least {LEAST_TARGETS} targets, and {TARGETS_PER_METRE} per metre"
     return ConditionCheck(
-        name, position.size >= required, f"{position.size} targets over {1e3 * travel_m:g} mm; required: {required}."
+        name, position.size >= required, f"{position.size} targets over {travel:g} mm; required: {required}."
     )
 
 
+def _travelled(position: np.ndarray) -> float:
+    """Return the measured travel to the digit that positions have, in mm or deg: their difference in binary numbers may be longer."""
+    return round(float(np.ptp(position)), _DIGITS)
+
+
 def _angles(position: np.ndarray) -> ConditionCheck:
-    travel = float(np.ptp(position))
+    travel = _travelled(position)
     required = next((least for angle, least in _ANGULAR_TARGETS if travel <= angle), _MOST_ANGULAR_TARGETS)
     name = f"at least {required} targets for this travel of a rotary axis"
     return ConditionCheck(name, position.size >= required, f"{position.size} targets over {travel:g}°.")
 
 
 def _travel(position: np.ndarray) -> ConditionCheck:
-    travel = float(np.ptp(position))
+    travel = _travelled(position)
     evidence = f"Measured travel {travel:g} mm."
     if travel > LONGEST_TRAVEL_MM:
         evidence += " Longer axes have a test of their own: one approach from each side to targets about 250 mm apart."

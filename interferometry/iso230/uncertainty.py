@@ -44,7 +44,8 @@ class UncertainTest:
         self._variation = budget.environmental_variation_um or 0.0
         self._mean, self._s = result["mean_unidirectional"].values, result["standard_deviation"].values
         self._count, self._distance_mm = result["count"].values, position_mm - position_mm.min()
-        self._excess = _excess_of_extremes(self._mean, self._s, self._count)
+        along = np.argsort(position_mm, kind="stable")
+        self._excess = _excess_of_extremes(self._mean[:, along], self._s[:, along], self._count[:, along])
         self._scale = 1e-3 * (
             GTC.ureal(0, budget.device_ppm, label="device")
             + GTC.ureal(0, budget.alignment_ppm, label="alignment")
@@ -181,15 +182,30 @@ def _contributions(value: GTC.lib.UncertainReal) -> list[float]:
 
 
 def _excess_of_extremes(mean: np.ndarray, s: np.ndarray, count: np.ndarray) -> dict[str, np.ndarray]:
-    """Return by how much the quantities of tests of an axis exceed those of the axis itself, on average, um."""
-    rng = np.random.default_rng(_SEED)
+    """Return by how much the quantities of tests of an axis exceed those of the axis itself, on average, um; targets in its order."""
     readings = np.where(np.isfinite(mean), count, 2)
     u = s / np.sqrt(readings)
     axis = _without_scatter(mean, u)
-    shape = (_DRAWS, *mean.shape)
-    drawn_s = s * np.sqrt(rng.chisquare(readings - 1, shape) / (readings - 1))
-    drawn, own = axis_quantities(axis + u * rng.standard_normal(shape), drawn_s), axis_quantities(axis, s)
+    squares, normal = _draw(readings - 1)
+    drawn_s = s * np.sqrt(squares / (readings - 1))
+    drawn, own = axis_quantities(axis + u * normal, drawn_s), axis_quantities(axis, s)
     return {name: np.fmax(values.mean(axis=0) - own[name], 0.0) for name, values in drawn.items()}
+
+
+def _draw(freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return chi-square numbers of these degrees of freedom (direction, target), and normal ones, as (draw, direction, target).
+
+    The second half is the first as seen from the other end of the axis, which turns approach and sign: neither end is preferred.
+    """
+    squares, normal = np.empty((2, _DRAWS, *freedom.shape))
+    half = _DRAWS // 2
+    for cell in np.ndindex(freedom.shape):
+        opposite = tuple(size - 1 - at for size, at in zip(freedom.shape, cell, strict=True))
+        for part, place, sign in ((slice(half), cell, 1.0), (slice(half, None), opposite, -1.0)):
+            rng = np.random.default_rng((_SEED, *place))
+            squares[(part, *cell)] = rng.chisquare(freedom[cell], half)
+            normal[(part, *cell)] = sign * rng.standard_normal(half)
+    return squares, normal
 
 
 def _without_scatter(mean: np.ndarray, u: np.ndarray) -> np.ndarray:

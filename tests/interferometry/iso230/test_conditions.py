@@ -55,6 +55,13 @@ def test_too_few_targets_and_equal_spacings_are_told():
     assert "Without times" in found(deviations)["settled"].evidence
 
 
+@pytest.mark.parametrize("start_mm", [0.0, 0.1, 0.3])
+def test_five_targets_per_metre_are_enough_on_every_travel(start_mm):
+    for targets in range(5, 11):
+        checks = found(at_positions(np.linspace(start_mm, start_mm + 200.0 * targets, targets)))
+        assert checks["targets"].met and checks["travel"].met
+
+
 @pytest.mark.parametrize(("t95_s", "met"), [(1000.0, True), (1400.0, False)])
 def test_the_window_must_begin_after_the_warm_up(t95_s, met):
     deviations = at_positions([0.0, 20.0, 45.0, 70.0, 100.0], cycles=7)

@@ -5,7 +5,7 @@ import pytest
 
 from interferometry.iso230 import CONTRIBUTIONS, Iso230Budget, evaluate_iso230
 from interferometry.iso230.budget import SCATTER_ALONE
-from interferometry.iso230.evaluation import axis_quantities, target_quantities
+from interferometry.iso230.evaluation import ONE_WAY, QUANTITIES, axis_quantities, target_quantities
 from tests.interferometry.iso230.made_tests import test_made
 
 pytestmark = pytest.mark.long
@@ -112,6 +112,23 @@ def test_a_test_worked_by_hand():
     assert found["E_unidirectional"].tolist() == [6.0, 2.0]
     # (6 + 1) - (0 - 1), (3 + 2) - (1 - 0.5) against 3 - 2 = 1 at the last position.
     assert found["A_unidirectional"].tolist() == [8.0, 4.5]
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_uncertainties_do_not_depend_on_the_order_of_the_targets_or_the_end_of_the_axis(rng, gaps):
+    x = rng.normal(0.0, 0.5, (5, 2, 7)) + np.linspace(0.0, 2.0, 7)
+    if gaps:
+        x[2, 0, 1] = x[:, 1, 4] = np.nan
+    test, order = test_made(x), rng.permutation(7)
+    found = evaluate_iso230(test)
+    listed = test.isel(target=order).assign_coords(target=test["target"].values)
+    mirrored = test_made(-x[:, ::-1, ::-1])
+    for other, side in ((evaluate_iso230(listed), slice(None)), (evaluate_iso230(mirrored), slice(None, None, -1))):
+        for name in QUANTITIES:
+            for one in (name, f"{name}_u"):
+                assert float(other[one]) == pytest.approx(float(found[one]), rel=1e-9)
+        for name in ONE_WAY:
+            np.testing.assert_allclose(other[f"{name}_u"][side], found[f"{name}_u"], rtol=1e-9)
 
 
 def test_many_tests_at_once_are_each_by_itself():
