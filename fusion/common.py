@@ -7,10 +7,11 @@ import json
 import platform
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import metadata
+from itertools import chain, count
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args, get_type_hints
 
@@ -60,6 +61,11 @@ def place_within(folder: Path, name: str) -> Path | None:
         return path if folder.resolve() in path.resolve().parents else None
     except (OSError, RuntimeError, ValueError):  # A link to itself, a name that no system can hold.
         return None
+
+
+def own_name(name: str, taken: Collection[str]) -> str:
+    """Return a name that is none of those taken: with a number behind it where names from a file make two alike."""
+    return next(one for one in chain([name], (f"{name} ({k})" for k in count(2))) if one not in taken)
 
 
 # TOML files that a user writes: read into tables, and their faults as sentences with line, key, value and remedy (pydantic finds them).

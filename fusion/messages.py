@@ -29,7 +29,7 @@ from rich.text import Text
 
 from fusion.common import FusionError, suggest
 from interferometry.common import InterferometryError
-from thermography.common import ThermographyError
+from thermography.common import ACTING, ThermographyError
 
 # Exit codes and signals: a command ends done, refused, stopped, or by a fault of its own, with one message.
 
@@ -251,9 +251,6 @@ def _module(filename: str) -> str:
     return path.relative_to(nearest).as_posix()
 
 
-#: Characters that move the cursor, colour, rename or clear a terminal (C0 but for tab and line feed, DEL, C1), turn the direction of what
-#: follows, end a line without being seen to, or are half of a character (bytes of a file name that are no text).
-_ACTING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _BEYOND_ASCII = re.compile("[^\x00-\x7f]+")
 #: Longer lines, and more of them, are cut: a message that names what somebody put into a file is read by people.
 _LONGEST_LINE, _MOST_LINES = 4_000, 2_000
@@ -261,12 +258,12 @@ _LONGEST_LINE, _MOST_LINES = 4_000, 2_000
 
 def printable(text: str) -> str:
     r"""Return a text in which nothing acts on a terminal (ECMA-48, UAX 9): such characters are written as in Python, ``\x1b``."""
-    return _ACTING.sub(lambda found: repr(found.group())[1:-1], text)
+    return ACTING.sub(lambda found: repr(found.group())[1:-1], text)
 
 
 def printable_json(text: str) -> str:
     r"""Return JSON in which nothing acts on a terminal: the same values, such characters written as ``\u009b``."""
-    return _ACTING.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
+    return ACTING.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
 
 
 def ascii_json(text: str) -> str:
@@ -302,6 +299,9 @@ def short(text: str) -> str:
 
 class Terminal(Console):
     """A console of which text is no markup, has no marks for pictures, and does not act on the terminal."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(emoji=False, **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print as `rich.console.Console.print` does; text as it is, and short enough to be read."""

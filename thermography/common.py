@@ -1,13 +1,17 @@
-"""What the whole package shares: its error, the contract of its products, and a robust scatter; light to import."""
+"""What the whole package shares: its error, the contract of its products, texts of tables, and a robust scatter; light to import."""
 
 from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pandas as pd
     from numpy.typing import ArrayLike, NDArray
 
 Array: TypeAlias = "NDArray[Any]"
@@ -64,6 +68,33 @@ def scatter_by_median(values: ArrayLike, *, centre: float | None = None) -> floa
         return float("nan")
     about = np.median(known) if centre is None else centre
     return float(np.median(np.abs(known - about))) / _NORMAL_MEDIAN
+
+
+#: Characters that move the cursor, colour, rename or clear a terminal (C0 but for tab and line feed, DEL, C1), turn the direction of what
+#: follows, end a line without being seen to, or are half of a character (bytes of a file name that are no text).
+ACTING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+#: Signs with which formulas of a spreadsheet begin, full-width ones too (OWASP, "CSV injection").
+_FORMULA = ("=", "+", "-", "@", "\t", "\n", "＝", "＋", "－", "＠")
+
+
+def spreadsheet_text(text: str) -> str:
+    """Return a text as a table for spreadsheets holds it: nothing in it acts, and an apostrophe stands before what begins a formula."""
+    shown = ACTING.sub(" ", text)
+    return f"'{shown}" if shown.startswith(_FORMULA) else shown
+
+
+def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> str | None:
+    """Write a table as CSV without its index, or return it; no heading and no text of it is a formula."""
+
+    def safe(value: object) -> object:
+        return spreadsheet_text(value) if isinstance(value, str) else value
+
+    texts = {at: column.map(safe) for at, (_, column) in enumerate(frame.items()) if column.dtype.kind not in "biufcmM"}
+    shown = frame.copy(deep=False)
+    for at, column in texts.items():
+        shown.isetitem(at, column)
+    shown.columns = [safe(name) for name in frame.columns]
+    return shown.to_csv(path, index=False, **options)
 
 
 #: Contract of the products, on which other packages rely: name of a variable -> (dims, units, kind), kind being a NumPy dtype kind

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from thermography.common import Array, ThermographyError
+from thermography.common import Array, ThermographyError, write_csv
 from thermography.evaluation import (
     OVERRANGE,
     UNDERRANGE,
@@ -180,9 +180,7 @@ def export_frames(
         dataset = table.to_dataset()
         named = {name: f"{name}_{unit}" for name, one in dataset.items() if (unit := one.attrs["units"]) != "1"}
         rows = dataset.to_dataframe().reset_index().rename(columns=named)
-        yield _write(
-            folder / "regions.csv", lambda path: rows[rows["pixels"] > 0].to_csv(path, index=False, float_format="%.4f")
-        )
+        yield _write(folder / "regions.csv", partial(write_csv, rows[rows["pixels"] > 0], float_format="%.4f"))
 
 
 def _scale(table: RegionTable) -> tuple[float, float]:

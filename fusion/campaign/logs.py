@@ -9,8 +9,10 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 import pandas as pd
@@ -80,8 +82,11 @@ def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str
     headings = list(headings)
     selected: set[str] = set()
     for pattern in patterns:
-        escaped = pattern.replace("[", "[[]")
-        matching = {heading for heading in headings if heading == pattern or fnmatch.fnmatchcase(heading, escaped)}
+        escaped = normalize("NFC", pattern).replace("[", "[[]")
+        # A heading that is called so is meant, whatever else it would match as a pattern; é may be one character or two.
+        matching = {pattern} & set(headings) or {
+            heading for heading in headings if fnmatch.fnmatchcase(normalize("NFC", heading), escaped)
+        }
         if not matching:
             raise CampaignError(f'no column is named "{pattern}"; the file has: {", ".join(headings)}')
         selected |= matching
@@ -275,6 +280,10 @@ def columns_of(
             )
         # TC(1) and TC(2) of a logger are two names, whose units stand elsewhere.
         roles[role][heading] = (heading if elsewhere and in_heading not in ("", elsewhere) else name, unit)
+    for of_role in roles.values():
+        names = [name for name, _ in of_role.values()]
+        # Columns that only their units tell apart are called by their whole headings.
+        of_role |= {heading: (heading, unit) for heading, (name, unit) in of_role.items() if names.count(name) > 1}
     used = {heading for of_role in roles.values() for heading in of_role}
     example = next((heading for heading in reversed(headings) if heading not in used), headings[-1])
     for role in ("temperature", "displacement"):
@@ -373,10 +382,12 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
 
 def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) -> Rows:
     """Return rows with the names of their columns, and their units, without the spaces around them."""
-    names = pd.Series([str(name).strip() for name in frame.columns], dtype=object)
-    again = names.groupby(names).cumcount()
-    # A name that recurs is numbered, as pandas does before the spaces are gone.
-    frame.columns = pd.Index(names.where(again == 0, names + "." + again.astype(str)))
+    names: list[str] = []
+    for name in frame.columns:
+        stripped = str(name).strip()
+        # As pandas numbers headings that are alike.
+        names.append(next(one for one in chain([stripped], (f"{stripped}.{k}" for k in count(1))) if one not in names))
+    frame.columns = names
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
 
 

@@ -42,7 +42,7 @@ from fusion.results.parts import Quantity
 from fusion.results.progress import Report, silent
 from fusion.results.results import Results, read_results
 from fusion.results.store import read_json_object, read_product, write_atomically, write_json, write_text
-from thermography.common import usable_processors
+from thermography.common import spreadsheet_text, usable_processors
 
 # Campaigns of a fleet: found in folders, each with a name of its own; and whether the results of one are still those
 # of its files.
@@ -312,13 +312,8 @@ def as_csv(rows: Sequence[Row]) -> str:
     writer.writerow([*_COLUMNS, "report"])
     for row in rows:
         values = [*(getattr(row, name) for name in _COLUMNS), row.report]
-        writer.writerow([_no_formula(value) if isinstance(value, str) else value for value in values])
+        writer.writerow([spreadsheet_text(value) if isinstance(value, str) else value for value in values])
     return written.getvalue()
-
-
-def _no_formula(text: str) -> str:
-    """Return a text with an apostrophe before a sign with which formulas begin."""
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 #: Decisions by ISO 14253-1, the least favourable first.

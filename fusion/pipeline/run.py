@@ -55,6 +55,7 @@ from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
+from thermography.common import write_csv
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
@@ -227,7 +228,7 @@ def _evaluate_thermograms(run: Run, camera: CameraInputs, alone: CameraInputs | 
     thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, camera))
     table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
     claim(run.folder, _TABLE)
-    run.products.append(write_text(run.folder / _TABLE, table.to_dataframe().reset_index().to_csv(index=False)))
+    run.products.append(write_text(run.folder / _TABLE, str(write_csv(table.to_dataframe().reset_index()))))
     series = run.parts["thermograms"]["series"] if alone else run.parts["regions"][0]["camera"]
     run.draw(partial(_draw, "pictures", thermograms, series))
     return thermograms

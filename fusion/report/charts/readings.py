@@ -24,6 +24,7 @@ from fusion.report.charts.style import (
     add_ordered_lines,
     add_series,
     fix_range,
+    literal,
     new_figure,
     of_direction,
     ordered_colours,
@@ -429,7 +430,7 @@ def plot_timeline(fused: xr.Dataset) -> Chart:
     shown: LayoutDOM = column(bars, *below, sizing_mode="stretch_width") if below else bars
     gaps = [f"{name} {len(parts) - 1}" for name, parts in spans.items() if len(parts) > 1]
     units = {name: print_unit(str(fused[name].attrs.get("units", "1"))) for name in series}
-    said = [f"{_words(name)} {span_words(fused[name], unit)}" for name, unit in units.items()]
+    said = [f"{_words(fused[name])} {span_words(fused[name], unit)}" for name, unit in units.items()]
     seen = (
         f"Recorded over {number(float(max(np.nanmax(hours) for hours in recorded.values())), 2)} h: {join(list(recorded))}; "
         f"{'gaps: ' + ', '.join(gaps) if gaps else 'no gaps'}." + (f" {'; '.join(said)}." if said else "")
@@ -476,16 +477,18 @@ def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> figure:
 def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure) -> figure:
     """Draw one logged quantity below the bars, on the same time axis."""
     unit = print_unit(str(values.attrs.get("units", "1")))
-    words = _words(str(values.name))
+    words = _words(values)
     drawn = new_figure(x=_TIME, y=unit, title=words, height=118)
     drawn.x_range = above.x_range
     drawn.yaxis.ticker.desired_num_ticks = 3
     low, high = shared_range(values.values)
     fix_range(drawn, low, high)
     line = drawn.line(hours, values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)
-    add_hover(drawn, [("time", "@x{0.00} h"), (words, f"@y{{0.00}} {unit}")], [line])
+    add_hover(drawn, [("time", "@x{0.00} h"), (words, f"@y{{0.00}} {literal(unit)}")], [line])
     return drawn
 
 
-def _words(name: str) -> str:
-    return name.removesuffix("_series").replace("_", " ")
+def _words(series: xr.DataArray) -> str:
+    """Return the name of a logged quantity: that of a driver as its file writes it."""
+    name = str(series.name).removesuffix("_series")
+    return name if series.dims == ("driver_time",) else name.replace("_", " ")

@@ -10,6 +10,7 @@ from bokeh.layouts import column
 from bokeh.models import Plot
 from bokeh.plotting import figure
 
+from fusion.common import own_name
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import (
     BEFORE,
@@ -107,14 +108,13 @@ def plot_drivers(record: xr.Dataset) -> Chart:
     for k, name in enumerate(str(driver) for driver in record["driver_name"].values):
         unit = print_unit(str(record["driver_units"].values[k]))
         values = record["driver"].values[:, k] * float(record["driver_size"].values[k])
-        label = f"{name} / {unit}" if unit else name
-        drawn = new_figure(x=_TIME, y=label, height=200)
+        drawn = new_figure(x=_TIME, y=unit, title=name, height=200)
         if parts:
             drawn.x_range = parts[0].x_range
         fix_range(drawn, *shared_range(values, np.zeros(1)))
         add_series(drawn, hours, values, name=name, colour=CATEGORIES[k % len(CATEGORIES)], legend=False)
         parts.append(drawn)
-        columns[label] = values
+        columns[own_name(f"{name} / {unit}" if unit else name, columns)] = values
         said.append(f"{name} {span_words(values, unit).strip()}")
     shown: Plot = parts[0] if len(parts) == 1 else column(*parts, sizing_mode="stretch_width")
     return Chart(shown, f"Logged drivers over time: {'; '.join(said)}.", columns)

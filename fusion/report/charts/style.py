@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from bokeh.models import (
     Line,
     LinearColorMapper,
     PanTool,
+    PlainText,
     Plot,
     Range1d,
     Scatter,
@@ -40,6 +42,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
+from fusion.common import own_name
 from fusion.report.charts.embedded import EmbeddedChart, in_script
 from interferometry.plots import ACCENT, COLOURS, GRID, INK, MUTED
 
@@ -118,7 +121,8 @@ def new_figure(
             axis.ticker = FixedTicker(ticks=_LOG_TICKS)
     drawn.grid.grid_line_color = GRID
     if title:
-        drawn.title.update(text_font=_FONT, text_font_size="13px", text_color=INK)
+        # A name from a file is no formula, which Bokeh would look for between signs such as $$.
+        drawn.title.update(text=PlainText(text=title), text_font=_FONT, text_font_size="13px", text_color=INK)
     drawn.add_layout(
         Legend(
             orientation="horizontal", ncols=legend_columns, border_line_color=None, background_fill_alpha=0.0, margin=0, padding=2,
@@ -138,6 +142,11 @@ def _announced(label: str, scale: str) -> str:
 def add_hover(drawn: figure, tips: Tips, renderers: Sequence[GlyphRenderer]) -> None:
     """Show the values under the pointer."""
     drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers)))
+
+
+def literal(name: str) -> str:
+    """Return a name from a file as it stands in a value under the pointer, which Bokeh reads as HTML with fields after @ and $."""
+    return html.escape(name).replace("@", "&#64;").replace("$", "&#36;")
 
 
 def add_mark(drawn: figure, source: ColumnDataSource, glyph: Glyph, name: str = "", **options: Any) -> GlyphRenderer:
@@ -183,7 +192,8 @@ def add_series(
         parts.append(add_mark(drawn, source, points, named))
     (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
     shown = "@y{0.000}" + (" ± @half{0.000}" if half is not None else "")
-    add_hover(drawn, [("", name), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {y_unit}")], parts[-1:])
+    tips = [("", literal(name)), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {literal(y_unit)}")]
+    add_hover(drawn, tips, parts[-1:])
 
 
 class Courses:
@@ -197,7 +207,7 @@ class Courses:
     ) -> None:
         """Draw a series of values in µm; `heading` and `seen` where they are not its name with the unit, and the span of its values."""
         add_series(self.figure, x, y, name=name, **looks)
-        self.columns[heading or f"{name} / µm"] = y
+        self.columns[own_name(heading or f"{name} / µm", self.columns)] = y
         self.told.append(f"{name} {span_words(y, 'µm') if seen is None else seen}")
 
     def chart(self, subject: str) -> Chart:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from bokeh.plotting import figure
 
+from fusion.common import own_name
 from fusion.report.charts.plan import add_marks, add_names, draw_picture
 from fusion.report.charts.style import DIVERGING, Chart, add_series, new_figure, of_rank, span_words
 from fusion.report.numbers import fixed
@@ -147,7 +148,7 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
                 line=False,
                 marker="triangle",
             )
-        columns[f"{name} / °C"] = values.values
+        columns[own_name(f"{name} / °C", columns)] = values.values
         told.append(f"{name} {span_words(values, '°C')}{' and above' if beyond.any() else ''}")
     return Chart(drawn, f"Temperatures in {seconds.size} pictures: {'; '.join(told)}.", columns)
 
@@ -160,7 +161,8 @@ def plot_profiles(picture: xr.Dataset, lines: Sequence[Region]) -> Chart:
     for rank, line in enumerate(lines):
         along = read_profile(picture, line)
         add_series(drawn, along["distance"].values, along.values, name=line.name, **of_rank(rank))
-        columns |= {f"{line.name}, distance / px": along["distance"].values, f"{line.name} / °C": along.values}
+        columns[own_name(f"{line.name}, distance / px", columns)] = along["distance"].values
+        columns[own_name(f"{line.name} / °C", columns)] = along.values
         told.append(f"{line.name} {span_words(along.values, '°C')}")
     longest = max(len(values) for values in columns.values())
     padded = {

@@ -46,6 +46,7 @@ from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically
 from fusion.results.table_prediction import ENDING, TablePrediction
 from interferometry.iso230 import STANDARD_CYCLES
+from thermography.common import write_csv
 
 # The guard of compensation tables: why a run's profile should not go into a control, and what to know where it may.
 
@@ -488,7 +489,7 @@ def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_f
 
 
 def _frame_writer(frame: pd.DataFrame) -> Writer:
-    return lambda path: frame.to_csv(path, index=False, float_format="%.6g", date_format="%Y-%m-%dT%H:%M:%S.%fZ")
+    return lambda path: write_csv(frame, path, float_format="%.6g", date_format="%Y-%m-%dT%H:%M:%S.%fZ")
 
 
 def _write(out: Path, content: dict[str, Writer], *, overwrite: bool) -> tuple[Path, ...]:

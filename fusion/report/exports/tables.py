@@ -15,11 +15,11 @@ import pandas as pd
 import xarray as xr
 from openpyxl import Workbook
 from openpyxl.cell import WriteOnlyCell
-from openpyxl.cell.cell import ILLEGAL_CHARACTERS_RE
 from openpyxl.chart import BarChart, Reference, ScatterChart, Series
 from openpyxl.styles import Alignment, Font
 from openpyxl.utils import get_column_letter
 
+from fusion.common import own_name
 from fusion.report.numbers import print_unit
 from fusion.report.terminal import summary_rows
 from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters
@@ -27,6 +27,7 @@ from fusion.results.loop import RecordLoop
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
 from interferometry import iso230
+from thermography.common import ACTING
 
 #: Bytes of a row of fields.csv, measured on the demo.
 _FIELD_ROW_BYTES = 38
@@ -238,13 +239,18 @@ def record_readings_table(record: xr.Dataset) -> pd.DataFrame:
     columns: dict[str, Any] = {"time [h]": elapsed}
     # The times of a record whose start nobody states count from zero.
     columns |= {"time_utc": time} if time[0] >= np.datetime64("1971-01-01") else {}
+
+    def add(name: str, unit: str, values: np.ndarray) -> None:
+        columns[own_name(f"{name} [{unit}]", columns)] = values
+
     for k, name in enumerate(record["channel"].values):
-        columns[f"{name} [um]"] = record["displacement"].values[:, k]
-        columns[f"{name}, predicted [um]"] = record["predicted_final"].values[:, k]
-    columns |= {f"{name} [degC]": record["temperature"].values[:, k] for k, name in enumerate(record["sensor"].values)}
+        add(name, "um", record["displacement"].values[:, k])
+        add(f"{name}, predicted", "um", record["predicted_final"].values[:, k])
+    for k, name in enumerate(record["sensor"].values):
+        add(name, "degC", record["temperature"].values[:, k])
     for k, name in enumerate(record["driver_name"].values):
         size, unit = (record[key].values[k] for key in ("driver_size", "driver_units"))
-        columns[f"{name} [{unit}]"] = record["driver"].values[:, k] * float(size)
+        add(name, unit, record["driver"].values[:, k] * float(size))
     return pd.DataFrame({**columns, "held_out": np.where(record["sealed"].values, "yes", "no")})
 
 
@@ -393,12 +399,11 @@ def write_workbook(path: Path, sheets: Mapping[str, pd.DataFrame], bars: Bars | 
 
 def in_words(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a table with headings for people, and expanded uncertainties (k = 2) in place of standard ones."""
-    return pd.DataFrame(
-        {
-            _heading(str(name)): 2 * column if _uncertain(str(name)) and column.dtype.kind == "f" else column
-            for name, column in frame.items()
-        }
-    )
+    shown: dict[str, Any] = {}
+    for name, column in frame.items():
+        expanded = _uncertain(str(name)) and column.dtype.kind == "f"
+        shown[own_name(_heading(str(name)), shown)] = 2 * column if expanded else column
+    return pd.DataFrame(shown)
 
 
 def _uncertain(name: str) -> re.Match[str] | None:
@@ -497,7 +502,7 @@ def _cell(sheet: object, value: Any, *, bold: bool = False, shown: str = "Genera
     """Return a cell: a text as a text, a number as a number, a time without its zone (UTC), nothing where there is no number."""
     cell = WriteOnlyCell(sheet)
     if isinstance(value, str | Linked):
-        text = ILLEGAL_CHARACTERS_RE.sub(" ", _text(value))
+        text = ACTING.sub(" ", _text(value))
         cell.value, cell.data_type = text, "s"
         if isinstance(value, Linked):
             cell.hyperlink, cell.style = value.target, "Hyperlink"
