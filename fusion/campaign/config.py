@@ -53,6 +53,7 @@ from fusion.campaign.values import (
     matching_files,
     not_a_file,
     split_uncertainty,
+    stored_path,
 )
 from fusion.common import FusionError, TomlError, describe, first_faults, place_in, read_toml, suggest
 from fusion.messages import near_file
@@ -228,7 +229,7 @@ class _Surroundings:
 def _existing(name: str, info: ValidationInfo) -> str:
     """Accept the name of a file that exists."""
     if isinstance(info.context, _Surroundings):
-        path = info.context.folder / name
+        path = stored_path(info.context.folder, name)
         if text := not_a_file(path):
             raise ValueError(text)
         if not os.path.isfile(path):  # noqa: PTH113 - no file has a name that is too long, or with a NUL
@@ -834,7 +835,7 @@ class Campaign(Table):
 
     def resolve(self, name: str) -> Path:
         """Return the absolute path of a file named in the campaign."""
-        return (self.folder / name).resolve()
+        return stored_path(self.folder, name).resolve()
 
     def frame_paths(self) -> tuple[Path, ...]:
         """Return the thermal files that the glob patterns match, each once, sorted by name."""

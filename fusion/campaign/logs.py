@@ -45,12 +45,10 @@ from interferometry.io.tables import (
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
-#: Names that a variable of NetCDF can have (netCDF-C, Users Guide, "names"), and that are short enough to be read.
-_NAME = re.compile(r"\w[^/\x00-\x1f\x7f]{0,99}")
 #: What the readings and the model call their own variables: a driver of that name would stand in their place.
 _TAKEN = (
     "cycle", "direction", "target", "position", "time", "deviation", "quality_flag", "inside_frames", "effect", "period", "mean_rise",
-    "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral", "driver_time", "environment_time", "frame_time",
+    "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral", "driver_time", "environment_time", "frame_time", "correlation",
 )  # fmt: skip
 #: Seconds beyond these are damaged numbers: LabVIEW counts from 1904, 4.5e9 s reach to 2046.
 _LONGEST_RECORD_S = 4.5e9
@@ -122,28 +120,33 @@ def read_drivers(path: str | Path, layout: LoggedTable | None = None) -> xr.Data
     >>> from fusion import align
     >>> fused = align(deviations, fields, axis, drivers=read_drivers("drivers.csv"))  # doctest: +SKIP
     """
-    path = Path(path)
+    log = _read_log(Path(path), layout)
+    for name in map(str, log.data_vars):
+        if "/" in name:
+            raise TableError(
+                f'{path}: the column "{name}" has a / in its name, by which the parts of a product are told apart; call it for example '
+                f'"{name.replace("/", "-")}"'
+            )
+        if name in _TAKEN or name.startswith("loop_") or name.endswith("_series"):
+            raise TableError(
+                f'{path}: the column "{name}" has the name of a result; rename it, for example "logged {name}"'
+            )
+    return log
+
+
+def _read_log(path: Path, layout: LoggedTable | None = None) -> xr.Dataset:
+    """Read a table of columns over time, each in its own unit."""
     table = read_table(path, ("time",)) if layout is None else _laid_out(path, layout)
     headings = {column: split_heading(path, column) for column in table.columns if column != "time"}
     if not headings:
         raise TableError(
             f'{path}: there is no column apart from time; add one named "name [unit]", or leave [drivers] out'
         )
-    for column, (name, _) in headings.items():
-        if not _NAME.fullmatch(name):
-            raise TableError(
-                f'{path}: the column "{column}" has a name that no product can store; begin it with a letter, leave / out, and write up to '
-                "100 characters"
-            )
-        if name in _TAKEN or name.startswith("loop_") or name.endswith("_series"):
-            raise TableError(
-                f'{path}: the column "{column}" has the name of a result; rename it, for example "logged {name}"'
-            )
-    variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
-    if len(variables) < len(headings):
-        names = [name for name, _ in headings.values()]
-        repeated = sorted({name for name in names if names.count(name) > 1})
+    names = [name for name, _ in headings.values()]
+    repeated = sorted({name for name in ["time", *names] if ["time", *names].count(name) > 1})
+    if repeated:
         raise TableError(f"{path}: more than one column is named {', '.join(repeated)}; give each its own name")
+    variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
     return read_timed_rows(
         table, variables, lambda fields: [table.numerals.number(fields[column]) for column in headings]
     )
@@ -622,7 +625,7 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
         return None
     path = campaign.resolve(table.file)
     zone = campaign.zone_of("sensors")
-    logged = bring_to_utc(read_drivers(path), zone, file=table.file, late_s=table.clock_offset_s)
+    logged = bring_to_utc(_read_log(path), zone, file=table.file, late_s=table.clock_offset_s)
     names = [str(name) for name in logged.data_vars]
     places = _read_places(campaign.resolve(table.places), names, plan.size_mm)
     columns = [
@@ -658,7 +661,9 @@ def _read_places(path: Path, names: list[str], size_mm: tuple[float, float]) -> 
                 f"{path}, line {line}: x {place[0]:g} mm, y {place[1]:g} mm is outside the plan of {size_mm[0]:g} x {size_mm[1]:g} mm; "
                 "correct the place, or plan.size"
             )
-        places[fields["name"].strip()] = place
+        written = fields["name"].strip()
+        alike = [name for name in names if normalize("NFC", name) == normalize("NFC", written)]
+        places[alike[0] if written not in names and alike else written] = place
     strange = sorted(set(names) ^ set(places))
     if strange:
         raise TableError(

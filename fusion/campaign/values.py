@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
+from unicodedata import normalize
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
@@ -307,6 +308,18 @@ def corner_words(corners: tuple[tuple[float, float], ...]) -> str:
     return ", ".join(f"({x:g}, {y:g})" for x, y in corners)
 
 
+def stored_path(folder: Path, name: str) -> Path:
+    """Return the path of a name below a folder, each part in the Unicode normal form in which it lies there: é is one character or two."""
+    path = folder
+    for part in Path(name).parts:
+        inside, path = path, path / part
+        if part.isascii() or os.path.lexists(path) or not os.path.isdir(inside):  # noqa: PTH112 - a name that is too long is none
+            continue
+        alike = [one for one in os.listdir(inside) if normalize("NFC", one) == normalize("NFC", part)]  # noqa: PTH208
+        path = inside / alike[0] if alike else path
+    return path
+
+
 def not_a_file(path: Path) -> str:
     """Return why something that is there is no file, or nothing."""
     if os.path.isdir(path):  # noqa: PTH112 - a name that no file can have is none
@@ -335,10 +348,16 @@ def matching_pipes(folder: Path, pattern: str) -> list[Path]:
 
 def _matches(folder: Path, pattern: str) -> list[Path]:
     """Return all that a pattern matches, folders too; nothing where it is too long for a name."""
-    given = Path(pattern)
-    start = Path(given.anchor) if given.anchor else folder
+    # What is there under this name is meant: brackets may stand in the name of a folder.
+    start, parts = folder, Path(pattern).parts
+    while parts and os.path.lexists(inside := stored_path(start, parts[0])):
+        start, parts = inside, parts[1:]
+    if not parts:
+        return [start]
     try:
-        return list(start.glob(str(given.relative_to(given.anchor))))
+        named = str(Path(*parts))
+        forms = dict.fromkeys([named, *(normalize(form, named) for form in ("NFC", "NFD"))])
+        return [path for form in forms for path in start.glob(form)]
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             return []

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +27,7 @@ from fusion.results.parts import Iso230Condition
 from fusion.results.store import group, write_atomically
 from fusion.results.thermal_test import ThermalTest
 from interferometry.plots import new_axes, plot_iso230
+from thermography.common import ACTING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,6 +43,8 @@ _SIGNED = {"Measured by": "Operator", "Approved by": "Approved by"}
 _CONVENTION = "not stated; taken as actual minus target position (ISO 230-2)"
 #: Dashes of lines as matplotlib names them.
 _LINES = {"solid": "-", "dashed": "--", "dotdash": "-.", "dotted": ":"}
+#: Characters of a name beside a curve; a longer one would leave no room for the curves.
+_LONGEST_LABEL = 40
 _MET = {True: "yes", False: "no", None: "not known"}
 
 
@@ -157,12 +162,17 @@ def write_thermal_tests(
 def plot_thermal_test(test: ThermalTest) -> Axes:
     """Plot the displacements of a test by ISO 230-3 over time."""
     axes = new_axes(None)
-    for rank, one in enumerate([one for one in test.courses if one.unit == "um"][:DRAWN]):
+    drawn = [one for one in test.courses if one.unit == "um"][:DRAWN]
+    for rank, one in enumerate(drawn):
         look = of_rank(rank)
         values = np.array(one.values, float)
-        axes.plot(one.hours, values, color=look["colour"], linestyle=_LINES[look["dash"]], label=one.name)
+        axes.plot(one.hours, values, color=look["colour"], linestyle=_LINES[look["dash"]])
     axes.set(xlabel="time since start / h", ylabel="drift / µm")
-    axes.legend(frameon=False, ncols=2)
+    # A name from a file may begin with an underscore, and is no formula.
+    legend = axes.legend(axes.lines, [" "] * len(axes.lines), frameon=False, ncols=2)
+    for text, one in zip(legend.get_texts(), drawn, strict=True):
+        shown = one.name if len(one.name) <= _LONGEST_LABEL else f"{one.name[: _LONGEST_LABEL - 1]}…"
+        text.set(text=shown, parse_math=False)
     return axes
 
 
@@ -179,6 +189,9 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
     normal = document.styles["Normal"]
     normal.font.name, normal.font.size, normal.paragraph_format.space_after = "Arial", Pt(7), Pt(0)
 
+    # XML holds no control characters.
+    clean = partial(ACTING.sub, " ")
+
     def put(rows: Iterable[Sequence[str]], widths_mm: Sequence[int], titles: Sequence[str] = ()) -> None:
         every = [*([titles] if titles else []), *rows]
         grid = document.add_table(rows=len(every), cols=len(every[0]), style="Table Grid")
@@ -187,20 +200,23 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
             column.width = Mm(width)
         for cells, texts in zip(grid.rows, every, strict=True):
             for cell, text, width in zip(cells.cells, texts, widths_mm, strict=False):
-                cell.text, cell.width = text, Mm(width)
+                cell.text, cell.width = clean(text), Mm(width)
         document.add_paragraph()
 
     pairs = (32, 57, 32, 57)
     for number, (sheet, axes) in enumerate(sheets):
         if number:
             document.add_page_break()
-        document.add_heading(sheet.title, level=1)
-        document.add_paragraph(sheet.standard)
+        document.add_heading(clean(sheet.title), level=1)
+        document.add_paragraph(clean(sheet.standard))
         put(in_pairs(sheet.stated.identity), pairs)
         drawn = axes.get_figure(root=True)
         assert drawn is not None
         picture = io.BytesIO()
-        drawn.savefig(picture, format="png", dpi=200, transparent=False)
+        with warnings.catch_warnings():
+            # A character that the font of charts lacks is a box there, and itself in the table below.
+            warnings.filterwarnings("ignore", "Glyph .* missing from font")
+            drawn.savefig(picture, format="png", dpi=200, transparent=False)
         document.add_picture(picture, width=Mm(125))
         # The first column holds names, the others share what is left of the width.
         titles = sheet.values.titles
@@ -211,7 +227,7 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
             put(in_pairs(sheet.stated.conditions), pairs)
         put([[f"{role}: {name}\n", "Date, signature:"] for role, name in sheet.stated.signatures], (89, 89))
         hashes = "; ".join(f"{name} {sha256}" for name, sha256 in sheet.files.items())
-        document.add_paragraph(f"thermofuse {sheet.version}. SHA-256: {hashes}")
+        document.add_paragraph(clean(f"thermofuse {sheet.version}. SHA-256: {hashes}"))
     document.save(str(path))
 
 

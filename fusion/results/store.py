@@ -8,17 +8,19 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from unicodedata import is_normalized
 
 import numpy as np
 from pydantic import BaseModel
 
-from fusion.common import FusionError, place_within
+from fusion.common import FusionError, own_name, place_within
 from interferometry.common import DEVIATIONS, DIRECTIONS
 from thermography.common import FIELDS
 from thermography.fields.large_arrays import IN_MEMORY_BYTES, in_pieces
@@ -99,7 +101,7 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
         netCDF4.set_chunk_cache(_CHUNK_BYTES)
         with netCDF4.Dataset(temporary, "w") as file:
             for node in tree.subtree:
-                dataset = _with_own_coordinates(node).load()
+                dataset = _storable(_with_own_coordinates(node).load())
                 group = file if node is tree else file.createGroup(node.relative_to(tree))
                 dataset.dump_to_store(NetCDF4DataStore(group), encoding=_encoding(dataset), writer=PieceWriter())
 
@@ -139,6 +141,30 @@ def _with_own_coordinates(node: xr.DataTree) -> xr.Dataset:
     """Return a node with the coordinates that it inherits, as far as its variables have their dimensions."""
     own, inherited = node.to_dataset(inherit=False), node.to_dataset().coords
     return own.assign_coords({name: inherited[name] for name in own.dims if name in inherited and name not in own})
+
+
+#: Names that a variable of NetCDF can have (netCDF-C, Users Guide, "Variables"), and the attribute with the name that it cannot.
+_STORABLE = re.compile(r"\w([^/\x00-\x1f\x7f]{0,98}[^/\s\x00-\x1f\x7f])?")
+_CALLED = "called"
+
+
+def _storable(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a Dataset with names that NetCDF can store; columns of a log may be called anything, which an attribute then says."""
+    names: dict[str, str] = {}
+    for name in map(str, dataset.data_vars):
+        if not (_STORABLE.fullmatch(name) and is_normalized("NFC", name)):
+            short = re.sub(r"\W", "_", name)[:80]
+            names[name] = own_name(f"column_{short}", {*map(str, dataset.variables), *names.values()})
+    called = {name: dataset[name].assign_attrs({_CALLED: name}) for name in names}
+    return dataset.assign(called).rename(names)
+
+
+def _as_called(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a Dataset that was read with the names that it had before it was stored."""
+    names = {
+        name: variable.attrs.pop(_CALLED) for name, variable in dataset.variables.items() if _CALLED in variable.attrs
+    }
+    return dataset.rename(names)
 
 
 def _encoding(dataset: xr.Dataset) -> dict[Any, dict[str, object]]:
@@ -189,7 +215,7 @@ def open_in_file(path: Path) -> xr.Dataset:
 def read_dataset(path: Path) -> xr.Dataset:
     """Read a Dataset written by `write_dataset` into memory."""
     with opened(path) as dataset:
-        return dataset.load()
+        return _as_called(dataset.load())
 
 
 def read_tree(path: Path) -> xr.DataTree:
@@ -197,7 +223,9 @@ def read_tree(path: Path) -> xr.DataTree:
     import xarray as xr
 
     with refuse_damaged(path), xr.open_datatree(path, **_READING) as tree:
-        return tree.load()
+        read = tree.load()
+        read.dataset = _as_called(read.to_dataset(inherit=False))
+        return read
 
 
 @contextmanager

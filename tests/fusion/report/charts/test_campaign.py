@@ -199,7 +199,7 @@ def test_direction_spectrum_events_and_contributions(loop, deviations):
     assert walk[-1] == pytest.approx(float(loop["innovation_declared"].sum()) / np.sqrt(walk.size))
     contributions = model_charts.plot_contributions(loop, deviations)
     assert len(contributions.columns) == 2 + loop.sizes["effect"]
-    assert contributions.figure.title.text == "at 250 mm, positive approach"
+    assert contributions.figure.title.text.text == "at 250 mm, positive approach"
 
 
 def test_nothing_added_is_drawn_once(loop, deviations):
@@ -277,7 +277,7 @@ def test_temperatures_drivers_and_held_out_runs_of_a_record(record):
     assert names == ["other sensors", "t5", "t4", "t3", "t2"]
     assert "those that move most are t5, t4, t3 and t2" in chart.seen
     chart = record_charts.plot_drivers(record)
-    assert chart.figure.yaxis.axis_label == "speed / 1/min"
+    assert (chart.figure.title.text.text, chart.figure.yaxis.axis_label) == ("speed", "1/min")
     np.testing.assert_allclose(chart.columns["speed / 1/min"][-1], 3000.0)
     two = xr.concat([record, record.assign_coords(driver_name=["load"])], "driver_name", data_vars="minimal")
     both = record_charts.plot_drivers(two)

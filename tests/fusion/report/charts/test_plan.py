@@ -63,7 +63,7 @@ def test_significance_has_four_steps_and_sensitivity_is_blank_without_it(plan_of
     chart = attribution.plot_significance(plan_of_cells, "common")
     np.testing.assert_array_equal(picture(chart), [[0.5, 1.5, 2.5], [np.nan] * 3])
     assert "2 of 6 cells" in chart.seen and "x 5 mm, y 5 mm (p 0.005)" in chart.seen
-    assert chart.figure.title.text == "drift common to all positions"
+    assert chart.figure.title.text.text == "drift common to all positions"
     chart = attribution.plot_sensitivity(plan_of_cells, "common")
     np.testing.assert_allclose(picture(chart), [[0.5, 3.0, np.nan], [np.nan] * 3])
     assert chart.figure.legend[0].items[0].label.value == "not significant (p > 0.05)"
@@ -78,7 +78,7 @@ def test_modes_clusters_and_regions_of_a_campaign(fused):
     modes = maps.children["modes"].to_dataset()
     chart = attribution.plot_mode(modes, 1, "common")
     np.testing.assert_allclose(picture(chart), modes["pattern"].sel(mode=1), rtol=1e-6)
-    assert chart.figure.title.text.startswith("mode 1: ")
+    assert chart.figure.title.text.text.startswith("mode 1: ")
     clusters = maps.children["clusters"].to_dataset()
     chart = attribution.plot_clusters(clusters)
     shown = next(r for r in chart.figure.renderers if type(r.glyph).__name__ == "Text").data_source.data
@@ -133,9 +133,9 @@ def test_recordings_and_logs_share_the_time_axis(fused):
     assert chart.seen.startswith("Recorded over ")
     assert "no gaps" in chart.seen
     bars, *below = chart.figure.children
-    assert {drawn.title.text for drawn in below} >= {"air temperature", "air pressure", "duty"}
+    assert {drawn.title.text.text for drawn in below} >= {"air temperature", "air pressure", "duty"}
     assert all(drawn.x_range is bars.x_range for drawn in below)
-    (pressure,) = [drawn for drawn in below if drawn.title.text == "air pressure"]
+    (pressure,) = [drawn for drawn in below if drawn.title.text.text == "air pressure"]
     assert pressure.yaxis.axis_label == "hPa"
     np.testing.assert_array_equal(pressure.renderers[0].data_source.data["y"], root["air_pressure_series"])
 

@@ -120,7 +120,7 @@ def test_the_history_holds_readings_and_the_line_through_them(deviations):
     np.testing.assert_array_equal(chart.columns["deviation, positive approach / µm"], read)
     noise = drift["noise"].sel(target=2, direction="positive")
     np.testing.assert_allclose(chart.columns["profile and drift, positive approach / µm"], read - noise)
-    assert chart.figure.title.text == f"position 2 ({float(deviations['position'].sel(target=2)):g} mm)"
+    assert chart.figure.title.text.text == f"position 2 ({float(deviations['position'].sel(target=2)):g} mm)"
 
 
 def test_windows_beside_the_whole_test(deviations):
