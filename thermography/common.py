@@ -92,7 +92,7 @@ def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> 
     texts = {at: column.map(safe) for at, (_, column) in enumerate(frame.items()) if column.dtype.kind not in "biufcmM"}
     shown = frame.copy(deep=False)
     for at, column in texts.items():
-        shown.isetitem(at, column)
+        shown.isetitem(at, column.array)
     shown.columns = [safe(name) for name in frame.columns]
     return shown.to_csv(path, index=False, **options)
 

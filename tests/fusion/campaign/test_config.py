@@ -207,6 +207,9 @@ def test_no_campaign_file(folder: Path) -> None:
 def test_columns_are_selected_by_name_or_pattern_in_file_order() -> None:
     headings = ["time [s]", "t1 [degC]", "t2 [degC]", "ch1 [um]"]
     assert match_columns(["t2 [degC]", "t* [degC]"], headings) == ("t1 [degC]", "t2 [degC]")
+    # A column that is called like a pattern is that column; é is one character or two.
+    assert match_columns(["x*"], ["x*", "x1"]) == ("x*",)
+    assert match_columns(["\u00e9*"], ["e\u0301 [K]", "e [K]"]) == ("e\u0301 [K]",)
     with pytest.raises(CampaignError, match=r'no column is named "z\*"; the file has: time \[s\], t1'):
         match_columns(["z*"], headings)
 

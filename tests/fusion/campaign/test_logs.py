@@ -250,6 +250,15 @@ def test_temperatures_are_read_with_their_places(copied: Path) -> None:
     assert sensors.x_mm.tolist() == [500.0, 200.0] and sensors.u_K == 0.2
 
 
+def test_a_sensor_may_have_a_name_that_no_driver_can_have(copied: Path) -> None:
+    sensors = read(
+        copied,
+        LOG.replace("t1", "in/out").replace("t2", "e\u0301"),
+        PLACES.replace("t1", "in/out").replace("t2", "\u00e9"),
+    )
+    assert sensors is not None and sensors.names == ["in/out", "e\u0301"]
+
+
 @pytest.mark.parametrize(
     ("log", "places", "fault"),
     [
@@ -400,3 +409,30 @@ def test_runs_that_cannot_be_one_record_are_refused(tmp_path: Path, other: str, 
     campaign = write_runs(tmp_path, 'files = ["a.csv", "b.csv"]', a=stamped(1), b=other)
     with pytest.raises(TableError, match=message):
         read_record(load_campaign(campaign))
+
+
+# Names that only a unit, a blank or a Unicode form tells apart.
+
+
+@pytest.mark.parametrize(
+    ("headings", "channels"),
+    [
+        (["ch [um]", "ch [mm]"], ["ch [um]", "ch [mm]"]),
+        (["ch [um]", "ch(um)"], ["ch [um]", "ch(um)"]),
+        (["ch\u00e9 [um]", "che\u0301 [um]"], ["ch\u00e9", "che\u0301"]),
+        (["ch. x [um]", "ch 1 [um]"], ["ch. x", "ch 1"]),
+    ],
+)
+def test_two_columns_stay_two(tmp_path: Path, headings: list[str], channels: list[str]) -> None:
+    rows = [f"{k},{20 + k / 10},{k / 3:.2f},{k / 5:.2f},0" for k in range(9)]
+    content = "\n".join([",".join(["time [min]", "t1 [degC]", *headings, "spindle [1]"]), *rows])
+    table = read_record(load_campaign(record(tmp_path, content)))
+    assert table["channel"].values.tolist() == channels
+
+
+@pytest.mark.parametrize("second", ["ch [um]", "ch [um] ", " ch [um]"])
+def test_headings_that_are_alike_are_refused_by_column(tmp_path: Path, second: str) -> None:
+    rows = [f"{k},{20 + k / 10},{k / 3:.2f},{k / 5:.2f},0" for k in range(9)]
+    content = "\n".join([f'time [min],t1 [degC],ch [um],"{second}",spindle [1]', *rows])
+    with pytest.raises(TableError, match=r'the column "ch \[um\]\.1" has no unit'):
+        read_record(load_campaign(record(tmp_path, content)))

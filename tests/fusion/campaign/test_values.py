@@ -10,7 +10,15 @@ import pytest
 from pydantic import TypeAdapter
 
 from fusion.campaign import values as value_types
-from fusion.campaign.values import QuantityError, conversion, read_option, read_quantity, unit_name
+from fusion.campaign.values import (
+    QuantityError,
+    conversion,
+    matching_files,
+    read_option,
+    read_quantity,
+    stored_path,
+    unit_name,
+)
 
 
 @pytest.mark.parametrize(
@@ -97,6 +105,29 @@ def test_a_relative_pattern_names_files_where_they_are(tmp_path: Path) -> None:
         real / "disk" / "1.jpg",
         tmp_path / "here" / "3.jpg",
     ]
+
+
+@pytest.mark.parametrize(
+    ("lies", "written"),
+    [
+        ("IR [1]/a.jpg", "IR [1]/*.jpg"),
+        ("run[1]?.csv", "run[1]?.csv"),
+        ("Gro\u0308\u00dfe/e\u0301.csv", "Gr\u00f6\u00dfe/\u00e9.csv"),
+        ("Gr\u00f6\u00dfe/\u00e9.csv", "Gro\u0308\u00dfe/e\u0301*"),
+        ("a {0} #%41 'q' <b>/=1.csv", "a {0} #%41 'q' <b>/=?.csv"),
+    ],
+)
+def test_a_file_is_found_by_its_name_whatever_it_is(tmp_path: Path, lies: str, written: str) -> None:
+    (tmp_path / lies).parent.mkdir(exist_ok=True)
+    (tmp_path / lies).touch()
+    (tmp_path / "IR 1").mkdir()
+    (tmp_path / "IR 1" / "a.jpg").touch()
+    assert matching_files(tmp_path, written) == [tmp_path / lies]
+    assert "*" in written or "?" in written or stored_path(tmp_path, written) == tmp_path / lies
+
+
+def test_no_pattern_and_a_folder_match_no_file(tmp_path: Path) -> None:
+    assert [matching_files(tmp_path, pattern) for pattern in ("", ".", "/", "..")] == [[], [], [], []]
 
 
 def test_pipes_and_sockets_that_a_pattern_matches_are_told_apart_from_files(tmp_path: Path) -> None:

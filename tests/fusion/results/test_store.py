@@ -363,3 +363,17 @@ def test_values_by_place_and_approach_are_those_of_their_labels() -> None:
         coords={"direction": ["negative", "positive"], "target": [1, 2, 7]},
     )
     np.testing.assert_array_equal(by_approach(values, target=np.array([7, 1])), [[6.0, 3.0], [4.0, 1.0]])
+
+
+def test_variables_keep_names_that_netcdf_cannot_store(tmp_path: Path) -> None:
+    names = [
+        "=1+1", " a", "a ", "a b", "a_b", "🌡", "{0}", "<b>", "#", "@x", "%41", '"q"', "\\", "a.b", "-1", ".", "a\tb", "1", "_",
+        "L" * 300, "L" * 299 + "x", "\u00e9", "e\u0301", "\u03a9", "\u2126",
+    ]  # fmt: skip
+    series = {name: ("time", np.arange(3.0) + at, {"units": "1"}) for at, name in enumerate(names)}
+    written = xr.Dataset(series, {"time": [0, 1, 2]})
+    tree = xr.DataTree(written, children={"part": xr.DataTree(xr.Dataset({"z": ("time", np.zeros(3))}))})
+    xr.testing.assert_identical(read_dataset(write_dataset(tmp_path / "a.nc", written)), written)
+    read = read_tree(write_dataset(tmp_path / "b.nc", tree))
+    xr.testing.assert_identical(read.to_dataset(), written)
+    assert list(read.children) == ["part"]
