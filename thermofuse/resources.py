@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 
 def resource(name: str) -> Path:
@@ -10,3 +13,13 @@ def resource(name: str) -> Path:
     package = Path(__file__).parent
     installed = package / "data"
     return (installed if installed.is_dir() else package.with_name("data")) / name
+
+
+def vocabulary(name: str) -> dict[str, Any]:
+    """Return the words of a file in `data/vocabulary/`."""
+    return tomllib.loads(resource(f"vocabulary/{name}.toml").read_text(encoding="utf-8"))
+
+
+def by_word(meanings: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return what each word stands for, of the words for each meaning."""
+    return {word: meaning for meaning, words in meanings.items() for word in words}

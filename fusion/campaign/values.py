@@ -16,44 +16,22 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from fusion.common import FusionError, suggest
+from thermofuse.resources import by_word, vocabulary
+
+_VOCABULARY = vocabulary("units")
 
 # Values that carry their unit: ``"5 mm"`` to a number in the unit that the calculation uses.
 
 #: Accepted units per canonical unit, as ``(factor, offset)``: canonical = value * factor + offset.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    "mm": {
-        "nm": (1e-6, 0.0), "um": (1e-3, 0.0), "mm": (1.0, 0.0), "cm": (10.0, 0.0), "m": (1e3, 0.0), "in": (25.4, 0.0),
-        "mil": (25.4e-3, 0.0),
-    },
-    "um": {
-        "nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0), "in": (25.4e3, 0.0), "mil": (25.4, 0.0),
-    },
-    "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)},
-    "K": {"mK": (1e-3, 0.0), "K": (1.0, 0.0), "degC": (1.0, 0.0), "degF": (5.0 / 9.0, 0.0)},
-    "s": {"ms": (1e-3, 0.0), "s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
-    "ppm": {"ppb": (1e-3, 0.0), "ppm": (1.0, 0.0), "um/m": (1.0, 0.0), "%": (1e4, 0.0)},
-    "ppm/K": {"ppm/K": (1.0, 0.0), "um/m/K": (1.0, 0.0), "1/K": (1e6, 0.0)},
-    "mm/min": {"mm/min": (1.0, 0.0), "m/min": (1e3, 0.0), "mm/s": (60.0, 0.0)},
-    "px": {"px": (1.0, 0.0)},
-}  # fmt: skip
-_SPELLINGS = {
-    "µm": "um", "μm": "um", "°C": "degC", "℃": "degC", "C": "degC", "°F": "degF", "F": "degF", "sec": "s",
-    "µm/m": "um/m", "μm/m": "um/m", "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
-    "K^-1": "1/K", "pixel": "px", "pixels": "px",
-}  # fmt: skip
+    target: {unit: (factor, offset) for unit, (factor, offset) in units.items()}
+    for target, units in _VOCABULARY["quantities"].items()
+}
+_SPELLINGS = by_word(_VOCABULARY["spellings"])
 #: Units written out, in any case.
-_WORDS = {
-    "deg c": "degC", "degree c": "degC", "degrees c": "degC", "celsius": "degC", "degree celsius": "degC", "degrees celsius": "degC",
-    "kelvin": "K", "deg f": "degF", "fahrenheit": "degF", "micron": "um", "microns": "um", "micrometer": "um", "micrometers": "um",
-    "micrometre": "um", "micrometres": "um", "millimeter": "mm", "millimetre": "mm", "second": "s", "seconds": "s", "minute": "min",
-    "grad c": "degC", "inch": "in", "inches": "in", "mils": "mil", "thou": "mil",
-    "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
-}  # fmt: skip
+_WORDS = by_word(_VOCABULARY["words"])
 #: Other units, and what loggers write in a row of units for their own columns.
-_OF_LOGGERS = (
-    "TS", "RN", "V", "mV", "Volts", "A", "mA", "W", "kW", "N", "kN", "Nm", "rpm", "RPM", "1/min", "bar", "hPa", "mbar", "kPa", "Pa", "%",
-    "%RH", "m/s", "g", "m/s^2", "Hz", "-", "1",
-)  # fmt: skip
+_OF_LOGGERS = frozenset(_VOCABULARY["of_loggers"])
 _EXAMPLES = {
     "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
     "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min", "px": "4 px",

@@ -32,6 +32,9 @@ from interferometry.io.tables import (
     read_heading,
     where_clock_goes_back,
 )
+from thermofuse.resources import by_word, vocabulary
+
+_VOCABULARY = vocabulary("columns")
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
@@ -49,9 +52,7 @@ _PER = re.compile(r"/\s*(ms|s|min|h)$")
 _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|datetime|last_changed$|时间|時間)", re.I)
 _VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
-_MARKS = (
-    -127, -180, 999, -999, 999.9, -999.9, 9999, -9999, 6999, -6999, 7999, -7999, 3276.7, -3276.8, 32767, -32768, 65535,
-)  # fmt: skip
+_MARKS = tuple(_VOCABULARY["marks"])
 #: A mark lies this far outside the other values of its column.
 _FAR = 50.0
 #: Times that neither ISO 8601 nor the guess of pandas covers.
@@ -68,39 +69,17 @@ _LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
 #: Shortest thermal test, by which a number without unit is told to be seconds or minutes.
 _SHORTEST_S = 1800.0
 #: Words of headings, the plain ones before those of one or two letters.
-_WORDS = (
-    ("setpoint", "target setpoint setpt soll cmd"),
-    ("out", "comment humidity rh feuchte pressure druck rain wind level batt battery"),
-    ("temperature", "temp temps temperature temperatures temperatur temperatura température tmp thermo thermocouple rtd ntc pt100 温度"),
-    ("driver", "rpm speed drehzahl load last power leistung current strom voltage volt volts torque feed duty flow valve pump fan coolant "
-     "转速"),
-    ("displacement", "disp displ displacement displacements position pos deviation gap lvdt probe expansion elongation drift growth error "
-     "verschiebung verlagerung weg ausdehnung déplacement desplazamiento deformation 位移 误差"),
-    ("temperature", "t tt tc te ti pt"),
-    ("displacement", "x y z dx dy dz dl delta"),
-)  # fmt: skip
+_WORDS = tuple((one["name"], frozenset(one["words"])) for one in _VOCABULARY["role"])
 #: Words of a column that counts, where no other word stands beside them.
-_COUNTING = "index sample record recno rn no nr n id row scan count counter nummer number unnamed"
+_COUNTING = frozenset(_VOCABULARY["counting"])
 #: Most columns of a table with a line for every change: date, time, channel, value, unit, quality.
 _WIDEST_LONG = 6
 #: Columns of a table of changes that say how a value was read.
 _STATE = re.compile(r"quality|alarm|status|severity|state|flag|güte", re.I)
 #: Units at the end of a heading, after a space or an underscore.
-_SUFFIXES = {
-    "um": "um",
-    "µm": "um",
-    "mm": "mm",
-    "nm": "nm",
-    "degc": "degC",
-    "°c": "degC",
-    "c": "degC",
-    "degf": "degF",
-    "inch": "in",
-    "mil": "mil",
-}
-#: The same of letters that end other names as well, such as that of a temperature at an inlet, by the role that the name must have.
-_SUFFIXES_OF = {"displacement": {"in": "in"}, "temperature": {"f": "degF"}}
-_UNIT_OF_WORD = {"rpm": "1/min", "drehzahl": "1/min", "转速": "1/min", "power": "W", "current": "A", "voltage": "V"}
+_SUFFIXES = by_word(_VOCABULARY["suffixes"])
+_SUFFIXES_OF = {role: by_word(suffixes) for role, suffixes in _VOCABULARY["suffixes_of"].items()}
+_UNIT_OF_WORD = by_word(_VOCABULARY["unit_of_word"])
 
 
 class ColumnsError(FusionError):
@@ -568,10 +547,10 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
 def _word(name: str) -> tuple[str, str]:
     """Return the word of a name that tells its role, and the role; empty where none does."""
     words = re.findall(r"[^\W\d_]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name.rpartition(":")[2]).casefold())
-    if words and set(words) <= set(_COUNTING.split()):
+    if words and _COUNTING.issuperset(words):
         return words[0], "out"
     for role, known in _WORDS:
-        found = next((word for word in words if word in known.split()), "")
+        found = next((word for word in words if word in known), "")
         if found:
             return found, role
     return "", ""

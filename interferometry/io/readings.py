@@ -28,6 +28,7 @@ from interferometry.deviations import (
 from interferometry.io.faults import BadReading, LaserFormatError, LeftOut, Numerals, raise_if_mostly_invalid
 from interferometry.io.renishaw import is_ecmc_log, read_ecmc_log, read_rtl
 from interferometry.io.tables import (
+    UNIT_WORDS,
     UNITS,
     DateOrder,
     DelimitedTable,
@@ -547,7 +548,6 @@ _ROWS_ABOVE, _ROWS_BELOW = 2, 3
 _FEWEST_TARGETS = 2
 #: More than any table of positions by run has; rows are given the width of the widest one, which must not fill the memory.
 _MOST_CELLS = 5_000_000
-_UNIT_WORDS = {"unit", "units", "einheit", "einheiten", "unite", "unites", "unidad", "unidades", "单位"}
 
 
 @dataclass(frozen=True)
@@ -750,7 +750,7 @@ def _deviation_unit(titles: Sequence[str]) -> str | None:
     for i, text in enumerate(titles):
         name, unit = split_unit(re.sub(r"\s*[:=]\s*", " ", text))
         following = find_unit(titles[i + 1].strip("[]() ")) if i + 1 < len(titles) else None
-        if fold(name) in _UNIT_WORDS and (unit or following):
+        if fold(name) in UNIT_WORDS and (unit or following):
             return unit or following
         if unit and any(read_heading(part).role == "deviation" for part in name.split("\\")):
             return unit

@@ -27,6 +27,10 @@ from interferometry.io.faults import (
     raise_if_mostly_invalid,
 )
 from interferometry.io.spreadsheets import is_workbook, read_sheets
+from thermofuse.resources import vocabulary
+
+#: Words of tables: headings, directions, units, months.
+_VOCABULARY = vocabulary("headings")
 
 # Dates and times of a whole file: ISO 8601 and the usual other orders, refused where the file does not settle the
 # order.
@@ -38,27 +42,7 @@ NO_ZONE = "no zone in the file: taken as UTC"
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*")
 _YEARS = (1950, 2199)
 
-_MONTHS = {
-    name: month
-    for month, names in enumerate(
-        (
-            "jan januar january janv janvier ene enero jän jänner",
-            "feb februar february fév févr février fev fevr fevrier febrero",
-            "mar mär märz mrz march mars marzo",
-            "apr april avr avril abr abril",
-            "may mai mayo",
-            "jun juni june juin junio",
-            "jul juli july juil juillet julio",
-            "aug august août aout ago agosto",
-            "sep sept september septembre septiembre",
-            "oct okt october oktober octobre octubre",
-            "nov november novembre noviembre",
-            "dec dez december dezember déc décembre decembre dic diciembre",
-        ),
-        start=1,
-    )
-    for name in names.split()
-}
+_MONTHS = {name: month for month, names in enumerate(_VOCABULARY["months"], start=1) for name in names}
 _CLOCK = (
     r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,](?P<fraction>\d{1,9}))?)?"
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
@@ -180,111 +164,6 @@ def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
 
 # Headings of columns: what they name, in five languages, and the unit that they carry.
 
-#: What a column holds -> its usual headings in English, German, French, Spanish and Chinese.
-_TABLE = {
-    "cycle": (
-        "cycle, cycle no, cycle number, zyklus, messzyklus, zyklus nr, cycle de mesure, ciclo, ciclo no, 循环, 循环号, "
-        "循环次数"
-    ),
-    "run": (
-        "run, run no, run number, pass, lauf, messlauf, durchlauf, lauf nr, passe, passage, pasada, corrida, "
-        "recorrido, 测量次数, 次数, 行程"
-    ),
-    "direction": (
-        "direction, approach, direction of approach, approach direction, dir, richtung, anfahrrichtung, "
-        "verfahrrichtung, messrichtung, sens, sens d'approche, sens de déplacement, dirección, sentido, "
-        "sentido de aproximación, 方向, 接近方向, 趋近方向, 运动方向"
-    ),
-    "target": (
-        "target, target no, target number, point, point no, position no, punkt, messpunkt, zielpunkt, punkt nr, "
-        "position nr, point de mesure, cible, punto, punto no, objetivo, 目标, 目标点, 点号, 测点, 序号"
-    ),
-    "position": (
-        "position, target position, nominal, nominal position, commanded position, programmed position, pos, "
-        "sollposition, soll, sollwert, zielposition, nennposition, position cible, position nominale, "
-        "position programmée, posición, posición objetivo, posición nominal, posición programada, 位置, 目标位置, 名义位置, "
-        "理论位置, 指令位置, angle, target angle, nominal angle, angular position, winkel, sollwinkel, winkelposition, ángulo, 角度"
-    ),
-    "measured": (
-        "measured, measured position, actual, actual position, laser position, ist, istposition, istwert, "
-        "messwert, position mesurée, mesure, position réelle, posición medida, medida, posición real, 实测位置, 实测值, "
-        "测量值, 实际位置"
-    ),
-    "deviation": (
-        "deviation, error, positioning error, position error, positional error, positional deviation, "
-        "positioning deviation, linear error, angular error, angle error, angular deviation, winkelabweichung, deviations, errors, "
-        "positioning errors, abweichung, "
-        "positionsabweichung, positionierabweichung, fehler, positionierfehler, abweichungen, écart, erreur, "
-        "écart de position, erreur de position, erreur de positionnement, écarts, erreurs, desviación, "
-        "error de posición, error de posicionamiento, desviación de posición, desviaciones, errores, 偏差, 误差, 位置偏差, "
-        "定位误差, 定位偏差, 位置误差"
-    ),
-    "date": "date, datum, fecha, 日期",
-    "time": (
-        "time, timestamp, time stamp, date time, datetime, date and time, time of day, zeit, zeitstempel, uhrzeit, "
-        "datum uhrzeit, datum zeit, heure, horodatage, date heure, date et heure, hora, fecha hora, fecha y hora, "
-        "时间, 日期时间, 测量时间"
-    ),
-    "air_temperature": (
-        "air temperature, temperature of the air, lufttemperatur, temperatur der luft, température de l'air, "
-        "température air, temperatura del aire, temperatura aire, 空气温度, 气温"
-    ),
-    "air_pressure": (
-        "air pressure, pressure, luftdruck, druck, pression, pression atmosphérique, presión, presión atmosférica, "
-        "气压, 大气压, 空气压力"
-    ),
-    "relative_humidity": (
-        "relative humidity, humidity, luftfeuchte, relative feuchte, luftfeuchtigkeit, feuchte, humidité, "
-        "humidité relative, humedad, humedad relativa, 湿度, 相对湿度"
-    ),
-    "material_temperature": (
-        "material temperature, sample temperature, workpiece temperature, scale temperature, materialtemperatur, "
-        "werkstücktemperatur, maschinentemperatur, température matière, température du matériau, "
-        "température de la pièce, temperatura del material, temperatura material, 材料温度, 工件温度, 机床温度"
-    ),
-}
-#: Direction of approach, whether the word names the sign of the travel, and the words. "Forward" only names the first of two runs.
-_DIRECTION_TABLE: tuple[tuple[str, bool, str], ...] = (
-    ("positive", True, "positive, pos, +, +1, p, positiv, positif, positiva, positivo, ↑, 正, 正方向"),
-    ("negative", True, "negative, neg, -, -1, n, negativ, négatif, negativa, negativo, ↓, 负, 负方向"),
-    (
-        "positive",
-        False,
-        "forward, forwards, fwd, fw, up, outward, vorwärts, vor, hin, hinfahrt, aller, avant, avance, adelante, ida, "
-        "正向, 前进, 去程",
-    ),
-    (
-        "negative",
-        False,
-        "reverse, rev, backward, backwards, bwd, bw, down, return, rückwärts, rück, zurück, rückfahrt, retour, arrière, "
-        "atrás, vuelta, "
-        "retroceso, 反向, 负向, 后退, 回程",
-    ),
-)
-
-#: Kind of quantity, how its units are written, factor to mm, deg, degC, hPa or percent, and what is added after it.
-_UNIT_TABLE: tuple[tuple[str, str, float, float], ...] = (
-    ("length", "nm", 1e-6, 0.0),
-    ("length", "um, µm, micron, microns, micrometer, micrometre, mikrometer, 微米", 1e-3, 0.0),
-    ("length", "mm, millimeter, millimetre, 毫米", 1.0, 0.0),
-    ("length", "m", 1e3, 0.0),
-    ("length", "inch, inches, in, zoll", 25.4, 0.0),
-    ("length", "mil, thou", 25.4e-3, 0.0),
-    ("length", "uin, µin, microinch", 25.4e-6, 0.0),
-    ("angle", "arcsec, arcsecond, arcseconds, ″, '', \", 角秒, bogensekunden", 1 / 3600, 0.0),
-    ("angle", "arcmin, arcminute, arcminutes", 1 / 60, 0.0),
-    ("angle", "deg, degree, degrees, °, grad, 度", 1.0, 0.0),
-    ("temperature", "degc, °c, ℃, c", 1.0, 0.0),
-    ("temperature", "k", 1.0, -273.15),
-    ("temperature", "degf, °f, f", 5 / 9, -160 / 9),
-    ("pressure", "hpa, mbar", 1.0, 0.0),
-    ("pressure", "pa", 1e-2, 0.0),
-    ("pressure", "kpa", 10.0, 0.0),
-    ("pressure", "mmhg, torr", 1013.25 / 760, 0.0),
-    ("pressure", "bar", 1000.0, 0.0),
-    ("humidity", "%, percent, %rh, % rh, %rf, % rf", 1.0, 0.0),
-)
-
 
 @dataclass(frozen=True)
 class Unit:
@@ -295,11 +174,11 @@ class Unit:
     offset: float
 
 
+#: What a cell says of the row or column of units.
+UNIT_WORDS = frozenset(_VOCABULARY["unit_words"])
 #: Unit as it is written, in lower case -> its meaning.
 UNITS = {
-    text.strip(): Unit(kind, factor, offset)
-    for kind, texts, factor, offset in _UNIT_TABLE
-    for text in texts.split(", ")
+    word: Unit(unit["kind"], unit["factor"], unit["offset"]) for unit in _VOCABULARY["units"] for word in unit["words"]
 }
 
 _IN_BRACKETS = re.compile(r"(.*?)\s*[(\[（【{]\s*([^()\[\]（）【】{}]*?)\s*[)\]）】}]\s*(.*)")
@@ -361,13 +240,11 @@ def _key(word: str) -> str:
 
 
 _SIGNS = ("+", "-", "+1", "-1", "↑", "↓")
-_ROLES = {fold(word).replace(" ", ""): role for role, words in _TABLE.items() for word in words.split(", ")}
-_DIRECTIONS = {
-    _key(word): (direction, signed) for direction, signed, words in _DIRECTION_TABLE for word in words.split(", ")
-}
+_ROLES = {fold(word).replace(" ", ""): role for role, words in _VOCABULARY["headings"].items() for word in words}
+_DIRECTIONS = {_key(word): (one["name"], one["signed"]) for one in _VOCABULARY["direction"] for word in one["words"]}
 #: By these, text in the Chinese code page is recognised.
 CHINESE_WORDS = tuple(
-    word for words in _TABLE.values() for word in words.split(", ") if len(word) > 1 and word > "\u4e00"
+    word for words in _VOCABULARY["headings"].values() for word in words if len(word) > 1 and word > "\u4e00"
 )
 
 
