@@ -132,7 +132,7 @@ def write_deviations_csv(path: str | Path, deviations: xr.Dataset) -> None:
     readings = cells.dropna(subset=["deviation", "time"]).sort_values("time", kind="stable")
     table: dict[str, Any] = {
         **{name: readings[name].to_numpy() for name in ("cycle", "direction", "target")},
-        "position_mm": [f"{value:.6g}" for value in readings["position"]],
+        "position_mm": [np.format_float_positional(value, trim="-") for value in readings["position"]],
         "time": _iso_utc(readings["time"].to_numpy()),
         "deviation_um": [f"{value:.4f}" for value in readings["deviation"]],
     }

@@ -30,7 +30,7 @@ from interferometry import iso230
 from thermography.common import ACTING
 
 #: Bytes of a row of fields.csv, measured on the demo.
-_FIELD_ROW_BYTES = 38
+_FIELD_ROW_BYTES = 43
 
 
 def findings_table(results: Results) -> pd.DataFrame:

@@ -30,10 +30,13 @@ def test_rtl_writer_refuses_what_has_no_place(tmp_path, rng):
 
 def test_csv_round_trip(tmp_path, rng):
     deviations, _ = simulate(rng, cycles=3)
+    # Beyond a metre, at places with all their digits.
+    deviations = deviations.assign_coords(position=1000.0 + np.pi * deviations["position"])
     write_deviations_csv(tmp_path / "t.csv", deviations)
     back = read_deviations(tmp_path / "t.csv")
     np.testing.assert_allclose(back["deviation"], deviations["deviation"], atol=5.1e-5)
     assert (back["time"].values == deviations["time"].values).all()
+    assert (back["position"].values == deviations["position"].values).all()
 
 
 def test_environment_csv_round_trip(tmp_path):

@@ -14,8 +14,8 @@ import xarray as xr
 from fusion import cli
 from fusion.report.exports import tables
 from fusion.report.exports.controls import ExportError, header_lines, read_origin, read_thermal_state
-from fusion.report.exports.export import FORMATS, export_results, objections, remarks
-from fusion.report.exports.tables import write_workbook
+from fusion.report.exports.export import FORMATS, _frame_writer, export_results, objections, remarks
+from fusion.report.exports.tables import profile_table, readings_table, write_workbook
 from fusion.results.results import Results, ResultsError, assemble, read_results
 from fusion.results.store import read_dataset, write_dataset, write_json
 from fusion.results.table_prediction import TablePredictionError, read_table_prediction
@@ -40,6 +40,21 @@ def test_csv_writes_tables_and_leaves_the_large_one_out(small_run, tmp_path):
     assert "fields.csv" not in [path.name for path in whole.files] and "--fields" in whole.remarks[0]
     with_fields = export_results(thermal, "csv", tmp_path / "d", fields=True)
     assert with_fields.files[-1].name == "fields.csv" and with_fields.remarks == ()
+
+
+def test_csv_holds_every_number_as_it_was_computed(small_run, tmp_path):
+    written = export_results(small_run, "csv", tmp_path).files
+    deviations = read_dataset(small_run / "deviations.nc")
+    # A position beyond a metre, a displacement that counts from far away, and what is far below one.
+    moved = deviations.assign_coords(position=deviations["position"] + 1234.5678)
+    moved = moved.assign(deviation=moved["deviation"] + 1_234_567.0, drift_drift=moved["drift_drift"] * 1e-9)
+    for folder, dataset in ((written[0].parent, deviations), (tmp_path / "far", moved)):
+        folder.mkdir(exist_ok=True)
+        for name, made in (("drift", readings_table(dataset)), ("profile", profile_table(dataset))):
+            _frame_writer(made)(folder / f"{name}.csv")
+            back = pd.read_csv(folder / f"{name}.csv", dtype=str)
+            for column in made.select_dtypes(float):
+                assert back[column].map(float).tolist() == made[column].tolist()
 
 
 @pytest.mark.parametrize(
@@ -423,7 +438,7 @@ def test_fields_are_tabulated_on_request(tmp_path):
     frame = tables.fields_table(tmp_path)
     assert list(frame) == ["cycle", "y_mm", "x_mm", "temperature_degC", "rise_K", "rise_u_K"]
     assert len(frame) == 10
-    assert tables.fields_megabytes(tmp_path) == pytest.approx(12 * 38e-6)
+    assert tables.fields_megabytes(tmp_path) == pytest.approx(12 * 43e-6)
 
 
 def test_the_workbook_reads_back(small_run, tmp_path):
