@@ -16,7 +16,7 @@ import rich.table
 import xarray as xr
 
 from fusion.report.campaign import describe_iso230, values_to_sign
-from fusion.report.charts.readings import plot_test, plot_windows
+from fusion.report.charts.readings import has_windows, plot_test, plot_windows
 from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed, of_rank
 from fusion.report.page import page_format, render_page, write_page
@@ -122,7 +122,7 @@ def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
     """Return the charts of the section on ISO 230-2, by name."""
     charts = {"iso230": plot_test(group(dataset, "settled"), dataset["position"])}
     windows = group(dataset, "iso")
-    return charts if windows.sizes["window"] < 3 else {**charts, "windows": plot_windows(windows)}
+    return {**charts, "windows": plot_windows(windows)} if has_windows(windows) else charts
 
 
 def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> str:

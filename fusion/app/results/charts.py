@@ -153,8 +153,7 @@ def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui
         linker.link(chart.figure, x=POSITION)
         parts.append(shown(chart, f"Means ± 2 s of both approaches, {part.window}."))
     windows = group(read, "iso")
-    both = read["deviation"].notnull().any(("cycle", "target")).values.all()
-    if both and windows.sizes.get("window", 0) > 1 and np.isfinite(windows["A"].values).any():
+    if readings.has_windows(windows):
         chart = readings.plot_windows(windows)
         linker.link(chart.figure, x=CYCLE)
         parts.append(shown(chart, "A, R and B of windows of five cycles along the test. A click chooses the cycle."))

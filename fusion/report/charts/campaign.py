@@ -142,7 +142,7 @@ def _drift_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     if len(_sides(deviations)) == 2:
         both["reversal"] = readings.plot_reversal(joint, position)
         # The last window is the whole test.
-        both |= {"windows": readings.plot_windows(windows)} if windows.sizes["window"] > 1 else {}
+        both |= {"windows": readings.plot_windows(windows)} if readings.has_windows(windows) else {}
     return {
         "drift": readings.plot_drift(joint, deviations),
         "profile": readings.plot_profile(joint, position),

@@ -377,6 +377,11 @@ def plot_history(deviations: xr.Dataset, drift: xr.Dataset, target: int) -> Char
     return Chart(drawn, seen, columns)
 
 
+def has_windows(windows: xr.Dataset) -> bool:
+    """Tell whether a test has several windows, with the values of both approaches that their chart shows."""
+    return windows.sizes.get("window", 0) > 2 and bool(windows["A"].notnull().any())
+
+
 def plot_windows(windows: xr.Dataset) -> Chart:
     """Draw accuracy A, repeatability R and reversal B of five-cycle windows along the test; dotted: all cycles as one window."""
     unit = print_unit(str(windows["A"].attrs.get("units", "um")))

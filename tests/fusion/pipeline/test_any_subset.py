@@ -171,7 +171,7 @@ def published(path: Path, out: Path) -> Results:
 
 @pytest.mark.parametrize(
     ("cycles", "targets", "directions"),
-    [(1, 5, BOTH), (1, 2, ("negative",)), (2, 2, BOTH), (5, 5, ("positive",))],
+    [(1, 5, BOTH), (1, 2, ("negative",)), (2, 2, BOTH), (6, 5, ("positive",))],
 )
 def test_what_a_test_does_not_measure_is_judged_as_not_measured(tmp_path, cycles, targets, directions):
     results = published(write_laser(tmp_path / "campaign", cycles, targets, directions), tmp_path / "results")
