@@ -256,7 +256,7 @@ def _conditions(
     conditions = {
         **identity(report, date_of(dataset["time"].values, zone), "" if campaign is None else campaign.campaign.axis),
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
-        "Measured travel": f"{np.ptp(position):g}{unit}, {exact(position.min())} to {exact(position.max())}{unit}",
+        "Measured travel": f"{exact(np.ptp(position))}{unit}, {exact(position.min())} to {exact(position.max())}{unit}",
         "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
         "Feed": "" if feed is None else f"{feed:g} mm/min",
         "Dwell at a target": "" if dwell is None else f"{dwell:g} s",

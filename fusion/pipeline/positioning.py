@@ -63,7 +63,10 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
         parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
     if drift is not None:
         course = drift["drift"].mean("direction")
-        range_u = drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0)
+        # No estimate knows the change from one half of the test to the other better than the means of the readings in both: a drift
+        # whose variance is estimated as zero has no uncertainty of its own.
+        least_u = 2.0 * drift["sigma"] / np.sqrt(deviations["deviation"].notnull().sum(("cycle", "direction")))
+        range_u = np.maximum(drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0), least_u)
         parts["drift"] = {
             **{f"{name}_um": by_direction(drift[name]) for name in ("profile", "profile_u", "scatter")},
             "position_mm": deviations["position"].values.tolist(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -359,14 +360,22 @@ def _budget_table(shown: Iso230Window, unit: str) -> Table:
         names = tuple(f"{symbol}_{side}" for symbol in ONE_WAY_TERMS)
         titles = [f"{symbol}{ARROWS[side]}" for symbol in ONE_WAY_TERMS]
     rows: list[Row] = []
-    for entry in shown.contributions:
-        u = "–" if entry.u is None else f"{number(entry.u, 2)} {unit if entry.unit == 'um' else entry.unit}"
-        found = (entry.unidirectional_um.get(name) if side else getattr(entry, f"{name}_um") for name in names)
-        cause = CONTRIBUTORS.get(entry.contributor, entry.contributor)
-        rows.append(Row([cause, u, entry.origin, *(number(value, 2) for value in found)]))
     without = [shown.u_without_sampling_um.get(name) for name in names]
     values = [getattr(getattr(shown, side), f"{symbol}_um") for symbol in ONE_WAY_TERMS] if side else []
     with_it = [value.u for value in values or (getattr(shown, f"{symbol}_um") for symbol in _BUDGETED)]
+    # A thousandth of the largest uncertainty changes none of its digits.
+    largest = max((u for u in with_it if u), default=0.0)
+    least = 10.0 ** (math.floor(math.log10(largest)) - 3) if largest else 0.0
+    for entry in shown.contributions:
+        of_length = entry.unit == "um"
+        u = (
+            "–"
+            if entry.u is None
+            else f"{number(entry.u, 2, least=least * of_length)} {unit if of_length else entry.unit}"
+        )
+        found = (entry.unidirectional_um.get(name) if side else getattr(entry, f"{name}_um") for name in names)
+        cause = CONTRIBUTORS.get(entry.contributor, entry.contributor)
+        rows.append(Row([cause, u, entry.origin, *(number(value, 2, least=least) for value in found)]))
     for name, sums in (("U (k = 2) without the sampling of the cycles", without), ("U (k = 2)", with_it)):
         expanded = (number(None if u is None else 2 * u, 2) for u in sums)
         rows.append(Row([name, "", "", *expanded], marked=True))
@@ -661,7 +670,7 @@ def _positions_table(deviations: xr.Dataset) -> Table:
         for name, places in decimals.items():
             both = zip(laid[name][at], laid[f"{name}_u"][at], strict=True)
             row += [measured(float(value), float(u), decimals=places) for value, u in both]
-        rows.append([*row, *(f"{value:.2f}" for value in s[at])])
+        rows.append([*row, *(fixed(value, decimals["scatter"]) for value in s[at])])
     quantities = ("Profile", "Scatter s", "Conventional s")
     return table(
         ["Target", "Position / mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows
@@ -680,9 +689,10 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
     columns = [name for name in headings if name in comparison]
     links = comparison["link"].values
     values = np.stack([by_approach(comparison[name], link=links) for name in columns], axis=-1)
-    rows = [
-        [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
-    ]
+    # Two digits of a typical standard deviation, and two decimals at least.
+    places = max(2, decimals_of(float(comparison["conventional"].median()) / 2.0))
+    shown = [2 if name == "ratio" else places for name in columns]
+    rows = [[str(link), *map(fixed, of_link.ravel(), 2 * shown)] for link, of_link in zip(links, values, strict=True)]
     return table(["Target", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
 
 

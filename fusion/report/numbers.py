@@ -9,22 +9,32 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+#: What is smaller, in any unit that is printed (a femtometre, a nanokelvin), is rounding of the arithmetic.
+_ROUNDING = 1e-9
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with significant digits and a true minus sign."""
+
+def number(value: float | None, digits: int = 3, *, least: float = _ROUNDING) -> str:
+    """Return a number with significant digits and a true minus sign; a size below `least`, where a table has one, as that bound."""
     if value is None or not math.isfinite(value):
         return "–"
-    return fixed(value, max(0, digits - 1 - math.floor(math.log10(abs(value))))) if value else "0"
+    if abs(value) < _ROUNDING:
+        return "0"
+    if abs(value) < least:
+        return f"< {exact(least)}"
+    return fixed(value, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
 
 
 def exact(value: float | None) -> str:
     """Return a number that is stated, such as a position, with no more digits than it has and a true minus sign; a dash without one."""
-    return "–" if value is None else f"{value:g}".replace("-", "−")
+    if value is None:
+        return "–"
+    # Ten digits hold a micrometre in ten metres, and no rounding of the arithmetic.
+    return np.format_float_positional(value or 0.0, precision=10, fractional=False, trim="-").replace("-", "−")
 
 
 def fixed(value: float | None, decimals: int) -> str:
     """Return a number with so many decimals and a true minus sign; a dash where there is none."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")
+    return "–" if value is None or not math.isfinite(value) else f"{value:z.{decimals}f}".replace("-", "−")
 
 
 def decimals_of(u: float) -> int:
@@ -37,7 +47,7 @@ def measured(value: float | None, u: float | None, unit: str = "", *, decimals: 
     tail = f" {unit}" if unit else ""
     if value is None or not math.isfinite(value):
         return "–"
-    if u is None or not math.isfinite(2 * u) or u <= 0:
+    if u is None or not math.isfinite(2 * u) or u < _ROUNDING:
         return f"{number(value)}{tail}"
     places = decimals_of(u) if decimals is None else decimals
     return f"{value:z.{places}f} ± {2 * u:.{places}f}{tail}".replace("-", "−")
@@ -83,10 +93,12 @@ def p_words(p: float | None, least: float | None = None) -> str:
 
 
 def alike(values: Sequence[float | None], *, distinct: bool = True) -> list[str]:
-    """Return numbers that are compared with as many decimals each, so many that the smallest has two digits, more where `distinct`."""
+    """Return numbers that are compared with as many decimals each: so many that the smallest has two digits and the largest no more than
+    five, more where `distinct`.
+    """
     known = [value for value in values if value is not None and math.isfinite(value) and value]
-    smallest = min(map(abs, known), default=1.0)
-    decimals = max(0, 1 - math.floor(math.log10(smallest)))
+    smallest, largest = (math.floor(math.log10(of(map(abs, known), default=1.0))) for of in (min, max))
+    decimals = max(0, min(1 - smallest, 4 - largest))
     differ = len(set(known))
     while distinct and decimals < 4 and len({round(value, decimals) for value in known}) < differ:
         decimals += 1
@@ -94,14 +106,16 @@ def alike(values: Sequence[float | None], *, distinct: bool = True) -> list[str]
 
 
 def duration(seconds: float | None) -> str:
-    """Return a time span in seconds below 2 min, in minutes below 2 h, in hours above."""
+    """Return a time span, as rounded, in seconds below 2 min, in minutes below 2 h, in hours above."""
     if seconds is None or not math.isfinite(seconds):
         return "–"
+    if seconds < 0:
+        return f"−{duration(-seconds)}"
     if 0 < seconds < 2:
         return f"{seconds:.2g} s"
-    if seconds < 120:
+    if round(seconds) < 120:
         return f"{seconds:.0f} s"
-    if seconds < 7200:
+    if round(seconds / 60) < 120:
         return f"{seconds / 60:.0f} min"
     return f"{seconds / 3600:.1f} h"
 

@@ -72,9 +72,10 @@ def _scatter_range(drift: DriftPart) -> str:
     scatter = drift.scatter_um.values()
     if not scatter:
         return "not known: no position has enough readings"
+    least, largest, median = alike([min(scatter), max(scatter), float(np.median(scatter))], distinct=False)
     # A variance whose estimate is negative is kept as zero: no position is free of scatter.
-    span = f"{min(scatter):.2f} to" if min(scatter) > 0.0 else "up to"
-    return f"{span} {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm"
+    span = f"{least} to" if min(scatter) > 0.0 else "up to"
+    return f"{span} {largest} µm, median {median} µm"
 
 
 def _loop_rows(loop: Loop) -> list[tuple[str, str, Figures]]:

@@ -294,8 +294,6 @@ CONTRIBUTORS = {
     "sampling": "scatter of the readings",
     "extremes": "bias of the largest of scattered values",
 }
-#: A drift of less than this share of the median scatter is none that readings can show.
-_SHARE_OF_SCATTER = 0.01
 
 
 def _compiled(pattern: str) -> jinja2.BytecodeCache | None:
@@ -312,8 +310,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        condition, conditional, counted, duration, exact, fixed, gain, lower_first, measured, moment, number, p_cell, p_words, parameters,
-        percent, place, print_unit, quantity, region_words, small, upper_first,
+        condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first, measured, moment, number, p_cell, p_words,
+        parameters, percent, place, print_unit, quantity, region_words, small, upper_first,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
@@ -385,7 +383,7 @@ def quoted_term(symbol: str) -> str:
 
 
 class DriftExtreme(NamedTuple):
-    """Range of the drift at one position, µm; `negligible` where it is far below the scatter of the readings."""
+    """Range of the drift at one position, µm; `negligible` where it is below its standard uncertainty: none that the readings show."""
 
     size: Quantity
     target: int
@@ -395,15 +393,19 @@ class DriftExtreme(NamedTuple):
 
 def drift_extremes(drift: DriftPart) -> tuple[DriftExtreme, DriftExtreme]:
     """Return the largest and the smallest range of the drift."""
-    scatters = drift.scatter_um.values()
-    limit = _SHARE_OF_SCATTER * float(np.median(scatters)) if scatters else 0.0
     ranges = {at: value for at, value in enumerate(drift.range_um) if value is not None}
 
     def extreme(at: int) -> DriftExtreme:
-        size = Quantity(value=ranges[at], u=drift.range_u_um[at])
-        return DriftExtreme(size, at + 1, drift.position_mm[at], ranges[at] < limit)
+        u = drift.range_u_um[at]
+        negligible = u is not None and ranges[at] < u
+        return DriftExtreme(Quantity(value=ranges[at], u=u), at + 1, drift.position_mm[at], negligible)
 
     return extreme(max(ranges, key=ranges.__getitem__)), extreme(min(ranges, key=ranges.__getitem__))
+
+
+def drift_size(one: DriftExtreme) -> str:
+    """Return the range of the drift at one position with its uncertainty, of none that the readings show the bound."""
+    return f"below {number(2 * (one.size.u or 0.0), 2)} µm" if one.negligible else quantity(one.size, "µm")
 
 
 def anomaly_place(anomaly: AnomalyPart) -> str:

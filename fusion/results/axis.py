@@ -351,7 +351,7 @@ class DriftPart(ResultPart):
     range_um: tuple[Number, ...] = ()
     """Largest minus smallest drift of every target during the test, mean of both approaches, um."""
     range_u_um: tuple[Number, ...] = ()
-    """Standard uncertainty of that, um."""
+    """Standard uncertainty of that, um; at least that of a change between the means of both halves of the readings."""
 
     @model_validator(mode="after")
     def _one_of_each_target(self) -> DriftPart:

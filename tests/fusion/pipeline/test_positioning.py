@@ -26,6 +26,8 @@ from fusion.pipeline.positioning import (
     insufficient_for_model,
     sites_of,
 )
+from fusion.report.wording import drift_extremes, drift_size
+from fusion.results.axis import DriftPart
 from fusion.results.results import Notice
 from fusion.results.store import read_dataset
 from fusion.twin import simulate
@@ -33,6 +35,7 @@ from fusion.twin.recipe_file import read_recipe
 from fusion.twin.truth import deviations_of
 from interferometry.anomalies import Anomaly
 from interferometry.drift.estimate import estimate_drift
+from tests.fusion.campaign_parts import write_laser
 
 
 @pytest.fixture
@@ -89,6 +92,21 @@ def test_parts_agree_with_the_product(campaign_folder):
     np.testing.assert_allclose(drift["range_um"], course.max("cycle") - course.min("cycle"))
     assert all(0.0 < u < one for u, one in zip(drift["range_u_um"], drift["range_um"], strict=True))
     assert drift["position_mm"] == outcome.dataset["position"].values.tolist()
+
+
+def test_a_drift_of_nothing_is_known_no_better_than_the_readings_are(tmp_path):
+    """White noise: the change of the mean from one half of the test to the other has 2 s / sqrt(n) of the readings at a position."""
+    path, rng = write_laser(tmp_path / "test", 12, 5), np.random.default_rng(5)
+    table = pd.read_csv(path.with_name("laser.csv"))
+    still = table.assign(deviation_um=table["target"] + rng.normal(0.0, 0.25, len(table)))
+    still.to_csv(path.with_name("laser.csv"), index=False)
+    outcome = evaluate_interferometry(read_source(load_campaign(path)))
+    scatter = float(outcome.dataset["drift_sigma"])
+    # 120 readings less their means know a standard deviation to 7 %.
+    assert scatter == pytest.approx(0.25, rel=0.2)
+    assert min(outcome.parts["drift"]["range_u_um"]) >= 2.0 * scatter / np.sqrt(24) * (1.0 - 1e-12)
+    largest, _ = drift_extremes(DriftPart.model_validate(outcome.parts["drift"]))
+    assert largest.negligible and drift_size(largest).startswith("below 0.")
 
 
 def test_a_scatter_that_the_drift_hides_is_named_and_no_other(copied):

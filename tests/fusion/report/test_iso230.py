@@ -72,7 +72,8 @@ def cells_of(page: str) -> list[list[str]]:
 
 
 def as_number(text: str) -> float:
-    return float(text.replace("\u2212", "-"))
+    """The number of a cell; a bound is the largest that it allows."""
+    return float(text.removeprefix("< ").replace("\u2212", "-"))
 
 
 def test_the_values_of_the_axis_are_those_of_the_definitions(test_sheet):
