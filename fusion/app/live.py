@@ -19,7 +19,7 @@ from fusion.common import FusionError
 from fusion.messages import reported
 from fusion.pipeline.watch import Enough, LiveState, follow
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, palette, span_words
-from fusion.report.numbers import number
+from fusion.results.numbers import number
 from fusion.results.progress import counted
 from interferometry.plots import ACCENT, INK, MUTED
 

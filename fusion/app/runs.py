@@ -13,7 +13,7 @@ from typing import Any
 
 from fusion.common import FusionError
 from fusion.pipeline.workers import start_module
-from fusion.report.numbers import duration
+from fusion.results.numbers import duration
 
 # How far a run is, stage by stage, and how long the present one still takes.
 

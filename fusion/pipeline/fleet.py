@@ -33,11 +33,11 @@ from fusion.report.charts.fleet import plot_history
 from fusion.report.charts.style import Chart, embed
 from fusion.report.conclusions import headline
 from fusion.report.exports.tables import Bars, Bound, Linked, conditions_of, write_workbook
-from fusion.report.numbers import fixed, measured, upper_first
 from fusion.report.page import render_page
 from fusion.report.wording import ISO230_TERMS
 from fusion.results.folder import MANIFEST, claim, open_folder
 from fusion.results.loop import RecordLoop
+from fusion.results.numbers import fixed, measured, upper_first
 from fusion.results.parts import Quantity
 from fusion.results.progress import Report, silent
 from fusion.results.results import Results, read_results

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from fusion.campaign.values import name_and_unit
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.messages import unforeseen
-from fusion.report.numbers import duration, join, moment, print_unit
 from fusion.results.folder import MANIFEST
+from fusion.results.numbers import duration, join, moment, print_unit
 from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError

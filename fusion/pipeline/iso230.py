@@ -23,8 +23,8 @@ from fusion.campaign.config import (
 )
 from fusion.campaign.inputs import DATED, is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
-from fusion.report.numbers import exact, moment
 from fusion.results.axis import Iso230Part
+from fusion.results.numbers import exact, moment
 from fusion.results.parts import decide, is_determined
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results

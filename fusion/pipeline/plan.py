@@ -8,8 +8,8 @@ from pathlib import Path
 from fusion.analysis.attribution.duty import DutyPlanError, Machine, plan_duty, switchings
 from fusion.analysis.drift_model.next_test import propose_tests
 from fusion.campaign.values import read_option
-from fusion.report.numbers import duration
 from fusion.results.loop import RecordLoop
+from fusion.results.numbers import duration
 from fusion.results.results import read_results
 from fusion.results.store import read_product
 

@@ -18,7 +18,7 @@ from fusion.campaign.inputs import LaserInputs, Source, lacks_course
 from fusion.campaign.recompensation import material_by_cycle
 from fusion.campaign.time_zones import utc
 from fusion.pipeline.iso230 import estimate_joint, evaluate_standard
-from fusion.report.numbers import moment
+from fusion.results.numbers import moment
 from fusion.results.progress import Report, counted, listed, silent
 from fusion.results.results import Notice, Outcome
 from fusion.results.store import group, joined

@@ -24,7 +24,7 @@ from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import Campaign
 from fusion.campaign.inputs import DATED, pipe_notices, read_record
 from fusion.campaign.time_zones import lacks_zone
-from fusion.report.numbers import duration, number
+from fusion.results.numbers import duration, number
 from fusion.results.progress import Report, clock_notices, counted, left_out_notices, listed
 from fusion.results.results import Notice, Outcome
 

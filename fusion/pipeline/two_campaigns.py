@@ -12,7 +12,6 @@ from typing import Any
 from fusion.analysis.attribution.two_sessions import SessionComparisonError, compare_sessions
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.messages import naming
-from fusion.report.numbers import number
 from fusion.report.page import (
     channel_sentence,
     conclude_sessions,
@@ -24,6 +23,7 @@ from fusion.report.page import (
 )
 from fusion.report.wording import CHANNELS, effect_words
 from fusion.results.loop import RecordLoop
+from fusion.results.numbers import number
 from fusion.results.results import read_results
 from fusion.results.store import read_fusion, read_product, write_dataset, write_json, write_text
 

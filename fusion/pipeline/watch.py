@@ -23,7 +23,7 @@ from fusion.campaign.inputs import counted, overridden_parameters, plan_grid, st
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.common import Array
 from fusion.pipeline.positioning import insufficient_for_model
-from fusion.report.numbers import number
+from fusion.results.numbers import number
 from interferometry.common import InterferometryError
 from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift

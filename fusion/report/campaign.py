@@ -11,22 +11,6 @@ import xarray as xr
 
 from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS, ENTRY_LEVEL, REMAINDER_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
 from fusion.report.conclusions import first_screen, headline, next_steps, sharpen
-from fusion.report.numbers import (
-    alike,
-    decimals_of,
-    exact,
-    fixed,
-    gain,
-    join,
-    measured,
-    moment,
-    number,
-    p_cell,
-    p_words,
-    print_unit,
-    small,
-    upper_first,
-)
 from fusion.report.thermal_test import describe_thermal_tests
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
@@ -40,7 +24,6 @@ from fusion.report.wording import (
     Words,
     anomaly_cause,
     anomaly_place,
-    approach_of,
     assumption,
     baseline_words,
     conditional,
@@ -57,6 +40,22 @@ from fusion.report.wording import (
 )
 from fusion.results.axis import CorrelationPart, Evidence, Iso230Direction, Iso230Part, Iso230Window, PlacePart
 from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RunnerUp, StepPart
+from fusion.results.numbers import (
+    alike,
+    decimals_of,
+    exact,
+    fixed,
+    gain,
+    join,
+    measured,
+    moment,
+    number,
+    p_cell,
+    p_words,
+    print_unit,
+    small,
+    upper_first,
+)
 from fusion.results.parts import Figures
 from fusion.results.results import Results
 from fusion.results.store import by_approach, group, has
@@ -301,7 +300,7 @@ def values_to_sign(part: Iso230Part) -> Table:
     """Return the axis values of the quoted window, and of each direction what has a tolerance, with their decisions."""
     unit = print_unit(part.unit)
     judged = {one.quantity: [f"{one.limit_um:g}", one.decision] for one in part.tolerances}
-    one_way = bool(approach_of(part))
+    one_way = part.approach is not None
     found: list[tuple[str, str, Iso230Window | Iso230Direction]] = [
         *((term, symbol, part) for symbol, term in ISO230_TERMS.items()),
         *(
@@ -353,7 +352,7 @@ def _values_table(part: Iso230Part, unit: str) -> Table:
 
 def _budget_table(shown: Iso230Window, unit: str) -> Table:
     """Return the budget: every input with its contributions, and the expanded uncertainty without and with the sampling."""
-    side = approach_of(shown)
+    side = shown.approach
     names: tuple[str, ...] = _BUDGETED
     titles = [name.replace("_", " ") for name in _BUDGETED]
     if side:

@@ -16,7 +16,6 @@ from fusion.report.charts.comparison import (
     plot_scatters,
 )
 from fusion.report.charts.style import embed
-from fusion.report.numbers import fixed, join, measured, number, p_cell, print_unit
 from fusion.report.page import render_page
 from fusion.report.sheet import Sheet, Stated
 from fusion.report.wording import (
@@ -33,6 +32,7 @@ from fusion.report.wording import (
     table,
 )
 from fusion.results.loop import AxisLoop
+from fusion.results.numbers import fixed, join, measured, number, p_cell, print_unit
 from fusion.results.parts import Quantity
 from fusion.results.store import file_sha256, plain
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from fusion.report.wording import ARROWS, approach_of, conditional, randomised_causes, say
+from fusion.report.wording import ARROWS, conditional, randomised_causes, say
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import StepPart
 from fusion.results.parts import TimePart, decide
@@ -154,7 +154,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
     """Return what the uncertainty of the quoted A mostly is, and by how much a stated input would shrink it (k = 2); None without one."""
     if iso is None or not iso.contributions:
         return None
-    side = approach_of(iso)
+    side = iso.approach
     found = (getattr(iso, side) if side else iso).A_um
     if not found.u:
         return None

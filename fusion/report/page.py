@@ -21,10 +21,10 @@ from fusion.common import FusionError
 from fusion.report.campaign import describe_campaign
 from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
 from fusion.report.conclusions import headline
-from fusion.report.numbers import moment, number, place
 from fusion.report.record import describe_record
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
 from fusion.results.loop import RecordLoop
+from fusion.results.numbers import moment, number, place
 from fusion.results.results import Results, read_results
 from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically, write_text
 

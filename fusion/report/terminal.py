@@ -9,10 +9,10 @@ import rich.table
 
 from fusion.messages import cell
 from fusion.report.conclusions import conclude, headline, next_steps
-from fusion.report.numbers import alike, number, p_words
 from fusion.report.wording import baseline_words, condition, figures_of, say, untouched
 from fusion.results.axis import DriftPart, RegistrationPart
 from fusion.results.loop import Loop, RecordLoop
+from fusion.results.numbers import alike, number, p_words
 from fusion.results.parts import Figures
 from fusion.results.results import Results
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import rich.table
 
-from fusion.report.numbers import measured, number, print_unit, small
 from fusion.report.wording import Table, Words, print_table, quantity, table
+from fusion.results.numbers import measured, number, print_unit, small
 from fusion.results.thermal_test import ThermalDistortion, ThermalTest
 
 if TYPE_CHECKING:

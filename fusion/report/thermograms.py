@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import xarray as xr
 
-from fusion.report.numbers import fixed, measured, moment
 from fusion.report.wording import Row, Table, Words, say, table
+from fusion.results.numbers import fixed, measured, moment
 from fusion.results.parts import PicturePlace, Quantity, TemperatureRegionPart
 from fusion.results.results import Results
 

@@ -18,7 +18,9 @@ from markupsafe import Markup
 from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.messages import cell, printable
-from fusion.report.numbers import (
+from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
+from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
+from fusion.results.numbers import (
     alike,
     duration,
     exact,
@@ -37,8 +39,6 @@ from fusion.report.numbers import (
     small,
     upper_first,
 )
-from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
-from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.parts import AreaPart, Figures, InputsPart, Quantity
 from fusion.results.progress import counted
 from fusion.results.results import Results
@@ -358,19 +358,12 @@ def iso230_values(iso: Iso230Window) -> dict[str, str]:
     return {symbol: quantity(getattr(iso, f"{symbol}_um"), print_unit(iso.unit)) for symbol in ISO230_TERMS}
 
 
-def approach_of(iso: Iso230Window) -> str:
-    """Return the only direction of approach that a window holds, "positive" or "negative"; empty where it holds both."""
-    if iso.E_um.value is not None:
-        return ""
-    return next((side for side in ("positive", "negative") if getattr(iso, side).E_um.value is not None), "")
-
-
 def quoted_values(iso: Iso230Window) -> dict[str, str]:
     """Return the axis values to quote with their expanded uncertainty (k = 2) by symbol: A, R and B, of one approach A and R.
 
     Of one cycle, which has neither A nor R, they are E, M and B, of one approach E.
     """
-    side, unit = approach_of(iso), print_unit(iso.unit)
+    side, unit = iso.approach, print_unit(iso.unit)
     of_side = getattr(iso, side) if side else iso
     once = of_side.A_um.value is None and of_side.E_um.value is not None
     symbols, arrow = ("E" if once else "AR", ARROWS[side]) if side else ("EMB" if once else "ARB", "")

@@ -297,6 +297,15 @@ class Iso230Window(ResultPart):
     contributions: tuple[Iso230Contribution, ...]
     """Inputs of the budget."""
 
+    @property
+    def approach(self) -> Literal["positive", "negative"] | None:
+        """The only direction of approach that the window holds; None where it holds both."""
+        if self.E_um.value is not None:
+            return None
+        if self.positive.E_um.value is not None:
+            return "positive"
+        return "negative" if self.negative.E_um.value is not None else None
+
 
 class Iso230Range(ResultPart):
     """Smallest and largest value of a quantity over the windows of a test."""

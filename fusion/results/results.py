@@ -28,13 +28,13 @@ from fusion.results.axis import (
     RegistrationPart,
 )
 from fusion.results.loop import AxisLoop, RecordLoop
+from fusion.results.numbers import alike, measured, p_words, print_unit
 from fusion.results.parts import (
     ContactSensorPart,
     FieldPart,
     InputsPart,
     Number,
     PluginPart,
-    Quantity,
     RadiometryPart,
     ResultPart,
     TemperatureRegionPart,
@@ -202,35 +202,31 @@ class Results(ResultPart):
             doubts = ", ".join(check.code for check in self.inputs.doubts)
             rows.append(("inputs", f"{self.inputs.state}{f' ({doubts})' if doubts else ''}"))
         if self.iso230 is not None:
-            values = {name: getattr(self.iso230, f"{name}_um") for name in "ARBEM"}
-            told = ", ".join(f"{name} {_expanded(one)}" for name, one in values.items() if one)
-            rows.append(("ISO 230-2 (k = 2)", told.replace("µm", self.iso230.unit.replace("um", "µm"))))
+            unit, side = print_unit(self.iso230.unit), self.iso230.approach
+            of_side = self.iso230 if side is None else getattr(self.iso230, side)
+            values = {name: getattr(of_side, f"{name}_um") for name in ("ARE" if side else "ARBEM")}
+            told = ", ".join(f"{name} {measured(one.value, one.u, unit)}" for name, one in values.items())
+            from_side = f", {side} approach" if side else ""
+            rows.append(("ISO 230-2 (k = 2)", f"{self.iso230.window}{from_side}: {told}"))
         if self.anomalies is not None:
-            named = (f"position {one.target}: {one.cause}, p = {one.p_value:.2g}" for one in self.anomalies)
+            named = (
+                f"position {one.target}: {one.cause}, {p_words(one.p_value, one.p_resolution)}"
+                for one in self.anomalies
+            )
             rows.append(("anomalies", "; ".join(named) or "none"))
         if self.loop is not None:
-            final, declared = self.loop.errors.final or self.loop.errors.declared, self.loop.errors.declared
+            errors = self.loop.errors
+            before, after = alike([one.rmse_um for one in (errors.declared, errors.final)], distinct=False)
             rows += [
                 ("verdict", self.loop.verdict.replace("_", " ")),
                 ("added effects", ", ".join(step.effect for step in self.loop.steps) or "none"),
-                ("held-out error", f"{_micrometres(declared.rmse_um)} -> {_micrometres(final.rmse_um)}"),
+                ("held-out error", f"{before} -> {after} µm"),
             ]
         return [*rows, ("warnings", str(len(self.warnings)))]
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of results.json in JSON's own types; parts and keys that were never set are absent."""
         return self.model_dump(mode="json", exclude_unset=True)
-
-
-def _expanded(value: Quantity) -> str:
-    """A value with its expanded uncertainty, k = 2, in um."""
-    if value.u is None:
-        return _micrometres(value.value)
-    return f"{_micrometres(value.value, '')} ± {_micrometres(2.0 * value.u)}"
-
-
-def _micrometres(value: Number, unit: str = " µm") -> str:
-    return "undetermined" if value is None else f"{value:.3g}{unit}"
 
 
 def assemble(title: str, parts: Mapping[str, Any], warnings: Sequence[Notice]) -> Results:

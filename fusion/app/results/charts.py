@@ -40,7 +40,6 @@ from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
 from fusion.report.conclusions import action, conclude, next_steps, step_phrase
-from fusion.report.numbers import join, moment, number, p_words, place
 from fusion.report.record import shown_channels
 from fusion.report.wording import (
     Table,
@@ -54,6 +53,7 @@ from fusion.report.wording import (
 )
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import AxisLoop, RecordLoop
+from fusion.results.numbers import join, moment, number, p_words, place
 from fusion.results.store import DamagedProductError, group, has
 from interferometry.plots import ACCENT, INK, hours_since_start
 

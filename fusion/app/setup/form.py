@@ -18,7 +18,7 @@ from fusion.campaign.config import campaign_schema
 from fusion.campaign.values import read_quantity
 from fusion.common import FusionError
 from fusion.pipeline.draft import TO_FILL
-from fusion.report.numbers import print_unit
+from fusion.results.numbers import print_unit
 from fusion.results.progress import counted
 
 #: Directions along the plan, as `thermofuse init` names them.

@@ -25,7 +25,7 @@ from fusion.report.charts.style import (
     shared_range,
     span_words,
 )
-from fusion.report.numbers import number, print_unit
+from fusion.results.numbers import number, print_unit
 from interferometry.plots import ACCENT, INK
 
 #: Height of a line of a legend, px.

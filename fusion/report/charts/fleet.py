@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion.report.charts.comparison import control_limits
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, span_words
-from fusion.report.numbers import number
+from fusion.results.numbers import number
 
 _MARKS = ("circle", "square")
 

@@ -29,8 +29,8 @@ from fusion.report.charts.style import (
     palette,
     span_words,
 )
-from fusion.report.numbers import alike, duration, number, p_cell, p_words
 from fusion.report.wording import CHANNELS, effect_words, region_words
+from fusion.results.numbers import alike, duration, number, p_cell, p_words
 from interferometry.plots import COLOURS, INK, MUTED, hours_since_start
 
 # Maps and charts of the correlation: sensitivity and significance of cells, thermal modes, clusters, regions by

@@ -26,8 +26,8 @@ from fusion.report.charts.style import (
     palette,
     span_words,
 )
-from fusion.report.numbers import join, number, place
 from fusion.results.axis import HotspotPart
+from fusion.results.numbers import join, number, place
 from fusion.results.parts import AreaPart, ContactSensorPart
 from interferometry.plots import ACCENT, INK
 from thermography.fields.large_arrays import in_pieces

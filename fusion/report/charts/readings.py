@@ -32,7 +32,7 @@ from fusion.report.charts.style import (
     shared_range,
     span_words,
 )
-from fusion.report.numbers import join, number, print_unit
+from fusion.results.numbers import join, number, print_unit
 from interferometry.plots import ACCENT, ARROWS, COLOURS, INK, MUTED, hours_since_start
 
 # Charts of the joint estimate: drift of every position over time, drift-free profile.

@@ -27,10 +27,10 @@ from fusion.report.charts.style import (
     shared_range,
     span_words,
 )
-from fusion.report.numbers import join, number, print_unit
 from fusion.report.record import shown_channels
 from fusion.report.thermal_test import DRAWN
 from fusion.report.wording import effect_words
+from fusion.results.numbers import join, number, print_unit
 from fusion.results.thermal_test import ThermalTest
 from interferometry.plots import COLOURS, INK
 

@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 from fusion.common import own_name
 from fusion.report.charts.plan import add_marks, add_names, draw_picture
 from fusion.report.charts.style import DIVERGING, Chart, add_series, new_figure, of_rank, span_words
-from fusion.report.numbers import fixed
+from fusion.results.numbers import fixed
 from interferometry.plots import ACCENT, INK
 from thermography.evaluation import count_temperatures, read_profile
 from thermography.io.region import Region

@@ -37,10 +37,10 @@ from fusion.report.exports.controls import (
     tabulate,
 )
 from fusion.report.exports.recursions import MODELS, emit, objections_to_model
-from fusion.report.numbers import number
 from fusion.report.wording import anomaly_cause, anomaly_place
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
+from fusion.results.numbers import number
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically

@@ -20,10 +20,10 @@ from openpyxl.styles import Alignment, Font
 from openpyxl.utils import get_column_letter
 
 from fusion.common import own_name
-from fusion.report.numbers import print_unit
 from fusion.report.terminal import summary_rows
 from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters
 from fusion.results.loop import RecordLoop
+from fusion.results.numbers import print_unit
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
 from interferometry import iso230

@@ -10,8 +10,8 @@ import xarray as xr
 from fusion.campaign.config import Campaign, CampaignError
 from fusion.campaign.recompensation import StatedBudget
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test, read_window
-from fusion.report.numbers import moment
 from fusion.results.axis import Iso230Part
+from fusion.results.numbers import moment
 from fusion.results.parts import decide
 from fusion.results.results import ResultsError
 from fusion.results.store import joined, plain

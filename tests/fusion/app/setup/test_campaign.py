@@ -24,7 +24,7 @@ from fusion.app.setup.form import (
 )
 from fusion.campaign.config import campaign_schema, load_campaign
 from fusion.pipeline.draft import DraftError
-from fusion.report.numbers import print_unit
+from fusion.results.numbers import print_unit
 
 
 def test_a_folder_without_a_campaign_file_gets_the_draft_of_init(copied):

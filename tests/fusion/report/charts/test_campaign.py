@@ -16,7 +16,7 @@ from fusion.report.charts.embedded import chart_scripts
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed, new_figure
-from fusion.report.numbers import alike, number
+from fusion.results.numbers import alike, number
 from fusion.results.results import read_results
 from fusion.results.store import group, read_fusion, read_product
 from tests.browser import CHROMIUM, record_faults

@@ -17,7 +17,7 @@ from fusion.report.charts.readings import (
     plot_test,
     plot_windows,
 )
-from fusion.report.numbers import number
+from fusion.results.numbers import number
 from fusion.results.store import group
 from interferometry.iso230 import evaluate_iso230
 from tests.interferometry.iso230.made_tests import by_hand, test_made
