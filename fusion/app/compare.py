@@ -11,6 +11,7 @@ import panel as pn
 from fusion.analysis.comparison import PairComparison, compare_campaigns
 from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if, table_of
+from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.report.charts.comparison import draw_trend, follow_trends, plot_profiles, plot_remaining, plot_scatters
 from fusion.report.comparison import (
@@ -42,7 +43,7 @@ def find_results(root: Path) -> tuple[list[Path], bool]:
         folders[:] = sorted(name for name in folders if not name.startswith(".") and depth < _DEPTH)
         if len(found) > _MOST:
             break
-    return sorted(found[:_MOST]), len(found) <= _MOST
+    return in_order(found[:_MOST]), len(found) <= _MOST
 
 
 def label_of(root: Path, folder: Path) -> str:

@@ -50,6 +50,7 @@ from fusion.campaign.values import (
     area,
     check_pattern,
     corner_words,
+    in_order,
     matching_files,
     not_a_file,
     split_uncertainty,
@@ -840,7 +841,7 @@ class Campaign(Table):
     def frame_paths(self) -> tuple[Path, ...]:
         """Return the thermal files that the glob patterns match, each once, sorted by name."""
         patterns = () if self.thermography is None else self.thermography.frames
-        return tuple(sorted({path for pattern in patterns for path in matching_files(self.folder, pattern)}))
+        return tuple(in_order({path for pattern in patterns for path in matching_files(self.folder, pattern)}))
 
     def record_paths(self) -> tuple[Path, ...]:
         """Return the tables of the record's runs, each once, in the order in which the campaign file names them."""
@@ -962,4 +963,4 @@ def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
 
 def _each_match(folder: Path, patterns: tuple[str, ...]) -> tuple[Path, ...]:
     """Return the files that patterns match, each once, in the order of the patterns and of the names that one pattern matches."""
-    return tuple(dict.fromkeys(path for pattern in patterns for path in sorted(matching_files(folder, pattern))))
+    return tuple(dict.fromkeys(path for pattern in patterns for path in in_order(matching_files(folder, pattern))))

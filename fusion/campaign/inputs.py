@@ -44,7 +44,7 @@ from fusion.campaign.logs import (
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
-from fusion.campaign.values import matching_pipes, name_and_unit
+from fusion.campaign.values import in_order, matching_pipes, name_and_unit
 from fusion.common import FusionError
 from fusion.messages import naming
 from fusion.results.progress import clock_notices, counted, left_out_notices, listed
@@ -734,7 +734,7 @@ def pipe_notices(campaign: Campaign) -> list[Notice]:
     }
     notices = []
     for key, named in patterns.items():
-        pipes = sorted({path for pattern in named for path in matching_pipes(campaign.folder, pattern)})
+        pipes = in_order({path for pattern in named for path in matching_pipes(campaign.folder, pattern)})
         if pipes:
             several = f"{len(pipes)} pipes, sockets or devices, which are"
             what = "1 pipe, socket or device, which is" if len(pipes) == 1 else several

@@ -54,6 +54,8 @@ _TAKEN = (
 _LONGEST_RECORD_S = 4.5e9
 #: A log in which no channel writes for so many of their usual intervals is interrupted: at random, 1 in 2**10.
 _LONGEST_SILENCE = 10.0
+#: Hours, minutes and seconds; of two numbers nothing tells whether they are minutes and seconds.
+_ELAPSED = re.compile(r"(\d{2,5})(:\d\d:\d\d\S*)")
 _DECIMAL_COMMA = re.compile(r"\d,\d")
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
@@ -549,16 +551,31 @@ def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[
     return time, describe_time_zone(path, {zone: 0}), []
 
 
+def within_a_day(text: str) -> tuple[str, int]:
+    """Return an elapsed time such as 49:15:00 as a time of day, and the days before it; other texts as they are.
+
+    >>> within_a_day("49:15:00")
+    ('01:15:00', 2)
+    """
+    match = _ELAPSED.fullmatch(text)
+    if match is None:
+        return text, 0
+    days, hour = divmod(int(match[1]), 24)
+    return f"{hour:02d}{match[2]}", days
+
+
 def _formatted_times(path: Path, column: pd.Series, record: LoggedTable) -> tuple[np.ndarray, str]:
     """Return the times of ``time_format``, NaT where a row has none, and their zone; times of day count from midnight of the first day."""
     form = str(record.time_format)
+    texts, days = zip(*map(within_a_day, stripped(column)), strict=True) if len(column) else ((), ())
     try:
-        times = pd.to_datetime(column.astype(str).str.strip(), format=form, errors="coerce", utc="%z" in form)
+        times = pd.to_datetime(pd.Series(texts, column.index), format=form, errors="coerce", utc="%z" in form)
     except ValueError as error:
         raise TableError(f'{path}: time_format = "{form}": {error}; for example "%Y/%m/%d-%H:%M:%S"') from None
     if not set(re.findall(r"%-?([a-zA-Z])", form)) & set("dDjcxs"):
-        days = (times.ffill().diff() < pd.Timedelta(-12, "h")).cumsum()
-        elapsed = ((times - times.dt.normalize()) + pd.to_timedelta(days, unit="D")).dt.total_seconds()
+        # Hours that are counted beyond a day are elapsed; others begin again at midnight.
+        passed = np.array(days) if any(days) else (times.ffill().diff() < pd.Timedelta(-12, "h")).cumsum()
+        elapsed = ((times - times.dt.normalize()) + pd.to_timedelta(passed, unit="D")).dt.total_seconds()
         return _after_start(elapsed.to_numpy(), record, path)[0], "+0000"
     aware = times.dt.tz is not None
     return times.dt.tz_localize(None).to_numpy("M8[ns]"), "+0000" if aware else ""

@@ -6,7 +6,7 @@ import errno
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -317,6 +317,21 @@ def matching_files(folder: Path, pattern: str) -> list[Path]:
         real[path.parent] / path.name if not path.is_symlink() else path.resolve() if path.exists() else path
         for path in there
     ]
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return paths sorted by the names of folders and files, the numbers in them by size.
+
+    >>> [path.name for path in in_order([Path("run_10.csv"), Path("run_9.csv")])]
+    ['run_9.csv', 'run_10.csv']
+    """
+
+    def by_numbers(path: Path) -> tuple[list[list[str | int]], Path]:
+        # Between two numbers stands a text: like is compared with like.
+        parts = (re.split(r"(\d+)", part) for part in path.parts)
+        return [[int(one) if k % 2 else one for k, one in enumerate(part)] for part in parts], path
+
+    return sorted(paths, key=by_numbers)
 
 
 def matching_pipes(folder: Path, pattern: str) -> list[Path]:

@@ -17,7 +17,16 @@ import pandas as pd
 from pandas.tseries.api import guess_datetime_format
 
 from fusion.campaign.config import HeaderRows, LoggedTable
-from fusion.campaign.logs import Rows, numbers_in, read_rows, read_times, stripped, text_lines, written_times
+from fusion.campaign.logs import (
+    Rows,
+    numbers_in,
+    read_rows,
+    read_times,
+    stripped,
+    text_lines,
+    within_a_day,
+    written_times,
+)
 from fusion.campaign.values import is_unit, name_and_unit, role_of_unit, unit_name
 from fusion.common import FusionError
 from fusion.pipeline.inspect import column_unit, is_time
@@ -466,7 +475,7 @@ def _clock(texts: Sequence[str]) -> dict[str, str] | None:
         order = DateOrder.of(Path(), enumerate(texts))
         if _mostly([_is_read(text, order) for text in texts]):
             return {}
-    likely = [text for text in texts if re.search(r"\d[:_]?\d\d", text)]
+    likely = [within_a_day(text)[0] for text in texts if re.search(r"\d[:_]?\d\d", text)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the day stands first
         guessed = dict.fromkeys(form for form in map(guess_datetime_format, likely) if form)

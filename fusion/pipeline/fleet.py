@@ -25,6 +25,7 @@ import xarray as xr
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import DATED
+from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.messages import cell
 from fusion.pipeline.stages import kept_results
@@ -70,7 +71,7 @@ def find_members(paths: Sequence[Path]) -> list[Member]:
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            found = sorted(path.rglob(CAMPAIGN_FILE))
+            found = in_order(path.rglob(CAMPAIGN_FILE))
             if not found:
                 raise FleetError(
                     f"{path}: holds no {CAMPAIGN_FILE}; thermofuse init {path} writes one, of several laser tests one for each; or "
@@ -105,7 +106,7 @@ def find_members(paths: Sequence[Path]) -> list[Member]:
             raise FleetError(
                 f"{member.campaign}: is in the folder of {names[outer].campaign}, so their results would too; move one of them"
             )
-    return sorted(members, key=lambda member: member.name)
+    return [names[place.as_posix()] for place in in_order(map(Path, names))]
 
 
 def is_unchanged(member: Member, folder: Path) -> bool:

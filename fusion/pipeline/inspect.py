@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.campaign.values import name_and_unit
+from fusion.campaign.values import in_order, name_and_unit
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.messages import unforeseen
 from fusion.results.folder import MANIFEST
@@ -514,7 +514,7 @@ def input_files(folder: Path, seen: set[Path] | None = None) -> Iterator[Path]:
     if folder.resolve() in seen:
         return
     seen.add(folder.resolve())
-    for path in sorted(folder.iterdir()):
+    for path in in_order(folder.iterdir()):
         if path.name.startswith("."):
             continue
         if not path.is_dir():

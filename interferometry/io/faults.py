@@ -83,6 +83,8 @@ _SPACES = re.compile(r"[\s\u00a0\u2007\u2009\u202f']")
 _NUMBER = re.compile(r"[+-]?(\d+[\d.,]*|[.,]\d+)([eE][+-]?\d+)?")
 #: A separator followed by three digits, once or more, may part thousands.
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
+#: A number whose decimal separator is told by its digits: one separator, or another one after groups of three.
+_DECIMAL = re.compile(r"[+-]?(\d*|\d{1,3}(?P<group>[.,])\d{3}((?P=group)\d{3})*)(?P<decimal>[.,])\d*([eE][+-]?\d+)?")
 #: 9999, -99999.999: four nines or more before the point and nothing but nines or zeros behind it.
 _ALL_NINES = re.compile(r"[+-]?9{4,}([.,](9+|0+))?")
 
@@ -102,25 +104,35 @@ def parse_number(text: str) -> float:
 
 @dataclass(frozen=True)
 class Numerals:
-    """How the numbers of one file are written: the decimal separator, "" where a single separator is the decimal one."""
+    """How the numbers of one file are written: the decimal separator, "" where a single separator is the decimal one.
+
+    ``examples`` are a number of each kind where the file has both.
+    """
 
     decimal: str = ""
+    examples: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, texts: Iterable[str]) -> Numerals:
-        """Find the decimal separator from all fields of a file; those that are no numbers are passed over."""
-        seen = set()
+        """Find the decimal separator from all fields of a file; those that are no numbers, such as dates, are passed over."""
+        seen: dict[str, str] = {}
         for text in texts:
             cleaned = _SPACES.sub("", text.translate(_SIGNS))
-            if _NUMBER.fullmatch(cleaned) and not _THOUSANDS.fullmatch(cleaned):
-                seen |= {max(".,", key=cleaned.rfind)} if ("." in cleaned or "," in cleaned) else set()
-        return cls(seen.pop() if len(seen) == 1 else "")
+            match = _DECIMAL.fullmatch(cleaned) if _NUMBER.fullmatch(cleaned) else None
+            if match and match["decimal"] != match["group"] and not _THOUSANDS.fullmatch(cleaned):
+                seen.setdefault(match["decimal"], text.strip())
+        return cls(next(iter(seen))) if len(seen) == 1 else cls(examples=tuple(seen.values()))
 
     def number(self, text: str) -> float:
         """Return a finite number."""
         cleaned = _SPACES.sub("", text.strip().translate(_SIGNS))
         if not _NUMBER.fullmatch(cleaned):
             return parse_number(text)
+        if self.examples and _THOUSANDS.fullmatch(cleaned):
+            both = " and ".join(map(repr, self.examples))
+            raise BadReading(
+                text, f"may part thousands or decimals, as the file has {both}; write one decimal separator"
+            )
         decimal = self.decimal or max(".,", key=cleaned.rfind)
         other = "," if decimal == "." else "."
         whole = cleaned.replace(other, "") if not self.decimal or _groups(cleaned, other) else cleaned

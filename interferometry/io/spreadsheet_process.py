@@ -60,7 +60,9 @@ def _marshallable(value: object) -> Cell:
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
     if isinstance(value, datetime.timedelta):
-        return str(datetime.datetime(1900, 1, 1) + value)[11:]
+        # An elapsed time counts its hours beyond a day.
+        clock = str(datetime.datetime(1900, 1, 1) + value % datetime.timedelta(days=1))[11:]
+        return f"{24 * value.days + int(clock[:2]):02d}{clock[2:]}"
     return str(value).strip()
 
 

@@ -417,7 +417,9 @@ class NetcdfReader(TemperatureReader):
         store = path.parent if path.name in _ZARR_METADATA else path
         zarr = store.is_dir()
         if zarr and not find_spec("zarr"):
-            raise ThermographyError(f"{path}: a Zarr store needs the package zarr: install it beside thermofuse (pip install zarr)")
+            raise ThermographyError(
+                f"{path}: a Zarr store needs the package zarr: install it beside thermofuse (pip install zarr)"
+            )
         with _refused(f"{path}: cannot be opened", "write it again"):
             # Each array of a store costs the library milliseconds whenever it is opened.
             if zarr and sum(entry.is_dir() for entry in store.iterdir()) > MOST_OBJECTS:

@@ -16,6 +16,7 @@ from fusion.campaign.config import CampaignError, DriversTable, load_campaign
 from fusion.campaign.inputs import pipe_notices, read_record
 from fusion.campaign.logs import ContactSensors, TableError, read_drivers, read_sensors, split_heading
 from fusion.common import FusionError
+from fusion.pipeline.draft import Asker, write_campaign
 from interferometry.io.faults import LaserFormatError
 from tests.fusion.campaign_parts import without
 
@@ -363,6 +364,24 @@ def test_runs_that_count_from_their_own_zero_follow_the_order_of_the_files(tmp_p
     assert json.loads(data.attrs["test"]) == [0]
     assert (np.diff(data["time"].values) > np.timedelta64(0)).all()
     assert [str(path) for path in load_campaign(campaign).files_of("record")] == ["b.csv", "a.csv"]
+
+
+@pytest.mark.parametrize("drafted", [False, True])
+def test_the_last_of_ten_runs_is_the_tenth(tmp_path: Path, drafted: bool) -> None:
+    """Runs that count from their own zero stay in the order of their names, numbers by size, of which the last is held out."""
+    for number in range(1, 11):
+        rows = "".join(f"{minute},{20 + 0.1 * minute},{number}\n" for minute in range(5))
+        (tmp_path / f"run_{number}.csv").write_text(f"time [min],t1 [degC],ch1 [um]\n{rows}")
+    if drafted:
+        write_campaign(tmp_path, Asker(None))
+    else:
+        (tmp_path / "campaign.toml").write_text(
+            '[campaign]\ntitle = "Runs"\n[record]\nfiles = ["run_*.csv"]\ntime = "time [min]"\n'
+            'temperatures = ["t*"]\ndisplacements = ["ch*"]\n'
+        )
+    data = read_record(load_campaign(tmp_path / "campaign.toml"))
+    assert json.loads(data.attrs["runs"]) == [f"run_{number}.csv" for number in range(1, 11)]
+    assert json.loads(data.attrs["test"]) == [9]
 
 
 def test_runs_that_begin_minutes_after_their_zero_are_no_reason_to_refuse(tmp_path: Path) -> None:

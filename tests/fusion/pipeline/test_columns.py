@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -420,3 +421,23 @@ def test_a_clock_that_goes_back_is_named_with_line_and_time(tmp_path: Path, back
     assert propose_table(tmp_path / "log.csv").attrs["clock"] == data.attrs["clock"]
     assert [notice.code for notice in clock_notices(data)] == ["clock_goes_back"] * bool(lines)
     assert all(str(stamps[one["line"] - 2]).replace("T", " ") == one["value"] for one in named)
+
+
+@pytest.mark.parametrize("kind", ["workbook", "text"])
+def test_elapsed_times_count_their_hours_beyond_a_day(tmp_path: Path, kind: str) -> None:
+    """Excel's [h]:mm:ss of a test of 70 h with a pause of 30 h, and the same as text."""
+    hours = np.r_[np.arange(0.0, 20.0, 0.5), np.arange(50.0, 70.5, 0.5)]
+    cells = [(timedelta(hours=hour), 20.0 + hour / 30, hour / 8) for hour in hours.tolist()]
+    if kind == "workbook":
+        sheet = openpyxl.Workbook()
+        for row in [("time", "T1 [degC]", "Z [um]"), *cells]:
+            sheet.active.append(row)
+        sheet.save(tmp_path / "log.xlsx")
+    else:
+        lines = [
+            f"{int(hour)}:{60 * hour % 60:02.0f}:00,{t},{z}\n" for hour, (_, t, z) in zip(hours, cells, strict=True)
+        ]
+        (tmp_path / "log.csv").write_text("time,T1 [degC],Z [um]\n" + "".join(lines))
+    path, _ = write_campaign(tmp_path, Asker(None))
+    time = read_record(load_campaign(path))["time"].values
+    np.testing.assert_array_equal((time - time[0]) / np.timedelta64(1, "h"), hours)

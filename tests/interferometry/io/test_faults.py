@@ -40,11 +40,24 @@ def test_a_file_is_refused_when_fewer_than_half_of_its_lines_can_be_used():
         (["0,64", "0.64"], "0.64", 0.64),
         (["0,64", "0.64"], "0,64", 0.64),
         (["09.03.2026"], "1.000", 1.0),
+        (["0,64", "13.03.2026"], "1.200", 1200.0),
+        (["0,64", "2.1.3", "192.168.0.1", "192.168.100"], "1.200", 1200.0),
+        (["1.234,5", "13.03.2026"], "1.200", 1200.0),
+        (["0.64", "13,03,2026"], "1,200", 1200.0),
         ([], "+.5", 0.5),
     ],
 )
 def test_the_whole_file_settles_the_decimal_separator(others, text, value):
     assert Numerals.of([*others, text]).number(text) == value
+
+
+@pytest.mark.parametrize("text", ["1.200", "-12,345", "1.200.000"])
+def test_what_parts_thousands_or_decimals_is_refused_where_the_file_has_both(text):
+    """A day such as 12.03 beside decimal commas: 1.200 mm is one millimetre or a metre."""
+    numerals = Numerals.of(["0,64", "12.03", text])
+    with pytest.raises(BadReading, match=r"'0,64' and '12\.03'"):
+        numerals.number(text)
+    assert [numerals.number(sure) for sure in ("0,125", "12.03", "1.200,5", "1200")] == [0.125, 12.03, 1200.5, 1200.0]
 
 
 @pytest.mark.parametrize("text", ["1_2.5", "", "-", "n/a", "1.2.3", "12..5", "0x10", "1,2,3"])

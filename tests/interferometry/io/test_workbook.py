@@ -4,7 +4,7 @@ import resource
 import struct
 import zipfile
 from collections.abc import Callable
-from datetime import datetime, time
+from datetime import datetime, time, timedelta
 from pathlib import Path
 
 import openpyxl
@@ -84,6 +84,7 @@ def test_merged_cells_dates_and_numbers_become_text(tmp_path):
     sheet.append([1.0, 0.1, datetime(2026, 3, 9, 6, 30, 5)])
     sheet.append([])
     sheet.append([time(6, 30, 5), "0,64", 123456789.125])
+    sheet.append([timedelta(minutes=30), timedelta(hours=24, minutes=30), timedelta(hours=73, seconds=5)])
     path = tmp_path / "t.xlsx"
     book.save(path)
     assert read_sheets(path) == {
@@ -91,6 +92,7 @@ def test_merged_cells_dates_and_numbers_become_text(tmp_path):
             (1, ["Run 1", "Run 1", "Run 2"]),
             (2, ["1", "0.1", "2026-03-09T06:30:05"]),
             (4, ["06:30:05", "0,64", "123456789.125"]),
+            (5, ["00:30:00", "24:30:00", "73:00:05"]),
         ]
     }
     assert read_cells(path, as_stored=True)["Sheet"][0] == (1, ["Run 1", "", "Run 2"])
