@@ -212,13 +212,17 @@ def reported(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return "the memory of this machine does not suffice for the input; check which file is so large, or use a machine with more"
     text = fault_report(error)
-    name = f"thermofuse-fault-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.txt"
-    for folder in (Path.cwd(), Path(tempfile.gettempdir())):
+    for folder in (Path.cwd, tempfile.gettempdir):
         try:
-            (folder / name).write_text(text, encoding="utf-8")
+            # A name that nobody can foretell, and link to a file of the user.
+            begin = f"thermofuse-fault-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-"
+            descriptor, name = tempfile.mkstemp(".txt", begin, folder())
+            os.close(descriptor)
+            Path(name).write_text(text, encoding="utf-8")
         except OSError:
             continue
-        advice = f"{name} in {folder} describes it without data of yours; please send it to the authors"
+        file = Path(name)
+        advice = f"{file.name} in {file.parent} describes it without data of yours; please send it to the authors"
         break
     else:
         advice = "and no folder is writable for a report of it"

@@ -7,10 +7,12 @@ import hmac
 import logging
 import os
 import secrets
+import tempfile
 import threading
 import tomllib
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -115,6 +117,10 @@ class Forbidden(RequestHandler):
         self.finish(f"403: {self._why}\n")
 
 
+#: A page that leads to another address at once.
+_ONWARD = '<!DOCTYPE html><title>thermofuse</title><meta http-equiv="refresh" content="0;url={0}"><a href="{0}">thermofuse</a>\n'
+
+
 class SignIn(RequestHandler):
     """Changes the token of the printed address for a cookie, and leads to the address without it."""
 
@@ -127,7 +133,11 @@ class SignIn(RequestHandler):
         cookie, secret = self._credentials.cookie, self._credentials.secret
         self.set_cookie(cookie, secret, httponly=True, samesite="Strict", path="/")
         self.set_header("Cache-Control", "no-store")
-        self.redirect("/")
+        if self.request.headers.get("Sec-Fetch-Site") == "cross-site":
+            # A redirect would count as one of the file that led here, and the browser would keep the cookie back.
+            self.finish(_ONWARD.format("/"))
+        else:
+            self.redirect("/")
 
 
 class SecurityHeaders(OutputTransform):
@@ -280,13 +290,29 @@ def serve(root: Path, *, port: int = 0, open_browser: bool = False, say: Callabl
     server.start()
     say(address)
     threading.Thread(target=lambda: [import_module(name) for name in AHEAD], daemon=True).start()
-    if open_browser:
-        webbrowser.open(address)
     try:
-        server.io_loop.start()
+        with opened_in_browser(address) if open_browser else nullcontext():
+            server.io_loop.start()
     finally:
         RUNS.end()
         server.stop(wait=False)
+
+
+@contextmanager
+def opened_in_browser(address: str) -> Iterator[Path]:
+    """Open an address by a file that its owner alone can read: every user of a machine sees the arguments of programs."""
+    try:
+        # Browsers in a sandbox see neither the folder of temporary files nor hidden files.
+        descriptor, name = tempfile.mkstemp(".html", "thermofuse-", Path.home())
+    except (OSError, RuntimeError):
+        descriptor, name = tempfile.mkstemp(".html", "thermofuse-")
+    try:
+        os.close(descriptor)
+        Path(name).write_text(_ONWARD.format(address), encoding="utf-8")
+        webbrowser.open(Path(name).as_uri())
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)
 
 
 def build_server(root: Path, *, port: int = 0) -> tuple[Any, str]:

@@ -247,8 +247,10 @@ def _print(program: str, address: str, out: Path, profile: str) -> None:
     ]  # fmt: skip
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         command.insert(1, "--no-sandbox")  # a browser refuses to run for root with its sandbox
+    # What the browser leaves goes with the folder; where it would write else may not exist.
+    environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), profile)
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False, env=environment)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise PrintError(f"{program} did not print: {error}; name another browser with --browser FILE") from error
     if done.returncode or not out.exists() or not out.stat().st_size:

@@ -6,6 +6,7 @@ import errno
 import io
 import re
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -65,6 +66,9 @@ def test_a_fault_of_the_program_is_reported_without_data_of_the_user(
     text = report.read_text()
     assert re.search(r"^thermofuse: \d", text, re.M) and re.search(r"^numpy: \d", text, re.M)
     assert "builtins.KeyError" in text and "builtins.ValueError" in text and "in stage:" in text
+    assert stat.S_IMODE(report.stat().st_mode) == 0o600 and re.search(r"Z-\S{8}\.txt$", report.name), (
+        "cannot be foretold"
+    )
     stack = [line for line in text.splitlines() if line.startswith("  ")]
     for private in ("could not convert", str(tmp_path), str(Path.home()), str(Path(__file__).parents[2])):
         assert private not in text

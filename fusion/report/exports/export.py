@@ -494,6 +494,8 @@ def _frame_writer(frame: pd.DataFrame) -> Writer:
 
 def _write(out: Path, content: dict[str, Writer], *, overwrite: bool) -> tuple[Path, ...]:
     """Write files, or none where one of them exists and may not be replaced."""
+    if out.exists() and not out.is_dir():
+        raise ExportError(f"{out} is a file; name a folder with --out")
     paths = {out / name: write for name, write in content.items()}
     there = [path.name for path in paths if path.exists()]
     if there and not overwrite:

@@ -2,15 +2,18 @@
 
 import shutil
 import socket
+import stat
 import subprocess
 import sys
+import webbrowser
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 from tornado.httputil import HTTPHeaders, HTTPServerRequest, RequestStartLine
 
 from fusion.app.parts import PathError, state_of
-from fusion.app.server import SCREENS, Credentials, offered, serve
+from fusion.app.server import SCREENS, Credentials, offered, opened_in_browser, serve
 
 #: What opens the page, its connection, its scripts, and the data.
 STATIC = ("/static/js/bokeh.min.js", "/static/extensions/panel/panel.min.js")
@@ -21,6 +24,22 @@ def test_the_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(app,
     answer = ask(app[0], f"/?{urlsplit(app[0]).query}")
     assert answer.status == 302 and answer.headers["Location"] == "/"
     assert "HttpOnly" in answer.headers["Set-Cookie"] and "SameSite=Strict" in answer.headers["Set-Cookie"]
+
+
+@pytest.mark.browser
+def test_a_browser_is_led_by_a_file_of_the_user_and_no_argument_holds_the_token(app, new_page, tmp_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    with opened_in_browser(app[0]) as file:
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600 and file.parent == tmp_path
+        assert opened == [file.as_uri()] and urlsplit(app[0]).query not in opened[0]
+        page = new_page(app[0]).context.browser.new_context().new_page()
+        assert page.goto(app[0].split("/?")[0]).status == 403
+        page.goto(file.as_uri())
+        page.get_by_role("heading", name="Set up").wait_for()
+        assert "token" not in page.url
+    assert not file.exists()
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import stat
+import tempfile
 from dataclasses import replace
 
 import pytest
@@ -301,7 +302,9 @@ def test_a_browser_that_fails_leaves_the_old_file(tmp_path):
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed (Debian: apt-get install chromium)")
-def test_the_report_is_printed_on_a4_with_its_charts(made_anew, tmp_path):
+def test_the_report_is_printed_on_a4_with_its_charts(made_anew, tmp_path, monkeypatch):
+    tempfile.gettempdir()
+    monkeypatch.setenv("TMPDIR", "/absent")  # as a service has it: the browser gets a folder of its own
     written = pdf.print_pdf(made_anew, tmp_path / "report.pdf", browser=CHROMIUM)
     content = written.read_bytes()
     assert content.startswith(b"%PDF")

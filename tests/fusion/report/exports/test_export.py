@@ -78,6 +78,8 @@ def test_nothing_is_overwritten_in_silence(small_run, tmp_path, format, names):
     before = {path: path.read_bytes() for path in written.files}
     with pytest.raises(ExportError, match=r"exists already; add --overwrite"):
         export_results(small_run, format, tmp_path, **options)
+    with pytest.raises(ExportError, match=r"is a file; name a folder with --out"):
+        export_results(small_run, format, written.files[0], **options)
     assert before == {path: path.read_bytes() for path in written.files}
     export_results(small_run, format, tmp_path, overwrite=True, **options)
 
