@@ -16,9 +16,10 @@ from thermography.io.sequence import usable_threads
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
-#: Pixels that lie in several cells are cut into this number of parts squared, each of which belongs to the cell of its centre.
+#: Pixels that lie in several cells are cut along and across into so many parts per length of a cell, and so many at least; each part
+#: belongs to the cell of its centre.
 _PARTS = 4
-#: Entries provided per pixel: one for a pixel within a cell, four for one on a corner of cells.
+#: Entries provided per pixel at first: one for a pixel within a cell, four for one on a corner of cells.
 _ENTRIES_PER_PIXEL = 4
 #: Cells of which less than this share is seen unmasked are NaN.
 LEAST_COVERAGE = 0.5
@@ -173,28 +174,48 @@ class _Pieces(NamedTuple):
     y: Array
 
 
-@njit(nogil=True)
 def _cut_pixels(
     corners: Array, rows: tuple[int, int], discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Cut every unmasked pixel of some rows at the cells: cell, pixel, area (mm2), mean x and y (mm) of every piece."""
+    most, count = _ENTRIES_PER_PIXEL * (rows[1] - rows[0]) * (corners.shape[1] - 1), -1
+    while count < 0:
+        pieces = _Pieces(np.empty(most, np.int32), np.empty(most, np.int32), *np.empty((3, most)))
+        count = _fill(pieces, corners, rows, discs, size, cell_mm, margin_px)
+        most *= 2
+    area = pieces.area[:count]
+    return pieces.cell[:count], pieces.pixel[:count], area, pieces.x[:count] / area, pieces.y[:count] / area
+
+
+@njit(nogil=True)
+def _fill(
+    pieces: _Pieces,
+    corners: Array,
+    rows: tuple[int, int],
+    discs: Array,
+    size: tuple[float, float],
+    cell_mm: float,
+    margin_px: float,
+) -> int:
+    """Add the pieces of every unmasked pixel of some rows: their number, -1 where there may be more than there is room for."""
     columns = corners.shape[1] - 1
     cells = (round(size[0] / cell_mm), round(size[1] / cell_mm))
-    most = _ENTRIES_PER_PIXEL * (rows[1] - rows[0]) * columns
-    pieces = _Pieces(np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(most), np.empty(most))
     count = 0
     for row in range(rows[0], rows[1]):
         for column in range(columns):
             pixel = _pixel(corners, row, column)
             across2 = pixel.across_x * pixel.across_x + pixel.across_y * pixel.across_y
             down2 = pixel.down_x * pixel.down_x + pixel.down_y * pixel.down_y
-            margin = margin_px * np.sqrt(max(across2, down2))
+            side = np.sqrt(max(across2, down2))
+            margin = margin_px * side
             inside_x = margin <= pixel.x <= size[0] - margin
             inside_y = margin <= pixel.y <= size[1] - margin
             if inside_x and inside_y and not _on_disc(pixel.x, pixel.y, discs, margin):
-                count = _add_pixel(pieces, count, row * columns + column, pixel, cells, cell_mm)
-    area = pieces.area[:count]
-    return pieces.cell[:count], pieces.pixel[:count], area, pieces.x[:count] / area, pieces.y[:count] / area
+                parts = max(_PARTS, int(np.ceil(_PARTS * side / cell_mm)))
+                if count + parts * parts > len(pieces.cell):
+                    return -1
+                count = _add_pixel(pieces, count, row * columns + column, pixel, parts, cells, cell_mm)
+    return count
 
 
 @njit(nogil=True)
@@ -223,20 +244,22 @@ def _on_disc(x: float, y: float, discs: Array, margin: float) -> bool:
 
 
 @njit(nogil=True, inline="always")
-def _add_pixel(pieces: _Pieces, count: int, number: int, pixel: _Pixel, cells: tuple[int, int], cell_mm: float) -> int:
-    """Add the pieces of one pixel after the first `count`; the new count."""
-    part_area = abs(pixel.across_x * pixel.down_y - pixel.across_y * pixel.down_x) / _PARTS**2
+def _add_pixel(
+    pieces: _Pieces, count: int, number: int, pixel: _Pixel, parts: int, cells: tuple[int, int], cell_mm: float
+) -> int:
+    """Add the pieces of one pixel, cut into parts squared, after the first `count`; the new count."""
+    part_area = abs(pixel.across_x * pixel.down_y - pixel.across_y * pixel.down_x) / parts**2
     reach_x = (abs(pixel.across_x) + abs(pixel.down_x)) / 2
     reach_y = (abs(pixel.across_y) + abs(pixel.down_y)) / 2
     left, top = int((pixel.x - reach_x) / cell_mm), int((pixel.y - reach_y) / cell_mm)
     right, bottom = int((pixel.x + reach_x) / cell_mm), int((pixel.y + reach_y) / cell_mm)
     if left == right and top == bottom and left < cells[0] and top < cells[1]:
         # Most pixels lie within one cell.
-        return _add_piece(pieces, count, count, top * cells[0] + left, number, part_area * _PARTS**2, pixel.x, pixel.y)
+        return _add_piece(pieces, count, count, top * cells[0] + left, number, part_area * parts**2, pixel.x, pixel.y)
     first = count
-    for i in range(_PARTS):
-        for j in range(_PARTS):
-            s, t = (j + 0.5) / _PARTS - 0.5, (i + 0.5) / _PARTS - 0.5
+    for i in range(parts):
+        for j in range(parts):
+            s, t = (j + 0.5) / parts - 0.5, (i + 0.5) / parts - 0.5
             x = pixel.x + s * pixel.across_x + t * pixel.down_x
             y = pixel.y + s * pixel.across_y + t * pixel.down_y
             column, row = int(x / cell_mm), int(y / cell_mm)
@@ -248,13 +271,12 @@ def _add_pixel(pieces: _Pieces, count: int, number: int, pixel: _Pixel, cells: t
 @njit(nogil=True, inline="always")
 def _add_piece(pieces: _Pieces, first: int, count: int, cell: int, number: int, area: float, x: float, y: float) -> int:
     """Add an area at (x, y) to the entry of its cell among those from `first` on, which are the pixel's, or to a new one; the count."""
-    entry = first
-    while entry < count and pieces.cell[entry] != cell:
-        entry += 1
-    if entry == len(pieces.cell):
-        # No entry left: pixels larger than cells, a plan too coarsely imaged for its grid.
-        return count
-    if entry == count:
+    # The part before lies in the same cell or in one beside it.
+    entry = count - 1
+    while entry >= first and pieces.cell[entry] != cell:
+        entry -= 1
+    if entry < first:
+        entry = count
         pieces.cell[entry], pieces.pixel[entry] = cell, number
         pieces.area[entry], pieces.x[entry], pieces.y[entry] = 0.0, 0.0, 0.0
         count += 1

@@ -1,5 +1,6 @@
 """Weights of a camera that looks straight down at 2 px/mm, where every area is known."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,9 @@ from scipy import ndimage
 
 from tests.thermography.plan_scene import DISCS, GRID, overhead, registered
 from thermography.common import ThermographyError
-from thermography.fields.resampling import centring_matrix, plan_weights, plan_window
+from thermography.fields.resampling import LEAST_COVERAGE, centring_matrix, plan_weights, plan_window
 from thermography.registration.plan import Fiducial, PlanGrid, mask_discs
+from thermography.registration.register import register_points
 
 #: Cells of 10 x 10 px. Pixel centres lie at multiples of 0.5 mm less a quarter: pixel borders are cell borders.
 PLAN = PlanGrid(60, 40, 5)
@@ -93,6 +95,27 @@ def test_pixels_on_borders_of_cells_are_divided():
     far = ~mask_discs(GRID.centres_mm, DISCS, margin_mm=8.0)[2:-2, 2:-2]
     # A pixel is 1.2 mm: sixteen parts of it put 0.02 of a cell of 5 mm to its neighbour at most.
     assert abs(weights.coverage[2:-2, 2:-2][far] - 1).max() < 0.05
+
+
+@pytest.mark.parametrize("cell_mm", [8.0, 3.0, 2.0, 1.5, 1.0, 0.5, 0.2])
+def test_cells_of_every_size_are_seen_by_the_pixels_above_them(cell_mm):
+    """Pixels of 3 mm, turned by a degree: all cells inside the margin are seen, and a linear field is true within half a pixel."""
+    grid = PlanGrid(72, 48, cell_mm)
+    corners = [
+        Fiducial(name, *place, 1.0) for name, place in zip("ABCD", itertools.product((0, 72), (0, 48)), strict=True)
+    ]
+    along = np.exp(1j * np.deg2rad(1.0)) / 3.0
+    on_sensor = {one.name: 4.0 + 3.0j + along * complex(one.x_mm, one.y_mm) for one in corners}
+    picked = {name: (place.real, place.imag) for name, place in on_sensor.items()}
+    registration = replace(register_points(picked, corners, (24, 32)), masked=())
+    weights = plan_weights(registration, grid, margin_px=0.0)
+    inner = grid.contains(grid.centres_mm, margin_mm=3.0 + cell_mm)
+    assert inner.any() and (weights.coverage[inner] >= LEAST_COVERAGE).all()
+    rows, columns = weights.window
+    column, row = np.meshgrid(np.arange(columns.stop), np.arange(rows.start, rows.stop))
+    x = registration.to_plan(np.stack([column, row], axis=-1).astype(float))[..., 0]
+    error = weights.resample(x) - grid.centres_mm[..., 0]
+    assert np.abs(error[inner]).max() < 1.5 * 1.1
 
 
 def test_centring_moves_a_cell_along_the_gradient_of_its_neighbours():
