@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from interferometry.common import Array, InterferometryError, check_dataset
+from interferometry.deviations import ROUNDING
 from interferometry.drift.gls import memory_of_each, typical_memory, von_neumann_p_value
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
@@ -43,6 +44,8 @@ _PERMUTED_VALUES = 1 << 18
 #: Levels of the tests whether a target stands out from the others: by its scatter, both directions together and either alone, and by its
 #: motion over the cycles. Scatter that differs naturally is significant by permutation, so that the first two must share 0.05.
 ESD_LEVELS = {"together": 0.035, "single": 0.01, "motion": 0.02}
+#: Standard deviations within which values are equal.
+_ARITHMETIC = 1e-6
 #: Level at which the remainder of a step is still called slow.
 SLOW_REMAINDER_LEVEL = 0.01
 
@@ -157,7 +160,7 @@ def _scatter_anomalies(
 ) -> list[Anomaly]:
     """Return positions with excess scatter, step down: each leaves the pool before the others are tested again."""
     z = _without_memory(estimated["standardised"].values)
-    scatter = estimated["scatter_position"].values
+    scatter, digit_um = estimated["scatter_position"].values, float(estimated["resolution"])
     usable = np.flatnonzero(np.isfinite(scatter) & (scatter > 0))
     stands_out = _stands_out(estimated, usable)
     anomalies: list[Anomaly] = []
@@ -173,6 +176,10 @@ def _scatter_anomalies(
         direction = _scatter_direction(estimated, target, others)
         scatter_um = _scatter_of(estimated, target, direction)
         typical = float(np.median(scatter[others]))
+        extra_um = float(np.sqrt(max(scatter_um**2 - typical**2, 0.0)))
+        pool = others
+        if extra_um <= digit_um:
+            continue
         anomalies.append(
             Anomaly(
                 target=int(estimated["target"].values[target]),
@@ -180,12 +187,11 @@ def _scatter_anomalies(
                 kind="scatter",
                 p_value=min(1.0, p / WEIGHTS["scatter"]),
                 scatter_um=scatter_um,
-                extra_um=float(np.sqrt(max(scatter_um**2 - typical**2, 0.0))),
+                extra_um=extra_um,
                 stands_out=bool(stands_out[target] and scatter[target] > typical),
                 least_p_value=_least_p_value("scatter", permutations),
             )
         )
-        pool = others
     return anomalies
 
 
@@ -303,17 +309,20 @@ def _series_anomalies(
     anomalies = []
     for kind, target in _one_kind_per_target(significant, values):
         p_value, row = significant[kind][target]
-        size, at_cycle, period_s = _size_of_motion(estimated, kind, values[row], periodogram)
         direction = labels[row].direction
-        scatter_um = _scatter_of(estimated, target, direction)
+        course = _course(estimated, labels[row])
+        size, at_cycle, period_s = _size_of_motion(estimated, kind, values[row], course, periodogram)
+        extra_um = size * _unit_um(estimated) / float(np.sqrt(2) if direction == "both" else 1.0)
+        if extra_um <= float(estimated["resolution"]):
+            continue
         anomalies.append(
             Anomaly(
                 target=int(estimated["target"].values[target]),
                 direction=direction,
                 kind=kind,
                 p_value=min(p_value, 1.0),
-                scatter_um=scatter_um,
-                extra_um=size * (scatter_um / (np.sqrt(2) if direction == "both" else 1.0)),
+                scatter_um=_scatter_of(estimated, target, direction),
+                extra_um=extra_um,
                 stands_out=target in apart[kind],
                 at_cycle=at_cycle,
                 period_s=period_s,
@@ -358,6 +367,8 @@ def _permutation_tests(
 def _against_permuted(measured: Array, shuffled: Array) -> tuple[Array, Array]:
     """Standardise a statistic (series,) by that of permuted series (permutation, series); return it with its p-values."""
     centre, spread = shuffled.mean(axis=0), shuffled.std(axis=0)
+    # A statistic that no permutation changes has no strength.
+    spread = np.where(spread > 0, spread, np.inf)
     largest = ((shuffled - centre) / spread).max(axis=1)
     strength = (measured - centre) / spread
     reached = np.count_nonzero(largest[:, None] >= strength, axis=0)
@@ -367,20 +378,38 @@ def _against_permuted(measured: Array, shuffled: Array) -> tuple[Array, Array]:
 def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
     """Return the series of each target, per direction and for both together, and their labels."""
     z = np.clip(estimated["standardised"].values, -WINSOR, WINSOR)
+    # Rounding moves a reading by half a digit at most: what ranges over no more than a digit, or over what the arithmetic rounds, is a
+    # series without any course. So is one whose readings are all left out, each at the limit.
+    least = max(float(estimated["resolution"]) / _unit_um(estimated), _ARITHMETIC)
     names = [str(name) for name in estimated["direction"].values]
     labels, rows = [], []
     for target in range(z.shape[2]):
         measured = [d for d in range(z.shape[1]) if np.isfinite(z[:, d, target]).sum() >= SHORTEST_TEST_CYCLES]
         centred = {d: np.nan_to_num(z[:, d, target] - np.nanmean(z[:, d, target])) for d in measured}
-        # Where all readings of an approach are left out, each stands at the limit: a series without any course.
-        single = {d: row for d, row in centred.items() if row.any()}
+        single = {d: row for d, row in centred.items() if np.ptp(row) > least}
         for d, row in single.items():
             labels.append(_Series(target, names[d]))
             rows.append(row)
-        if len(single) == 2:
+        both = sum(single.values()) / np.sqrt(2)
+        if len(single) == 2 and np.ptp(both) > least:
             labels.append(_Series(target, "both"))
-            rows.append((single[0] + single[1]) / np.sqrt(2))
+            rows.append(both)
     return labels, np.array(rows)
+
+
+def _unit_um(estimated: xr.Dataset) -> float:
+    """Return the standard deviation in which residuals are standardised, um."""
+    return max(float(estimated["sigma"]), ROUNDING * float(estimated["resolution"]))
+
+
+def _course(estimated: xr.Dataset, label: _Series) -> Array:
+    """Return the standardised residuals (cycle,) of a series less their mean, 0 where a reading is missing."""
+    z = estimated["standardised"].values[:, :, label.target]
+    if label.direction != "both":
+        z = z[:, estimated["direction"].values == label.direction]
+    # A reading that is left out counts as far as one may in the tests.
+    z = np.where(np.isinf(z), WINSOR, z)
+    return np.asarray(np.nan_to_num(z - np.nanmean(z, axis=0)).sum(axis=1) / np.sqrt(z.shape[1]))
 
 
 def _slowness(values: Array) -> Array:
@@ -450,12 +479,15 @@ def _one_kind_per_target(significant: dict[str, dict[int, tuple[float, int]]], v
 
 
 def _size_of_motion(
-    estimated: xr.Dataset, kind: str, row: Array, periodogram: _Periodogram
+    estimated: xr.Dataset, kind: str, row: Array, course: Array, periodogram: _Periodogram
 ) -> tuple[float, int | None, float | None]:
-    """Return the size of a motion in units of a series' (cycle,) standard deviation, the cycle after a step, and the period in s."""
+    """Return the size of a motion in standard deviations of a reading, the cycle after a step, and the period in s.
+
+    From the series (cycle,) as it is tested; the height of a step from its course, which is not winsorised.
+    """
     if kind == "step":
         step = _step_index(row)
-        return abs(float(row[step:].mean() - row[:step].mean())), int(estimated["cycle"].values[step]), None
+        return abs(float(course[step:].mean() - course[:step].mean())), int(estimated["cycle"].values[step]), None
     if kind == "periodic":
         power = periodogram.power(row)
         period_s = float(1 / periodogram.frequency[int(np.argmax(power))])

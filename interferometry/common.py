@@ -89,6 +89,8 @@ ESTIMATE: Contract = {
     "scatter": (("direction", "target"), "um", "f"),
     "scatter_freedom": (("direction", "target"), "1", "f"),
     "scatter_position": (("target",), "um", "f"),
+    "sigma": ((), "um", "f"),
+    "resolution": ((), "um", "f"),
 }
 
 #: Name of a contracted argument -> its contract, and what returns such a Dataset.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from interferometry.common import DIRECTIONS, InterferometryError
+from interferometry.common import DIRECTIONS, Array, InterferometryError
 
 DIMS = ("cycle", "direction", "target")
 
@@ -34,6 +34,11 @@ OUTLIER = Flag(16, "outlier")
 #: Every flag, in the order of the bits.
 REGISTRY: tuple[Flag, ...] = (MISSING, UNREADABLE, DUPLICATE, OUT_OF_ORDER, OUTLIER)
 
+#: Share of a step by which a difference may miss a multiple of it: numbers in other units are rounded once more.
+_OFF_STEP = 1e-3
+#: Standard deviation of the rounding to steps of 1 (GUM F.2.2.1).
+ROUNDING = 1.0 / np.sqrt(12.0)
+
 
 def build_deviations(
     cycles: Sequence[int], targets: Sequence[int], position_mm: np.ndarray, deviation_um: np.ndarray, time: np.ndarray
@@ -58,7 +63,7 @@ def build_deviations(
     -------
     xarray.Dataset
         Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
-        (mm; target). Missing readings are flagged.
+        (mm; target). Missing readings are flagged. ``resolution`` (um) is the step in which the readings were recorded, 0 where none shows.
 
     Raises
     ------
@@ -112,9 +117,32 @@ def build_deviations(
                     "flag_meanings": " ".join(flag.name for flag in REGISTRY),
                 },
             ),
+            "resolution": (
+                (),
+                resolution(deviation_um),
+                {"units": "um", "long_name": "step of the readings as recorded"},
+            ),
         },
         coords={"cycle": list(cycles), "direction": list(DIRECTIONS), "target": list(targets)},
     )
+
+
+def resolution(values: Array) -> float:
+    """Return the step of which all differences of the values are multiples; 0 where none shows."""
+    finite = values[np.isfinite(values)]
+    steps = np.diff(np.unique(finite))
+    # Sums of decimal fractions differ by rounding from one another.
+    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(finite).max(initial=0.0)))]
+    if not steps.size:
+        return 0.0
+    multiples = steps / steps.min()
+    return float(steps.min()) if np.abs(multiples - np.rint(multiples)).max() < _OFF_STEP else 0.0
+
+
+def resolution_um(deviations: xr.Dataset) -> float:
+    """Return the step in which readings were recorded, um; a correction since then does not change it."""
+    stated = deviations.get("resolution")
+    return resolution(deviations["deviation"].values) if stated is None else float(stated)
 
 
 def set_flag(deviations: xr.Dataset, flag: Flag, where: np.ndarray) -> xr.Dataset:
@@ -143,6 +171,7 @@ def sort_readings(deviations: xr.Dataset) -> xr.Dataset:
             "target": (("reading",), deviations["target"].values[target[order]]),
             "sign": (("reading",), sign, {"units": "1"}),
             "position": (("reading",), deviations["position"].values[target[order]], {"units": "mm"}),
+            "resolution": ((), resolution_um(deviations), {"units": "um"}),
         }
     )
 

@@ -19,13 +19,13 @@ from fusion.pipeline.iso230 import date_of, files_of_run, hashed, identity
 from fusion.results.parts import Iso230Condition, Quantity
 from fusion.results.results import read_results
 from fusion.results.thermal_test import TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
+from interferometry.deviations import ROUNDING, resolution
 from interferometry.iso230.thermal import (
     AVERAGED_S,
     Distortion,
     average,
     axis_courses,
     evaluate_distortion,
-    resolution,
     scatter,
     tilt,
     with_start,
@@ -85,7 +85,7 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     courses = []
     for k, channel in enumerate(channels):
         noise = scatter(raw[:, k]) / np.sqrt(per_piece)
-        digit = resolution(raw[:, k]) / np.sqrt(12.0)
+        digit = ROUNDING * resolution(raw[:, k])
         sources: dict[str, tuple[float | None, str]] = {
             "noise": (noise, "from the second differences of the readings, mean of one minute"),
             "resolution": (digit, "from the digits of the readings"),

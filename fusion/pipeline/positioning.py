@@ -92,10 +92,19 @@ def _approach_notices(deviations: xr.Dataset) -> Iterator[Notice]:
 
 
 def _scatter_notices(drift: xr.Dataset | None) -> Iterator[Notice]:
-    """Return the notice that the drift between readings hides their noise."""
-    if drift is None or not drift.attrs["scatter_undetermined"]:
+    """Return the notices that the digits of the readings, or the drift between them, hide their noise."""
+    if drift is None:
         return
-    sigma = float(drift["sigma"])
+    sigma, step = float(drift["sigma"]), float(drift["resolution"])
+    if sigma < step:
+        yield Notice(
+            "coarse_digits",
+            f"Readings are recorded in steps of {step:.3g} µm, more than their standard deviation of {sigma:.2g} µm: rounding alone makes "
+            "positions differ by up to a step, so that one that stands out by no more than that is not named.",
+            "Write more digits, or read with an instrument of finer resolution.",
+        )
+    if not drift.attrs["scatter_undetermined"]:
+        return
     yield Notice(
         "scatter_undetermined",
         "The drift from one reading to the next is so large that the noise of the readings is negligible against it: the search for the "

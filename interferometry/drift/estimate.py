@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from interferometry.common import Array, InterferometryError, check_dataset, one_thread
-from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
+from interferometry.deviations import DIMS, OUTLIER, ROUNDING, set_flag, sort_readings
 from interferometry.drift.gls import (
     DriftFit,
     average_drift,
@@ -177,7 +177,8 @@ def estimate_drift(
           deviation over the test; ``drift_rate`` (component): standard deviation of the increments of one hour;
           ``drift_share`` (component, direction, target; 1): its share in a reading.
         - ``noise`` (cycle, direction, target): estimated random part of each reading. ``standardised`` (1): its deletion
-          residual in standard deviations, infinite for a gross outlier.
+          residual in standard deviations, of at least that of the rounding to the ``resolution`` (um) of the readings, infinite for a gross
+          outlier.
         - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted); ``scatter_undetermined``: 1 where the noise is small against the
           drift between readings, so that ``sigma`` and ``scatter`` are what the search for the variances was limited to, 0 elsewhere.
 
@@ -302,7 +303,8 @@ def _is_gross(readings: xr.Dataset) -> NDArray[np.bool_]:
     """Mark gross outliers, which would mislead even the start of a robust fit: sentinels, beam breaks, readings of other targets."""
     remainder = _without_medians(readings)
     typical = float(np.median(np.abs(remainder))) or float(np.mean(np.abs(remainder)))
-    return np.abs(remainder) > GROSS_LIMIT * typical
+    # The median distance of a value from what it is rounded to is a quarter of a digit.
+    return np.abs(remainder) > GROSS_LIMIT * max(typical, float(readings["resolution"]) / 4.0)
 
 
 def _without_medians(readings: xr.Dataset) -> Array:
@@ -364,7 +366,17 @@ def _fit(
     design = np.zeros((cell.size, len(cells)))
     design[np.arange(cell.size), cell] = 1.0
     seconds, deviation = readings["seconds"].values, readings["deviation"].values
-    fit = estimate(seconds, loadings, deviation, design, order=order, robust=robust, settling=True, memory=True)
+    fit = estimate(
+        seconds,
+        loadings,
+        deviation,
+        design,
+        order=order,
+        robust=robust,
+        settling=True,
+        memory=True,
+        least_sigma=ROUNDING * float(readings["resolution"]),
+    )
     named = (*components, *(f"shape_{k + 1}" for k in range(shapes.shape[1])))
     return JointFit(readings, cells, cell, named, shapes, fit)
 
@@ -478,7 +490,8 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     weights = state_weights(fit.system.seconds, joint.readings["cycle"].values, state)
     at_state = _drift_at_state(joint, columns, weights)
     drift, covariance = _drift_from_state(joint, smoothed, at_state)
-    deletion = fit.deletion_residuals()
+    resolution_um = float(joint.readings["resolution"])
+    deletion = fit.deletion_residuals(ROUNDING * resolution_um)
     scatter, freedom = _scatter(joint, smoothed, deletion)
     standardised = grid.per_reading(deletion)
     standardised[grid.is_left_out(deviations)] = np.inf
@@ -495,6 +508,7 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
             "noise": _um(DIMS, grid.per_reading(noise), "random part of the reading"),
             "standardised": (DIMS, standardised, {"units": "1"}),
             "sigma": _um((), fit.sigma),
+            "resolution": _um((), resolution_um, "step of the readings as recorded"),
             **_component_variables(grid, joint, drift, covariance),
         },
         coords={**{name: deviations[name].values for name in DIMS}, "component": list(joint.components)},

@@ -174,12 +174,14 @@ class DriftFit:
         noise, share = self.noise()
         return np.asarray(noise / (self.sigma * np.sqrt(np.maximum(share, 1e-12))))
 
-    def deletion_residuals(self) -> Array:
-        """Each reading minus its prediction from all others, in standard deviations of an ordinary reading (n,); NaN if not observed."""
+    def deletion_residuals(self, least_sigma: float = 0.0) -> Array:
+        """Each reading minus its prediction from all others, in standard deviations of an ordinary reading, of at least ``least_sigma``
+        (n,); NaN if not observed.
+        """
         smoothed = self.system.smooth(self.residual()[:, None])
         with np.errstate(divide="ignore", invalid="ignore"):
             ordinary = 1.0 / smoothed.D + (1.0 - self.system.variance) * self.system.independent / self.system.variance
-            standardised = (smoothed.u[:, 0] / smoothed.D) / (self.sigma * np.sqrt(ordinary))
+            standardised = (smoothed.u[:, 0] / smoothed.D) / (max(self.sigma, least_sigma) * np.sqrt(ordinary))
         return np.where(smoothed.D > 0, standardised, np.nan)
 
 
@@ -446,8 +448,11 @@ def estimate(
     start: Array | None = None,
     observed: NDArray[np.bool_] | None = None,
     variance: Array | None = None,
+    least_sigma: float = 0.0,
 ) -> DriftFit:
-    """Fit fixed effects and the variances of the drift together by restricted maximum likelihood."""
+    """Fit fixed effects and the variances of the drift together by restricted maximum likelihood; no reading is an outlier by less than
+    ``least_sigma`` lets it be.
+    """
     trends = start_columns(seconds, loadings, 2)[:, loadings.shape[1] :]
     with_trends = np.column_stack([design, trends])
 
@@ -472,7 +477,8 @@ def estimate(
             for _ in range(_ROBUST_PASSES):
                 # Relative variances (n,) under which a reading far from the others is down-weighted (redescending weight function).
                 # Where the others leave no scatter an outlier is any multiple of it; the square of that has to stay a number.
-                excess = np.minimum(np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT, _LARGEST_EXCESS)
+                deletion = np.abs(np.nan_to_num(fit.deletion_residuals(least_sigma)))
+                excess = np.minimum(deletion / _OUTLIER_LIMIT, _LARGEST_EXCESS)
                 fit = fit_fixed_effects(
                     replace(fit.system, variance=np.where(excess > 1.0, excess**2, 1.0)), response, columns
                 )

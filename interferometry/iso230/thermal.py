@@ -140,14 +140,6 @@ def scatter(values: Array) -> float:
     return float(np.std(second) / np.sqrt(6.0)) if second.size else np.nan
 
 
-def resolution(values: Array) -> float:
-    """Return the smallest step between the values of a course (n,); 0 where there is none."""
-    steps = np.diff(np.unique(values[np.isfinite(values)]))
-    # Sums of decimal fractions differ by rounding from one another.
-    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))]
-    return float(steps.min()) if steps.size else 0.0
-
-
 def tilt(first_um: Array, second_um: Array, *, distance_mm: float) -> Array:
     """Return the tilt, um/m (microradian), that two displacements (n,) in um show over the distance of their sensors."""
     return (second_um - first_um) / distance_mm * 1e3

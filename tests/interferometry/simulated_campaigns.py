@@ -80,6 +80,12 @@ def simulate(
     return dataset, Truth(both, shift, stretch, seconds, position)
 
 
+def recorded(deviations: xr.Dataset, digit_um: float) -> xr.Dataset:
+    """Return a test as it is where its readings are written in whole digits."""
+    rounded = digit_um * np.rint(deviations["deviation"] / digit_um)
+    return deviations.assign(deviation=rounded, resolution=((), digit_um, {"units": "um"}))
+
+
 def _drift(rng: np.random.Generator, kind: str, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     grid = np.arange(0.0, seconds.max() + 2.0, 2.0)
     if kind == "none":

@@ -16,7 +16,7 @@ from interferometry.anomalies import (
 from interferometry.common import InterferometryError
 from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.gls import Autoregression
-from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate, with_memory
+from tests.interferometry.simulated_campaigns import SIGMA_UM, recorded, simulate, with_memory
 
 pytestmark = pytest.mark.long
 
@@ -275,7 +275,7 @@ def test_an_outlier_is_marked_from_its_percentage_point_on(deviate, first, outli
 
 
 def test_how_large_a_motion_is():
-    """In units of the scatter of the series; a slow one without what noise leaves in means of blocks."""
+    """In standard deviations of a reading; a slow one without what noise leaves in means of blocks."""
     estimated = xr.Dataset(coords={"cycle": np.arange(101, 141)})
     block = anomalies_module.BLOCK_CYCLES
     periodogram = anomalies_module._Periodogram(600.0 * np.arange(40.0))
@@ -287,7 +287,7 @@ def test_how_large_a_motion_is():
         ("slow", noise, (0.0, None, None)),
         ("step", step, (4.0, 114, None)),
     ):
-        size, *rest = anomalies_module._size_of_motion(estimated, kind, row, periodogram)
+        size, *rest = anomalies_module._size_of_motion(estimated, kind, row, row, periodogram)
         assert (size, *rest) == (pytest.approx(expected[0]), *expected[1:])
 
 
@@ -296,7 +296,7 @@ def test_an_approach_whose_readings_are_all_left_out_has_no_course(rng):
     standardised[:, 1, 2] = np.inf
     labels, values = anomalies_module._series(
         xr.Dataset(
-            {"standardised": (("cycle", "direction", "target"), standardised)},
+            {"standardised": (("cycle", "direction", "target"), standardised), "sigma": 0.4, "resolution": 0.0},
             coords={"direction": ["positive", "negative"]},
         )
     )
@@ -321,3 +321,46 @@ def test_noise_with_a_memory_over_the_cycles_makes_no_position_scatter():
     white = np.random.default_rng(1).normal(size=(40, 2, 16))
     white[3, 0, 2] = np.nan
     np.testing.assert_array_equal(anomalies_module._without_memory(white), white)
+
+
+@pytest.mark.parametrize("noise_um", [0.2, 0.25, 0.3])
+def test_digits_coarser_than_the_noise_make_no_anomaly_and_hide_no_larger_one(noise_um):
+    """A settled machine, 25 cycles in whole micrometres: many positions read the same in every cycle, and none moves."""
+    for seed in range(3):
+        test, _ = simulate(np.random.default_rng(seed), kind="none", cycles=25, sigma=noise_um)
+        assert anomalies_of(recorded(test, 1.0)) == []
+    test["deviation"][13:, :, 4] += 3.0
+    (step,) = [one for one in anomalies_of(recorded(test, 1.0)) if one.kind == "step"]
+    # The shift and the stretch that all positions share take up to three of the sixteen parts of a step of one.
+    assert (step.target, step.at_cycle, step.extra_um) == (5, 14, pytest.approx(2.8, abs=0.3))
+
+
+def test_approaches_that_mirror_each_other_have_no_course_in_common(rng):
+    """Their sum is nothing but what the arithmetic rounds, which the statistics must not standardise."""
+    standardised = rng.normal(size=(40, 1, 6))
+    estimated = xr.Dataset(
+        {
+            "standardised": (
+                ("cycle", "direction", "target"),
+                np.concatenate([standardised, 1e-13 - standardised], axis=1),
+            ),
+            "sigma": 0.4,
+            "resolution": 0.0,
+        },
+        coords={"direction": ["positive", "negative"]},
+    )
+    labels, _ = anomalies_module._series(estimated)
+    assert {label.direction for label in labels} == {"positive", "negative"}
+    strength, p = anomalies_module._against_permuted(
+        np.ones(3), np.column_stack([np.ones(199), rng.normal(size=(199, 2))])
+    )
+    assert (strength[0], p[0] > 0.5) == (0.0, True)
+
+
+@pytest.mark.parametrize("height_um", [2.0, 6.0])
+def test_the_height_of_a_step_is_not_that_of_its_winsorised_residuals(height_um):
+    test, _ = simulate(np.random.default_rng(1), kind="none", cycles=40)
+    test["deviation"][20:, :, 4] += height_um
+    step = next(one for one in anomalies_of(test) if one.kind == "step")
+    # Up to three of sixteen parts belong to the shift and stretch of all.
+    assert step.extra_um == pytest.approx(height_um, rel=0.2)

@@ -10,6 +10,8 @@ from interferometry.deviations import (
     REGISTRY,
     build_deviations,
     detect_out_of_order,
+    resolution,
+    resolution_um,
     set_flag,
     sort_readings,
 )
@@ -76,3 +78,23 @@ def test_arrays_of_other_sizes_are_refused_with_their_shapes(name, message):
 
     with pytest.raises(InterferometryError, match=message):
         build_deviations([1, 2], [1, 2, 3], **{**arrays(3), name: arrays(4)[name]})
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 25.4, 1e4])
+@pytest.mark.parametrize(("step", "expected"), [(1.0, 1.0), (0.1, 0.1), (0.5, 0.5), (0.001, 0.001), (None, 0.0)])
+def test_the_step_of_the_readings_is_found_in_every_unit(rng, unit, step, expected):
+    """Also behind an offset, with gaps, and where no two differ by a single step."""
+    values = rng.normal(40.0, 3.0, (20, 2, 5))
+    values = values if step is None else step * np.rint(values / step)
+    values[3:6, 1, 2] = np.nan
+    # Numbers in another unit are rounded once more: 2e-16 of 50 in steps of 0.001.
+    assert resolution(unit * values) == pytest.approx(unit * expected, rel=1e-9)
+    assert resolution(unit * np.array([3.0, np.nan, 3.0])) == 0.0
+
+
+def test_a_correction_does_not_change_in_what_steps_readings_were_recorded(rng):
+    time = np.datetime64("2026-03-09T06:30", "ns") + np.arange(40).reshape(10, 2, 2) * np.timedelta64(1, "s")
+    read = build_deviations(range(10), [1, 2], np.array([0.0, 9.0]), np.rint(rng.normal(0, 3, (10, 2, 2))), time)
+    corrected = read.assign(deviation=read["deviation"] + rng.normal(0, 0.1, (10, 2, 2)))
+    assert resolution_um(read) == resolution_um(corrected) == resolution_um(read.drop_vars("resolution")) == 1.0
+    assert resolution_um(corrected.drop_vars("resolution")) == 0.0

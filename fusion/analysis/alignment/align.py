@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.reflections import find_switching_patch, seen_throughout
 from fusion.analysis.alignment.sensor_health import SensorFault
 from fusion.common import Array, FusionError
+from interferometry.deviations import resolution_um
 from thermography.fields.large_arrays import in_pieces, piece_slices
 
 _DIMS = ("cycle", "direction", "target")
@@ -178,7 +179,7 @@ def align(
     series = _reduce_fields(fields, axis, deviations["position"].values)
     inside = ~np.isnat(reading_time) & (reading_time >= frame_time[0]) & (reading_time <= frame_time[-1])
 
-    fused = deviations[_KEPT].copy().assign_coords(frame_time=frame_time)
+    fused = _kept(deviations).assign_coords(frame_time=frame_time)
     fused["inside_frames"] = (_DIMS, inside, {"long_name": "the reading is between the first and the last frame"})
     for name, values in series.items():
         at_readings = np.where(inside, interpolate_series(deviations["time"].values, frame_time, values), np.nan)
@@ -192,7 +193,11 @@ def align_logs(
     deviations: xr.Dataset, *, environment: xr.Dataset | None = None, drivers: xr.Dataset | None = None
 ) -> xr.Dataset:
     """Give every reading what was logged at its own time, where no temperature of the table was measured."""
-    return _add_logs(deviations[_KEPT].copy(), environment, drivers)
+    return _add_logs(_kept(deviations), environment, drivers)
+
+
+def _kept(deviations: xr.Dataset) -> xr.Dataset:
+    return deviations[_KEPT].copy().assign(resolution=((), resolution_um(deviations), {"units": "um"}))
 
 
 def _add_logs(fused: xr.Dataset, environment: xr.Dataset | None, drivers: xr.Dataset | None) -> xr.Dataset:

@@ -31,6 +31,7 @@ from fusion.analysis.attribution.significance import (
 )
 from fusion.analysis.drift_model.null_simulation import rank_p_value
 from fusion.common import Array, FusionError
+from interferometry.deviations import ROUNDING, resolution_um
 
 #: Candidate time constants of the response to the local temperature, s.
 LAGS_S = (0.0, 600.0, 1800.0, 3600.0)
@@ -78,7 +79,7 @@ class Residual:
     seconds : (cycles,) mean time of the target's readings in each cycle since the first reading, s
     values : (2, cycles) residual in the positive and in the negative direction, NaN where missing, um
     cycle : (cycles,) cycle numbers
-    typical_um : robust standard deviation that this target would have if it scattered like the others, um
+    typical_um : robust standard deviation that this target would have if it scattered like the others, at least that of their rounding, um
     temperature : (frames,) each, times, s, and local temperature rise, K; None where the camera does not see the target
     """
 
@@ -192,7 +193,7 @@ def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residu
         np.nanmean(seconds[used], axis=1),
         values[:, used],
         ordered["cycle"].values[used].astype(np.int64),
-        _typical_scatter(residuals, design, sound, column),
+        max(_typical_scatter(residuals, design, sound, column), ROUNDING * resolution_um(fused)),
         _local_temperature(ordered, column, start),
     )
 

@@ -8,7 +8,6 @@ from interferometry.iso230.thermal import (
     average,
     axis_courses,
     evaluate_distortion,
-    resolution,
     scatter,
     tilt,
     with_start,
@@ -49,7 +48,6 @@ def test_the_mean_of_a_minute_lowers_the_noise_and_its_size_is_found():
     values = np.round(seconds / 3600.0 + 0.3 * rng.standard_normal(seconds.size), 2)[:, None]
     # A standard deviation from 10 800 readings: 1 %.
     assert scatter(values[:, 0]) == pytest.approx(0.3, rel=0.03)
-    assert resolution(values[:, 0]) == pytest.approx(0.01)
     time, mean = average(seconds, values)
     assert time.size == 360
     assert scatter(mean[:, 0]) == pytest.approx(0.3 / np.sqrt(30), rel=0.15)
