@@ -15,6 +15,7 @@ import numpy as np
 import ref_index
 
 from interferometry.common import Array, InterferometryError, check_dataset
+from interferometry.deviations import UNREADABLE, set_flag
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -173,7 +174,7 @@ def compensate(
         The compensated deviations and, at every reading in um, ``correction_scale`` and ``correction_dead_path`` (both already added);
         ``air_u``, ``material_u`` and ``dead_path_u``, standard uncertainties, and ``compensation_u``, their root sum of squares;
         ``air_index`` (1). ``attrs["outside_environment"]`` counts readings before or after the log, which take its first or last
-        condition.
+        condition; ``attrs["without_time"]`` those without a time, whose conditions nobody knows: they are NaN and flagged as unreadable.
 
     Raises
     ------
@@ -216,7 +217,7 @@ def compensate(
     )
     air, outside = _conditions_at(deviations, environment)
     if material_temperature_degC is not None:
-        air["material_temperature"] = material_temperature_degC.values
+        air["material_temperature"] = material_temperature_degC.transpose(*deviations["deviation"].dims).values
     index, travel_mm = _index_of(air, wavelength_nm), deviations["position"].values - zero_mm
     stretch = _stretch(air["material_temperature"], expansion_coefficient_ppm_per_K)
     change = index - float(index.ravel()[int(np.nanargmin(_seconds(deviations)))])
@@ -232,7 +233,11 @@ def compensate(
         "material_u": length_m * _material_ppm(air["material_temperature"], expansion_coefficient_ppm_per_K, sensors),
         "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(change) * (dead_path_mm != 0),
     }
-    return _corrected(deviations, added, u, index).assign_attrs(outside_environment=outside)
+    without_time = np.isfinite(deviations["deviation"].values) & np.isnat(deviations["time"].values)
+    corrected = _corrected(deviations, added, u, index)
+    if without_time.any():
+        corrected = set_flag(corrected, UNREADABLE, without_time)
+    return corrected.assign_attrs(outside_environment=outside, without_time=int(without_time.sum()))
 
 
 def _check_numbers(**numbers: float) -> None:

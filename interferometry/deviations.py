@@ -140,9 +140,9 @@ def resolution(values: Array) -> float:
 
 
 def resolution_um(deviations: xr.Dataset) -> float:
-    """Return the step in which readings were recorded, um; a correction since then does not change it."""
+    """Return the step in which readings were recorded, um; a correction since then does not change it. Of joined tests the coarsest."""
     stated = deviations.get("resolution")
-    return resolution(deviations["deviation"].values) if stated is None else float(stated)
+    return resolution(deviations["deviation"].values) if stated is None else float(stated.max())
 
 
 def set_flag(deviations: xr.Dataset, flag: Flag, where: np.ndarray) -> xr.Dataset:

@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from interferometry.common import Array, InterferometryError, check_dataset, one_thread
+from interferometry.common import DIRECTIONS, Array, InterferometryError, check_dataset, one_thread
 from interferometry.deviations import DIMS, OUTLIER, ROUNDING, set_flag, sort_readings
 from interferometry.drift.gls import (
     DriftFit,
@@ -213,8 +213,20 @@ def estimate_drift(
     >>> estimated["reversal"].values.round(1).tolist()
     [-2.0, -2.0, -2.0]
     """
-    joint = fit_joint(deviations, robust=robust, order=order, components=components)
-    return _describe(deviations, joint, state)
+    check_dataset(deviations, "deviations")
+    # Profiles and covariances are laid out by the index of the approach.
+    ordered = deviations.reindex(direction=list(DIRECTIONS)) if _unordered(deviations) else deviations
+    joint = fit_joint(ordered, robust=robust, order=order, components=components)
+    found = _describe(ordered, joint, state)
+    if ordered is deviations:
+        return found
+    place = [DIRECTIONS.index(str(name)) for name in deviations["direction"].values]
+    return found.isel(direction=place, other_direction=place)
+
+
+def _unordered(deviations: xr.Dataset) -> bool:
+    """Whether the approaches are not stored as both, the positive one first."""
+    return tuple(str(name) for name in deviations["direction"].values) != DIRECTIONS
 
 
 def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:

@@ -183,7 +183,7 @@ def _cycle_components(deviations: xr.Dataset, estimated: xr.Dataset) -> tuple[Ar
     loadings = share.reshape(share.shape[0], -1).T
     seconds, rows = [], []
     for cycle, values in zip(time, drift, strict=True):
-        present = np.isfinite(values.ravel())
+        present = np.isfinite(values.ravel()) & ~np.isnat(cycle.ravel())
         if not present.any() or np.linalg.matrix_rank(loadings[present]) < loadings.shape[1]:
             continue
         rows.append(np.linalg.lstsq(loadings[present], values.ravel()[present], rcond=None)[0])

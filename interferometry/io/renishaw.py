@@ -50,9 +50,11 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
             if not all(index and len(index) <= _MOST_DIGITS and int(index) > 0 for index in needed):
                 raise BadReading(text, "names no target or cycle from 1")
             if name == "TGT_DATA":
-                target_at[int(target)] = number
+                stated_before = target_at.setdefault(int(target), number)
             else:
-                readings[int(cycle) - 1, _DIRECTION[name], int(target) - 1] = number
+                stated_before = readings.setdefault((int(cycle) - 1, _DIRECTION[name], int(target) - 1), number)
+            if stated_before != number:
+                raise BadReading(text, f"is stated before as {stated_before:g}; the first is kept")
     unit = stated.get("UNIT", "mm")
     if unit not in _UM_PER_UNIT:
         raise LaserFormatError(f"{path}: UNIT={unit} is not known; use one of {', '.join(_UM_PER_UNIT)}")

@@ -156,7 +156,7 @@ def axis_courses(deviations: xr.Dataset) -> tuple[Array, dict[str, Array], dict[
     Returns
     -------
     seconds : (cycles,) ndarray
-        Mean time of each cycle since the first, s; without times the number of the cycle counts as NaN.
+        Mean time of each cycle since the first reading, s; NaN of a cycle without times.
     courses : dict of str to (cycles,) ndarray
         ``zero`` and ``end``, um: drift at the first and at the last target by the straight line; ``scale``, um/m.
     u : dict of str to (cycles,) ndarray
@@ -166,7 +166,8 @@ def axis_courses(deviations: xr.Dataset) -> tuple[Array, dict[str, Array], dict[
     values = readings.values.reshape(readings.sizes["cycle"], -1)
     position = deviations["position"].values.astype(float)
     length = float(np.ptp(position))
-    share = np.tile((position - position.min()) / length, readings.sizes["direction"])
+    # One target alone shows no line: its courses are NaN.
+    share = np.tile((position - position.min()) / (length or 1.0), readings.sizes["direction"])
     line = np.column_stack([np.ones(share.size), share])
     known = np.isfinite(values)
     found = np.zeros((len(values), 2))
@@ -184,7 +185,7 @@ def axis_courses(deviations: xr.Dataset) -> tuple[Array, dict[str, Array], dict[
     covariance = float((residual**2).sum()) / free * inverse
     found = np.where(np.isfinite(inverse[:, 0, :]), found, np.nan)
     times = deviations["time"].transpose("cycle", "direction", "target").values.astype("datetime64[ns]")
-    elapsed = np.where(np.isnat(times), np.nan, (times - times[~np.isnat(times)].min()) / np.timedelta64(1, "s"))
+    elapsed = (times - np.fmin.reduce(times, axis=None)) / np.timedelta64(1, "s")
     seconds = np.array([np.mean(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in elapsed])
     metres = length * 1e-3
     courses = {"zero": found[:, 0], "end": found.sum(axis=1), "scale": found[:, 1] / metres}

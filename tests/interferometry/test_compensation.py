@@ -15,6 +15,7 @@ from interferometry.compensation import (
     environment_factor,
     implied_wavelength_nm,
 )
+from interferometry.deviations import UNREADABLE
 from interferometry.io.readings import read_deviations
 from tests.interferometry.simulated_campaigns import START, simulate
 
@@ -212,3 +213,33 @@ def test_a_number_that_has_no_meaning_is_refused(name, value, reason, rng):
     environment = conditions(np.array([20.0]), np.array([1013.25]), np.array([20.0]), np.zeros(1))
     with pytest.raises(CompensationError, match=f"{name}={value} {reason}"):
         compensate(deviations, environment, **{name: value})
+
+
+def test_a_reading_without_a_time_is_flagged_and_counted(campaign):
+    deviations, environment = campaign
+    whole = compensate(deviations, environment, dead_path_mm=500.0)
+    nameless = deviations.copy(deep=True)
+    nameless["time"].values[3, 1, 2] = np.datetime64("NaT")
+    found = compensate(nameless, environment, dead_path_mm=500.0)
+    lost = np.argwhere(found["quality_flag"].values & UNREADABLE.mask).tolist()
+    assert (lost, found.attrs["without_time"], whole.attrs["without_time"]) == ([[3, 1, 2]], 1, 0)
+    expected = whole["deviation"].values.copy()
+    expected[3, 1, 2] = np.nan
+    np.testing.assert_array_equal(found["deviation"].values, expected)
+
+
+def test_a_temperature_at_the_readings_may_have_its_dims_in_any_order(campaign):
+    deviations, environment = campaign
+    seen = 20.0 + deviations["deviation"] * 0.1
+    factor = (float(environment_factor(1.00027)),) * 2
+    plain, turned = (
+        compensate(
+            deviations,
+            environment,
+            applied_factor_um=factor,
+            expansion_coefficient_ppm_per_K=11.0,
+            material_temperature_degC=one,
+        )
+        for one in (seen, seen.transpose("target", "cycle", "direction"))
+    )
+    np.testing.assert_array_equal(plain["deviation"].values, turned["deviation"].values)

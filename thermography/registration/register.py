@@ -1028,11 +1028,14 @@ _MOST_CELLS = 160
 
 
 def picture_grid(shape: tuple[int, int]) -> PlanGrid:
-    """Return the grid of a plan that is the picture itself: the smallest cells that divide both sides, at most 160 along the longer one."""
+    """Return the grid of a plan that is the picture itself: the smallest cells that divide both sides, at most 160 along the longer one.
+
+    Where no such cell divides both, the last row and column of cells end within half a cell of the picture's edge.
+    """
     rows, columns = shape
-    common = math.gcd(rows, columns)
-    sizes = [size for size in range(1, common + 1) if common % size == 0]
-    return PlanGrid(columns, rows, next((size for size in sizes if max(shape) <= _MOST_CELLS * size), common))
+    common, least = math.gcd(rows, columns), math.ceil(max(shape) / _MOST_CELLS)
+    size = next((size for size in range(least, common + 1) if common % size == 0), least)
+    return PlanGrid(*(size * max(1, round(pixels / size)) for pixels in (columns, rows)), size)
 
 
 def register_picture(shape: tuple[int, int]) -> Registration:

@@ -20,6 +20,10 @@ def _respond(values: Array, seconds: Array, time_constant_s: float, start: Array
         step = seconds[k + 1] - seconds[k]
         decay = np.exp(-step / time_constant_s)
         for j in range(start.size):
+            if step == 0.0:
+                # Of two samples at one time the second is a jump, to which nothing has responded yet.
+                response[k + 1, j] = response[k, j]
+                continue
             ramp = (values[k + 1, j] - values[k, j]) / step * time_constant_s
             response[k + 1, j] = (response[k, j] - values[k, j] + ramp) * decay + values[k + 1, j] - ramp
     return response

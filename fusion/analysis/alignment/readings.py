@@ -156,7 +156,8 @@ class Readings:
     @property
     def target_index(self) -> NDArray[np.int64]:
         """Index of each reading's target in `targets`, (n,)."""
-        return np.searchsorted(self.targets, self.target)
+        order = np.argsort(self.targets)
+        return order[np.searchsorted(self.targets, self.target, sorter=order)]
 
     @property
     def profile(self) -> Array:

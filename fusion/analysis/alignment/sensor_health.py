@@ -425,10 +425,10 @@ def _without_signal(seconds: Array, temperature: Array) -> list[SensorFault]:
     for k in range(temperature.shape[1]):
         outside = is_implausible(temperature[:, k])
         readings = np.flatnonzero(np.isfinite(temperature[:, k]))
-        in_a_row = np.convolve(outside[readings], np.ones(_LEAST_IMPLAUSIBLE))
-        if in_a_row.max(initial=0.0) >= _LEAST_IMPLAUSIBLE:
-            # What is missing before the first implausible reading is no signal either.
-            sound = readings[readings < np.argmax(outside)]
+        in_a_row = np.convolve(outside[readings], np.ones(_LEAST_IMPLAUSIBLE)) >= _LEAST_IMPLAUSIBLE
+        if in_a_row.any():
+            # What is missing before the first of these implausible readings is no signal either; a single one before them is a glitch.
+            sound = readings[: int(np.argmax(in_a_row)) - _LEAST_IMPLAUSIBLE + 1]
             first = int(sound[-1]) + 1 if sound.size else 0
             faults.append(SensorFault(k, Kind.NO_SIGNAL, True, float(seconds[first]), step, np.nan))
         elif readings.size and seconds[-1] - seconds[readings[-1]] > _ENDED_SHARE * (seconds[-1] - seconds[0]):

@@ -25,8 +25,9 @@ from fusion.results.loop import RecordLoop
 #: Lengths and mean times at one level that are tried.
 _HOURS = (4.0, 8.0, 12.0, 24.0)
 _HOLDS_MIN = (15.0, 30.0, 60.0, 120.0)
-#: Most rows of a proposed test, also after a record of milliseconds.
+#: Most rows of a proposed test, also after a record of milliseconds, and its longest step: a third of the shortest mean time at one level.
 _MOST_ROWS = 10_000
+_LONGEST_STEP_S = 20.0 * min(_HOLDS_MIN)
 #: The duty under which a prediction is judged: hours of it, and its mean time at one level.
 _JUDGED_H, _JUDGED_HOLD_MIN = 24.0, 60.0
 
@@ -72,7 +73,7 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
     rng = np.random.default_rng(seed)
 
     def under(hours: float, hold_min: float) -> tuple[Record, Array]:
-        step_s = max(record.block_s, 3600.0 * hours / _MOST_ROWS)
+        step_s = min(max(record.block_s, 3600.0 * hours / _MOST_ROWS), _LONGEST_STEP_S)
         seconds = np.asarray(step_s * np.arange(round(3600.0 * hours / step_s)), float)
         law = DutyLaw(60.0 * hold_min, 15.0 * hold_min)
         # Rest, half and full: linear and quadratic heat differ.
@@ -93,7 +94,7 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
         tried = []
         for hold_min in _HOLDS_MIN:
             test, values = under(hours, hold_min)
-            after = [_after(one, test.seconds, values) for one in responses]
+            after = [_after(one, test, values) for one in responses]
             tried.append((_width(after, judged), hold_min, test))
         width, hold_min, test = min(tried, key=lambda one: one[0])
         sizes = np.array([record.driver_sizes[name][0] for name in test.drivers])
@@ -103,15 +104,17 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
         yield NextTest(hours, hold_min, _width(now, judged), width, largest, minutes, levels[changed])
 
 
-def _after(one: Response, seconds: Array, values: Array) -> Array:
-    """Return the covariance of a response after a test (n, p) as well."""
-    still = np.zeros(seconds.size)
-    marginal = Marginal.of(seconds, still, np.ones((seconds.size, 1)), values, ratio=one.ratio)
+def _after(one: Response, test: Record, values: Array) -> Array:
+    """Return the covariance of a response after a test, whose steps need not be as long as the record's blocks, (n, p) as well."""
+    seconds, steps = test.seconds, test.block_s / float(test.seconds[1] - test.seconds[0])
+    # The noise of a block mean is that of so many steps.
+    noise_um, ratio = one.noise_um * np.sqrt(steps), one.ratio / steps
+    marginal = Marginal.of(seconds, np.zeros(seconds.size), np.ones((seconds.size, 1)), values, ratio=ratio)
     scale = np.sqrt(np.diag(one.covariance))
     # Of standardised coefficients: their variances differ by many powers of ten.
     before = np.linalg.inv(one.covariance / np.outer(scale, scale))
     return np.asarray(
-        np.linalg.inv(before + marginal.gram * np.outer(scale, scale) / one.noise_um**2) * np.outer(scale, scale)
+        np.linalg.inv(before + marginal.gram * np.outer(scale, scale) / noise_um**2) * np.outer(scale, scale)
     )
 
 

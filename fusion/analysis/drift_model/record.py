@@ -535,9 +535,18 @@ def _step_event(record: Record, near: Candidate | None) -> Iterator[Candidate]:
         for share in (0.0,) if near is None else _SHARES:
             late = (record.seconds >= instant).astype(float)
             place = int(np.argmax(late))
-            if record.run[place - 1] == record.run[place]:
-                late[place - 1] = share
-            yield Candidate(late[:, None], {"time_s": float(instant - share * record.block_s)}, ("um",), float(instant))
+            # The first block of a run has none before it that the event could lie in.
+            before = share if record.run[place - 1] == record.run[place] else 0.0
+            late[place - 1] = before
+            # The instant is the middle of the first block that lies after the event as a whole.
+            time_s = float(instant - (0.5 + before) * record.block_s)
+            yield Candidate(late[:, None], {"time_s": time_s}, ("um",), float(instant))
+
+
+def _happened_s(candidate: Candidate) -> float | None:
+    """When an event happened, s since the start; None for an effect that lasts."""
+    time_s = candidate.parameters.get("time_s", candidate.event_s)
+    return None if candidate.event_s is None else float(time_s)
 
 
 def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Candidate]:
@@ -639,12 +648,17 @@ class RecordGrounds:
         if candidate.event_s is None:
             return None
         if self._is_switched(candidate.event_s):
-            return candidate.event_s / 3600.0
+            return float(_happened_s(candidate) or 0.0) / 3600.0
         if self._least_gain <= 0.0:
             return None
         record = self._record
         shifts = [
-            Candidate((record.seconds >= instant).astype(float)[:, None], {}, ("um",), float(instant))
+            Candidate(
+                (record.seconds >= instant).astype(float)[:, None],
+                {"time_s": float(instant - 0.5 * record.block_s)},
+                ("um",),
+                float(instant),
+            )
             for instant in record.seconds[record.switched() & self._model.used]
         ]
         if not shifts:
@@ -652,7 +666,7 @@ class RecordGrounds:
         rival = shifts[int(np.argmax(channel_gains(self._model, shifts).gain[:, 0]))]
         both = replace(candidate, columns=np.column_stack([candidate.columns, rival.columns]), beside=1)
         gain = float(channel_gains(self._model, [both]).gain[0, 0])
-        return None if gain >= self._least_gain else float(rival.event_s or 0.0) / 3600.0
+        return None if gain >= self._least_gain else float(_happened_s(rival) or 0.0) / 3600.0
 
     def heat_is_logged(self) -> bool:
         """Whether a driver was logged."""
@@ -1226,7 +1240,7 @@ class RecordResult:
             chained_rmse_before_um=step.round.start_error_um,
             chained_rmse_after_um=step.score.error_um,
             rejected=_rejected(step.round),
-            event_s=term.candidate.event_s,
+            event_s=_happened_s(term.candidate),
         )
 
     def contribution(self, term: Term) -> Array:

@@ -21,6 +21,8 @@ from fusion.common import Array, FusionError
 
 #: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
 MOST_BLOCKS = 600
+#: Times as many blocks as that may be filled in part: a pause cuts blocks in two.
+_CUT = 1.1
 #: Blocks below which nothing can be held out.
 LEAST_BLOCKS = 40
 #: Blocks below which a run of several shows nothing.
@@ -335,12 +337,19 @@ def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
             f"{source}: {samples} samples are too few to hold a part out; a record needs at least {LEAST_BLOCKS}"
         )
     step = float(np.median(np.concatenate([np.diff(one) for one in times])))
-    length = step * max(1, int(np.ceil(samples / MOST_BLOCKS)))
+
+    def blocks_of(run_times: Array, length: float) -> NDArray[np.int64]:
+        # A sample that comes a little early still belongs to its own block.
+        return np.floor((run_times - run_times[0] + 0.5 * step) / length).astype(np.int64)
+
+    # As many samples as share out evenly; more of a log whose samples come in bursts, each of which would fill blocks of its own.
+    together = max(1, int(np.ceil(samples / MOST_BLOCKS)))
+    while (filled := sum(np.unique(blocks_of(one, together * step)).size for one in times)) > _CUT * MOST_BLOCKS:
+        together = int(np.ceil(together * filled / MOST_BLOCKS))
+    length = together * step
     places, seconds, first, zeros, start = [], [], [0], [], 0.0
     for k, one in enumerate(times):
-        # A sample that comes a little early still belongs to its own block.
-        number = np.floor((elapsed[run == k] - one[0] + 0.5 * step) / length).astype(int)
-        numbers, place = np.unique(number, return_inverse=True)
+        numbers, place = np.unique(blocks_of(one, length), return_inverse=True)
         if len(times) > 1 and numbers.size < LEAST_RUN_BLOCKS:
             raise RecordError(
                 f"{names[k]}: the run fills {numbers.size} blocks of {length:g} s, fewer than {LEAST_RUN_BLOCKS}; leave it out of "

@@ -413,7 +413,10 @@ def sensor_curve(
     squares, free = np.array(asked), np.array([[[plain.free for _, plain in part]] for part in parts])
 
     def ratios(kept: Sequence[int]) -> tuple[Array, Array]:
-        rms = np.sqrt(squares[kept].sum(axis=0) / free[kept].sum(axis=0)).mean(axis=1)
+        # A displacement that these parts do not hold says nothing.
+        with np.errstate(invalid="ignore"):
+            by_channel = np.sqrt(squares[kept].sum(axis=0) / free[kept].sum(axis=0))
+        rms = known_mean(by_channel, axis=1)
         return rms, rms / rms[0]
 
     cross, ratio = ratios([*numbers])
@@ -435,6 +438,10 @@ def _marginals(
     """Return one displacement in a part, from its own level, under noise and wandering with columns of unit prior, and as measured."""
     course = record.displacement[:, channel]
     here = part & np.isfinite(course)
+    if not here.any():
+        p = values.shape[1]
+        nothing = Marginal(0.0, np.zeros(p), np.zeros((p, p)), 0.0, 0)
+        return nothing, nothing
     constants = _constants(record, events[..., channel], here)
     scaled = values[here] * one.prior_u
     weighted, plain = (

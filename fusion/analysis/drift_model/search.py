@@ -1131,7 +1131,7 @@ def left_out_of_forecast(problem: Problem[M], state: LoopState[M], contradicted:
     """Places of the steps that leave the forecast: contradicted ones, and those with which the hold-out set is predicted worse."""
     steps = range(len(state.errors_without_um))
     left = set(contradicted) & set(steps)
-    while problem.hold_out_error(state.kept(left)) > _WORSE * state.errors_um[0]:
+    while left != set(steps) and problem.hold_out_error(state.kept(left)) > _WORSE * state.errors_um[0]:
         left.add(min(set(steps) - left, key=lambda place: problem.hold_out_error(state.kept(left | {place}))))
     return left
 

@@ -366,3 +366,16 @@ def test_a_single_position_memory_of_all_and_too_few_cycles_or_targets_give_no_s
     assert common_shape(with_memory(rng.normal(0, 0.3, (100, 16)), 0.5), KNOWN) is None
     assert common_shape(rng.normal(size=(14, 16)), KNOWN) is None
     assert common_shape(rng.normal(size=(80, 3)), KNOWN[:3]) is None
+
+
+def test_the_approaches_may_be_stored_in_any_order_and_one_may_lack(rng):
+    test, _ = simulate(rng, cycles=8)
+    plain = estimate_drift(test)
+    turned = estimate_drift(test.isel(direction=[1, 0]))
+    assert turned["direction"].values.tolist() == ["negative", "positive"]
+    xr.testing.assert_identical(turned.isel(direction=[1, 0], other_direction=[1, 0]), plain)
+    for name in ("positive", "negative"):
+        alone = estimate_drift(test.sel(direction=[name]))
+        empty = estimate_drift(test.where(test["direction"] == name).assign(position=test["position"]))
+        np.testing.assert_array_equal(alone["profile"].sel(direction=name), empty["profile"].sel(direction=name))
+        assert (alone.sizes["direction"], alone["reversal"].isnull().all()) == (1, True)

@@ -87,3 +87,12 @@ def test_a_test_too_short_to_see_the_end_says_so(rng):
     deviations["deviation"].values[:] += 60.0 * (1 - np.exp(-truth.seconds / 50_000.0))
     (shift,) = estimate_settling(deviations, estimate_drift(deviations))
     assert shift.t95_high_s == math.inf
+
+
+def test_a_reading_without_a_time_takes_no_part_in_the_settling(rng):
+    test, _ = simulate(rng, cycles=40)
+    nameless = test.copy(deep=True)
+    nameless["time"].values[3, 0, 2] = np.datetime64("NaT")
+    missing = nameless.copy(deep=True)
+    missing["deviation"].values[3, 0, 2] = np.nan
+    assert estimate_settling(nameless, estimate_drift(nameless)) == estimate_settling(missing, estimate_drift(missing))

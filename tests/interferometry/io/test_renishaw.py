@@ -203,6 +203,13 @@ def test_logs_of_assignments_are_read(tmp_path):
     assert test["time"].attrs["origin"] == "none"
 
 
+def test_of_an_assignment_that_is_repeated_the_first_is_kept_and_the_other_listed(tmp_path):
+    again = "REF_DATA_FWD[1,1]=10.001\nREF_DATA_FWD[1,1]=99\nTGT_DATA[1]=0"
+    test = read_deviations(log(tmp_path, "REF_DATA_FWD[1,1]=10.001", again))
+    assert test["deviation"].values[0, 0, 0] == pytest.approx(1.0)
+    assert [one["line"] for one in json.loads(test.attrs["left_out"])] == [7, 8]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

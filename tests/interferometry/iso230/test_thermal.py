@@ -101,3 +101,14 @@ def test_scale_and_zero_of_an_axis_are_those_it_drifts_by():
         # Twelve values: their spread is known to a fifth; three times that.
         assert np.std(missed) == pytest.approx(u[name].mean(), rel=0.6)
     assert u["zero"].mean() < noise_um
+
+
+@pytest.mark.filterwarnings("error")
+def test_courses_of_readings_without_times_or_of_one_target_are_not_known():
+    readings = np.random.default_rng(2).normal(size=(4, 2, 3))
+    no_time = np.full(readings.shape, np.datetime64("NaT", "ns"))
+    position = np.array([0.0, 50.0, 100.0])
+    test = build_deviations(range(1, 5), range(1, 4), position, readings, no_time)
+    seconds, courses, _ = axis_courses(test)
+    assert np.isnan(seconds).all() and np.isfinite(courses["scale"]).all()
+    assert all(np.isnan(course).all() for course in axis_courses(test.isel(target=[1]))[1].values())

@@ -136,6 +136,11 @@ def test_the_picture_as_the_plan():
     assert not registration.position_u(picture_grid((6, 8)).centres_mm).any()
     assert picture_grid((512, 640)).cell_size_mm == 4 and picture_grid((7, 11)).cell_size_mm == 1
     assert picture_grid((480, 640)).shape == (120, 160)
+    for shape in ((481, 641), (767, 1023), (1080, 1920), (97, 1601)):
+        grid = picture_grid(shape)
+        assert max(grid.shape) <= 160
+        # What lies beyond the last cells, or what these reach beyond the picture, is half a cell at most.
+        assert np.abs(np.subtract((grid.height_mm, grid.width_mm), shape)).max() <= grid.cell_size_mm / 2
 
 
 X, Y = np.arange(20) * 5.0 + 2.5, np.arange(10) * 5.0 + 2.5

@@ -43,6 +43,20 @@ def test_readings_come_in_order_of_time_with_their_sites():
     np.testing.assert_array_equal(readings.loadings[:3], [[1, 0], [1, 0.5], [1, 1]])
 
 
+def test_targets_may_be_stored_in_any_order():
+    readings, turned = read_fused(fused()), read_fused(fused().isel(target=[2, 0, 1]))
+    np.testing.assert_array_equal(turned.targets[turned.target_index], readings.target)
+    np.testing.assert_array_equal(turned.positions_mm[turned.target_index], readings.position_mm)
+    assert np.unique(turned.site).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_of_two_samples_at_one_time_the_second_is_a_jump():
+    """To which a lag has not responded yet; then it does as after any step."""
+    values = np.array([[0.0], [0.0], [1.0], [1.0]])
+    found = respond(values, np.array([0.0, 60.0, 60.0, 120.0]), time_constant_s=60.0)
+    np.testing.assert_allclose(found[:, 0], [0.0, 0.0, 0.0, 1.0 - np.exp(-1.0)])
+
+
 def test_the_profile_has_a_constant_per_target_and_a_reversal_where_both_directions_exist():
     one_sided = fused()
     one_sided["deviation"][:, 1, 2] = np.nan

@@ -97,6 +97,15 @@ def test_no_signal_begins_with_the_first_implausible_reading_whatever_gaps_follo
     assert fault.onset_s == seconds[893 if missing.start == 893 else 900]
 
 
+def test_a_glitch_long_before_is_not_the_onset_of_no_signal(sound):
+    seconds, temperature, _ = sound
+    spoilt = temperature.copy()
+    spoilt[30, 2] = spoilt[400:402, 2] = 999.0
+    spoilt[900:, 2] = 850.0
+    (fault,) = examine_sensors(seconds, spoilt)
+    assert (fault.kind, fault.onset_s) == (Kind.NO_SIGNAL, seconds[900])
+
+
 # Displacements: what leaves the course and comes back is at fault; what stays, or takes its time, may be true.
 
 

@@ -350,7 +350,7 @@ def test_an_event_needs_a_twentieth_of_the_record_on_either_side():
     np.testing.assert_array_equal([c.event_s for c in events], inner)
     for candidate in events[::40]:
         np.testing.assert_array_equal(candidate.columns[:, 0], np.where(of.seconds < candidate.event_s, 0.0, 1.0))
-        assert candidate.parameters == {"time_s": candidate.event_s}
+        assert candidate.parameters == {"time_s": candidate.event_s - 0.5 * of.block_s}
 
 
 def test_a_long_record_tries_every_second_block_and_a_closer_look_all():
@@ -362,8 +362,26 @@ def test_a_long_record_tries_every_second_block_and_a_closer_look_all():
     # A hundredth of 399 blocks on either side, and eight instants within each.
     np.testing.assert_array_equal([c.event_s for c in closer], np.repeat(of.seconds[197:204], 8))
     within = closer[26]
-    assert within.parameters == {"time_s": of.seconds[200] - 0.25 * of.block_s}
+    assert within.parameters == {"time_s": of.seconds[200] - 0.75 * of.block_s}
     np.testing.assert_array_equal(within.columns[198:202, 0], [0.0, 0.25, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.125, 0.5, 0.875])
+@pytest.mark.parametrize("samples_per_block", [1, 8])
+def test_an_event_has_the_time_at_which_it_happened(share, samples_per_block):
+    """A step within a block whose mean it moves by the share of the samples after it; the best candidate has the very columns."""
+    step_s, block = 60.0, 120
+    displacement = np.zeros((240 * samples_per_block, 1))
+    first = block * samples_per_block - round(share * samples_per_block)
+    displacement[first:] = 5.0
+    places = np.arange(240 * samples_per_block) // samples_per_block
+    means = np.bincount(places, displacement[:, 0])[:, None] / samples_per_block
+    of = record_of(means, np.zeros((240, 1)), block_s=samples_per_block * step_s)
+    # Of the samples' own times, whose mean is that of the block.
+    truth_s = of.seconds[0] + step_s * (first - 0.5 * samples_per_block)
+    closer = candidates("step_event", of, near(float(of.seconds[block]), time_s=0.0))
+    best = min(closer, key=lambda one: float(np.abs(5.0 * one.columns - means).max()))
+    assert best.parameters["time_s"] == pytest.approx(truth_s)
 
 
 def test_a_rhythm_has_six_periods_and_four_blocks_in_each():
@@ -443,7 +461,8 @@ def test_an_event_beside_a_switching_must_not_stand_in_for_its_response():
     late = Candidate((np.arange(MANY) >= 123).astype(float)[:, None], {}, ("um",), float(model.record.seconds[123]))
     grounds = RecordGrounds(model, least_gain=10.0)
     assert grounds.is_admissible(late)
-    assert grounds.at_switching(late) == pytest.approx(float(model.record.seconds[120]) / 3600.0)
+    switched_s = float(model.record.seconds[120]) - 0.5 * model.record.block_s
+    assert grounds.at_switching(late) == pytest.approx(switched_s / 3600.0)
     for at, beside in ((60, None), (60, 120)):
         model, event = stepped(at, beside=beside)
         assert RecordGrounds(model, least_gain=10.0).at_switching(event) is None

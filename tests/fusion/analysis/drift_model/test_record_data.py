@@ -94,6 +94,17 @@ def test_a_record_has_at_most_six_hundred_blocks(samples, block_s, rng):
     assert record.seconds.size == -(-samples * 60 // int(block_s))
 
 
+@pytest.mark.parametrize(("burst", "bursts"), [(3, 1000), (1, 700), (10, 90)])
+def test_samples_in_bursts_share_blocks(burst, bursts, rng):
+    """Some samples a second apart, every hour."""
+    samples = burst * bursts
+    seconds = (3600.0 * np.arange(bursts)[:, None] + np.arange(burst)).ravel()
+    table = table_of(*linear_samples(rng, samples))
+    record = reduce_record(table.assign_coords(time=table["time"].values[0] + np.round(seconds * 1e9).astype("m8[ns]")))
+    # No more than twice as long as they must be.
+    assert min(bursts, 300) <= record.seconds.size <= 660
+
+
 def test_a_sample_that_comes_a_little_early_belongs_to_its_own_block(rng):
     table = table_of(*linear_samples(rng, 1200))
     jitter = np.zeros(1200)

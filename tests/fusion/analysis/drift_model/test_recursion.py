@@ -1,9 +1,12 @@
 """Displacements as responses to what was logged: their likelihood, what a control makes of them, and the fewest sensors that suffice."""
 
+import itertools
+
 import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.analysis.alignment.readings import Series
 from fusion.analysis.attribution.duty import DutyPlanError
 from fusion.analysis.drift_model.next_test import propose_tests
 from fusion.analysis.drift_model.record import close_record
@@ -168,6 +171,30 @@ def test_an_event_is_in_the_fit_and_not_in_the_recursion():
     model = make_recursion(product, loop, sampling_s=record.block_s, **FROM)
     assert "not contained, because no reading shows it: step_event" in model.remarks
     assert {one.name for one in model.inputs} <= {*record.sensors, *record.drivers}
+
+
+def test_a_displacement_that_a_part_does_not_hold_takes_no_part_there():
+    step = EffectRecipe("step_event", 6.0, parameters={"at_cycle": 9})
+    record, product, loop = run_of(twin_table(step, seed=5))
+    empty = product.copy(deep=True)
+    part = product["part"].values == product["part"].values[record.seconds.size // 3]
+    empty["displacement"].values[part, 1] = np.nan
+    model = make_recursion(empty, loop, sampling_s=record.block_s, reduced=True, **FROM)
+    assert model.sensor_curve and all(np.isfinite(one.cross_rmse) for one in model.sensor_curve)
+
+
+@pytest.mark.parametrize("block_h", [3.0, 8.0, 30.0])
+def test_a_longer_test_leaves_less_open_also_where_the_record_has_long_blocks(block_h):
+    """A year of a load that rests and works for days, followed by its displacement and by a sensor."""
+    rng = np.random.default_rng(4)
+    load = np.repeat(rng.integers(0, 2, 40), 10).astype(float)
+    series = Series(3600.0 * block_h * np.arange(400.0), load, "1")
+    displacement = series.lagged(3600.0 * 2 * block_h).values[:, None] * 9.0 + rng.normal(0.0, 0.1, (400, 1))
+    temperature = 20.0 + series.lagged(3600.0 * block_h).values[:, None] * 4.0 + rng.normal(0.0, 0.01, (400, 1))
+    _, product, loop = run_of(table_of(displacement, temperature, load, step_s=3600.0 * block_h))
+    widths = [one.width_um for one in propose_tests(product, loop)]
+    # Random duties differ: a longer one is worse by chance by a little at most.
+    assert len(widths) == 4 and all(later < 1.2 * earlier for earlier, later in itertools.pairwise(widths))
 
 
 def test_a_next_test_leaves_less_open_and_says_what_is_open_now(driven):
