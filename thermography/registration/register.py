@@ -1035,7 +1035,8 @@ def picture_grid(shape: tuple[int, int]) -> PlanGrid:
     rows, columns = shape
     common, least = math.gcd(rows, columns), math.ceil(max(shape) / _MOST_CELLS)
     size = next((size for size in range(least, common + 1) if common % size == 0), least)
-    return PlanGrid(*(size * max(1, round(pixels / size)) for pixels in (columns, rows)), size)
+    width, height = (float(size * max(1, round(pixels / size))) for pixels in (columns, rows))
+    return PlanGrid(width, height, size)
 
 
 def register_picture(shape: tuple[int, int]) -> Registration:

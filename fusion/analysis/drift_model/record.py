@@ -545,8 +545,7 @@ def _step_event(record: Record, near: Candidate | None) -> Iterator[Candidate]:
 
 def _happened_s(candidate: Candidate) -> float | None:
     """When an event happened, s since the start; None for an effect that lasts."""
-    time_s = candidate.parameters.get("time_s", candidate.event_s)
-    return None if candidate.event_s is None else float(time_s)
+    return None if candidate.event_s is None else float(candidate.parameters.get("time_s", candidate.event_s))
 
 
 def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Candidate]:
