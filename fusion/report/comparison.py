@@ -254,7 +254,7 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
         figures["ISO 230-2 window"] = results.iso230.window
         figures |= {f"{symbol} by ISO 230-2": value for symbol, value in iso230_values(results.iso230).items()}
         for one in results.iso230.tolerances:
-            limit = f"at most {number(one.limit_um)} {print_unit(results.iso230.unit)}"
+            limit = f"at most {one.limit_um:g} {print_unit(results.iso230.unit)}"
             figures[f"{one.quantity} {limit}"] = one.decision
     if results.anomalies is not None:
         named = [

@@ -218,6 +218,7 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
             warnings.filterwarnings("ignore", "Glyph .* missing from font")
             drawn.savefig(picture, format="png", dpi=200, transparent=False)
         document.add_picture(picture, width=Mm(125))
+        document.add_paragraph(sheet.caption)
         # The first column holds names, the others share what is left of the width.
         titles = sheet.values.titles
         put([row.cells for row in sheet.values.rows], (58, *[120 // (len(titles) - 1)] * (len(titles) - 1)), titles)
