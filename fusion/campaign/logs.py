@@ -524,16 +524,13 @@ def read_times(
                 continue
             zones.setdefault(zone, int(column.index[at]))
         words = describe_time_zone(path, zones) if zones else ""
-    present, timed = column.notna().to_numpy(), ~np.isnat(time)
+    timed = ~np.isnat(time)
     cells = frame[list(headings)]
     left_out = [
         RejectedLine(path.name, int(frame.index[at]), " ".join(map(str, cells.iloc[at].dropna())), "is not a time")
         for at in np.flatnonzero(~timed)
     ]
-    # Rows without a time below the last one that has one are the end of a sheet, and no fault of its times.
-    below = int(np.flatnonzero(timed).max(initial=-1))
-    faulty = [line for line, at in zip(left_out, np.flatnonzero(~timed), strict=True) if present[at] or at < below]
-    raise_if_mostly_invalid(path, int(timed.sum()), faulty)
+    raise_if_mostly_invalid(path, int(timed.sum()), left_out, last=int(frame.index[timed].max()) if timed.any() else None)
     return time, words, left_out
 
 

@@ -55,6 +55,8 @@ _STEP = re.compile(r"#\s*step_dist\w*\s*=\s*([\d.]+)\s*$")
 _HEAD = 200
 #: Rows of values, one below the other, that are no accident.
 _ROWS_OF_VALUES = 3
+#: Rows that may stand between them: an empty one, a remark, a header that is repeated.
+_ROWS_BETWEEN = 2
 _MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?\s+\S")
 _TIME_UNITS = ("ms", "s", "min", "h")
 _PER = re.compile(r"/\s*(ms|s|min|h)$")
@@ -66,7 +68,8 @@ _MARKS = tuple(_VOCABULARY["marks"])
 _FAR = 50.0
 #: Times that neither ISO 8601 nor the guess of pandas covers.
 _FORMATS = (
-    "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
+    "%H:%M:%S", "%H:%M:%S.%f", "%H:%M", "%I:%M:%S %p", "%I:%M %p",
+    "%Y%m%d_%H%M%S", "%Y%m%d%H%M%S", "%m/%d/%y %H:%M:%S", "%m/%d/%y-%H:%M:%S",
     "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m/%d/%y %H:%M", "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y %I:%M %p",
     "%d-%b-%y %H:%M:%S", "%d-%b-%y %H:%M", "%d-%b-%y %I:%M:%S %p", "%d-%b-%y %I:%M %p",
 )  # fmt: skip
@@ -341,7 +344,7 @@ def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 def _header_rows(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return where the names, the units and the values of any other table stand, nothing where the names are its first line."""
     rows = [(line, fields) for line, text, fields in head if not text.startswith("#")]
-    first = next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES])), None)
+    first = next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
     if first is None:
         raise LaserFormatError("no rows of numbers below one another")
     width = len(rows[first][1])
@@ -357,11 +360,14 @@ def _header_rows(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 
 
 def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
-    """Whether rows are equally wide and hold little but numbers and times, with a number in each."""
-    widths = {len(fields) for _, fields in rows}
+    """Whether the first row and enough others as wide hold little but numbers and times, with a number in each."""
     texts = [[text.strip() for text in fields if text.strip()] for _, fields in rows]
     numeric = [sum(_VALUE.fullmatch(text) is not None for text in row) for row in texts]
-    return len(widths) == 1 and all(count >= max(1, len(row) / 2) for count, row in zip(numeric, texts, strict=True))
+    values = [
+        count >= max(1, len(row) / 2) and len(fields) == len(rows[0][1])
+        for count, row, (_, fields) in zip(numeric, texts, rows, strict=True)
+    ]
+    return values[0] and sum(values) >= min(_ROWS_OF_VALUES, len(rows))
 
 
 def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str, Any]:
@@ -393,10 +399,12 @@ def _long(rows: Rows, asked: dict[str, str], units: dict[str, str]) -> dict[str,
 def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str, ...]:
     """Return the headings of the times; write into `keys` how they are to be read, and into `asked` what nothing tells."""
     frame = rows.frame
-    samples = {name: _sample(frame[name]) for name in frame.columns}
+    samples = {name: _sample(frame[name]) for name in frame.columns if not pd.api.types.is_numeric_dtype(frame[name])}
     # A line of text among numbers, as a footer or a second header is, leaves a column one of numbers.
     texts = [
-        name for name in frame.columns if not _mostly(np.isfinite(numbers_in(pd.Series(samples[name], dtype=object))))
+        name
+        for name, sample in samples.items()
+        if not _mostly(np.isfinite(numbers_in(pd.Series(sample, dtype=object))))
     ]
     named = [name for name in frame.columns if _is_time_name(name, rows.units.get(name, ""))]
     days = [name for name in named if name in texts and _mostly([_OF_DAY.fullmatch(text) for text in samples[name]])]
@@ -478,11 +486,14 @@ def _clock(texts: Sequence[str]) -> dict[str, str] | None:
     likely = [within_a_day(text)[0] for text in texts if re.search(r"\d[:_]?\d\d", text)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the day stands first
-        guessed = dict.fromkeys(form for form in map(guess_datetime_format, likely) if form)
+        shapes = {re.sub(r"\d", "0", text): text for text in likely}.values()
+        guessed = dict.fromkeys(form for form in map(guess_datetime_format, shapes) if form)
     read: dict[str, list[datetime]] = {}
     for form in dict.fromkeys((*guessed, *_FORMATS)):
         # Day and month are told apart by the shorter test.
         for written in (form, _SWAPPED.sub(r"%\3\2%\1", form)):
+            if not any(_formatted(text, written) for text in shapes):
+                continue
             times = [time for text in likely if (time := _formatted(text, written)) is not None]
             if len(times) > len(texts) / 2:
                 read[written] = times

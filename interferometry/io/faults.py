@@ -60,8 +60,13 @@ class LeftOut:
         return json.dumps([asdict(line) for line in self.lines])
 
 
-def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine]) -> None:
-    """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings."""
+def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine], *, last: int | None = None) -> None:
+    """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings.
+
+    Below `last`, the last line that was read, lines without a value are the end of a sheet and no fault.
+    """
+    if last is not None:
+        left_out = [line for line in left_out if line.value.strip() or line.line < last]
     if kept == 0 and not left_out:
         raise LaserFormatError(f"{path}: no reading below the header; export the measured values again")
     if kept < len(left_out):

@@ -501,7 +501,7 @@ def read_timed_rows(
             rows[instant] = parse(fields)
             kept[instant] = line
             zones.setdefault(zone, line)
-    raise_if_mostly_invalid(table.path, len(rows), left_out.lines)
+    raise_if_mostly_invalid(table.path, len(rows), left_out.lines, last=max(kept.values(), default=None))
     instants = np.array(list(rows), dtype="datetime64[ns]")
     goes_back = where_clock_goes_back(table.path, [kept[instant] for instant in rows], instants)
     times = sorted(rows)

@@ -75,6 +75,17 @@ def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
         read_drivers(path)
 
 
+def test_rows_without_a_time_at_the_end_of_a_log_refuse_no_log(tmp_path: Path) -> None:
+    path, rows = tmp_path / "drivers.csv", "".join(f"2026-03-09T06:3{k}:00Z,0.{k}\n" for k in range(3))
+    path.write_text(f"time,duty [1]\n{rows}" + 10 * ",0.5\n")
+    drivers = read_drivers(path)
+    assert drivers.sizes["time"] == 3
+    assert [one["line"] for one in json.loads(drivers.attrs["left_out"])] == list(range(5, 15))
+    path.write_text("time,duty [1]\n" + 10 * ",0.5\n" + rows)
+    with pytest.raises(LaserFormatError, match="10 of 13 lines cannot be used"):
+        read_drivers(path)
+
+
 def test_drivers_of_another_layout_are_those_of_headings_that_say_everything(tmp_path: Path) -> None:
     """A logger's table: a line about the station, a row of units, a mark for no reading, local times with day and month swapped."""
     (tmp_path / "plain.csv").write_text(

@@ -93,6 +93,7 @@ LAYOUTS: dict[str, str] = {
     "minutes without a unit": "Time,TT_100,TT_101,Z\n" + rows("{m},{t1},{t2},{z}"),
     "no times": "T1\tT2\tdelta L\n" + rows("{t1}\t{t2}\t{z}"),
     "times of day": "Uhrzeit;Spindel [°C];Lager [°C];Z [mm]\n" + rows("{time:%H:%M:%S};{t1};{t2};{z}").replace(".", ","),
+    "times of day of 12 hours": "time;Spindel [°C];Lager [°C];Z [mm]\n" + rows("{time:%I:%M:%S %p};{t1};{t2};{z}"),
     "row of units": "Logger 7\n\ntime,spindle,bearing,nose\ns,degC,K,mm\n"
     + "".join(f"{60 * m},{t1},{t2 + 273.15:.2f},{z}\n" for m, t1, t2, z in zip(MINUTES, SPINDLE, BEARING, NOSE, strict=True)),
     "date and time": "Date,Time,T1,T2,Z\n" + rows("{time:%Y-%m-%d},{time:%H:%M:%S},{t1},{t2},{z}"),
@@ -373,6 +374,17 @@ def test_lines_without_a_time_are_left_out_and_named_wherever_they_stand(
     proposed = propose_table(tmp_path / "folder" / "log.txt")
     assert proposed.attrs["left_out"] == data.attrs["left_out"]
     assert proposed.rows == 240
+
+
+@pytest.mark.parametrize("odd", [",,,", "s,degC,degC,mm", "time,T1,T2,Z", "*** spindle started ***", ",21,20,0.001"])
+def test_an_odd_row_among_the_first_ones_hides_no_value_above_it(tmp_path: Path, odd: str) -> None:
+    first, *others = rows("{time:%Y-%m-%d %H:%M:%S},{t1},{t2},{z}").splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["time,T1,T2,Z", first, odd, *others]))
+    proposed = propose_table(path)
+    assert "header_rows" not in proposed.keys
+    assert proposed.rows == 240
+    assert [one["line"] for one in json.loads(proposed.attrs["left_out"])] == [3]
 
 
 def test_rows_without_a_time_below_the_last_one_refuse_no_table(tmp_path: Path) -> None:
