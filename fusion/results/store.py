@@ -291,14 +291,22 @@ def digest(*parts: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def _read_stamps(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the stamps of a results folder; of a stage without one, or with one that is damaged, nothing is known to be done."""
+    return {
+        stage: stamp
+        for stage, stamp in read_json_object(folder / _STAMPS).items()
+        if isinstance(stamp, dict) and {"key", "files", "note"} <= stamp.keys() and isinstance(stamp["files"], dict)
+    }
+
+
 class StageStamps:
     """Stages of a run that are done, with their input and their files; stored in the results folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._path = folder / _STAMPS
-        # Without stamps, or with damaged ones, nothing is known to be done.
-        self._stamps: dict[str, dict[str, Any]] = read_json_object(self._path)
+        self._stamps = _read_stamps(folder)
 
     def done(self, stage: str, key: str) -> bool:
         """Tell whether `stage` was finished from input `key` and its files are still as they were written."""
@@ -369,13 +377,13 @@ def is_file_list(content: object) -> TypeGuard[dict[str, Any]]:
 
 def finished_stages(folder: Path) -> list[str]:
     """Return the stages of a run that a results folder holds, in the order in which they were finished."""
-    return list(read_json_object(folder / _STAMPS))
+    return list(_read_stamps(folder))
 
 
 def noted_messages(folder: Path) -> list[dict[str, Any]]:
     """Return the notices of the finished stages of a run, also while it is under way."""
-    stamps = read_json_object(folder / _STAMPS)
-    return [notice for stamp in stamps.values() for notice in (stamp.get("note") or {}).get("notices", [])]
+    notes = [stamp["note"] for stamp in _read_stamps(folder).values()]
+    return [notice for note in notes if isinstance(note, dict) for notice in note.get("notices", [])]
 
 
 #: What `annotate` writes for the whole file.

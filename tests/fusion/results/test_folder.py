@@ -98,7 +98,7 @@ def test_a_name_that_leads_out_of_a_results_folder_is_refused_by_name(tmp_path: 
         discard(folder, name)
     (folder / ".stages").mkdir()
     told = refusal(folder, resume=True)
-    stamp = {"key": "x", "files": {name: file_sha256(victim / "file.txt")}}
+    stamp = {"key": "x", "files": {name: file_sha256(victim / "file.txt")}, "note": {}}
     stamps = write_json(folder / ".stages" / "stamps.json", {"report": stamp})
     with pytest.raises(OutputError) as stamped:
         StageStamps(folder).done("report", "x")

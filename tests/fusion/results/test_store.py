@@ -145,6 +145,13 @@ def test_the_digest_depends_on_content_alone() -> None:
     assert digest({"b": 1, "a": [1.5]}) == digest({"a": [np.float64(1.5)], "b": np.int64(1)}) != digest({"a": 2})
 
 
+@pytest.mark.parametrize("stamp", [5, [], {}, {"key": "k"}, {"key": "k", "files": [], "note": {}}])
+def test_a_damaged_stamp_is_none(tmp_path: Path, stamp: object) -> None:
+    write_json(tmp_path / ".stages" / "stamps.json", {"fields": stamp})
+    assert not StageStamps(tmp_path).done("fields", "k")
+    assert finished_stages(tmp_path) == noted_messages(tmp_path) == []
+
+
 def test_notices_of_finished_stages_are_told_while_a_run_is_under_way(tmp_path: Path) -> None:
     assert noted_messages(tmp_path) == []
     stamps = StageStamps(tmp_path)
