@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,11 +12,13 @@ from contextlib import AbstractContextManager, contextmanager
 from enum import StrEnum
 from functools import reduce
 from importlib import import_module, metadata
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer import Argument, Option
+from typer.core import TyperGroup
 
 from fusion.messages import (
     ExitCode,
@@ -34,9 +38,28 @@ if TYPE_CHECKING:
     from fusion.results.progress import Report
     from fusion.results.results import Results
 
-app = typer.Typer(no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+class _Commands(TyperGroup):
+    """The commands, none of which takes an empty argument."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse an empty argument, which a path would take for the present folder."""
+        for before, one in pairwise(["thermofuse", *args]):
+            if one == "" or re.fullmatch("--[a-z-]+=", one):
+                empty = one or f"after {before}"
+                raise typer.BadParameter(
+                    f"the argument {empty} is empty; write it, or leave it out (is a variable of the shell not set?)"
+                )
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_Commands, no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False, rich_markup_mode=None
+)
 console = Terminal()
 errors = Terminal(stderr=True, soft_wrap=True)
+#: The longest time to wait for data, s.
+_YEAR_S = 365 * 86400.0
 #: Characters of a line of a wide table where the output is no terminal.
 _TABLE_WIDTH = 160
 
@@ -148,7 +171,10 @@ def run(
     until_idle: Annotated[
         float | None,
         Option(
-            metavar="SECONDS", min=0.0, help="With --watch: the test has ended when no data have arrived for this time."
+            metavar="SECONDS",
+            min=0.0,
+            max=_YEAR_S,
+            help="With --watch: the test has ended when no data have arrived for this time.",
         ),
     ] = None,
     wanted: Annotated[
@@ -551,6 +577,8 @@ def iso230(
     from fusion.pipeline.iso230 import read_test
     from fusion.report.sheet import describe_sheet, iso230_csv, iso230_json, iso230_tables, write_iso230
 
+    if as_json and as_csv:
+        _refuse("--json and --csv: what is printed has one format; write one of them")
     with _answering():
         found = read_test(test, cycles)
         if as_json:
@@ -699,18 +727,23 @@ def report(
     results: ResultsFolder,
     pdf: Annotated[bool, Option("--pdf", help="Print it to PDF with an installed Chrome, Chromium or Edge.")] = False,
     out: Annotated[
-        Path | None, Option(help="File to write, which must not exist; left out: report.html or report.pdf in RESULTS.")
+        Path | None,
+        Option(
+            help="File to write, .html or .pdf, which must not exist; left out: report.html or report.pdf in RESULTS."
+        ),
     ] = None,
     browser: Annotated[
         str | None, Option(help="With --pdf: the browser that prints; left out: one is looked for.")
     ] = None,
 ) -> None:
     """Make the report of a finished run again, or print it to PDF."""
-    from fusion.report.page import print_pdf, report_of
+    from fusion.report.page import page_format, print_pdf, report_of
     from fusion.results.folder import claim_file
     from fusion.results.store import StageStamps, write_text
 
     with _answering():
+        if out is not None:
+            pdf = page_format(out, *([".pdf"] if pdf else [".html", ".pdf"])) == ".pdf"
         page = report_of(results)
         file = claim_file(results, "report.pdf" if pdf else "report.html", out)
         written = print_pdf(page, file, browser=browser) if pdf else write_text(file, page)
@@ -816,6 +849,10 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop_at_once)
     collect_garbage_less()
+    # A service may start the command with its outputs closed: what is said goes nowhere then.
+    sys.stdout, sys.stderr = (
+        stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w") for stream in (sys.stdout, sys.stderr)
+    )
     # A terminal or pipe of another encoding than UTF-8 shows what it has no character for as its number.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

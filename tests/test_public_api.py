@@ -79,7 +79,7 @@ def test_the_root_module_re_exports_names_of_the_packages():
     for name in thermofuse.__all__:
         thing = getattr(thermofuse, name)
         assert any(getattr(importlib.import_module(package), name, None) is thing for package in PACKAGES), name
-    assert set(thermofuse.__all__) <= set(dir(thermofuse))
+    assert sorted([*thermofuse.__all__, "__version__"]) == dir(thermofuse)
     assert thermofuse.__version__.count(".") == 2
     with pytest.raises(AttributeError, match="module 'thermofuse' has no attribute 'nothing'"):
         thermofuse.nothing  # noqa: B018

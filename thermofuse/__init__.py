@@ -163,5 +163,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Names of the module, public ones included."""
-    return sorted({*globals(), *__all__})
+    """Names for a user."""
+    return sorted([*__all__, "__version__"])

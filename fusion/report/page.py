@@ -215,9 +215,7 @@ def page_format(path: Path, *formats: str) -> str:
         raise PageFileError(f"{path} exists already; name another file with --out, or remove it")
     asked = ".html" if path.suffix.lower() == ".htm" else path.suffix.lower()
     if asked not in formats:
-        raise PageFileError(
-            f"{path}: it is written as {', '.join(formats[:-1])} or {formats[-1]}; name such a file with --out"
-        )
+        raise PageFileError(f"{path}: it is written as {' or '.join(formats)}; name such a file with --out")
     return asked
 
 

@@ -241,7 +241,7 @@ def read_results(folder: str | Path) -> Results:
     Parameters
     ----------
     folder : str or Path
-        The results folder.
+        The results folder, or the ``results.json`` in it.
 
     Returns
     -------
@@ -264,6 +264,8 @@ def read_results(folder: str | Path) -> Results:
     """
     folder = Path(folder)
     path = folder / "results.json"
+    if folder.name == path.name and folder.is_file():
+        folder, path = folder.parent, folder
     if not path.is_file():
         raise ResultsError(f"{folder}: there is no results.json in it; name the results folder of a finished run")
     try:

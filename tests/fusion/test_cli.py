@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 from fusion import cli
 from fusion.results.results import results_schema
-from tests.fusion.campaign_parts import change, record_of_rows
+from tests.fusion.campaign_parts import change, record_of_rows, write_laser
 from tests.fusion.compared_tests import readings_of, write_results
 
 pytestmark = pytest.mark.long
@@ -362,3 +362,39 @@ def test_a_report_of_no_results_writes_nothing(tmp_path: Path, pdf: tuple[str, .
         told = invoke("report", folder, *pdf)
         assert told.exit_code == 2 and "there is no results.json in it" in told.output.replace("\n", "")
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("run", "campaign.toml", "--out", ""), "after --out"),
+        (("run", "campaign.toml", "--out="), "--out="),
+        (("inspect", ""), "after inspect"),
+        (("run", "campaign.toml", "--watch", "--until-idle", "1e999"), "--until-idle"),
+        (("iso230", "laser.csv", "--json", "--csv"), "--json and --csv"),
+    ],
+)
+def test_what_a_user_cannot_mean_is_refused_by_its_argument(
+    arguments: tuple[str, ...], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = invoke(*arguments)
+    assert ended.exit_code == 2 and named in ended.output
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("pdf", "name"), [((), "report.exe"), ((), "report"), (("--pdf",), "report.html")])
+def test_a_report_is_written_as_what_its_file_is_called(
+    results_folder: Path, tmp_path: Path, pdf: tuple[str, ...], name: str
+) -> None:
+    ended = invoke("report", results_folder, *pdf, "--out", tmp_path / name)
+    assert ended.exit_code == 2 and "it is written as " in ended.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_command_whose_outputs_are_closed_ends_as_it_would(tmp_path: Path) -> None:
+    """As some services start programs."""
+    laser = write_laser(tmp_path / "campaign", 3, 2).parent / "laser.csv"
+    command = f'exec "$0" -m fusion.cli iso230 "$1" --json --out "{tmp_path}/sheet.html" >&- 2>&-'
+    ended = subprocess.run(["sh", "-c", command, sys.executable, str(laser)], check=False)
+    assert ended.returncode == 0 and (tmp_path / "sheet.html").is_file()

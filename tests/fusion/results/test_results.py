@@ -85,7 +85,7 @@ def test_results_are_read_back_from_a_folder(tmp_path: Path) -> None:
         read_results(tmp_path)
     (tmp_path / "results.json").write_text(text)
     read = read_results(tmp_path)
-    assert read == written
+    assert read == written == read_results(tmp_path / "results.json")
     assert read.anomalies is not None and read.anomalies[0].evidence.support == ("a",)
     assert "probability_local_temperature" not in read.anomalies[0].evidence.numbers()
 

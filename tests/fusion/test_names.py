@@ -1,0 +1,285 @@
+"""Names that columns, fiducials, files, folders and tests may have: each arrives as it is wherever it is shown, and two stay two."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from html.parser import HTMLParser
+from io import StringIO
+from pathlib import Path
+from unicodedata import normalize
+
+import docx
+import numpy as np
+import openpyxl
+import pytest
+from typer.testing import CliRunner
+
+from fusion import cli
+from fusion.app.parts import State
+from fusion.app.results.charts import loop_steps
+from fusion.app.results.data import Linker, Products, Selection
+from fusion.app.results.screen import results_screen
+from fusion.app.setup.screen import SetUpScreen
+from fusion.campaign.config import load_campaign
+from fusion.pipeline.fleet import Row, as_csv, find_members, render_fleet, with_findings, write_book
+from fusion.report.exports.recursions import emit
+from fusion.results.recursion import read_recursion
+from tests.fusion.app.texts import texts
+from tests.fusion.campaign_parts import change, simulated
+
+pytestmark = pytest.mark.chain
+
+NFD = normalize("NFD", "Größe")
+TITLE = " =1+1 <mark>A/B</mark> {{7*7}} [red]x[/red] 'q' \"q\" \\ 🌡 %41 @name $$x$$ :smile: "
+CHANNELS = (
+    "Disp. X", "101", "items", "X", "X, predicted", "$\\frac$", "_y", "<mark>{{7*7}}</mark>", "a/b", "L" * 300, "mean",
+)  # fmt: skip
+SENSORS = ("time", "1", "=1+1", "@x $y {0}", "[red]t[/red]", "Größe", NFD, "{0}", "%41 #", "index", "x.y.z")
+DRIVERS = ("a b", "a_b", "'q' \"q\"", "back\\slash", "🌡 :smile:", "values", "100 %", "D / 1")
+#: What an axis is given: fiducials, and drivers beside those of the record.
+FIDUCIALS = ("a.b", "1", "<mark>F", "{{7*7}}", "=1+1", "@name", "#", "[red]", "Größe", NFD, "items", "L" * 300)
+
+
+class Page(HTMLParser):
+    """The text of a page without its scripts, and the names of its elements."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.told: list[str] = []
+        self.elements: set[str] = set()
+        self.feed(page)
+
+    @classmethod
+    def of(cls, path: Path) -> Page:
+        return cls(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.add(tag)
+
+    def handle_data(self, data: str) -> None:
+        if self.lasttag not in ("script", "style"):
+            self.told.append(data)
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.told)
+
+
+def run(*arguments: str | Path) -> str:
+    ended = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+    assert ended.exit_code == 0, ended.output
+    return ended.output
+
+
+def missing(names: Sequence[str], text: str) -> list[str]:
+    return [name for name in names if name not in text]
+
+
+def headings(path: Path) -> list[str]:
+    return next(csv.reader(StringIO(path.read_text(encoding="utf-8"))))
+
+
+def as_text(name: str) -> str:
+    """A name as a spreadsheet gets it."""
+    return f"'{name}" if name.startswith(("=", "@")) else name
+
+
+def cells(path: Path) -> Iterator[openpyxl.cell.Cell]:
+    for sheet in openpyxl.load_workbook(path):
+        for row in sheet.iter_rows():
+            yield from row
+
+
+def words_of(path: Path) -> str:
+    """All texts of a document of Word."""
+    document = docx.Document(str(path))
+    in_tables = (cell.text for table in document.tables for row in table.rows for cell in row.cells)
+    return "\n".join([*(paragraph.text for paragraph in document.paragraphs), *in_tables])
+
+
+# A record whose columns are called so.
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of seven hours with a step that is found; nothing is written outside them."""
+    base = tmp_path_factory.mktemp("names")
+    folder = base / f"=1+1 #%41 {{0}} [1] <b>' {NFD}"
+    folder.mkdir()
+    rng, seconds = np.random.default_rng(1), 60.0 * np.arange(400)
+    courses = [1.0 - np.exp(-seconds / (1800.0 * (1 + k))) for k in range(len(SENSORS))]
+    courses[0] += 0.4 * np.sin(seconds / 700.0)
+    step = seconds > 11_000.0
+    columns = {
+        **{f"{name} [degC]": 20.0 + 5.0 * course for name, course in zip(SENSORS, courses, strict=True)},
+        **{f"{name} [um]": (4.0 + k) * courses[0] + (2.0 + k) * step for k, name in enumerate(CHANNELS)},
+    }
+    noisy = {name: np.round(values + rng.normal(0.0, 0.05, seconds.size), 3) for name, values in columns.items()}
+    drivers = {f"{name} [1/min]": np.arange(seconds.size) // (40 + 10 * k) % 2 for k, name in enumerate(DRIVERS)}
+    table = {"time [s]": seconds, **noisy, **drivers}
+    with (folder / "rec [1] #.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([list(table), *zip(*(values.tolist() for values in table.values()), strict=True)])
+    units = {"temperatures": "degC", "displacements": "um", "drivers": "1/min"}
+    used = {
+        key: [f"{name} [{unit}]" for name in names]
+        for (key, unit), names in zip(units.items(), (SENSORS, CHANNELS, DRIVERS), strict=True)
+    }
+    lines = [f"{key} = {json.dumps(names, ensure_ascii=False)}" for key, names in used.items()]
+    stated = ['file = "rec [1] #.csv"', 'time = "time [s]"', 'start = "2026-03-09T06:30:00Z"', *lines]
+    title = f"title = {json.dumps(TITLE, ensure_ascii=False)}"
+    text = "\n".join(["[campaign]", title, "[record]", *stated])
+    (folder / "campaign.toml").write_text(f"{text}\n", encoding="utf-8")
+    run("run", folder / "campaign.toml")
+    assert [path.name for path in base.iterdir()] == [folder.name]
+    return folder / "results"
+
+
+def test_a_report_of_a_record_holds_every_name_as_text(record: Path) -> None:
+    results = json.loads((record / "results.json").read_text(encoding="utf-8"))
+    assert results["campaign"] == TITLE and tuple(results["loop"]["channels"]) == CHANNELS
+    assert results["loop"]["steps"], "without an effect there is no column for it"
+    page = Page.of(record / "report.html")
+    assert not missing([*CHANNELS, *SENSORS, *DRIVERS, TITLE.strip()], page.text)
+    assert "mark" not in page.elements
+
+
+def test_sheets_by_iso_230_3_hold_every_name_as_text(record: Path, tmp_path: Path) -> None:
+    for name in ("sheet.html", "sheet.docx"):
+        run("iso230-3", record, "--out", tmp_path / name)
+    text = words_of(tmp_path / "sheet.docx")
+    assert not missing([*CHANNELS, TITLE.strip()], text)
+    assert not missing([*CHANNELS, TITLE.strip()], Page.of(tmp_path / "sheet.html").text)
+
+
+def test_exports_of_a_record_hold_every_name_once_and_no_formula(record: Path, tmp_path: Path) -> None:
+    for format in ("csv", "xlsx", "model-json"):
+        run("export", record, "--format", format, "--out", tmp_path / format, "--force")
+    of_readings = headings(tmp_path / "csv" / "readings.csv")
+    assert len(set(of_readings)) == len(of_readings) == 3 + 2 * len(CHANNELS) + len(SENSORS) + len(DRIVERS)
+    assert not missing([as_text(f"{name} [degC]") for name in SENSORS], "\n".join(of_readings))
+    for path in (tmp_path / "csv").iterdir():
+        rows = csv.reader(StringIO(path.read_text(encoding="utf-8")))
+        assert not [text for row in rows for text in row if text.startswith(("=", "@", "+"))], path.name
+    every = list(cells(tmp_path / "xlsx" / "results.xlsx"))
+    assert not [cell for cell in every if cell.data_type == "f"]
+    shown = "\n".join(str(cell.value) for cell in every)
+    assert not missing([*CHANNELS, *SENSORS, *DRIVERS, TITLE.strip()], shown)
+    model = read_recursion(tmp_path / "model-json" / "model.json")
+    assert {one.name for one in model.outputs} <= set(CHANNELS)
+    assert {one.name for one in model.inputs} <= {*SENSORS, *DRIVERS}
+    for format in ("model-c", "model-st", "model-linuxcnc"):
+        _, text = emit(model, format)
+        if format == "model-linuxcnc":
+            compile(text, "hal", "exec")
+
+
+def test_the_screens_of_a_record_hold_every_name_and_write_them_again(record: Path, tmp_path: Path) -> None:
+    products = Products(record)
+    linker = Linker(Selection(), [], products.cycles, None)
+    assert loop_steps(products, linker)
+    state = State(root=record.parent, results=record)
+    assert TITLE.strip() in texts([results_screen(state)])
+    shutil.copy(record.parent / "rec [1] #.csv", tmp_path)
+    screen = SetUpScreen(State(root=tmp_path))
+    asyncio.run(screen.look())
+    assert screen.editor is not None
+    asyncio.run(screen.editor._on_save(None))
+    stated = load_campaign(tmp_path / "campaign.toml").record
+    assert stated is not None
+    assert set(stated.columns) >= {f"{name} [um]" for name in CHANNELS}
+
+
+# An axis with a camera, whose files, fiducials and drivers are called so.
+
+RECIPE = """\
+[campaign]
+title = "names"
+axis = "X"
+seed = 11
+[test]
+cycles = 12
+targets = 6
+spacing_mm = 40
+[camera]
+columns = 320
+rows = 240
+focal_px = 765
+"""
+FILES = {
+    "thermal": "IR [1] {0}",
+    "laser.csv": normalize("NFD", "Läser 'q' %41.csv"),
+    "environment.csv": "env;x&y.csv",
+    "drivers.csv": "=drivers #1.csv",
+    "fiducials.csv": "<mark>fid [1].csv",
+}
+
+
+@pytest.fixture(scope="module")
+def axis(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of an axis; the campaign file names its files in the composed form, in which one of them does not lie there."""
+    base = tmp_path_factory.mktemp("axis")
+    folder = base / "=fleet" / f"#%41 {{0}} [red] <b>' {NFD}"
+    folder.parent.mkdir()
+    simulated(base, RECIPE).parent.rename(folder)
+    rows = list(csv.reader(StringIO((folder / "fiducials.csv").read_text())))
+    named = [[name, *row[1:]] for name, row in zip(FIDUCIALS, rows[1:], strict=True)]
+    with (folder / "fiducials.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([rows[0], *named])
+    added = [name for name in (*FIDUCIALS, *DRIVERS) if "/" not in name]
+    lines = list(csv.reader(StringIO((folder / "drivers.csv").read_text())))
+    rng = np.random.default_rng(2)
+    with (folder / "drivers.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerow([*lines[0], *(f"{name} [1]" for name in added)])
+        csv.writer(file).writerows([*row, *np.round(rng.random(len(added)), 3)] for row in lines[1:])
+    campaign = change(folder / "campaign.toml", '"names"', json.dumps(TITLE, ensure_ascii=False))
+    for old, new in FILES.items():
+        (folder / old).rename(folder / new)
+        change(campaign, f'"{old}', f'"{normalize("NFC", new)}')
+    run("run", campaign)
+    return folder / "results"
+
+
+def test_a_report_of_an_axis_holds_every_name_as_text(axis: Path) -> None:
+    results = json.loads((axis / "results.json").read_text(encoding="utf-8"))
+    assert results["campaign"] == TITLE
+    assert tuple(results["registration"]["leave_one_out_mm"]) == FIDUCIALS
+    page = Page.of(axis / "report.html")
+    assert "mark" not in page.elements
+    assert not missing([*FIDUCIALS, TITLE.strip(), *(name for name in FILES.values() if "." in name)], page.text)
+
+
+def test_drivers_of_an_axis_keep_their_names_in_the_product(axis: Path) -> None:
+    fused = Products(axis).fusion
+    assert fused is not None
+    assert not missing([name for name in (*FIDUCIALS, *DRIVERS) if "/" not in name], "\n".join(map(str, fused)))
+
+
+def test_sheet_exports_fleet_and_comparison_of_an_axis(axis: Path, tmp_path: Path) -> None:
+    for name in ("sheet.html", "sheet.docx"):
+        run("iso230", axis, "--out", tmp_path / name)
+    assert TITLE.strip() in words_of(tmp_path / "sheet.docx")
+    assert TITLE.strip() in Page.of(tmp_path / "sheet.html").text
+    for format in ("csv", "xlsx", "linuxcnc", "siemens840d", "heidenhain", "renishaw"):
+        run("export", axis, "--format", format, "--out", tmp_path / format, "--force", "--spacing", "40 mm")
+    assert not [cell for cell in cells(tmp_path / "xlsx" / "results.xlsx") if cell.data_type == "f"]
+    other = shutil.copytree(axis, tmp_path / "other")
+    run("compare", axis, other, "--out", tmp_path / "compared.html")
+    assert TITLE.strip() in Page.of(tmp_path / "compared.html").text
+    (member,) = find_members([axis.parent.parent])
+    row = with_findings(Row(f"=1/{member.name}", state="finished"), axis)
+    (line,) = csv.DictReader(StringIO(as_csv([row])))
+    assert (line["name"], line["title"]) == (f"'{row.name}", TITLE)
+    page = Page(render_fleet([row], started="2026-03-09T06:30:00+00:00"))
+    assert not missing([row.name, TITLE.strip()], page.text) and "mark" not in page.elements
+    write_book(tmp_path / "fleet.xlsx", [row])
+    assert not [cell for cell in cells(tmp_path / "fleet.xlsx") if cell.data_type == "f"]
+
+
+def test_the_screens_of_an_axis_hold_its_title(axis: Path) -> None:
+    products = Products(axis)
+    assert TITLE.strip() in texts([results_screen(State(root=axis.parent, results=axis))])
+    assert products.layers
