@@ -84,7 +84,7 @@ def spreadsheet_text(text: str) -> str:
 
 
 def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> str | None:
-    """Write a table as CSV without its index, or return it; no heading and no text of it is a formula."""
+    """Write a table as CSV without its index, or return it, with times in UTC; no heading and no text of it is a formula."""
 
     def safe(value: object) -> object:
         return spreadsheet_text(value) if isinstance(value, str) else value
@@ -94,7 +94,7 @@ def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> 
     for at, column in texts.items():
         shown.isetitem(at, column.array)
     shown.columns = [safe(name) for name in frame.columns]
-    return shown.to_csv(path, index=False, **options)
+    return shown.to_csv(path, index=False, date_format="%Y-%m-%dT%H:%M:%S.%fZ", **options)
 
 
 #: Contract of the products, on which other packages rely: name of a variable -> (dims, units, kind), kind being a NumPy dtype kind

@@ -364,7 +364,7 @@ class ComparedCampaign:
     def name(self) -> str:
         """Title of the campaign, with the day of its first reading."""
         time = self.results.time
-        return self.results.campaign + (f", {time.first[:10]}" if time else "")
+        return self.results.campaign + (f", {time.day}" if time else "")
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def label_of(root: Path, folder: Path) -> str:
         results = read_results(folder)
     except (FusionError, OSError):
         return f"{name} (cannot be read)"
-    day = f", {results.time.first[:10]}" if results.time else ""
+    day = f", {results.time.day}" if results.time else ""
     return f"{name}: {results.campaign}{day}"
 
 

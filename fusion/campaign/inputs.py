@@ -43,7 +43,7 @@ from fusion.campaign.logs import (
     read_sensors,
 )
 from fusion.campaign.recompensation import RecompensationError, StatedBudget, compensate_readings, see_material
-from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones, utc
+from fusion.campaign.time_zones import DATED, bring_to_utc, refuse_mixed_zones, utc, zone_notices
 from fusion.campaign.values import in_order, matching_pipes, name_and_unit
 from fusion.common import FusionError
 from fusion.messages import naming
@@ -399,6 +399,7 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     if not is_rotary(deviations):
         check(deviations, DEVIATIONS, name=laser.name)
     deviations, notices = _timed_cycles(deviations, file=interferometry.deviations)
+    notices += zone_notices(deviations, code="laser_no_zone", of=interferometry.deviations)
     _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations, alone=alone)
     if is_rotary(deviations) and campaign.acceptance.limits():
         raise SourceError(
@@ -755,7 +756,6 @@ def _reason(item: Mapping[str, Any]) -> str:
 #: Time between runs that each count their seconds from zero, so that they can be laid one after the other: one day.
 _BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
 #: Times before this one count from a start that is not stated.
-DATED = np.datetime64("1980-01-01", "ns")
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
 from fusion.campaign.config import CampaignError
+from fusion.results.results import Notice
 from interferometry.io.tables import NO_ZONE
+
+#: Earlier times are no dates, but count from zero.
+DATED = np.datetime64("1980-01-01", "ns")
 
 
 def utc(time: np.datetime64) -> str:
@@ -43,6 +49,36 @@ def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str, late_s: floa
 def lacks_zone(table: xr.Dataset) -> bool:
     """Return whether the times of a table come from a file that gives no zone."""
     return table["time"].attrs.get("reference") == NO_ZONE
+
+
+def shown_zone(table: xr.Dataset, stated: str | None) -> str | None:
+    """Return the zone in which the times of a table are shown: as stated, None for UTC, and "", as logged, where nobody gives one."""
+    return stated or ("" if lacks_zone(table) else None)
+
+
+def is_dated(times: NDArray[np.datetime64]) -> bool:
+    """Tell whether times hold a date; those without a stated beginning count from zero."""
+    known = times[~np.isnat(times)]
+    return bool(known.size and known.max() > DATED)
+
+
+def time_part(table: xr.Dataset, stated: str | None) -> dict[str, Any]:
+    """Return the part ``time`` of results.json; nothing where no time holds a date."""
+    times = table["time"].values
+    if not is_dated(times):
+        return {}
+    times = times[~np.isnat(times)]
+    return {"time": {"first": utc(times.min()), "last": utc(times.max()), "zone": shown_zone(table, stated)}}
+
+
+def zone_notices(table: xr.Dataset, *, code: str, of: str) -> Iterator[Notice]:
+    """Yield the notice of times of day that nobody has given a zone."""
+    if lacks_zone(table) and is_dated(table["time"].values):
+        yield Notice(
+            code,
+            f"The times of {of} carry no zone: they are shown as logged; results.json and the products take them as UTC.",
+            'Write the zone of the logged times under [campaign], such as time_zone = "Europe/Vienna".',
+        )
 
 
 def refuse_mixed_zones(tables: Mapping[str, xr.Dataset], *, source: str) -> None:

@@ -57,7 +57,7 @@ class CampaignCheck:
         if quiet:
             return [*doubts, *faults]
         title = [f"{self.path}: {self.title}"] if self.title else []
-        zone = "no zone" if any(notice.code == "record_no_zone" for notice in self.notices) else "UTC"
+        zone = "no zone" if any(notice.code.endswith("_no_zone") for notice in self.notices) else "UTC"
         details = [f"  {line}" for line in (*self.content, *time_bars(self.recordings, zone=zone))]
         notices = [f"note: {notice.message} {notice.remedy}".rstrip() for notice in self.notices]
         if faults:

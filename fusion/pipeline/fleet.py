@@ -24,7 +24,7 @@ import rich.table
 import xarray as xr
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.inputs import DATED
+from fusion.campaign.time_zones import DATED
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.messages import cell
@@ -281,13 +281,14 @@ def _hottest(results: Results, maps: xr.Dataset | None) -> tuple[Quantity, bool]
 
 def _day(results: Results, conditions: Mapping[str, str], maps: xr.Dataset | None) -> str:
     """Return the day of the first reading or picture; empty where no file says it."""
-    pictures = results.thermograms.cameras if results.thermograms else ()
-    first = [one.first for one in pictures if one.first]
     if results.time is not None:
-        first = [results.time.first]
-    elif maps is not None and (taken := maps["time"].values.min()) > DATED:
-        first = [str(np.datetime_as_string(taken, "D"))]
-    return min(first, default=conditions.get("Date of the test", ""))[:10]
+        return results.time.day
+    pictures = results.thermograms.cameras if results.thermograms else ()
+    if first := [one.first for one in pictures if one.first]:
+        return min(first)[:10]
+    if maps is not None and (taken := maps["time"].values.min()) > DATED:
+        return str(np.datetime_as_string(taken, "D"))
+    return conditions.get("Date of the test", "")[:10]
 
 
 def as_json(rows: Sequence[Row], *, started: str, finished: str) -> dict[str, Any]:

@@ -21,8 +21,9 @@ from fusion.campaign.config import (
     ReportTable,
     load_campaign,
 )
-from fusion.campaign.inputs import DATED, is_rotary, lacks_course, read_laser
+from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
+from fusion.campaign.time_zones import is_dated, shown_zone
 from fusion.results.axis import Iso230Part
 from fusion.results.numbers import exact, moment
 from fusion.results.parts import decide, is_determined
@@ -252,7 +253,7 @@ def _conditions(
         )
         for name in ("air_temperature", "material_temperature")
     }
-    zone = None if campaign is None else campaign.zone_of("interferometry")
+    zone = shown_zone(dataset, None if campaign is None else campaign.zone_of("interferometry"))
     conditions = {
         **identity(report, date_of(dataset["time"].values, zone), "" if campaign is None else campaign.campaign.axis),
         "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
@@ -292,10 +293,10 @@ def identity(report: ReportTable, date: str, axis: str) -> dict[str, str]:
 
 
 def date_of(times: NDArray[np.datetime64], zone: str | None) -> str:
-    """Return from when to when readings were taken, in local time where the zone is stated, else in UTC; empty of times without a date."""
-    known = times[~np.isnat(times)]
-    if not known.size or known.max() < DATED:
+    """Return from when to when readings were taken in a zone, see `moment`; empty of times without a date."""
+    if not is_dated(times):
         return ""
+    known = times[~np.isnat(times)]
     return f"{moment(known.min(), zone)} to {moment(known.max(), zone)}"
 
 

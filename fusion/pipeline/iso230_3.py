@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
+from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
 from fusion.pipeline.iso230 import date_of, files_of_run, hashed, identity
 from fusion.results.parts import Iso230Condition, Quantity
@@ -232,13 +232,12 @@ def _distortion(course: _Course, seconds: Array) -> ThermalDistortion:
     )
 
 
-def with_conditions(
-    tests: Sequence[ThermalTest], campaign: Campaign, times: NDArray[np.datetime64]
-) -> tuple[ThermalTest, ...]:
-    """Return the tests of a campaign with whose test it was, and under which conditions, as the campaign file states."""
-    report, zone = campaign.report, campaign.zone_of("interferometry" if campaign.record is None else "record")
+def with_conditions(tests: Sequence[ThermalTest], campaign: Campaign, table: xr.Dataset) -> tuple[ThermalTest, ...]:
+    """Return the tests of a campaign, evaluated from a table, with whose they were, and under which conditions, as its file states."""
+    zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
+    report, date = campaign.report, date_of(table["time"].values, zone)
     conditions = {
-        **identity(report, date_of(times, zone), campaign.campaign.axis),
+        **identity(report, date, campaign.campaign.axis),
         "Warm-up": report.warm_up,
         "Compensation of the machine": report.machine_compensation,
         "Places of the sensors": report.sensor_places,
@@ -279,9 +278,9 @@ def thermal_tests(campaign: Campaign) -> tuple[ThermalTest, ...]:
     """Read and evaluate the tests of a campaign."""
     if campaign.record is not None:
         table = read_record(campaign)
-        return with_conditions(evaluate_record_test(table, campaign.thermal_test), campaign, table["time"].values)
+        return with_conditions(evaluate_record_test(table, campaign.thermal_test), campaign, table)
     if campaign.interferometry is None:
         return ()
     deviations = read_laser(campaign)["deviations"]
     tests = evaluate_axis_test(deviations, campaign.thermal_test)
-    return with_conditions(tests, campaign, deviations["time"].values)
+    return with_conditions(tests, campaign, deviations)

@@ -16,7 +16,7 @@ from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose
 from fusion.analysis.levels import POSITION_LEVEL
 from fusion.campaign.inputs import LaserInputs, Source, lacks_course
 from fusion.campaign.recompensation import material_by_cycle
-from fusion.campaign.time_zones import utc
+from fusion.campaign.time_zones import shown_zone, utc
 from fusion.pipeline.iso230 import estimate_joint, evaluate_standard
 from fusion.results.numbers import moment
 from fusion.results.progress import Report, counted, listed, silent
@@ -58,7 +58,7 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
         parts["neighbours"] = {key: by_direction(comparison[name]) for key, name in compared.items()}
     groups |= {} if drift is None else {"drift": drift}
     dataset = joined(deviations, **groups)
-    zone = source.campaign.zone_of("interferometry")
+    zone = shown_zone(deviations, source.campaign.zone_of("interferometry"))
     if not np.isnat(times).all():
         parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
     if drift is not None:
@@ -150,14 +150,14 @@ def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
 
 def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
     """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
-    used, notices = _without_gross(deviations, source.campaign.zone_of("interferometry"))
+    used, notices = _without_gross(deviations, shown_zone(deviations, source.campaign.zone_of("interferometry")))
     fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
     return fused, [*notices, *_outside_notices(fused), *_gap_notices(fields, deviations)]
 
 
 def align_with_logs(source: LaserInputs, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
     """Give every reading the environment and the drivers at its own time, where there are no frames."""
-    used, notices = _without_gross(deviations, source.campaign.zone_of("interferometry"))
+    used, notices = _without_gross(deviations, shown_zone(deviations, source.campaign.zone_of("interferometry")))
     fused = align_logs(used, environment=source.environment, drivers=source.drivers)
     sensors, plan = source.sensors, source.campaign.plan
     if sensors is not None and plan is not None and plan.axis is not None:

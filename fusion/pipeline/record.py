@@ -22,8 +22,8 @@ from fusion.analysis.drift_model.record import (
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, reduce_record
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import Campaign
-from fusion.campaign.inputs import DATED, pipe_notices, read_record
-from fusion.campaign.time_zones import lacks_zone
+from fusion.campaign.inputs import pipe_notices, read_record
+from fusion.campaign.time_zones import zone_notices
 from fusion.results.numbers import duration, number
 from fusion.results.progress import Report, clock_notices, counted, left_out_notices, listed
 from fusion.results.results import Notice, Outcome
@@ -48,7 +48,7 @@ def read_source(campaign: Campaign) -> RecordSource:
     declare(declared, record)
     left_out = [
         *pipe_notices(campaign),
-        *_zone_notices(table),
+        *zone_notices(table, code="record_no_zone", of="the record"),
         *_held_notices(table),
         *left_out_notices(table, "record_rows_left_out"),
         *clock_notices(table),
@@ -57,17 +57,6 @@ def read_source(campaign: Campaign) -> RecordSource:
     return RecordSource(
         record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
     )
-
-
-def _zone_notices(table: xr.Dataset) -> Iterator[Notice]:
-    """Notice of times of day that nobody has given a zone."""
-    if lacks_zone(table) and table["time"].values[0] > DATED:
-        message = "The times of the record carry no zone: they are shown as logged; results.json and fusion.nc take them as UTC."
-        yield Notice(
-            "record_no_zone",
-            message,
-            'Write the zone of the logged times under [campaign], such as time_zone = "Europe/Vienna".',
-        )
 
 
 def _held_notices(table: xr.Dataset) -> Iterator[Notice]:

@@ -27,6 +27,7 @@ from fusion.campaign.inputs import (
     read_source,
     window_notice,
 )
+from fusion.campaign.time_zones import time_part
 from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, thermal
 from fusion.pipeline import positioning as interferometry
@@ -49,13 +50,12 @@ from fusion.pipeline.stages import (
     stamp_run,
 )
 from fusion.pipeline.thermal import camera_corrected, describe_field
-from fusion.pipeline.thermograms import evaluate_thermograms, has_regions
+from fusion.pipeline.thermograms import csv_of, evaluate_thermograms, has_regions
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
 from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
-from thermography.common import write_csv
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
@@ -226,9 +226,10 @@ def _evaluate_thermograms(run: Run, camera: CameraInputs, alone: CameraInputs | 
     if alone is None and not has_regions(camera):
         return None
     thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, camera))
-    table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
     claim(run.folder, _TABLE)
-    run.products.append(write_text(run.folder / _TABLE, str(write_csv(table.to_dataframe().reset_index()))))
+    run.products.append(write_text(run.folder / _TABLE, csv_of(thermograms)))
+    if alone:
+        run.parts |= time_part(thermograms, run.campaign.campaign.time_zone)
     series = run.parts["thermograms"]["series"] if alone else run.parts["regions"][0]["camera"]
     run.draw(partial(_draw, "pictures", thermograms, series))
     return thermograms
@@ -281,7 +282,7 @@ def _evaluate(run: Run, laser: LaserInputs, evaluation: Callable[[], xr.Dataset]
         run.parts["iso230"], deviations, campaign=run.campaign, environment=laser.environment
     )
     tests = evaluate_axis_test(deviations, run.campaign.thermal_test)
-    run.parts["iso230_3"] = with_conditions(tests, run.campaign, deviations["time"].values)
+    run.parts["iso230_3"] = with_conditions(tests, run.campaign, deviations)
     return deviations
 
 
@@ -414,7 +415,8 @@ def _model_record(run: Run, record_source: record_stage.RecordSource) -> xr.Data
     record: xr.Dataset = run.stage("record", partial(record_stage.model_record, record_source))
     table = record_source.health.table
     tests = evaluate_record_test(table, run.campaign.thermal_test)
-    run.parts["iso230_3"] = with_conditions(tests, run.campaign, table["time"].values)
+    run.parts["iso230_3"] = with_conditions(tests, run.campaign, table)
+    run.parts |= time_part(table, run.campaign.zone_of("record"))
     return record
 
 

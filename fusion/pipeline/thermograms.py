@@ -26,7 +26,7 @@ from fusion.pipeline.thermal import (
 )
 from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome
-from thermography.common import Array, ThermographyError
+from thermography.common import Array, ThermographyError, write_csv
 from thermography.evaluation import (
     WHOLE_PICTURE,
     evaluate_regions,
@@ -51,6 +51,17 @@ _COMPARED = 32
 _WIDEST = 640
 #: What a series of pictures shows.
 Scene = Literal["one picture", "still", "moved", "unlike", "no series"]
+
+
+def csv_of(thermograms: xr.Dataset) -> str:
+    """Return the regions of every picture as CSV, columns with their unit."""
+    table = thermograms.drop_dims(["row", "column"]).drop_dims(["visible_row"], errors="ignore")
+    named = {
+        name: f"{name}_{unit}"
+        for name, one in table.items()
+        if (unit := str(one.attrs.get("units", "1"))) not in ("1", "px")
+    }
+    return str(write_csv(table.to_dataframe().reset_index().rename(columns=named)))
 
 
 def has_regions(source: CameraInputs) -> bool:

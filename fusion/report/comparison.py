@@ -83,7 +83,7 @@ def campaign_names(pairs: Sequence[PairComparison]) -> list[str]:
 
 def short_names(pairs: Sequence[PairComparison]) -> list[str]:
     """Return the names of the tests for legends and columns; a letter comes with the day."""
-    days = [one.results.time.first[:10] if one.results.time else "" for one in compared_tests(pairs)]
+    days = [one.results.time.day if one.results.time else "" for one in compared_tests(pairs)]
     named = zip(_letters(pairs), days, strict=True)
     return [f"{letter}, {day}" if day and len(pairs) > 1 else letter for letter, day in named]
 

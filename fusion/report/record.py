@@ -44,7 +44,7 @@ def describe_record(results: Results, record: xr.Dataset, provenance: Mapping[st
     # The times of a record whose campaign file does not state the beginning count from zero.
     start = first if first >= np.datetime64("1971-01-01") else None
     channels, drivers = (join([str(name) for name in record[dim].values]) for dim in ("channel", "driver_name"))
-    zone = "" if any(notice.code == "record_no_zone" for notice in results.warnings) else None
+    zone = results.time.zone if results.time else None
     begun = "start not stated" if start is None else moment(start, zone)
     tested = results.iso230_3[0].distortions if results.iso230_3 else ()
     distances = [one for one in tested if one.name in shown_channels(record)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import math
-from datetime import datetime
+from datetime import UTC, datetime
 from inspect import cleandoc, getsource
 from itertools import pairwise
 from textwrap import dedent
@@ -118,7 +118,7 @@ def _of_time(text: str) -> str:
 
 def _known_zone(name: str) -> str:
     try:
-        ZoneInfo(name)
+        ZoneInfo(name or "UTC")
     # Also a name that is too long for a file, or leads out of the data base.
     except (LookupError, ValueError, OSError):
         raise ValueError("not a zone of the IANA database") from None
@@ -149,7 +149,14 @@ class TimePart(ResultPart):
     last: TimeText
     """Time of the last reading, UTC."""
     zone: Annotated[str, AfterValidator(_known_zone)] | None
-    """Zone that the campaign states, by its name in the IANA data base; null where it states none."""
+    """Zone in which times are shown: as the campaign states it, by its name in the IANA data base; null for UTC; empty, as logged, where
+    neither campaign nor files give one."""
+
+    @property
+    def day(self) -> str:
+        """Day of the first reading in that zone, ISO 8601."""
+        first = datetime.fromisoformat(self.first)
+        return first.replace(tzinfo=first.tzinfo or UTC).astimezone(ZoneInfo(self.zone or "UTC")).date().isoformat()
 
 
 # results.json, part ``inputs``: whether instruments, logs and physics agree.

@@ -220,7 +220,7 @@ def follow_trends(pairs: Sequence[PairComparison]) -> list[Trend]:
     """Return A, R and B by ISO 230-2 over the dates of tests; their error bars leave out what all tests have in common."""
     tests = [pairs[0].before, *(pair.after for pair in pairs if pair.changes)]
     dated = [
-        (one.results.iso230, one.results.time.first[:19])
+        (one.results.iso230, one.results.time.day)
         for one in tests
         if one.results.iso230 is not None and one.results.time is not None
     ]

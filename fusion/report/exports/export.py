@@ -489,7 +489,7 @@ def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_f
 
 
 def _frame_writer(frame: pd.DataFrame) -> Writer:
-    return lambda path: write_csv(frame, path, date_format="%Y-%m-%dT%H:%M:%S.%fZ")
+    return lambda path: write_csv(frame, path)
 
 
 def _write(out: Path, content: dict[str, Writer], *, overwrite: bool) -> tuple[Path, ...]:

@@ -20,7 +20,7 @@ from fusion.report.terminal import summary_rows
 from fusion.results.folder import claim, read_manifest
 from fusion.results.results import Results, read_results
 from fusion.results.store import read_dataset, read_tree
-from tests.fusion.campaign_parts import BOTH, change, keep_cycles, without, write_laser
+from tests.fusion.campaign_parts import BOTH, change, keep_cycles, record_of_rows, without, write_laser
 
 pytestmark = pytest.mark.chain
 
@@ -196,6 +196,51 @@ def test_readings_without_scatter_end_with_the_values_of_the_standard_and_their_
     assert "missed_trigger" not in [check.code for check in results.inputs.doubts]
     page = (tmp_path / "results" / "report.html").read_text(encoding="utf-8")
     assert "repeat exactly from cycle to cycle" in page and "times that of the differences" not in page
+
+
+def of_laser(folder: Path) -> Path:
+    """Readings that begin ten minutes after midnight of a clock without a zone."""
+    path = write_laser(folder, 6, 2)
+    text = path.with_name("laser.csv").read_text().replace("Z,", ",")
+    stamps = sorted({line.split(",")[4] for line in text.splitlines()[1:]})
+    late = np.datetime64("2026-03-10T00:10:00.000") - np.datetime64(stamps[0])
+    for stamp in reversed(stamps):
+        text = text.replace(stamp, str(np.datetime64(stamp) + late))
+    path.with_name("laser.csv").write_text(text)
+    return path
+
+
+def of_record(folder: Path) -> Path:
+    """A record of the same clock: a channel that follows a sensor, and white noise."""
+    folder.mkdir()
+    rng, rows = np.random.default_rng(2), []
+    for k in range(480):
+        time, warm = np.datetime64("2026-03-10T00:10:00") + np.timedelta64(60 * k, "s"), 5.0 * np.sin(k / 80.0)
+        rows.append(f"{time},{20.0 + warm + rng.normal(0, 0.02):.3f},{3.0 * warm + rng.normal(0, 0.2):.3f}")
+    path = record_of_rows(folder, *rows)
+    change(folder / "record.csv", "time [s]", "time")
+    return change(path, "time [s]", "time")
+
+
+@pytest.mark.usefixtures("no_charts")
+@pytest.mark.parametrize("zone", ["Europe/Vienna", ""])
+@pytest.mark.parametrize("write", [of_laser, of_record])
+def test_every_page_gives_the_date_of_the_test_in_its_own_zone(tmp_path, write, zone):
+    path, out = write(tmp_path / "test"), tmp_path / "results"
+    if zone:
+        change(path, "[campaign]\n", f'[campaign]\ntime_zone = "{zone}"\n')
+    results = run_campaign(path, out)
+    assert (results.time.zone, results.time.day) == (zone, "2026-03-10")
+    begun = "2026-03-10 00:10 CET" if zone else "2026-03-10 00:10 (no zone)"
+    sheets = [one.conditions for one in (results.iso230, *results.iso230_3) if one is not None]
+    dates = [row.text for rows in sheets for row in rows if row.name == "Date of the test"]
+    assert dates and all(date.startswith(begun) for date in dates)
+    assert begun in report_of(out)
+    assert with_findings(Row("test", "finished"), out).date == "2026-03-10"
+    codes = [warning.code for warning in results.warnings]
+    noted = "laser_no_zone" if results.iso230 else "record_no_zone"
+    assert (noted in codes) == (not zone)
+    assert noted in [notice.code for notice in check_campaign(path).notices] or zone
 
 
 @pytest.mark.slow

@@ -190,6 +190,7 @@ def test_pictures_of_several_cameras_are_a_table_by_camera(tmp_path, scene):
     assert results.field is None and results.registration is None
     table = pd.read_csv(tmp_path / "out" / "thermograms.csv")
     assert sorted(table["source"]) == sorted(path.name for path in (tmp_path / "in").glob("*.jpg"))
+    assert {"maximum_degC", "maximum_u_K", "mean_degC"} <= set(table) and table["time"].str.endswith("Z").all()
 
 
 def test_a_picture_of_another_camera_is_no_part_of_the_series(tmp_path, scene):
