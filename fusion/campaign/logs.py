@@ -49,6 +49,7 @@ _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
 _TAKEN = (
     "cycle", "direction", "target", "position", "time", "deviation", "quality_flag", "inside_frames", "effect", "period", "mean_rise",
     "axis_integral", "local_rise", "patch_mean_rise", "patch_axis_integral", "driver_time", "environment_time", "frame_time", "correlation",
+    "warm_up",
 )  # fmt: skip
 #: Seconds beyond these are damaged numbers: LabVIEW counts from 1904, 4.5e9 s reach to 2046.
 _LONGEST_RECORD_S = 4.5e9
@@ -530,7 +531,9 @@ def read_times(
         RejectedLine(path.name, int(frame.index[at]), " ".join(map(str, cells.iloc[at].dropna())), "is not a time")
         for at in np.flatnonzero(~timed)
     ]
-    raise_if_mostly_invalid(path, int(timed.sum()), left_out, last=int(frame.index[timed].max()) if timed.any() else None)
+    raise_if_mostly_invalid(
+        path, int(timed.sum()), left_out, last=int(frame.index[timed].max()) if timed.any() else None
+    )
     return time, words, left_out
 
 

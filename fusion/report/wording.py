@@ -229,28 +229,20 @@ def _parameter(name: str, value: Any) -> str:
     for ending, unit in _UNITS.items():
         if name.endswith(ending):
             return f"{name.removesuffix(ending).replace('_', ' ')} {in_words(value)} {unit}"
-    return f"{name.replace('_', ' ')} {in_words(value)}"
+    # A sensor has the name that its file gives it; other choices are names of the results.
+    return f"{name.replace('_', ' ')} {value if name == 'sensor' else in_words(value)}"
 
 
 def _as_well(name: str, fits: Range) -> str:
     """The values of a parameter that fit as well, in brackets."""
     others = [word for word in fits if isinstance(word, str)]
     if others or not fits:
-        return f" (or {join([spaced(word) for word in others])})"
+        return f" (or {join(others if name == 'sensor' else [in_words(word) for word in others])})"
     show = duration if name == "time_s" else number
     low, high = (None if value is None else show(float(value)) for value in fits)
     if low is None and high is None:
         return " (not determined)"
     return f" (at most {high})" if low is None else f" (at least {low})" if high is None else f" ({low} to {high})"
-
-
-def spaced(name: str) -> str:
-    """Return a name of the results as words, with the unit at its end set off."""
-    for ending, unit in _UNITS.items():
-        if name.endswith(ending):
-            bracketed = f"({unit})" if "/" in unit else unit
-            return f"{name.removesuffix(ending).replace('_', ' ')} / {bracketed}"
-    return name.replace("_", " ")
 
 
 def in_words(value: Any) -> str:

@@ -232,6 +232,7 @@ def test_one_mark_for_no_reading_costs_one_reading(tmp_path: Path) -> None:
         ("oil in/out", 'call it for example "oil in-out"'),
         ("deviation", 'the name of a result; rename it, for example "logged deviation"'),
         ("duty_series", "the name of a result"),
+        ("warm_up", "the name of a result"),
     ],
 )
 def test_names_that_the_products_cannot_keep_are_refused(tmp_path: Path, name: str, message: str) -> None:

@@ -136,7 +136,10 @@ def test_parameters_are_words_with_units_and_the_range_that_fits_as_well():
     assert told == "follows warm up, time constant 30.0 min"
     told = wording.parameters({"time_constant_min": 39.6}, {"time_constant_min": (29.0, None)})
     assert told == "time constant 39.6 min (at least 29.0)"
-    assert wording.spaced("jump_um_per_K") == "jump / (µm/K)"
+    told = wording.parameters(
+        {"sensor": "head_1_K", "start": "not_free"}, {"sensor": ("b_mm", "c"), "start": ("is_free",)}
+    )
+    assert told == "sensor head_1_K (or b_mm and c), start not free (or is free)"
     assert wording.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, – and warm up"
 
 

@@ -1,5 +1,7 @@
 """Charts of the axis: their numbers are those of the products, intervals are k = 2, missing values are gaps."""
 
+import html
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -194,3 +196,17 @@ def test_the_labels_of_both_spans_stand_apart():
     # Text of 12 px is a fifteenth of the chart's height.
     assert labels["E"].y - labels["A"].y > 15.0 / 15
     assert labels["A"].x < labels["E"].x
+
+
+@pytest.mark.parametrize("name", ["@y", "$x", "@{y}{0.0}", "<b>T</b>", "a & b", "'q' \"q\"", "Größe"])
+def test_a_name_under_the_pointer_is_neither_a_field_nor_markup(name):
+    """Bokeh replaces what stands after @ and $ and reads the rest as HTML."""
+    shown = literal(name)
+    assert not set("@$<>") & set(shown) and html.unescape(shown) == name
+
+
+def test_columns_to_download_stay_two_where_names_make_their_headings_alike():
+    courses = Courses(new_figure(x="time / h", y="rise / µm"))
+    for value in (1.0, 2.0, 3.0):
+        courses.add(np.zeros(2), np.full(2, value), "a", colour="black")
+    assert [values[0] for values in courses.columns.values()] == [1.0, 2.0, 3.0]
