@@ -15,7 +15,6 @@ import numpy as np
 import ref_index
 
 from interferometry.common import Array, InterferometryError, check_dataset
-from interferometry.deviations import UNREADABLE, set_flag
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -236,6 +235,8 @@ def compensate(
     without_time = np.isfinite(deviations["deviation"].values) & np.isnat(deviations["time"].values)
     corrected = _corrected(deviations, added, u, index)
     if without_time.any():
+        from interferometry.deviations import UNREADABLE, set_flag  # loads xarray, which a finished run does without
+
         corrected = set_flag(corrected, UNREADABLE, without_time)
     return corrected.assign_attrs(outside_environment=outside, without_time=int(without_time.sum()))
 
