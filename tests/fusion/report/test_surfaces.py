@@ -21,14 +21,17 @@ from fusion.app.results.data import Linker, Products, Selection
 from fusion.app.results.screen import _outcome
 from fusion.pipeline.fleet import Row, render_fleet, with_findings, write_book
 from fusion.pipeline.iso230 import read_test
+from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.pipeline.run import run_campaign
 from fusion.report.comparison import render_comparison
 from fusion.report.exports.export import export_results
-from fusion.report.sheet import describe_sheet, iso230_tables, write_iso230
+from fusion.report.sheet import describe_sheet, iso230_tables, write_iso230, write_thermal_tests
 from fusion.report.terminal import summary_table
+from fusion.report.thermal_test import thermal_test_tables
 from fusion.report.wording import ISO230_TERMS, ONE_WAY_TERMS
 from fusion.results.numbers import measured
 from fusion.results.results import read_results
+from fusion.twin.instruments import simulate_campaign
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import simulated
 from tests.fusion.conftest import RECIPE
@@ -47,6 +50,20 @@ E_unidirectional = "20 um"
 
 [report]
 machine = "Mill"
+"""
+RECORD = """
+[campaign]
+title = "A spindle"
+seed = 44
+
+[record]
+hours = 10
+sensors = 5
+channels = 2
+
+[[effect]]
+name = "unseen_heat_source"
+amplitude_um = 6
 """
 #: A value with its expanded uncertainty, a number, a decision by ISO 14253-1, and a day.
 VALUE, NUMBER, DAY = r"(−?[\d.]+ ± [\d.]+)", r"([\d.]+)", r"(\d{4}-\d\d-\d\d)"
@@ -80,11 +97,17 @@ def in_words(book: Path) -> str:
     """The numbers of the workbook of a run, each row as a line of what others print."""
     sheets = workbook(book)
     lines = [f"{row['finding']} {row['value']}" for row in sheets["Summary"]]
-    for row in sheets["A R E M B"]:
+    for row in sheets.get("Distortions", ()):
+        lines.append(
+            f"{row['quantity']} {row['unit']} whole {measured(row['whole test'], row['U(whole test) (k = 2)'] / 2)}"
+        )
+    for row in sheets.get("Predictions", ()):
+        lines.append(f"{row['prediction']} {row['rmse / µm']:.9f}")
+    for row in sheets.get("A R E M B", ()):
         found = measured(row["value / µm"], row["U (k = 2) / µm"] / 2)
         lines.append(f"{ISO230_TERMS[row['quantity']]} {found} {row['limit / µm'] or '–'} {row['decision']}")
     lines += [f"{row['condition']} {row['stated or logged']}" for row in sheets["Conditions"]]
-    lines += [f"evaluated {row['window']}." for row in sheets["ISO 230-2 positions"]]
+    lines += [f"evaluated {row['window']}." for row in sheets.get("ISO 230-2 positions", ())]
     return " ".join(" ".join(lines).split())
 
 
@@ -115,19 +138,48 @@ def run(tmp_path_factory) -> Path:
     return folder / "results"
 
 
-@pytest.fixture(scope="module")
-def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
-    """The text of every surface."""
-    out = tmp_path_factory.mktemp("out")
-    results, test = read_results(run), read_test(run, None)
-    sheet = describe_sheet(test.title, test.part, files=test.files, version="0")
-    for name in ("sheet.html", "sheet.docx"):
-        write_iso230(out / name, sheet, test.part, test.dataset, remarks=test.remarks)
+def common_surfaces(run: Path, out: Path) -> dict[str, str]:
+    """The text of what every run has, and of its sheet in a folder."""
+    results = read_results(run)
     document = docx.Document(out / "sheet.docx")
     cells = [cell.text for table in document.tables for row in table.rows for cell in row.cells]
     (book,) = export_results(run, "xlsx", out).files
     row = with_findings(Row("mill", state="finished", exit_code=0, seconds=1.0, peak_MB=1.0), run)
     write_book(out / "fleet.xlsx", [row])
+    return {
+        "print": str(results),
+        "notebook": on_one_line(results._repr_html_()),
+        "terminal": printed(summary_table(results)),
+        "report": on_one_line((run / "report.html").read_text(encoding="utf-8")),
+        "sheet": on_one_line((out / "sheet.html").read_text(encoding="utf-8")),
+        "Word": " ".join(" ".join([*(one.text for one in document.paragraphs), *cells]).split()),
+        "workbook": in_words(book),
+        "fleet": in_pairs(render_fleet([row], started="2026-03-10T00:00:00")),
+        "fleet workbook": in_columns(out / "fleet.xlsx"),
+    }
+
+
+@pytest.fixture(scope="module")
+def record_surfaces(tmp_path_factory) -> Mapping[str, str]:
+    """The text of every surface of a record of a spindle with a heat source that no sensor sees."""
+    folder = tmp_path_factory.mktemp("record")
+    (folder / "recipe.toml").write_text(RECORD)
+    run_campaign(simulate_campaign(folder / "recipe.toml", folder / "campaign"), folder / "results")
+    title, tests, files = read_thermal_tests(folder / "results")
+    for name in ("sheet.html", "sheet.docx"):
+        write_thermal_tests(folder / name, title, tests, files=files, version="0")
+    shown = printed(*thermal_test_tables(tests, title=title))
+    return {**common_surfaces(folder / "results", folder), "iso230-3": shown}
+
+
+@pytest.fixture(scope="module")
+def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
+    """The text of every surface."""
+    out = tmp_path_factory.mktemp("out")
+    test = read_test(run, None)
+    sheet = describe_sheet(test.title, test.part, files=test.files, version="0")
+    for name in ("sheet.html", "sheet.docx"):
+        write_iso230(out / name, sheet, test.part, test.dataset, remarks=test.remarks)
     products = Products(run)
     selection = Selection(cycle=1, target=3)
     linker = Linker(selection, products.targets, products.cycles, None)
@@ -137,16 +189,8 @@ def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
     ]  # fmt: skip
     again = shutil.copytree(run, out / "again")
     return {
-        "print": str(results),
-        "notebook": on_one_line(results._repr_html_()),
-        "terminal": printed(summary_table(results)),
+        **common_surfaces(run, out),
         "iso230": printed(*iso230_tables(test.part, test.dataset, title=test.title)),
-        "report": on_one_line((run / "report.html").read_text(encoding="utf-8")),
-        "sheet": on_one_line((out / "sheet.html").read_text(encoding="utf-8")),
-        "Word": " ".join(" ".join([*(one.text for one in document.paragraphs), *cells]).split()),
-        "workbook": in_words(book),
-        "fleet": in_pairs(render_fleet([row], started="2026-03-10T00:00:00")),
-        "fleet workbook": in_columns(out / "fleet.xlsx"),
         "application": on_one_line(texts(parts)),
         "comparison": on_one_line(render_comparison(compare_campaigns([run, again]))),
     }
@@ -268,6 +312,28 @@ def places() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
     )
 
 
+def places_of_a_record() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
+    """The same of a record."""
+    row = rf"X µm {VALUE.replace('(', '(?:')} {VALUE}"
+    yield "largest drift", {
+        **on(("report", "sheet", "Word", "iso230-3"), row), "report": (row, rf"Largest drift {VALUE} µm"),
+        "workbook": (rf"X µm whole {VALUE}",), "fleet": (rf"Drift / µm {VALUE}",), "fleet workbook": (rf"drift / µm {VALUE}",),
+    }  # fmt: skip
+    yield "held-out error after", {
+        **on(PRINTED, rf"-> {NUMBER} µm"), "terminal": (rf"held-out error {NUMBER} \[", rf"measured before: {NUMBER} µm"),
+        "report": (rf"Held-out error {NUMBER} µm", rf"with the added effects {NUMBER}"), **on(FLEET, rf"[Hh]eld-out error / µm {NUMBER}"),
+        "workbook": (rf"held-out error {NUMBER} \[", rf"with the added effects {NUMBER}"),
+    }  # fmt: skip
+    yield "verdict", {
+        **on(PRINTED, r"verdict:? (\w+)"), **on(("terminal", "workbook"), r"verdict (\w+):"), **on(FLEET, r"[Vv]erdict (\w+)"),
+    }  # fmt: skip
+    yield "date", {
+        **on(("sheet", "Word", "workbook"), rf"Date of the test {DAY}"), "report": (rf"machine not stated, {DAY}",),
+        **on(FLEET, rf"[Dd]ate {DAY}"),
+    }  # fmt: skip
+    yield "warnings", {**on(PRINTED, r"warnings:? (\d+)"), **on(FLEET, r"[Ww]arnings (\d+)")}
+
+
 def to_the_digits_of_both(texts: set[str]) -> set[str]:
     """Numbers without an uncertainty, rounded to the decimals of the one with the fewest; other texts in small letters."""
     if not all(re.fullmatch(r"\d+(\.\d+)?", text) for text in texts):
@@ -276,14 +342,19 @@ def to_the_digits_of_both(texts: set[str]) -> set[str]:
     return {f"{round(float(text), decimals):.{decimals}f}" for text in texts}
 
 
-@pytest.mark.parametrize(("quantity", "stands"), [pytest.param(name, one, id=name) for name, one in places()])
-def test_a_quantity_has_one_value_wherever_it_is_printed(surfaces, quantity, stands):
-    found = {
-        (surface, pattern): re.findall(pattern, surfaces[surface])
-        for surface, patterns in stands.items()
-        for pattern in patterns
-    }
-    assert not [place for place, values in found.items() if not values]
-    assert (
-        len(stands) >= 2 and len(to_the_digits_of_both({value for values in found.values() for value in values})) == 1
-    )
+def hold_one_value(surfaces: Mapping[str, str], stands: Mapping[str, tuple[str, ...]]) -> None:
+    """Every place of a quantity has a value, at least two surfaces show it, and they all show the same."""
+    every = [(surface, pattern) for surface, patterns in stands.items() for pattern in patterns]
+    found = {(surface, pattern): re.findall(pattern, surfaces[surface]) for surface, pattern in every}
+    assert len(stands) >= 2 and not [place for place, values in found.items() if not values]
+    assert len(to_the_digits_of_both({value for values in found.values() for value in values})) == 1, found
+
+
+@pytest.mark.parametrize("stands", [pytest.param(one, id=name) for name, one in places()])
+def test_a_quantity_of_an_axis_has_one_value_wherever_it_is_printed(surfaces, stands):
+    hold_one_value(surfaces, stands)
+
+
+@pytest.mark.parametrize("stands", [pytest.param(one, id=name) for name, one in places_of_a_record()])
+def test_a_quantity_of_a_record_has_one_value_wherever_it_is_printed(record_surfaces, stands):
+    hold_one_value(record_surfaces, stands)
