@@ -396,7 +396,11 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
             f'--cycles "{cycles}": {folder} holds the windows of its run; name the campaign file or the file of readings instead'
         )
     results = read_results(folder)
-    if results.iso230 is None or not results.iso230.cycles:
+    if results.iso230 is None:
+        raise CampaignError(
+            f"{folder}: its run had no readings of an axis; name the results of a campaign with [interferometry]"
+        )
+    if not results.iso230.cycles:
         raise CampaignError(
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )

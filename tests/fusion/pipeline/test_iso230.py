@@ -13,8 +13,8 @@ from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test,
 from fusion.results.axis import Iso230Part
 from fusion.results.numbers import moment
 from fusion.results.parts import decide
-from fusion.results.results import ResultsError
-from fusion.results.store import joined, plain
+from fusion.results.results import ResultsError, assemble
+from fusion.results.store import joined, plain, write_json
 from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.io.readings import read_deviations
@@ -137,6 +137,12 @@ def test_a_campaign_of_the_laser_alone_brings_its_budget_and_tolerances(tmp_path
     assert found.title == "Size"
     assert found.part.contributions[0].origin == "stated"
     assert [row.decision for row in found.part.tolerances] == ["pass"]
+
+
+def test_results_without_readings_of_an_axis_say_what_is_lacking(tmp_path):
+    write_json(tmp_path / "results.json", assemble("A", {}, []).as_json())
+    with pytest.raises(CampaignError, match=r"a campaign with \[interferometry\]"):
+        read_test(tmp_path, None)
 
 
 def test_the_results_of_a_run_hold_their_own_window(results_folder):
