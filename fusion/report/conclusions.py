@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from fusion.report.wording import ARROWS, conditional, randomised_causes, say
 from fusion.results.axis import Iso230Part
-from fusion.results.loop import StepPart
+from fusion.results.loop import RecordLoop, StepPart
 from fusion.results.parts import TimePart, decide
 from fusion.results.results import Results
 
@@ -217,4 +217,6 @@ def next_steps(results: Results) -> list[str]:
     if judged.get("A") != "pass" and (compensation := say("compensation_step", results)):
         unique.insert(0 if judged.get("A") == "fail" else len(unique), compensation)
     values = "profile" if results.drift else "values by ISO 230-2" if results.iso230 else "temperatures"
+    if isinstance(loop, RecordLoop):
+        values = "displacements"
     return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]

@@ -303,7 +303,7 @@ def environment(*, html: bool) -> jinja2.Environment:
     )  # fmt: skip
     formats = (
         condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first, measured, moment, number, p_cell, p_words,
-        parameters, percent, place, print_unit, quantity, region_words, small, upper_first,
+        parameters, percent, place, print_unit, quantity, region_words, small, upper_first, variance_left,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
@@ -322,7 +322,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, beaten_by_repetition, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, randomised_causes,
+        alike, beaten_by_repetition, better_plain, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, randomised_causes,
         worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
@@ -454,6 +454,35 @@ def beaten_by_repetition(loop: Loop) -> str:
     if plain is None or declared is None or final is None:
         return ""
     return "model" if plain < final else "declared" if plain < declared else ""
+
+
+#: Chance alone changes an error of prediction by this share.
+_BY_CHANCE = 1.02
+
+
+class PlainPrediction(NamedTuple):
+    """A plain prediction in words with its error on the hold-out, beside that of the model, µm."""
+
+    words: str
+    rmse_um: float
+    final_um: float
+
+
+def better_plain(loop: Loop) -> PlainPrediction | None:
+    """Return the last value or the mean, whichever predicts better, where the model predicts no better than that."""
+    words, final = baseline_words(loop), loop.rmse_final_um
+    known = [
+        (error, name) for name in ("last_value", "mean") if (error := getattr(loop.baselines, name).rmse_um) is not None
+    ]
+    if final is None or not known:
+        return None
+    error, name = min(known)
+    return PlainPrediction(words[name], error, final) if error < _BY_CHANCE * final else None
+
+
+def variance_left(share: float | None) -> str:
+    """Return the share of a variance that a prediction leaves, in per cent; "all" where the mean itself would leave less."""
+    return "–" if share is None else "all" if share > 1.0 else f"{number(100 * share, 2)} %"
 
 
 def worse_channels(loop: Loop) -> list[tuple[str, ChannelErrors]]:

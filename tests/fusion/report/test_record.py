@@ -52,7 +52,7 @@ def test_a_record_is_told_with_its_channels_and_its_driver():
     page = page_of()
     assert "1 displacement and 2 temperatures over 4 min, with speed as driver" in page
     tables = tables_of(page)
-    assert tables["Errors channel by channel"][1] == ["X", "0.900", "0.600", "0.400", "10", "0.10", "0.300"]
+    assert tables["Errors channel by channel"][1] == ["X", "0.900", "0.600", "0.400", "10 %", "0.10", "0.300"]
     assert tables["Errors of forward chaining"][-1] == ["mean", "", "0.900", "0.600", "0.400"]
     assert ["not tried: dead path of the laser", "no air"] in tables["Effects that were not admitted or not tried"]
     assert tables["Candidates with their scores"][1][-2:] == ["0.700 to 0.500", "chosen"]

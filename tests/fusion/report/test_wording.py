@@ -192,19 +192,22 @@ def step(effect: str, **changes: Any) -> StepPart:
     return StepPart.model_construct(**{**told, **changes})
 
 
+def baselines(mean_um: float = 2.2, last_um: float = 2.5) -> Baselines:
+    """Errors of plain predictions."""
+    told = {"last_value": last_um, "mean": mean_um, "ridge_with_lags": 0.31}
+    return Baselines.model_construct(
+        **{name: ErrorInterval.model_construct(rmse_um=error, low_um=0.3, high_um=3.0) for name, error in told.items()}
+    )
+
+
 def loop(verdict: str = "explained", *steps: StepPart, shape: str = "", **changes: Any) -> Loop:
     """The part of a loop that sentences are made of."""
     told = {
         "verdict": verdict, "declared": ("axis_expansion",), "steps": steps, "unconfirmed_effects": {}, "rmse_persistence_um": 2.5,
         "unexplained": Unexplained.model_construct(shape=shape, rms_um=0.2), "rmse_declared_um": 1.94, "rmse_final_um": 0.66,
-        "noise_floor_um": 0.42, "held_out": "cycles 49 to 60 held out; coefficients frozen",
+        "noise_floor_um": 0.42, "held_out": "cycles 49 to 60 held out; coefficients frozen", "baselines": baselines(),
     }  # fmt: skip
     return Loop.model_construct(**{**told, **changes})
-
-
-LAGGED = Baselines.model_construct(
-    ridge_with_lags=ErrorInterval.model_construct(rmse_um=0.31, low_um=0.3, high_um=0.32)
-)
 
 
 def results(found: Loop | None, **parts: Any) -> Results:
@@ -233,7 +236,7 @@ def results(found: Loop | None, **parts: Any) -> Results:
             ["predicted to 0.66 µm (last", "(0.20 µm rms)", "none of the known effects"],
         ),
         (
-            loop("unexplained", step("dead_path"), separable=False, baselines=LAGGED),
+            loop("unexplained", step("dead_path"), separable=False),
             ["with lags predict it to 0.31 µm; a cause is not separable."],
         ),
         (loop("unexplained"), ["Part of the drift remains unexplained"]),
@@ -245,6 +248,34 @@ def test_every_verdict_has_its_statement(found, stated):
     told = answers.headline(results(found))
     assert all(part in told for part in stated), told
     assert found is not None or answers.conclude(results(None)) == []
+
+
+def test_what_predicts_no_better_than_the_mean_explains_nothing():
+    noise = answers.headline(results(loop("complete", baselines=baselines(mean_um=0.661))))
+    assert "show no drift that the declared model" in noise and "0.66 and 0.66 µm" in noise and "explains" not in noise
+    assert "explains the drift" in answers.headline(results(loop("complete", baselines=baselines(mean_um=0.70))))
+    worse = loop("unexplained", shape="a wave", rmse_final_um=140.0, baselines=baselines(mean_um=81.0, last_um=67.0))
+    told = answers.headline(results(worse))
+    assert "no better than the last cycle simply repeated does (140 and 67 µm)" in told and "Part" not in told
+    # What a mean leaves less of is no share, and what the noise hides is no random drift.
+    assert [wording.variance_left(share) for share in (0.12, 1.146, None)] == ["12 %", "all", "–"]
+    assert "random drift" not in answers.headline(results(loop("complete", wandering_um=1e-4)))
+    assert "random drift of 0.00016" in answers.headline(
+        results(loop("complete", wandering_um=1.6e-4, noise_floor_um=5e-4))
+    )
+
+
+def test_a_forecast_without_its_only_effect_is_that_of_the_declared_model():
+    alone = loop("partial", step("unseen_heat_source"), left_out_of_forecast=("unseen_heat_source",))
+    told = dict(answers.conclude(results(alone)))["How sure"]
+    assert "The forecast holds none of the added effects. Error of predicting cycles 49 to 60" in told
+    assert "With the added effect" not in told
+
+
+def test_nothing_has_to_be_done_with_what_was_measured():
+    record = RecordLoop.model_construct(**{**vars(loop("complete")), "channels": {}})
+    assert "use the displacements" in next_steps(results(record))[0]
+    assert "use the temperatures" in next_steps(results(None))[0]
 
 
 @pytest.mark.parametrize(
