@@ -19,6 +19,7 @@ from fusion.report.charts.readings import (
     plot_test,
     plot_windows,
 )
+from fusion.report.charts.style import Courses, literal, new_figure
 from fusion.results.numbers import number
 from fusion.results.store import group
 from interferometry.iso230 import evaluate_iso230
