@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -56,7 +56,7 @@ from interferometry.io.readings import read_deviations, read_environment
 from interferometry.io.tables import DateOrder, parse_time, read_table
 from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import ZERO_CELSIUS_K, ThermographyError
-from thermography.io.frame import FrameReference
+from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
 from thermography.io.region import Region as PictureRegion
 from thermography.io.region import RegionKind
@@ -294,6 +294,8 @@ class Source(CameraInputs, LaserInputs):
         return float(np.abs(self.deviations["position"].values).max())
 
 
+#: Most sets of parameters of which a frame is compared with its checksums.
+_MOST_COMPARED = 100
 #: Words of the reason why a frame of another camera or size is left out.
 _OTHER_CAMERA = "among frames of"
 #: Words of the reason why a second frame of one time is left out.
@@ -572,7 +574,26 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
     if remarks := Counter(note for frame in source.frames for note in frame.notes):
         named = [f"{note} ({counted(count, 'frame')})" for note, count in remarks.items()]
         notices.append(Notice("frames_read_with_remarks", f"Remarks of the reader of the frames: {listed(named)}.", ""))
+    notices += _checksum_notices(source.frames)
     return [*notices, *camera_accuracy_notices(source.thermography, source.frames)]
+
+
+def _checksum_notices(frames: Sequence[FrameReference]) -> Iterator[Notice]:
+    """Yield the notice of frames whose records differ from their checksums: one frame of each set of parameters is compared."""
+    first: dict[CameraParameters, FrameReference] = {}
+    for frame in frames:
+        first.setdefault(frame.parameters, frame)
+    named = [
+        f"{frame.path.name}, frame {frame.index} ({', '.join(f'0x{kind:02X}' for kind in damaged)})"
+        for frame in islice(first.values(), _MOST_COMPARED)
+        if (damaged := frame.damaged_records())
+    ]
+    if named:
+        yield Notice(
+            "frames_checksum",
+            f"Records of frames differ from their checksums: {listed(named)}. The files were changed after the camera wrote them.",
+            "Compare these files with the originals, or leave them out: their parameters, and temperatures, may be wrong.",
+        )
 
 
 def window_notice(source: CameraInputs) -> Notice:

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +70,19 @@ def test_two_pictures_give_their_difference(tmp_path, scene):
     row, column = np.unravel_index(scene.argmax(), SHAPE)
     place = regions["whole picture"]["maximum_at"]
     assert (place["column_px"], place["row_px"], place["file"]) == (column, row, "A645sc_1.jpg")
+
+
+def test_a_picture_that_was_changed_after_the_camera_wrote_it_is_named(tmp_path, scene):
+    path = write(tmp_path, [scene, scene, scene])
+    assert "frames_checksum" not in {notice.code for notice in read_source(load_campaign(path)).notices}
+    data = bytearray((tmp_path / "A645sc_1.jpg").read_bytes())
+    stored = struct.pack("<f", SC660.planck_b)
+    assert data.count(stored) == 1
+    data[data.index(stored)] ^= 2
+    (tmp_path / "A645sc_1.jpg").write_bytes(data)
+    notices = read_source(load_campaign(path)).notices
+    (notice,) = [notice for notice in notices if notice.code == "frames_checksum"]
+    assert "A645sc_1.jpg, frame 0 (0x20)." in notice.message
 
 
 def test_pictures_of_one_name_in_two_folders_are_told_apart(tmp_path, scene):
