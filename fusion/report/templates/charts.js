@@ -81,7 +81,8 @@
   }
   function cell(value) {  // text that a spreadsheet would take for a formula gets an apostrophe
     if (typeof value === "number") return Number.isFinite(value) ? String(Number(value.toPrecision(7))) : "";
-    const text = /^[=+\-@\t\r]/.test(value) ? `'${value}` : String(value);
+    const shown = String(value).replace(/[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]/g, " ");
+    const text = /^[=+\-@\t\n＝＋－＠]/.test(shown) ? `'${shown}` : shown;
     return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   }
   function table(columns) {
