@@ -54,7 +54,8 @@ def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
     add_series(drawn, hours, declared, name="declared model", colour=BEFORE, dash="dashed")
     add_series(drawn, hours, final, name="final model", colour=_AFTER, width=2.2)
     add_series(drawn, hours, measured, name="measured", colour=INK, width=1.2)
-    missed = float(np.sqrt(np.nanmean((measured - final)[held] ** 2))) if held.any() else float("nan")
+    left = (measured - final)[held & np.isfinite(measured - final)]
+    missed = float(np.sqrt(np.mean(left**2))) if left.size else float("nan")
     seen = (
         f"{channel} measured from {span_words(measured, 'µm')}; where it was held out, the final model misses it by "
         f"{number(missed)} µm rms."
