@@ -148,6 +148,8 @@ def detect_anomalies(
     needed = int(np.ceil(1.0 / (level * min(WEIGHTS.values()))))
     if permutations + 1 < needed:
         raise InterferometryError(f"permutations={permutations} cannot reach level={level}; use at least {needed - 1}")
+    # Courses are those over the cycles as they were measured.
+    deviations, estimated = (one.sortby("cycle") for one in (deviations, estimated))
     rng = np.random.default_rng(seed)
     anomalies = _scatter_anomalies(estimated, level, permutations, rng)
     if estimated.sizes["cycle"] >= SHORTEST_TEST_CYCLES:

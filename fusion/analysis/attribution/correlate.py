@@ -211,7 +211,8 @@ def correlate(
     field = coarsen_field(fields) if isinstance(fields, xr.Dataset) else fields
     if field.dims != ("time", "y", "x"):
         raise CorrelationError(f"fields has dims {field.dims}; expected ('time', 'y', 'x')")
-    readings = clock_readings(fused, field["time"].values.astype("datetime64[ns]"))
+    # The drift is a course over the cycles as they were measured.
+    readings = clock_readings(fused.sortby("cycle"), field["time"].values.astype("datetime64[ns]"))
     candidates = _Candidates.collect(field, readings.frame_seconds, regions)
     cells = candidates.sets["cells"]
     excitation = describe_excitation(cells.values, cells.seconds)

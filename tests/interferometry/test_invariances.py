@@ -1,0 +1,127 @@
+"""What must not change a result: the order in which readings are stored, the end of the axis from which it is counted, unit and epoch."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from interferometry.anomalies import detect_anomalies
+from interferometry.common import DIRECTIONS
+from interferometry.drift.estimate import estimate_drift
+from interferometry.iso230.evaluation import evaluate_iso230
+from tests.interferometry.simulated_campaigns import recorded, simulate
+
+#: Of the joint estimate: the search for its variances ends at another last digit of its logarithms (reviewed: 2e-5 at most).
+SEARCH = 1e-4
+
+
+class Change(NamedTuple):
+    """Another way to store a test, by which values are multiplied by a factor, and whether approaches change their names."""
+
+    change: Callable[[xr.Dataset], xr.Dataset]
+    factor: float = 1.0
+    mirrored: bool = False
+
+
+def scaled(test: xr.Dataset, factor: float) -> xr.Dataset:
+    return test.assign(deviation=factor * test["deviation"], resolution=abs(factor) * test["resolution"])
+
+
+def mirrored(test: xr.Dataset) -> xr.Dataset:
+    """Counted from the other end: what was approached in positive direction is approached in negative."""
+    turned = scaled(test, -1.0).assign(position=300.0 - test["position"])
+    return turned.assign_coords(
+        direction=[DIRECTIONS[1 - DIRECTIONS.index(str(one))] for one in test["direction"].values]
+    )
+
+
+CHANGES = {
+    "cycles in another order": Change(
+        lambda test: test.isel(cycle=np.random.default_rng(1).permutation(test.sizes["cycle"]))
+    ),
+    "targets in another order": Change(lambda test: test.isel(target=[3, 0, 5, 1, 7, 4, 2, 6])),
+    "approaches in another order": Change(lambda test: test.isel(direction=[1, 0])),
+    "axis counted from its other end": Change(mirrored, -1.0, mirrored=True),
+    "nanometres for micrometres": Change(lambda test: scaled(test, 1000.0), 1000.0),
+    "sixty years earlier": Change(lambda test: test.assign(time=test["time"] - np.timedelta64(60 * 365, "D"))),
+    "positions from another zero": Change(lambda test: test.assign(position=test["position"] - 5000.0)),
+}
+
+
+@pytest.fixture(scope="module", params=["complete", "with gaps", "one approach", "in whole digits"])
+def test(request) -> xr.Dataset:
+    """Twenty cycles of eight targets, of which one scatters and moves by itself."""
+    made, _ = simulate(np.random.default_rng(4), kind="warmup", cycles=20, scale=0.3, sigma=0.25)
+    made = made.isel(target=slice(None, None, 2))
+    made["deviation"][10:, :, 2] += 1.5
+    if request.param == "with gaps":
+        gaps = [(5, slice(None), slice(None)), (9, 1, 4), (slice(0, 3), 0, 1), (0, 0, 0)]
+        for place in gaps:
+            made["deviation"][place], made["time"][place] = np.nan, np.datetime64("NaT", "ns")
+    if request.param == "one approach":
+        return made.sel(direction=["negative"])
+    return recorded(made, 0.5) if request.param == "in whole digits" else made
+
+
+def changed(test: xr.Dataset, change: Change) -> xr.Dataset:
+    if change is CHANGES["approaches in another order"] and test.sizes["direction"] == 1:
+        pytest.skip("a single approach has no order")
+    return change.change(test)
+
+
+def as_before(found: xr.Dataset, like: xr.Dataset, change: Change) -> xr.Dataset:
+    """A result over the coordinates of the test as it was."""
+    if change.mirrored and "direction" in found.coords:
+        found = found.assign_coords(
+            direction=[DIRECTIONS[1 - DIRECTIONS.index(str(one))] for one in found["direction"].values]
+        )
+    return found.sel({name: like[name] for name in ("cycle", "direction", "target") if name in found.indexes})
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_the_joint_estimate_keeps_profile_drift_and_scatter(test, change):
+    plain, found = estimate_drift(test), as_before(estimate_drift(changed(test, change)), test, change)
+    size_um = float(plain["drift"].max() - plain["drift"].min())
+    # A reversal is positive minus negative: of the mirrored axis the mirrored difference of the exchanged approaches.
+    for name, factor in {"profile": change.factor, "drift": change.factor, "reversal": abs(change.factor)}.items():
+        missed = np.abs(found[name] - factor * plain[name])
+        # Shift and stretch wander independently of each other about the first position: about the last one that is another model, whose
+        # values differ by less than they are known (k = 2).
+        limit = 2.0 * plain[f"{name}_u"] if change.mirrored else SEARCH * abs(factor) * size_um
+        assert bool(((missed <= limit) | plain[name].isnull()).all()), name
+    for name in ("profile_u", "drift_u", "scatter", "sigma"):
+        expected = abs(change.factor) * plain[name]
+        near = 0.25 if change.mirrored else 100 * SEARCH
+        np.testing.assert_allclose(
+            found[name], expected, rtol=near, atol=100 * SEARCH * float(expected.max()), err_msg=name
+        )
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_position_that_stands_out_is_the_same(test, change):
+    def steps(one: xr.Dataset) -> list[tuple[int, str, int | None]]:
+        found = detect_anomalies(one, estimate_drift(one))
+        moved = int(test["target"][2])
+        return [
+            (each.target, each.direction, each.at_cycle)
+            for each in found
+            if each.kind == "step" and each.target == moved
+        ]
+
+    ((target, direction, at_cycle),) = steps(test)
+    assert at_cycle == pytest.approx(11, abs=2)
+    other = {"positive": "negative", "negative": "positive"} if change.mirrored else {}
+    assert steps(changed(test, change)) == [(target, other.get(direction, direction), at_cycle)]
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_quantities_by_iso_230_2_are_the_same(test, change):
+    plain, found = evaluate_iso230(test), evaluate_iso230(changed(test, change))
+    # Exact: sums in another order.
+    for name in ("B", "E", "M", "A", "R", "mean_reversal"):
+        if name in plain:
+            np.testing.assert_allclose(
+                np.abs(found[name]), abs(change.factor) * np.abs(plain[name]), rtol=1e-9, atol=1e-9, err_msg=name
+            )
