@@ -330,13 +330,15 @@ def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
     source = str(table.attrs.get("source", "record"))
     names = tuple(json.loads(table.attrs["runs"])) if "runs" in table.attrs else (source,)
     run = table["run"].values if "runs" in table.attrs else np.zeros(elapsed.size, int)
-    times = [np.unique(elapsed[run == k]) for k in range(len(names))]
-    samples = sum(one.size for one in times)
+    times = [elapsed[run == k] for k in range(len(names))]
+    # Samples of one time, as after a clock that went back, count once.
+    distinct = [np.unique(one) for one in times]
+    samples = sum(one.size for one in distinct)
     if samples < LEAST_BLOCKS:
         raise RecordError(
             f"{source}: {samples} samples are too few to hold a part out; a record needs at least {LEAST_BLOCKS}"
         )
-    step = float(np.median(np.concatenate([np.diff(one) for one in times])))
+    step = float(np.median(np.concatenate([np.diff(one) for one in distinct])))
 
     def blocks_of(run_times: Array, length: float) -> NDArray[np.int64]:
         # A sample that comes a little early still belongs to its own block.

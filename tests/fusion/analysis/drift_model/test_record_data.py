@@ -105,6 +105,17 @@ def test_samples_in_bursts_share_blocks(burst, bursts, rng):
     assert min(bursts, 300) <= record.seconds.size <= 660
 
 
+def test_samples_of_one_time_share_their_block(rng):
+    """After a clock that went back, half of the times stand twice: each block holds the mean of both."""
+    table = table_of(*linear_samples(rng, 400))
+    again = np.sort(np.concatenate([np.arange(200), np.arange(200)]))
+    record = reduce_record(table.assign_coords(time=table["time"].values[again]))
+    values = table["displacement"].values
+    means = 0.5 * (values[0::2] + values[1::2])
+    np.testing.assert_allclose(np.diff(record.displacement, axis=0), np.diff(means, axis=0), atol=1e-9)  # rounding
+    assert record.block_s == 60.0
+
+
 def test_a_sample_that_comes_a_little_early_belongs_to_its_own_block(rng):
     table = table_of(*linear_samples(rng, 1200))
     jitter = np.zeros(1200)
