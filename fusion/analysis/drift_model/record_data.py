@@ -350,8 +350,8 @@ def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
         together = int(np.ceil(together * filled / MOST_BLOCKS))
     length = together * step
     places, seconds, first, zeros, start = [], [], [0], [], 0.0
-    for k, one in enumerate(times):
-        numbers, place = np.unique(blocks_of(one, length), return_inverse=True)
+    for k in range(len(names)):
+        numbers, place = np.unique(blocks_of(elapsed[run == k], length), return_inverse=True)
         if len(times) > 1 and numbers.size < LEAST_RUN_BLOCKS:
             raise RecordError(
                 f"{names[k]}: the run fills {numbers.size} blocks of {length:g} s, fewer than {LEAST_RUN_BLOCKS}; leave it out of "
