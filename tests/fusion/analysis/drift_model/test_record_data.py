@@ -22,16 +22,6 @@ def test_blocks_hold_the_means_of_their_samples(rng):
     assert record.drivers["speed"][1].max() == 1.0
 
 
-def test_samples_of_one_time_share_their_block(rng):
-    """A clock that restarts, sorted: every time twice."""
-    displacement, temperature, speed = linear_samples(rng)
-    table = table_of(displacement, temperature, speed).isel(time=slice(400))
-    record = reduce_record(table.assign_coords(time=np.repeat(table["time"].values[:200], 2)))
-    assert record.seconds.size == 200
-    np.testing.assert_allclose(record.displacement[7], displacement[14:16].mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(record.temperature[7], temperature[14:16].mean(axis=0), rtol=1e-12)
-
-
 def test_inputs_stay_as_they_are(rng):
     table = table_of(*linear_samples(rng))
     before = table.copy(deep=True)
