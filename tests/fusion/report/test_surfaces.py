@@ -11,6 +11,7 @@ from pathlib import Path
 
 import docx
 import openpyxl
+import pypdf
 import pytest
 from rich.console import Console
 from rich.table import Table
@@ -32,6 +33,7 @@ from fusion.report.wording import ISO230_TERMS, ONE_WAY_TERMS
 from fusion.results.numbers import measured
 from fusion.results.results import read_results
 from fusion.twin.instruments import simulate_campaign
+from tests.browser import CHROMIUM
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import simulated
 from tests.fusion.conftest import RECIPE
@@ -91,6 +93,11 @@ def workbook(path: Path) -> dict[str, list[dict[str, object]]]:
         headings, *rows = sheet.iter_rows(values_only=True)
         sheets[sheet.title] = [dict(zip(headings, row, strict=True)) for row in rows]
     return sheets
+
+
+def in_print(path: Path) -> str:
+    """The text of a PDF."""
+    return " ".join(" ".join(page.extract_text() for page in pypdf.PdfReader(path).pages).split())
 
 
 def in_words(book: Path) -> str:
@@ -180,6 +187,8 @@ def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
     sheet = describe_sheet(test.title, test.part, files=test.files, version="0")
     for name in ("sheet.html", "sheet.docx"):
         write_iso230(out / name, sheet, test.part, test.dataset, remarks=test.remarks)
+    if CHROMIUM:
+        write_iso230(out / "sheet.pdf", sheet, test.part, test.dataset, remarks=test.remarks)
     products = Products(run)
     selection = Selection(cycle=1, target=3)
     linker = Linker(selection, products.targets, products.cycles, None)
@@ -190,6 +199,7 @@ def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
     again = shutil.copytree(run, out / "again")
     return {
         **common_surfaces(run, out),
+        **({"PDF": in_print(out / "sheet.pdf")} if CHROMIUM else {}),
         "iso230": printed(*iso230_tables(test.part, test.dataset, title=test.title)),
         "application": on_one_line(texts(parts)),
         "comparison": on_one_line(render_comparison(compare_campaigns([run, again]))),
@@ -343,7 +353,9 @@ def to_the_digits_of_both(texts: set[str]) -> set[str]:
 
 
 def hold_one_value(surfaces: Mapping[str, str], stands: Mapping[str, tuple[str, ...]]) -> None:
-    """Every place of a quantity has a value, at least two surfaces show it, and they all show the same."""
+    """Every place of a quantity has a value, at least two surfaces show it, and they all show the same; a sheet its print too."""
+    if "PDF" in surfaces and "sheet" in stands:
+        stands = {**stands, "PDF": stands["sheet"]}
     every = [(surface, pattern) for surface, patterns in stands.items() for pattern in patterns]
     found = {(surface, pattern): re.findall(pattern, surfaces[surface]) for surface, pattern in every}
     assert len(stands) >= 2 and not [place for place, values in found.items() if not values]
