@@ -31,5 +31,5 @@ def test_a_table_keeps_its_numbers_and_columns_of_one_name(tmp_path):
     before = table.copy()
     assert write_csv(table, tmp_path / "t.csv") is None
     rows = list(csv.reader((tmp_path / "t.csv").read_text().splitlines()))
-    assert rows == [["'=1", "a", "a", "time"], ["-1.5", "'-x", "1", "2026-03-09"], ["", "y", "2", ""]]
+    assert rows == [["'=1", "a", "a", "time"], ["-1.5", "'-x", "1", "2026-03-09T00:00:00.000000Z"], ["", "y", "2", ""]]
     pd.testing.assert_frame_equal(table, before)
