@@ -981,6 +981,8 @@ class Unseen:
         """Response, shares and uncertain columns freed of `beside` and whitened by the drift and noise of these very readings, and the
         degrees of freedom; None where they cannot be estimated.
         """
+        if not self.rows.size:  # A displacement that ended before.
+            return None
         level, number = np.ones((self.rows.size, 1)), self.shares.shape[1]
         varying = np.column_stack([self.beside, self.shares])
         design = np.column_stack([level, varying[:, independent(varying)]])

@@ -635,6 +635,13 @@ def test_an_effect_is_borne_out_or_contradicted_whatever_drift_acts_there(size, 
     assert answer.power > 0.95
 
 
+def test_a_channel_that_ended_before_says_nothing(rng):
+    one, other = unseen(rng, 1.0, channels=2)
+    parts = ("rows", "seconds", "loadings", "response", "beside", "shares")
+    ended = replace(other, **{name: getattr(other, name)[:0] for name in parts})
+    assert answers([one, ended]) == answers([one])
+
+
 def test_channels_that_drift_alike_count_as_one(rng):
     (alone,) = answers(unseen(rng, 1.0, channels=1))
     (four,) = answers(unseen(rng, 1.0, channels=4, alike=1.0))
