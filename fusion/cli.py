@@ -702,12 +702,13 @@ def export(
     """
     from fusion.campaign.values import read_option
     from fusion.report.exports.export import export_results
+    from fusion.results.folder import own_place
 
     with _answering():
         exported = export_results(
             results,
             format.value,
-            out or results / "export",
+            out or own_place(results, "export"),
             axis=axis,
             spacing_mm=None if spacing is None else read_option("--spacing", spacing, "mm"),
             reference_mm=None if reference is None else read_option("--reference", reference, "mm"),

@@ -153,6 +153,10 @@ def report_of(folder: Path) -> str:
         raise ProductsError(f"{origin}: not the provenance of a run; {again}")
     if isinstance(results.loop, RecordLoop):
         return render_report(results, provenance, {"record": read_product(folder, "record")})
+    products = [f"{name}.nc" for name in _DRAWN]
+    missing = [name for name in products if name in provenance.get("products", ()) and not (folder / name).is_file()]
+    if missing:
+        raise ProductsError(f"{folder / missing[0]} is missing; put the file back, or {again}")
     there = [name for name in _DRAWN if (folder / f"{name}.nc").is_file()]
     read = {name: read_fusion(folder) if name == "fusion" else read_product(folder, name) for name in there}
     return render_report(results, provenance, read)

@@ -71,6 +71,12 @@ def claim(folder: Path, *names: str) -> None:
         write_json(folder / MANIFEST, {"software": "thermofuse", "written": dict(sorted(entries.items()))})
 
 
+def own_place(folder: Path, name: str) -> Path:
+    """Return the place of a file or folder within a results folder; one that a link leads out of it is refused."""
+    _require_within(folder, [name], folder)
+    return folder / name
+
+
 def claim_file(folder: Path, name: str, requested: Path | None) -> Path:
     """Return where a file is written that is made from a results folder later: where it was asked for, or in the folder."""
     if requested is None:

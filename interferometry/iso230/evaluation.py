@@ -263,7 +263,10 @@ def _mean_and_s(x: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _name_window(cycles: np.ndarray, left_out: Sequence[str]) -> str:
-    name = f"cycles {cycles[0]} to {cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
+    # Of a few cycles with others between them each is named.
+    apart = int(cycles[-1] - cycles[0]) >= cycles.size and cycles.size <= STANDARD_CYCLES
+    numbers = ", ".join(map(str, cycles)) if apart else f"{cycles[0]} to {cycles[-1]}"
+    name = f"cycles {numbers}" if cycles.size > 1 else f"cycle {cycles[0]}"
     if cycles.size != STANDARD_CYCLES:
         counted = "1 cycle" if cycles.size == 1 else f"{cycles.size} cycles"
         name += f" ({counted}, not the {STANDARD_CYCLES} of the standard's acceptance test)"

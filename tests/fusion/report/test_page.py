@@ -165,6 +165,9 @@ def test_it_is_made_anew_from_its_products(made_anew, report, tmp_path):
     with pytest.raises(ProductsError, match=r"provenance\.json is missing; run the campaign again"):
         report_of(tmp_path)
     whole = json.loads((report.parent / "provenance.json").read_text(encoding="utf-8"))
+    (tmp_path / "provenance.json").write_text(json.dumps(whole))
+    with pytest.raises(ProductsError, match=r"\w+\.nc is missing; put the file back, or run the campaign again"):
+        report_of(tmp_path)
     damaged = [
         None, [], *({key: value for key, value in whole.items() if key != lost} for lost in ("started", "finished", "command", "inputs")),
         {**whole, "versions": {}}, {**whole, "parameters": {"campaign": 5}}, {**whole, "inputs": {"laser.csv": -1}},

@@ -17,7 +17,7 @@ import pytest
 import xarray as xr
 
 from fusion.pipeline.run import run_campaign
-from fusion.results.folder import MANIFEST, claim, claim_file, discard, open_folder, read_manifest
+from fusion.results.folder import MANIFEST, claim, claim_file, discard, open_folder, own_place, read_manifest
 from fusion.results.store import (
     OutputError,
     StageStamps,
@@ -98,6 +98,8 @@ def test_a_name_that_leads_out_of_a_results_folder_is_refused_by_name(tmp_path: 
         discard(folder, name)
     (folder / ".stages").mkdir()
     told = refusal(folder, resume=True)
+    with pytest.raises(OutputError):
+        own_place(folder, name)
     stamp = {"key": "x", "files": {name: file_sha256(victim / "file.txt")}, "note": {}}
     stamps = write_json(folder / ".stages" / "stamps.json", {"report": stamp})
     with pytest.raises(OutputError) as stamped:

@@ -174,6 +174,14 @@ def test_windows_that_are_evaluated_some_at_a_time_are_those_of_all_at_once(rng,
     assert together.sizes["window"] == 7
 
 
+def test_a_window_over_cycles_that_are_missing_names_each(rng):
+    deviations, _ = simulate(rng, kind="none", cycles=9)
+    windows = evaluate_windows(deviations.sel(cycle=[1, 2, 3, 5, 6, 8, 9]))
+    assert windows["window"].values.tolist() == [
+        "cycles 1, 2, 3, 5, 6", "cycles 3, 5, 6, 8, 9", "cycles 1 to 9 (7 cycles, not the 5 of the standard's acceptance test)",
+    ]  # fmt: skip
+
+
 def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng):
     deviations, _ = simulate(rng, kind="warmup", cycles=40)
     windows = evaluate_windows(deviations)
