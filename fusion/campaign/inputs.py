@@ -808,7 +808,8 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     numbered = [
         table.assign_coords(run=("time", np.full(table.sizes["time"], k))) for k, table in enumerate(tables.values())
     ]
-    joined = xr.concat(numbered, "time", data_vars="minimal", coords="minimal", compat="override", join="exact")
+    # The columns of every run may stand in an order of their own.
+    joined = xr.concat(numbered, "time", data_vars="minimal", coords="minimal", compat="override", join="left")
     runs = [named[path] for path in tables]
     listed_of = {
         name: json.dumps([one for table in tables.values() for one in json.loads(table.attrs[name])])

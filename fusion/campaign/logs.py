@@ -7,6 +7,7 @@ import io
 import json
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain, count
@@ -145,8 +146,8 @@ def _read_log(path: Path, layout: LoggedTable | None = None) -> xr.Dataset:
         raise TableError(
             f'{path}: there is no column apart from time; add one named "name [unit]", or leave [drivers] out'
         )
-    names = [name for name, _ in headings.values()]
-    repeated = sorted({name for name in ["time", *names] if ["time", *names].count(name) > 1})
+    names = Counter(column if column == "time" else split_heading(path, column)[0] for column in table.columns)
+    repeated = sorted(name for name, times in names.items() if times > 1)
     if repeated:
         raise TableError(f"{path}: more than one column is named {', '.join(repeated)}; give each its own name")
     variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
@@ -287,9 +288,9 @@ def columns_of(
         # TC(1) and TC(2) of a logger are two names, whose units stand elsewhere.
         roles[role][heading] = (heading if elsewhere and in_heading not in ("", elsewhere) else name, unit)
     for of_role in roles.values():
-        names = [name for name, _ in of_role.values()]
-        # Columns that only their units tell apart are called by their whole headings.
-        of_role |= {heading: (heading, unit) for heading, (name, unit) in of_role.items() if names.count(name) > 1}
+        # Columns that only their units tell apart are called by their whole headings, which may be the name of another one.
+        while repeated := [name for name, times in Counter(name for name, _ in of_role.values()).items() if times > 1]:
+            of_role |= {heading: (heading, unit) for heading, (name, unit) in of_role.items() if name in repeated}
     used = {heading for of_role in roles.values() for heading in of_role}
     example = next((heading for heading in reversed(headings) if heading not in used), headings[-1])
     for role in ("temperature", "displacement"):

@@ -73,6 +73,9 @@ def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
     path.write_text("time,t [degC],t [K]\n2026-03-09T06:31:00+00:00,1,2\n")
     with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
         read_drivers(path)
+    path.write_text("stamp,t [degC],t (degC)\n2026-03-09T06:31:00+00:00,1,2\n")
+    with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
+        read_drivers(path, DriversTable(file="drivers.csv", time="stamp").layout)
 
 
 def test_rows_without_a_time_at_the_end_of_a_log_refuse_no_log(tmp_path: Path) -> None:
@@ -359,6 +362,18 @@ def test_runs_are_joined_in_the_order_of_their_times(tmp_path: Path) -> None:
     assert (np.diff(data["time"].values) > np.timedelta64(0)).all()
 
 
+def test_columns_of_a_run_may_stand_in_another_order(tmp_path: Path) -> None:
+    rows = {
+        "time [s],t1 [degC],t2 [degC],ch1 [um],ch2 [um],speed 1 [1/s],speed 2 [rpm]": "{k},20,21,{k},5,7,8",
+        "time [s],speed 2 [rpm],t2 [degC],t1 [degC],ch2 [um],ch1 [um],speed 1 [1/s]": "{k},8,21,20,5,{k},7",
+    }
+    first, other = ("\n".join([names, *(row.format(k=60 * k) for k in range(3))]) for names, row in rows.items())
+    campaign = load_campaign(write_runs(tmp_path, 'files = "r*.csv"', time="time [s]", r1=first, r2=first))
+    expected = read_record(campaign)
+    (tmp_path / "r2.csv").write_text(other)
+    xr.testing.assert_identical(read_record(campaign), expected)
+
+
 def test_a_pipe_among_the_runs_is_left_out_and_named(tmp_path: Path) -> None:
     campaign = load_campaign(write_runs(tmp_path, 'files = "r*.csv"', r1=stamped(9), r2=stamped(7)))
     assert pipe_notices(campaign) == []
@@ -452,13 +467,16 @@ def test_runs_that_cannot_be_one_record_are_refused(tmp_path: Path, other: str, 
         (["ch [um]", "ch(um)"], ["ch [um]", "ch(um)"]),
         (["ch\u00e9 [um]", "che\u0301 [um]"], ["ch\u00e9", "che\u0301"]),
         (["ch. x [um]", "ch 1 [um]"], ["ch. x", "ch 1"]),
+        (["ch [um]", "ch (um)", "ch [um] [um]"], ["ch [um]", "ch (um)", "ch [um] [um]"]),
     ],
 )
-def test_two_columns_stay_two(tmp_path: Path, headings: list[str], channels: list[str]) -> None:
-    rows = [f"{k},{20 + k / 10},{k / 3:.2f},{k / 5:.2f},0" for k in range(9)]
+def test_every_column_stays_its_own(tmp_path: Path, headings: list[str], channels: list[str]) -> None:
+    rows = [",".join(map(str, [k, 20 + k / 10, *(k * n for n in range(len(headings))), 0])) for k in range(9)]
     content = "\n".join([",".join(["time [min]", "t1 [degC]", *headings, "spindle [1]"]), *rows])
     table = read_record(load_campaign(record(tmp_path, content)))
     assert table["channel"].values.tolist() == channels
+    factor = np.array([1000.0 if "mm" in heading else 1.0 for heading in headings])
+    np.testing.assert_allclose(table["displacement"].values[1], np.arange(len(headings)) * factor)
 
 
 @pytest.mark.parametrize("second", ["ch [um]", "ch [um] ", " ch [um]"])
