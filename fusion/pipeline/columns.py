@@ -219,7 +219,7 @@ def propose_runs(paths: Sequence[Path]) -> TableProposal:
 def propose_table(path: Path) -> TableProposal:
     """Read a logged table, and propose how it is laid out and what its columns hold."""
     head = _head(path)
-    keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(head)
+    keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(path, head)
     rows = read_rows(path, header=HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None)
     frame, asked = rows.frame, dict[str, str]()
     if frame.empty:
@@ -341,12 +341,14 @@ def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     return {"header_rows": {"values": 1}, "long": {"time": ["2", "3"], "channel": "1", "value": "4"}}
 
 
-def _header_rows(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
+def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return where the names, the units and the values of any other table stand, nothing where the names are its first line."""
     rows = [(line, fields) for line, text, fields in head if not text.startswith("#")]
     first = next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
     if first is None:
-        raise LaserFormatError("no rows of numbers below one another")
+        raise LaserFormatError(
+            f"{path}: no rows of numbers below one another; export it again with its readings, or move it out of the folder"
+        )
     width = len(rows[first][1])
     above = [(line, fields) for line, fields in rows[:first] if sum(map(bool, fields)) > width / 2]
     if not above:

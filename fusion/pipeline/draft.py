@@ -98,6 +98,7 @@ _NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE)
 _HINTS = {
     Kind.DEVIATIONS: "; one campaign takes one file of deviations: join the tables of one test",
     Kind.STACK: ", not mixed with the frames of a FLIR camera",
+    Kind.RECORD: "; the runs of one record have the same columns, another record is a campaign of its own",
     Kind.PLACES: ", for [sensors] together with [plan]: docs/reference/campaign-file.md",
 }
 #: Values above this are kelvins and no temperatures of a machine table in degC.
@@ -559,9 +560,9 @@ def _drivers(content: FolderContent) -> Iterator[str]:
 
 
 def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker) -> Iterator[str]:
-    """Yield a record: all files with the columns of the first are runs of one test."""
+    """Yield a record: all files with the columns of the first, in whatever order, are runs of one test."""
     first = records[0]
-    runs = [one for one in records if one.headings == first.headings]
+    runs = [one for one in records if sorted(one.headings) == sorted(first.headings)]
     name = content.relative(first.path)
     table = _confirmed(propose_runs([one.path for one in runs]), name, asker)
     yield from ("", "[record]                                 # temperatures and displacements over time")

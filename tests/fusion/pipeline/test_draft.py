@@ -16,6 +16,7 @@ from fusion.pipeline.check import check_campaign
 from fusion.pipeline.draft import Asker, DraftError, draft_lines, unused_files, write_campaign, write_campaigns
 from fusion.pipeline.fleet import find_members
 from fusion.pipeline.inspect import scan_folder
+from interferometry.io.faults import LaserFormatError
 from tests.fusion.campaign_parts import write_laser
 from thermography.io.flir import index_frames
 from thermography.radiometry.planck import calibrate
@@ -126,18 +127,26 @@ def test_a_folder_without_measurements_is_refused(tmp_path):
         write_campaign(tmp_path / "absent", Asker(None))
 
 
+def test_a_record_without_rows_is_named(tmp_path):
+    (tmp_path / "log.csv").write_text("time [s],T1 [degC],X [um]\n")
+    with pytest.raises(LaserFormatError, match=r"log\.csv: no rows of numbers"):
+        write_campaign(tmp_path, Asker(None))
+
+
 def test_runs_of_a_record_are_one_campaign(tmp_path):
     seconds = np.arange(0, 36_000, 60)
     warm = 20 + 5 * (1 - np.exp(-seconds / 9000))
     rows = "".join(f"{s},{t:.3f},{3 * (t - 20):.3f},{s % 7}\n" for s, t in zip(seconds, warm, strict=True))
-    for name in ("run_1.csv", "run_2.csv"):
-        (tmp_path / name).write_text(f"time [s],t1 [degC],ch1 [um],speed [1/min]\n{rows}")
+    (tmp_path / "run_1.csv").write_text(f"time [s],t1 [degC],ch1 [um],speed [1/min]\n{rows}")
+    backwards = "".join(",".join(reversed(row.split(","))) + "\n" for row in rows.splitlines())
+    (tmp_path / "run_2.csv").write_text(f"speed [1/min],ch1 [um],t1 [degC],time [s]\n{backwards}")
     (tmp_path / "other.csv").write_text(f"time [s],t1 [degC],ch9 [um],speed [1/min]\n{rows}")
     path, missing = write_campaign(tmp_path, Asker(None))
     record = load_campaign(path).record
     assert missing == []
     # The first file decides, and the one with other columns is named beside it.
     assert record.file == "other.csv" and '# file = "run_1.csv"   # also found' in path.read_text()
+    assert len(unused_files(path)) == 2 and all("the same columns" in line for line in unused_files(path))
     (tmp_path / "other.csv").unlink()
     path.unlink()
     write_campaign(tmp_path, Asker(None))
