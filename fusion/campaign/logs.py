@@ -10,7 +10,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import chain, count
+from itertools import accumulate, chain, count
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -59,6 +59,9 @@ _LONGEST_SILENCE = 10.0
 #: Hours, minutes and seconds; of two numbers nothing tells whether they are minutes and seconds.
 _ELAPSED = re.compile(r"(\d{2,5})(:\d\d:\d\d\S*)")
 _DECIMAL_COMMA = re.compile(r"\d,\d")
+#: A heading in quotes that goes on in the next line, as Excel's Alt+Enter writes it, and the most lines of such headings.
+_OPEN_HEADING = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
+_LONGEST_HEADER = 20
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: Where seconds count from in a table whose start is not stated.
@@ -333,8 +336,16 @@ def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None, missin
 
 
 def text_lines(path: Path) -> list[str]:
-    """Return the lines of a text, each with its end."""
-    return list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
+    """Return the lines of a text, each with its end; the rest of a line of headings that one of them breaks is empty."""
+    lines = list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
+    first, header = find_header(lines)
+    if _OPEN_HEADING.search(header):
+        quotes = accumulate(line.count('"') for line in lines[first : first + _LONGEST_HEADER])
+        end = next((k for k, number in enumerate(quotes, first + 1) if number % 2 == 0), first + 1)
+        headings = " ".join(line.strip("\n ") for line in lines[first:end])
+        # Lines are counted in the file.
+        lines[first:end] = [f"{headings}\n", *["\n"] * (end - first - 1)]
+    return lines
 
 
 def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]) -> Rows:

@@ -479,6 +479,19 @@ def test_every_column_stays_its_own(tmp_path: Path, headings: list[str], channel
     np.testing.assert_allclose(table["displacement"].values[1], np.arange(len(headings)) * factor)
 
 
+@pytest.mark.parametrize("drafted", [False, True])
+def test_a_line_break_in_a_heading_is_a_blank(tmp_path: Path, drafted: bool) -> None:
+    rows = [f"{k},{20 + k / 10},{k},0" for k in range(9)] + ["?,20,0,0"]
+    campaign = record(tmp_path, "\n".join(['time [min],"t1\nat the nut [degC]","ch\n1 [um]",spindle [1]', *rows]))
+    if drafted:
+        campaign.unlink()
+        write_campaign(tmp_path, Asker(None))
+    table = read_record(load_campaign(campaign))
+    assert table["sensor"].values.tolist() == ["t1 at the nut"] and table["channel"].values.tolist() == ["ch 1"]
+    assert table.sizes["time"] == 9
+    assert [one["line"] for one in json.loads(table.attrs["left_out"])] == [13]
+
+
 @pytest.mark.parametrize("second", ["ch [um]", "ch [um] ", " ch [um]"])
 def test_headings_that_are_alike_are_refused_by_column(tmp_path: Path, second: str) -> None:
     rows = [f"{k},{20 + k / 10},{k / 3:.2f},{k / 5:.2f},0" for k in range(9)]
