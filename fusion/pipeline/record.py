@@ -18,6 +18,7 @@ from fusion.analysis.drift_model.record import (
     declare,
     examine_record,
     known_mean,
+    together,
 )
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, reduce_record
 from fusion.analysis.effects.thermal import QUASI_STATIC
@@ -101,7 +102,34 @@ def model_record(source: RecordSource, *, report: Report) -> Outcome:
         progress=lambda done, total, what: report("closed loop", done, total),
     )
     loop = result.described(source.health.findings)
-    return Outcome(record_variables(source.record, result), {"loop": loop}, tuple(source.notices))
+    notices = (*source.notices, *digit_notices(result))
+    return Outcome(record_variables(source.record, result), {"loop": loop}, notices)
+
+
+def digit_notices(result: RecordResult) -> Iterator[Notice]:
+    """Notice of the columns whose digits hide the noise: half a step of what they leave in a displacement exceeds it."""
+    record, step = result.record, together(result.steps)
+    hidden = 0.5 * step > result.whole.sigma
+    # Of several columns those with no less than an equal share.
+    large = hidden & (len(result.steps) * result.steps**2 >= step**2)
+    named = [
+        f"{name} in steps of {record.digits[name]:.3g} µm"
+        for name, one in zip(record.channels, large[0], strict=True)
+        if one
+    ]
+    named += [
+        f"{name} in steps of {record.digits[name]:.3g} K"
+        for name, one in zip(record.sensors, large[1:].any(axis=1), strict=True)
+        if one
+    ]
+    if named:
+        told = [f"{name} {um:.3g} µm" for name, um, one in zip(record.channels, step, hidden, strict=True) if one]
+        yield Notice(
+            "coarse_digits",
+            f"Readings are recorded in coarse digits: {listed(named)}. Rounding moves displacements in steps of {listed(told)}; an effect "
+            "that moves none by more than a step is not named, and no shape is stated of what is left within half a step.",
+            "Write more digits, or read with an instrument of finer resolution.",
+        )
 
 
 def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
@@ -251,7 +279,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             **_predictions(record, result),
             "predicted_u": ("channel", spread, {**um, "long_name": f"standard uncertainty of a prediction, {unseen}"}),
             "contribution": (("effect", *dims), contributions.reshape(len(terms), *record.displacement.shape), um),
-            "noise": ("channel", result.whole.sigma, {**um, "long_name": "noise of a block mean"}),
+            "noise": ("channel", result.noise, {**um, "long_name": "noise of a block mean"}),
             "sealed": ("time", result.hold_out, {"long_name": "held-out block"}),
             "elapsed": ("time", record.seconds, {"units": "s", "long_name": elapsed}),
             "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),

@@ -78,6 +78,7 @@ from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results import loop as schema
+from interferometry.deviations import ROUNDING
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
 from interferometry.drift.kalman import DriftModelError, drift_system
 
@@ -188,6 +189,21 @@ def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tup
         coefficients[:, :, channel] = (projected / (np.maximum(values, 0.0) + PENALTIES[:, None])) @ vectors.T
         levels[:, channel] = middle - coefficients[:, :, channel] @ offset
     return [(standard @ one + levels[k], one / scale[:, None]) for k, one in enumerate(coefficients)]
+
+
+# Digits of the readings: nothing is stated that rounding may look like.
+
+
+def rounding_steps(record: Record, terms: Sequence[Term], coefficients: Array) -> Array:
+    """Steps of every displacement, um: of its own digits, then of those of every temperature by its coefficient (1 + sensors, channels)."""
+    per_kelvin = [coefficients[place_of(terms, term)] for term in terms if term.effect == QUASI_STATIC]
+    through = np.sum([np.zeros((len(record.sensors), len(record.channels))), *np.abs(per_kelvin)], axis=0)
+    return np.vstack([record.displacement_step, record.temperature_step[:, None] * through])
+
+
+def together(steps: Array) -> Array:
+    """Step of every displacement that rounds as much as its independent steps (number, channels) do."""
+    return np.asarray(np.linalg.norm(steps, axis=0))
 
 
 # Plain predictions of a record's hold-out set, which the model has to beat: last value, mean, and regressions on all
@@ -796,6 +812,15 @@ class RecordProblem(Problem[RecordFit]):
 
     def refuse(self, score: Score, model: RecordFit) -> Decision | None:
         """Refuse an effect that this record does not identify; a user's own effect is only held against the switchings."""
+        terms = [*model.terms, Term(score.name, score.best)]
+        fitted = self.predict(terms).coefficients
+        moved = np.ptp(score.best.columns @ fitted[place_of(terms, terms[-1])], axis=0)
+        step = together(rounding_steps(self.record, terms, fitted))
+        if (moved < step).all():
+            largest = int(np.argmax(moved))
+            return Decision(
+                score.name, Reason.WITHIN_DIGITS, {"range_um": float(moved[largest]), "step_um": float(step[largest])}
+            )
         excited_by = self.effects[score.name].excited_by if score.name in BUILT_IN else ""
         return refuse(score.name, excited_by, score.best, RecordGrounds(model, least_gain=score.critical))
 
@@ -930,20 +955,31 @@ class RecordRemainder(ResidualStructure):
     variance_share: Array
 
 
-def examine(model: RecordFit, hold_out_rmse: Array, rng: np.random.Generator) -> RecordRemainder:
-    """Test what is left."""
+def noise_floor(sigma: Array, step: Array) -> Array:
+    """Noise of a block mean in every channel, um: no less than the standard deviation of rounding to its step."""
+    return np.maximum(sigma, ROUNDING * step)
+
+
+def examine(model: RecordFit, hold_out_rmse: Array, step: Array, rng: np.random.Generator) -> RecordRemainder:
+    """Test what is left beyond rounding to steps (channels,), um."""
     record = model.record
     innovations = np.zeros(record.displacement.shape)
+    # Rounding moves a reading by up to half a step, here in units of the innovations.
+    half = 0.5 * step
+    is_larger = False
     for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
         whitened, _ = fit.system.whiten(fit.residual()[:, None])
         scale = 1.4826 * np.median(np.abs(whitened)) or 1.0
         innovations[rows, k] = np.clip(whitened[:, 0] / scale, -_CLIP, _CLIP)
+        is_larger |= bool(np.sqrt(np.mean(whitened**2)) > half[k])
+        half[k] /= scale
     innovations -= innovations.mean(axis=0)
     switched = record.switched()
     test = _test(innovations, switched, rng)
     share = hold_out_rmse**2 / np.nanvar(record.displacement, axis=0)
-    words = _shapes(test, innovations, record, rng) if test.p_value < REMAINDER_LEVEL else []
-    error_um, noise_um = float(np.sqrt(known_mean(hold_out_rmse**2))), float(np.sqrt(np.mean(model.sigma**2)))
+    words = _shapes(test, innovations, record, half, rng) if is_larger and test.p_value < REMAINDER_LEVEL else []
+    noise = noise_floor(model.sigma, step)
+    error_um, noise_um = float(np.sqrt(known_mean(hold_out_rmse**2))), float(np.sqrt(np.mean(noise**2)))
     if exceeds_noise(error_um, noise_um, RESIDUAL_SHARE):
         words.append(
             f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
@@ -977,8 +1013,10 @@ def _repeats(innovations: Array, record: Record, rng: np.random.Generator) -> bo
     return rank_p_value(alike(np.zeros(len(runs), int)), np.array(drawn)) < REMAINDER_LEVEL
 
 
-def _shapes(test: PermutationTest, innovations: Array, record: Record, rng: np.random.Generator) -> list[str]:
-    """What a significant test shows, in words."""
+def _shapes(
+    test: PermutationTest, innovations: Array, record: Record, half: Array, rng: np.random.Generator
+) -> list[str]:
+    """What a significant test shows, in words; beside a rhythm what is larger than half a step (channels,)."""
     if _repeats(innovations, record, rng):
         return [_REPEATED]
     if test.p_values[_RHYTHM] >= REMAINDER_LEVEL:
@@ -992,7 +1030,9 @@ def _shapes(test: PermutationTest, innovations: Array, record: Record, rng: np.r
     if share < _RHYTHM_SHARE and rest.p_values[_COURSE] < REMAINDER_LEVEL:
         return [_WORDS[_COURSE if test.strongest == _RHYTHM else test.strongest]]
     words = [f"a rhythm of about {record.block_s / 60.0 / frequency:.0f} min"]
-    return [*words, _WORDS[rest.strongest]] if rest.p_value < REMAINDER_LEVEL and rest.strongest in _WORDS else words
+    is_larger = (np.sqrt(np.mean(left**2, axis=0)) > half).any()
+    is_told = is_larger and rest.p_value < REMAINDER_LEVEL and rest.strongest in _WORDS
+    return [*words, _WORDS[rest.strongest]] if is_told else words
 
 
 def _without_wave(innovations: Array) -> tuple[float, Array, float]:
@@ -1063,6 +1103,7 @@ class RecordResult:
     answers : what blocks that the coefficients were not fitted to say of every added effect
     away : places of the effects that left the forecast
     forecast : prediction with the others, from the training part
+    steps : (1 + sensors, channels) of its displacements, um, as `rounding_steps` gives them
     tracking : errors with a reading from time to time, None for several runs
     wandering_um : root mean square of the random drift beside the final model, mean over the channels, um
     """
@@ -1081,13 +1122,19 @@ class RecordResult:
     answers: list[Answer]
     away: set[int]
     forecast: Prediction
+    steps: Array
     tracking: schema.Tracking | None
     wandering_um: float
 
     @property
+    def noise(self) -> Array:
+        """Noise of a block mean (channels,), um."""
+        return noise_floor(self.whole.sigma, together(self.steps))
+
+    @property
     def noise_um(self) -> float:
         """Noise of a block mean, mean over the channels, um."""
-        return float(np.mean(self.whole.sigma))
+        return float(np.mean(self.noise))
 
     @property
     def cross_um(self) -> list[float]:
@@ -1207,7 +1254,7 @@ class RecordResult:
                     rmse_persistence_um=persistence_um[k],
                     rmse_declared_um=self.errors[0, k],
                     rmse_final_um=final_um[k],
-                    noise_um=self.whole.sigma[k],
+                    noise_um=self.noise[k],
                     variance_share=self.remainder.variance_share[k],
                 )
                 for k, name in enumerate(self.record.channels)
@@ -1300,7 +1347,9 @@ def close_record(
     ]
     told = ask_unseen(record, ~train, state, predictions[-1], left_out)
     away = left_out_of_forecast(problem, state, {place for place, one in enumerate(told) if one.word == "no"})
-    forecast = problem.predict(state.kept(away))
+    kept = state.kept(away)
+    forecast = problem.predict(kept)
+    steps = rounding_steps(record, kept, forecast.coefficients)
     final_um = channel_rmse(record, forecast.predicted, ~train)
     plain, tracking = plain_predictions(record, train), None
     if not record.runs:
@@ -1315,11 +1364,12 @@ def close_record(
         plain=plain,
         left_out=left_out,
         whole=whole,
-        remainder=examine(whole, final_um, np.random.default_rng(seed)),
+        remainder=examine(whole, final_um, together(steps), np.random.default_rng(seed)),
         chained=chained,
         answers=told,
         away=away,
         forecast=forecast,
+        steps=steps,
         tracking=tracking,
         wandering_um=float(np.mean([np.sqrt(np.mean(unexplained_drift(fit)[0] ** 2)) for fit in whole.channels])),
     )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.readings import Readings, Series, known_mean, sample_noise
 from fusion.analysis.effects.thermal import SENSOR_PREFIX
 from fusion.common import Array, FusionError
+from interferometry.deviations import resolution
 
 #: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
 MOST_BLOCKS = 600
@@ -44,6 +45,8 @@ _POSSIBLE = {
 _ROUNDING = 1e-12
 #: Share of its squared length that a column must keep beside those before it.
 _DEPENDENT = 1e-8
+#: Noise of single samples, in steps of their digits, from which on rounding acts as noise that a mean reduces.
+_DITHER = 0.5
 #: Blocks on either side of a switching that are near it.
 _NEAR_SWITCHING = 2
 #: Most and fewest parts that a record is cut into for forward chaining.
@@ -85,6 +88,8 @@ class Record:
     displacement : (blocks, channels) mean, um, of several runs minus that of each run's first block; NaN where a block holds no sample
     temperature : (blocks, sensors) mean, degC, gaps interpolated
     temperature_noise : (sensors,) standard uncertainty of a block mean from the scatter of the samples, K
+    digits : column to the step in which it was recorded, um or K; 0 where none shows
+    displacement_step, temperature_step : (channels,) um and (sensors,) K, the steps of readings that would round as much as a block mean is
     drivers : driver to its powers, exponent to (blocks,) values as a share of the driver's largest size
     channels, sensors : names
     duplicates : sensors left out because they are a linear combination of the others
@@ -103,6 +108,9 @@ class Record:
     displacement: Array
     temperature: Array
     temperature_noise: Array
+    digits: Mapping[str, float]
+    displacement_step: Array
+    temperature_step: Array
     drivers: Mapping[str, Mapping[int, Array]]
     channels: tuple[str, ...]
     sensors: tuple[str, ...]
@@ -270,6 +278,16 @@ def reduce_record(table: xr.Dataset) -> Record:
             f"{blocks.source}: no temperature changes; nothing that a displacement could follow; add sensors that warm"
         )
     per_block = max(1.0, elapsed.size / blocks.seconds.size)
+    measured = dict(zip(sensors, samples.T, strict=True))
+    measured |= {
+        str(name): values for name, values in zip(table["channel"].values, table["displacement"].values.T, strict=True)
+    }
+    digits = {name: resolution(values) for name, values in measured.items()}
+
+    def step(name: str) -> float:
+        dithers = sample_noise(measured[name][np.isfinite(measured[name])]) >= _DITHER * digits[name]
+        return digits[name] / np.sqrt(per_block) if dithers else digits[name]
+
     return Record(
         start=time[0],
         seconds=blocks.seconds,
@@ -278,6 +296,9 @@ def reduce_record(table: xr.Dataset) -> Record:
         temperature=temperature[:, kept],
         temperature_noise=np.array([sample_noise(samples[np.isfinite(samples[:, k]), k]) for k in kept])
         / np.sqrt(per_block),
+        digits=digits,
+        displacement_step=np.array([step(name) for name in channels]),
+        temperature_step=np.array([step(sensors[k]) for k in kept]),
         drivers=drivers,
         channels=channels,
         sensors=tuple(sensors[k] for k in kept),

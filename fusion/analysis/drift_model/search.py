@@ -51,6 +51,7 @@ class Reason(StrEnum):
     FOLLOWS_RATE = "follows the rate"
     SMOOTHING = "smoothing"
     UNLOGGED_HEAT = "unlogged heat"
+    WITHIN_DIGITS = "within the digits"
     NOT_CONFIRMED = "not confirmed"
     NOT_PREDICTED = "later parts not predicted better"
     WEAKER_THAN_UNCONFIRMED = "weaker than an unconfirmed effect"
@@ -75,7 +76,7 @@ FINAL = frozenset(
 #: Reasons for which an effect that had entered was taken out again without another doing its work.
 WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS}
 #: Reasons for which a significant effect has no name: it shows that something is missing all the same.
-WITHHELD = (BLOCKING - {Reason.COLLINEAR}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
+WITHHELD = (BLOCKING - {Reason.COLLINEAR, Reason.WITHIN_DIGITS}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
 
 _SENTENCES: Mapping[Reason, str] = {
     Reason.ENTERED: "added to the model",
@@ -114,6 +115,10 @@ _SENTENCES: Mapping[Reason, str] = {
     Reason.UNLOGGED_HEAT: (
         "nothing that makes heat was logged: the delayed response to a source that is not logged cannot be told from a lag, nor from a "
         "drift; log duty, speed or load"
+    ),
+    Reason.WITHIN_DIGITS: (
+        "it moves no displacement by more than the digits of the readings, so that rounding may look like it (largest: {range_um:.3g} µm, "
+        "digits: {step_um:.3g} µm)"
     ),
     Reason.NOT_CONFIRMED: "significant (p = {p_value:.2g}), but not confirmed on readings that its coefficients were not fitted to",
     Reason.NOT_PREDICTED: (

@@ -10,7 +10,7 @@ from fusion.analysis.drift_model.fit import Term
 from fusion.analysis.drift_model.record import SensorHealth
 from fusion.analysis.drift_model.record_data import Record
 from fusion.analysis.effects.effect import Candidate
-from fusion.pipeline.record import declared_effects, record_notices, record_variables, sensor_notices
+from fusion.pipeline.record import declared_effects, digit_notices, record_notices, record_variables, sensor_notices
 from fusion.results.loop import SensorFaultPart
 from tests.fusion.record_tables import record_of
 
@@ -111,7 +111,7 @@ def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[flo
         forecast=predictions[-1],
         chained=[SimpleNamespace(channel_rmse_final_um=errors) for errors in chained],
         contribution=lambda term: np.full((50, 2), 10.0 + places[id(term)]),
-        whole=SimpleNamespace(sigma=np.array([0.1, 0.2])),
+        noise=np.array([0.1, 0.2]),
         hold_out=np.arange(50) >= 40,
         plain={"last_value": np.full((50, 2), 7.0)},
         left_out=[np.full((50, 2), 4.0), np.full((50, 2), 6.0)],
@@ -152,3 +152,15 @@ def test_the_uncertainty_of_a_prediction_is_what_unseen_parts_were_missed_by():
 def test_a_record_without_drivers_has_a_product_all_the_same():
     record = plain(drivers={})
     assert record_variables(record, result_of(record, names=("a",), chained=[]))["driver"].shape == (50, 0)
+
+
+def test_columns_whose_digits_hide_the_noise_are_named():
+    record = replace(plain(), digits=dict.fromkeys((*plain().channels, *plain().sensors), 1.0))
+    steps = np.array([[1.0, 0.1], *np.zeros((len(record.sensors), 2))])
+    steps[1, 1] = 1.0
+    fine, coarse = (
+        list(digit_notices(SimpleNamespace(record=record, steps=steps, whole=SimpleNamespace(sigma=np.full(2, sigma)))))
+        for sigma in (0.6, 0.4)
+    )
+    assert fine == [] and [one.code for one in coarse] == ["coarse_digits"]
+    assert "ch1 in steps of 1 µm; t1 in steps of 1 K" in coarse[0].message

@@ -34,7 +34,7 @@ from fusion.analysis.drift_model.record import (
     search_record,
 )
 from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
-from fusion.analysis.drift_model.search import Confirmed, Decision, Reason, Round, Score
+from fusion.analysis.drift_model.search import WITHHELD, Confirmed, Decision, Reason, Round, Score
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.library import LIBRARY, library
 from fusion.twin.recipe import EffectRecipe
@@ -246,6 +246,25 @@ def test_a_users_effect_is_only_held_against_the_switchings():
     assert problem.refuse(score("own", event_s=switched), model) == Decision(
         "own", Reason.AT_SWITCHING, {"hours": switched / 3600.0}
     )
+
+
+def test_an_effect_within_the_digits_is_not_named_and_one_of_several_digits_is():
+    # The wave ranges over 2 um in either channel; digits of the sensor act by its coefficients of 1 and -2 um/K.
+    record = small()
+    wave, found = score("periodic_disturbance"), {}
+    for um, kelvin in ((0.0, 0.0), (0.5, 0.0), (3.0, 0.0), (0.0, 0.5), (0.0, 3.0)):
+        digits = {"displacement_step": np.full(2, um), "temperature_step": np.full(1, kelvin)}
+        problem = problem_of(replace(record, **digits))
+        found[um, kelvin] = problem.refuse(wave, problem.start(declare(["quasi_static"], record)).model)
+    assert [one and one.reason for one in found.values()] == [
+        None,
+        None,
+        Reason.WITHIN_DIGITS,
+        None,
+        Reason.WITHIN_DIGITS,
+    ]
+    assert found[3.0, 0.0].evidence["range_um"] == pytest.approx(2.0, rel=0.2)  # noise and shrinkage
+    assert Reason.WITHIN_DIGITS not in WITHHELD
 
 
 def test_every_part_from_the_third_on_is_predicted_from_the_time_before(monkeypatch):

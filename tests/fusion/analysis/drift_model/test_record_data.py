@@ -22,6 +22,16 @@ def test_blocks_hold_the_means_of_their_samples(rng):
     assert record.drivers["speed"][1].max() == 1.0
 
 
+def test_digits_count_less_in_means_only_where_the_readings_dither(rng):
+    time = np.linspace(0.0, 20.0, 2000)
+    smooth, dithered = np.round(time), np.round(time + rng.normal(0.0, 1.0, 2000))
+    record = reduce_record(table_of(np.column_stack([smooth, dithered, np.sqrt(time)]), np.round(time, 1)[:, None]))
+    assert record.digits == pytest.approx({"t1": 0.1, "ch1": 1.0, "ch2": 1.0, "ch3": 0.0})
+    # 2,000 samples in blocks of four.
+    np.testing.assert_allclose(record.displacement_step, [1.0, 0.5, 0.0])
+    np.testing.assert_allclose(record.temperature_step, [0.1])
+
+
 def test_inputs_stay_as_they_are(rng):
     table = table_of(*linear_samples(rng))
     before = table.copy(deep=True)

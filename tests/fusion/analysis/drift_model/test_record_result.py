@@ -102,6 +102,7 @@ def result(*, shape: str = "") -> RecordResult:
         answers=[Answer(1.0, 0.1, 50)],
         away=set(),
         forecast=Prediction(np.full((4, 2), 0.5), coefficients, 1.0, 0.4),
+        steps=np.zeros((2, 2)),
         tracking=None,
         wandering_um=0.15,
     )
@@ -399,9 +400,9 @@ def quiet_fit(record: Record) -> RecordFit:
     return RecordFit(record, np.ones(BLOCKS, bool), (), tuple(fits), tuple(rows))
 
 
-def examined(record: Record, *, hold_out_rmse: float = 0.0) -> RecordRemainder:
+def examined(record: Record, *, hold_out_rmse: float = 0.0, step: float = 0.0) -> RecordRemainder:
     errors = np.full(len(record.channels), hold_out_rmse)
-    return examine(quiet_fit(record), errors, np.random.default_rng(1))
+    return examine(quiet_fit(record), errors, np.full_like(errors, step), np.random.default_rng(1))
 
 
 def test_noise_leaves_nothing():
@@ -414,6 +415,19 @@ def test_what_comes_and_goes_within_blocks_is_a_course_in_time():
     noise = np.random.default_rng(2).standard_normal(BLOCKS + 8)
     left = examined(record_with(1.0 * np.convolve(noise, np.ones(9), "valid") / 2.0))
     assert left.shape == "changes that come and go within a few blocks, too quick for the drift"
+
+
+@pytest.mark.parametrize(("digits", "words"), [(0.4, ""), (4.0, "a rhythm of about 100 min")])
+def test_a_rhythm_is_told_where_it_is_larger_than_the_digits(digits, words):
+    # A wave in whole um, without noise: what is left of one of 0.4 um is the rounding itself.
+    wave = np.round(digits * np.sin(2.0 * np.pi * 12.0 * BLOCK / BLOCKS) + 0.3)
+    left = examined(replace(record_with(), displacement=np.column_stack([wave, wave])), step=1.0)
+    assert left.p_value < 0.01 and left.shape == words
+
+
+def test_a_drift_within_the_digits_is_none():
+    assert "slow drift" in examined(record_with(), hold_out_rmse=4.0).shape
+    assert examined(record_with(), hold_out_rmse=4.0, step=6.0).shape == ""
 
 
 def test_no_rhythm_is_longer_than_half_a_run():
@@ -485,7 +499,7 @@ def test_what_a_rhythm_leaves_is_told_beside_it():
     ],
 )
 def test_the_channels_with_the_larger_errors_are_named(errors, words):
-    left = examine(quiet_fit(record_with(channels=3)), 5.0 * np.array(errors), np.random.default_rng(1))
+    left = examine(quiet_fit(record_with(channels=3)), 5.0 * np.array(errors), np.zeros(3), np.random.default_rng(1))
     assert left.shape.endswith(f"largest in {words}")
     assert left.rms_um == pytest.approx(5.0 * np.nanmean(errors))
 
@@ -507,7 +521,7 @@ def test_blocks_without_a_value_are_no_shape(rng):
     holed[50:60, 0] = np.nan
     assert examined(replace(record, displacement=holed)).shape == "a rhythm of about 30 min"
     model = fit_record(record, [], np.ones(BLOCKS, bool))
-    assert examine(model, np.zeros(2), rng).p_values["periodicity"] < 0.02
+    assert examine(model, np.zeros(2), np.zeros(2), rng).p_values["periodicity"] < 0.02
 
 
 def test_statistics_of_a_wave_that_is_known():
