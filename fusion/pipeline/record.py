@@ -109,7 +109,7 @@ def model_record(source: RecordSource, *, report: Report) -> Outcome:
 def digit_notices(result: RecordResult) -> Iterator[Notice]:
     """Notice of the columns whose digits hide the noise: half a step of what they leave in a displacement exceeds it."""
     record, step = result.record, together(result.steps)
-    hidden = 0.5 * step > result.whole.sigma
+    hidden = np.greater(0.5 * step, result.whole.sigma)
     # Of several columns those with no less than an equal share.
     large = hidden & (len(result.steps) * result.steps**2 >= step**2)
     named = [
@@ -119,8 +119,8 @@ def digit_notices(result: RecordResult) -> Iterator[Notice]:
     ]
     named += [
         f"{name} in steps of {record.digits[name]:.3g} K"
-        for name, one in zip(record.sensors, large[1:].any(axis=1), strict=True)
-        if one
+        for name, of_channels in zip(record.sensors, large[1:], strict=True)
+        if of_channels.any()
     ]
     if named:
         told = [f"{name} {um:.3g} µm" for name, um, one in zip(record.channels, step, hidden, strict=True) if one]
