@@ -307,6 +307,11 @@ def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
         raise DriftDataError(
             f"{cycles} cycles and {targets} targets hold readings; the joint estimate needs two of each"
         )
+    if not np.ptp(readings["seconds"].values):
+        raise DriftDataError(
+            f"deviations: every reading has the time {np.datetime_as_string(readings['time'].values[0], 's')}; the joint estimate "
+            "needs the time at which each was measured"
+        )
     if not _without_medians(readings).any():
         raise NoScatterError("readings repeat exactly: there is no scatter to weight them by; export more digits")
 

@@ -49,6 +49,8 @@ from interferometry.drift.kalman import (
 _LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.0, 8.0)}
 #: A search that comes as near as this to a limit, decades, ended there: twice the accuracy of the search.
 _AT_LIMIT = 0.06
+#: What a search takes for minus the log-likelihood where there is no model, per decade of drift.
+_NO_MODEL = 1e100
 #: Edge of the first simplex, decades.
 _FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
@@ -273,14 +275,28 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
     step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
     simplex = np.vstack([guess, guess + np.diag(step)])
+
+    def cost(log_ratio: Array) -> float:
+        found = -_log_likelihood(replace(searched, ratios=ratios(log_ratio)), few)
+        # Less drift is nearer to a model.
+        return found if np.isfinite(found) else _NO_MODEL * (1.0 + float((log_ratio - low).sum()))
+
     optimum = scipy.optimize.minimize(
-        lambda log_ratio: -_solve(replace(searched, ratios=ratios(log_ratio)), few).log_likelihood,
+        cost,
         guess,
         method="Nelder-Mead",
         bounds=[(low, high)] * components,
         options={"initial_simplex": simplex, "xatol": 0.03, "fatol": 1e-3, "maxfev": 120 * components},
     )
     return _solve(replace(system, ratios=ratios(optimum.x)), problem)
+
+
+def _log_likelihood(system: DriftSystem, problem: _Problem) -> float:
+    """Restricted log-likelihood; -inf where a drift far out in a search hides a column, or everything: no model there."""
+    try:
+        return _solve(system, problem).log_likelihood
+    except DriftModelError:
+        return -np.inf
 
 
 def _log_ratio_unit(system: DriftSystem) -> Array:
@@ -327,19 +343,13 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     searched, few = _for_search(system, problem)
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
 
-    def fitted(log_ratio: Array, time_s: float, exponent: float) -> DriftFit:
-        scale = settling_noise_scale(searched.seconds, time_s, exponent)
-        return _solve(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
-
     def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
-        # Far out in the search the drift hides everything else all the time, or a column is negligible against it: no model there.
+        # The drift hides everything else all the time.
         mean = np.log10(settling_noise_scale(searched.seconds, time_s, exponent).mean())
         if (log_ratio + mean > largest).any():
             return -np.inf
-        try:
-            return float(fitted(log_ratio, time_s, exponent).log_likelihood)
-        except DriftModelError:
-            return -np.inf
+        scale = settling_noise_scale(searched.seconds, time_s, exponent)
+        return _log_likelihood(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
     def with_same_mean(exponent: float) -> Array:
         return np.log10(system.ratios / settling_noise_scale(searched.seconds, first_s, exponent).mean())
@@ -364,8 +374,8 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     )
     if -optimum.fun < constant + _SETTLING_MARGIN:
         return fit
-    settled = fitted(optimum.x[:components], 10.0 ** optimum.x[-2], optimum.x[-1]).system
-    start_scale = float(np.exp(np.log(np.maximum(settled.ratios / system.ratios, 1e-300)).mean()))
+    ratios = 10.0 ** optimum.x[:components]
+    start_scale = float(np.exp(np.log(np.maximum(ratios / system.ratios, 1e-300)).mean()))
     settling = settling_noise_scale(system.seconds, 10.0 ** optimum.x[-2], optimum.x[-1])
     scale = np.maximum(1.0, start_scale * settling)
     return _solve(replace(system, process_noise_scale=scale), problem)
@@ -400,10 +410,7 @@ def _fit_memory(fit: DriftFit) -> DriftFit:
         return replace(over, ratios=10.0 ** np.clip(x[:-2], low, high), memory=Memory(share, time_s))
 
     def likelihood(x: Array) -> float:
-        try:
-            return float(_solve(with_memory(x, searched), few).log_likelihood)
-        except DriftModelError:
-            return -np.inf
+        return _log_likelihood(with_memory(x, searched), few)
 
     drift = np.log10(np.maximum(system.ratios, 1e-300))
     starts = [
@@ -465,7 +472,7 @@ def estimate(
         smooth = _maximise(system(2, neutral), response, with_trends, None)
         # The simplex can lose a component on its way: where the smooth drift is likelier by the sizes that the walk has, it starts there.
         as_walk = 10.0 ** (np.log10(walk.system.ratios) - _log_ratio_unit(walk.system) + _log_ratio_unit(smooth.system))
-        if fit_fixed_effects(system(2, as_walk), response, with_trends).log_likelihood > smooth.log_likelihood:
+        if _log_likelihood(system(2, as_walk), _Problem.of(response, with_trends)) > smooth.log_likelihood:
             again = _maximise(system(2, neutral), response, with_trends, as_walk)
             smooth = max((smooth, again), key=lambda fit: fit.log_likelihood)
         order = 2 if smooth.log_likelihood > walk.log_likelihood + _SMOOTH_MARGIN else 1

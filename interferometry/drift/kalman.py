@@ -381,6 +381,8 @@ Order = Literal[1, 2]
 
 #: Columns of which a Gram matrix is swept by its Cholesky factor, and which are smoothed at a time.
 MANY_COLUMNS = 64
+#: Variance of an innovation, over that of the reading's noise, whose rounding is a tenth of that noise: the update subtracts the two.
+_LARGEST_INNOVATION = 0.1 / float(np.finfo(float).eps)
 #: Values that are whitened before they are multiplied, 512 kB.
 _VALUES_AT_ONCE = 2**16
 
@@ -488,6 +490,10 @@ class DriftSystem:
     def whitening(self, columns: int) -> Whitening:
         """Start to whiten so many columns, some readings after others."""
         gains, innovation_variances, _ = filter_covariance(*self.arrays, False)
+        if (innovation_variances > _LARGEST_INNOVATION * self.independent).any():
+            raise DriftModelError(
+                "between two readings the drift grows so large that their noise is lost in rounding; leave out those far apart in time"
+            )
         return Whitening(self, gains, np.sqrt(innovation_variances), np.zeros((gains.shape[1], columns)))
 
     def normal_equations(self, columns: Array) -> tuple[Array, float]:

@@ -187,6 +187,10 @@ def test_readings_that_cannot_be_fitted_are_refused(rng):
     timeless["time"].values[:] = np.datetime64("NaT")
     with pytest.raises(DriftDataError, match="no reading has a time"):
         estimate_drift(timeless)
+    at_once = deviations.copy(deep=True)
+    at_once["time"].values[:] = np.datetime64("2026-03-09T06:30")
+    with pytest.raises(DriftDataError, match="deviations: every reading has the time 2026-03-09T06:30:00;"):
+        estimate_drift(at_once)
     with pytest.raises(DriftDataError, match="readings repeat exactly"):
         estimate_drift(deviations.assign(deviation=xr.ones_like(deviations["deviation"])))
     for order in (0, 3, "2"):

@@ -197,6 +197,35 @@ def test_bad_input_is_named(rng, change, message):
         fit_fixed_effects(drift_system(seconds, loadings, order=1, ratios=[0.01, 0.02]), y, design)
 
 
+def test_a_drift_that_leaves_rounding_alone_of_the_noise_is_no_model(rng):
+    """A clock that is 26 years off: an integrated walk of 7e-4 / s^3 grows to 1e23 variances of a reading; their rounding is 1e7."""
+    seconds = 60.0 * np.arange(400.0) + np.where(np.arange(400) < 150, 0.0, 8.26e8)
+    one, y = np.ones((400, 1)), rng.normal(size=400)
+    with pytest.raises(DriftModelError, match="lost in rounding"):
+        fit_fixed_effects(drift_system(seconds, one, order=2, ratios=[7e-4]), y, one)
+    fit = estimate(seconds, one, y, one, robust=True)
+    # White noise of unit variance, to three times the uncertainty of 400 readings.
+    assert fit.sigma == pytest.approx(1.0, abs=3.0 / np.sqrt(800))
+
+
+def test_a_search_goes_on_where_its_drift_hides_a_column(rng):
+    """A reading every two days: an integrated walk at the upper limit grows by 4e12 variances of a reading between two of them."""
+    targets = np.tile(np.r_[np.arange(5), np.arange(4, -1, -1)], 12)
+    sign = np.tile(np.r_[np.ones(5), -np.ones(5)], 12)
+    seconds, loadings = 172800.0 * np.arange(120.0), np.column_stack([np.ones(120), targets / 4.0])
+    design = np.column_stack([np.eye(5)[targets], np.eye(5)[targets] * sign[:, None]])
+    largest = 1e8 / 3600.0**3
+    with pytest.raises(DriftModelError, match="depends linearly"):
+        fit_fixed_effects(
+            drift_system(seconds, loadings, order=2, ratios=[largest, 1e-25]), rng.normal(size=120), design
+        )
+    fit = estimate(seconds, loadings, rng.normal(size=120), design)
+    assert fit.sigma == pytest.approx(1.0, abs=3.0 / np.sqrt(2.0 * 110))
+    assert np.isfinite(
+        estimate(seconds, loadings, fit.response, design, order=2, start=[largest, 1e-25]).log_likelihood
+    )
+
+
 @pytest.mark.parametrize(("order", "ratio"), [(1, 0.01), (2, 1e-6)])
 def test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps(rng, order, ratio):
     seconds, _, y = readings(rng, 40)
