@@ -49,6 +49,8 @@ _AT_REST = 0.02
 _RATIOS = 10.0 ** np.arange(-6.0, 0.1, 0.5)
 #: Effects that are responses to readings.
 _FOLLOWED = ("thermal_lag", "unseen_heat_source")
+#: Least variance of noise and of a standardised coefficient, um^2: a millionth of a micrometre is nothing.
+_LEAST_UM2 = 1e-12
 #: Turns and change (in the logarithm of a variance) in which the sizes settle.
 _TURNS, _SETTLED = 60, 1e-3
 
@@ -237,14 +239,17 @@ def _most_probable(marginal: Marginal, ratio: float) -> tuple[float, Response]:
     """Return the log-likelihood and the response under the sizes of noise and coefficients for which it is largest."""
     values, vectors = np.linalg.eigh(marginal.gram)
     values, moment = np.maximum(values, 0.0), vectors.T @ marginal.moment
-    size, variance = marginal.square / marginal.free, 0.1 * marginal.square / marginal.free
+    # Readings that their constants use up, or that do not move, leave both at their least: the response is none.
+    free = max(marginal.free, 1)
+    size, variance = max(marginal.square / free, _LEAST_UM2), max(0.1 * marginal.square / free, _LEAST_UM2)
     for _ in range(_TURNS):
         shrunk = moment / (values + variance / size)
         known = values / (values + variance / size)
         before = np.log([size, variance])
-        size = max(float(shrunk @ shrunk) / max(float(known.sum()), 1e-9), 1e-12)
+        size = max(float(shrunk @ shrunk) / max(float(known.sum()), 1e-9), _LEAST_UM2)
         missed = marginal.square - 2.0 * float(shrunk @ moment) + float(values @ shrunk**2)
-        variance = max(missed / (marginal.free - float(known.sum())), 1e-12)
+        left = free - float(known.sum())
+        variance = max(missed / left, _LEAST_UM2) if left > 0.0 else _LEAST_UM2
         if np.abs(np.log([size, variance]) - before).max() < _SETTLED:
             break
     scaled = replace(marginal, moment=marginal.moment * np.sqrt(size), gram=marginal.gram * size)
@@ -386,9 +391,15 @@ def make_recursion(
 
 
 def _parts(record: Record, used: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return the runs of some blocks, or the parts of a single run."""
+    """Return the runs of some blocks, or the parts of a single run, or where a pause leaves one of them alone, as many of equal size."""
     numbers = record.run if np.unique(record.run[used]).size > 1 else record.chained
-    return [np.array(used & (numbers == number), bool) for number in np.unique(numbers[used])]
+    parts = [np.array(used & (numbers == number), bool) for number in np.unique(numbers[used])]
+    measured = np.isfinite(record.displacement).any(axis=1)
+    # A single block is its own zero.
+    if sum(int((part & measured).sum()) > 1 for part in parts) > 1:
+        return parts
+    split = np.array_split(np.flatnonzero(used), np.unique(record.chained).max() + 1)
+    return [np.isin(np.arange(used.size), rows) for rows in split if rows.size]
 
 
 def sensor_curve(
@@ -418,9 +429,10 @@ def sensor_curve(
     def ratios(kept: Sequence[int]) -> tuple[Array, Array]:
         # A displacement that these parts do not hold says nothing.
         with np.errstate(invalid="ignore"):
-            by_channel = np.sqrt(squares[kept].sum(axis=0) / free[kept].sum(axis=0))
+            by_channel = np.sqrt(np.maximum(squares[kept].sum(axis=0), 0.0) / free[kept].sum(axis=0))
         rms = known_mean(by_channel, axis=1)
-        return rms, rms / rms[0]
+        # Displacements that do not move are predicted exactly with any sensors.
+        return rms, rms / max(float(rms[0]), np.finfo(float).tiny)
 
     cross, ratio = ratios([*numbers])
     without = np.array([ratios([k for k in numbers if k != out])[1] for out in numbers])

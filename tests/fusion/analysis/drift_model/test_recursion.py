@@ -151,6 +151,33 @@ def test_the_fewest_sensors_are_those_that_the_displacement_follows():
     np.testing.assert_allclose(np.array(model.outputs[0].coefficients)[at_once], [6.0, -3.0], rtol=0.03)
 
 
+@pytest.mark.parametrize(("after", "pause_h"), [(200, 24.0), (399, 6.5e5)])
+def test_after_a_long_pause_the_curve_is_that_of_the_part_before_it(after, pause_h):
+    """Two displacements that each follow one sensor by 2 um/K exactly, with 24 h between the halves, or a last row in 2100."""
+    rng = np.random.default_rng(8)
+    temperature = 20.0 + np.cumsum(rng.normal(0.0, 0.05, (400, 3)), axis=0)
+    table = table_of(2.0 * (temperature[:, :2] - 20.0) + 0.01 * rng.standard_normal((400, 2)), temperature)
+    pause = np.where(np.arange(400) < after, 0, round(3600.0 * pause_h)).astype("m8[s]")
+    _, product, loop = run_of(table.assign_coords(time=table["time"].values + pause))
+    assert np.unique(product["part"].values[~product["sealed"].values.astype(bool)]).size == 1
+    model = make_recursion(product, loop, sampling_s=60.0, reduced=True, **FROM)
+    assert [one.name for one in model.inputs] == ["t1", "t2"]
+    assert all(np.isfinite(one.cross_rmse) for one in model.sensor_curve)
+    assert all(one.u < 0.2 * one.before for one in model.outputs)
+
+
+@pytest.mark.parametrize(("rows", "moves"), [(1, True), (2, False), (40, False)])
+def test_of_readings_that_say_nothing_the_response_is_none(driven, rows, moves):
+    record, _, _ = driven
+    values = evaluate_columns(record, columns_of(record, record.sensors))
+    course = record.displacement if moves else np.ones_like(record.displacement)
+    still = Record(**{**vars(record), "displacement": course})
+    none = np.empty((0, *course.shape))
+    for one in respond(still, values, none, np.arange(record.seconds.size) < rows):
+        np.testing.assert_allclose(one.coefficients, 0.0, atol=1e-6)
+        assert np.isfinite(one.covariance).all() and one.noise_um > 0.0
+
+
 def test_of_several_runs_each_is_predicted_from_the_others_and_its_own_zero():
     _, product, loop = run_of(runs_table(5.0, -3.0, 8.0, 1.0))
     (output,) = make_recursion(product, loop, sampling_s=60.0, **FROM).outputs
