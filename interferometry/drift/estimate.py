@@ -14,7 +14,7 @@ belongs to; the result as a Dataset.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -382,11 +382,13 @@ def _fit(
     loadings = _loadings(readings, components, shapes, readings["sign"].values.astype(float), position)
     design = np.zeros((cell.size, len(cells)))
     design[np.arange(cell.size), cell] = 1.0
-    seconds, deviation = readings["seconds"].values, readings["deviation"].values
+    deviation = readings["deviation"].values
+    # Of a level far from zero the search would see the rounding.
+    level = np.bincount(cell, deviation) / np.bincount(cell)
     fit = estimate(
-        seconds,
+        readings["seconds"].values,
         loadings,
-        deviation,
+        deviation - level[cell],
         design,
         order=order,
         robust=robust,
@@ -394,6 +396,9 @@ def _fit(
         memory=True,
         least_sigma=ROUNDING * float(readings["resolution"]),
     )
+    coefficients = fit.coefficients.copy()
+    coefficients[: level.size] += level
+    fit = replace(fit, response=deviation, coefficients=coefficients)
     named = (*components, *(f"shape_{k + 1}" for k in range(shapes.shape[1])))
     return JointFit(readings, cells, cell, named, shapes, fit)
 
