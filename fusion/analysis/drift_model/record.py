@@ -971,8 +971,7 @@ def examine(model: RecordFit, hold_out_rmse: Array, step: Array, rng: np.random.
         whitened, _ = fit.system.whiten(fit.residual()[:, None])
         scale = 1.4826 * np.median(np.abs(whitened)) or 1.0
         innovations[rows, k] = np.clip(whitened[:, 0] / scale, -_CLIP, _CLIP)
-        # With its drift, which takes up what is slow.
-        is_larger |= bool(np.std(fit.residual()) > half[k])
+        is_larger |= bool(np.sqrt(np.mean(whitened**2)) > half[k])
         half[k] /= scale
     innovations -= innovations.mean(axis=0)
     switched = record.switched()
