@@ -14,7 +14,7 @@ belongs to; the result as a Dataset.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -382,13 +382,11 @@ def _fit(
     loadings = _loadings(readings, components, shapes, readings["sign"].values.astype(float), position)
     design = np.zeros((cell.size, len(cells)))
     design[np.arange(cell.size), cell] = 1.0
-    deviation = readings["deviation"].values
-    # Of a level far from zero the search would see the rounding.
-    level = np.bincount(cell, deviation) / np.bincount(cell)
+    seconds, deviation = readings["seconds"].values, readings["deviation"].values
     fit = estimate(
-        readings["seconds"].values,
+        seconds,
         loadings,
-        deviation - level[cell],
+        deviation,
         design,
         order=order,
         robust=robust,
@@ -396,9 +394,6 @@ def _fit(
         memory=True,
         least_sigma=ROUNDING * float(readings["resolution"]),
     )
-    coefficients = fit.coefficients.copy()
-    coefficients[: level.size] += level
-    fit = replace(fit, response=deviation, coefficients=coefficients)
     named = (*components, *(f"shape_{k + 1}" for k in range(shapes.shape[1])))
     return JointFit(readings, cells, cell, named, shapes, fit)
 

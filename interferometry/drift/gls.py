@@ -51,11 +51,6 @@ _LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.
 _AT_LIMIT = 0.06
 #: What a search takes for minus the log-likelihood where there is no model, per decade of drift.
 _NO_MODEL = 1e100
-#: A search ends where the log-likelihood changes by less.
-_LIKELIHOOD_ACCURACY = 1e-3
-#: Levels of each component, decades, at which a likelier drift is looked for once a search has ended, from none to much; the distance
-#: from its end at which it is looked for, too; and how often a search begins again there at most.
-_OTHER_LEVELS, _NEARBY, _MOST_RESTARTS = (-8.0, -5.0, -2.0, 1.0), 0.25, 4
 #: Edge of the first simplex, decades.
 _FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
@@ -266,7 +261,7 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
 
 
 def _maximise(system: DriftSystem, response: Array, design: Array, start: Array | None) -> DriftFit:
-    """Restricted maximum likelihood of the variance ratios by bounded simplices in their logarithm, until no other level is likelier."""
+    """Restricted maximum likelihood of the variance ratios by a bounded simplex in their logarithm."""
     low, high = _LOG_RATIO_LIMITS[system.order]
     components = system.loadings.shape[1]
     problem = _Problem.of(response, design)
@@ -276,41 +271,23 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     def ratios(log_ratio: Array) -> Array:
         return np.asarray(10.0 ** (unit + np.clip(log_ratio, low, high)))
 
+    guess = np.zeros(components) if start is None else np.clip(np.log10(np.maximum(start, 1e-300)) - unit, low, high)
+    # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
+    step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
+    simplex = np.vstack([guess, guess + np.diag(step)])
+
     def cost(log_ratio: Array) -> float:
         found = -_log_likelihood(replace(searched, ratios=ratios(log_ratio)), few)
         # Less drift is nearer to a model.
         return found if np.isfinite(found) else _NO_MODEL * (1.0 + float((log_ratio - low).sum()))
 
-    def descend(guess: Array) -> scipy.optimize.OptimizeResult:
-        # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
-        step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
-        return scipy.optimize.minimize(
-            cost,
-            guess,
-            method="Nelder-Mead",
-            bounds=[(low, high)] * components,
-            options={
-                "initial_simplex": np.vstack([guess, guess + np.diag(step)]),
-                "xatol": 0.03,
-                "fatol": _LIKELIHOOD_ACCURACY,
-                "maxfev": 120 * components,
-            },
-        )
-
-    optimum = descend(
-        np.zeros(components) if start is None else np.clip(np.log10(np.maximum(start, 1e-300)) - unit, low, high)
+    optimum = scipy.optimize.minimize(
+        cost,
+        guess,
+        method="Nelder-Mead",
+        bounds=[(low, high)] * components,
+        options={"initial_simplex": simplex, "xatol": 0.03, "fatol": 1e-3, "maxfev": 120 * components},
     )
-    # A simplex ends in any local maximum, and where it has lost its volume: on the flat that a component too small to matter makes.
-    component = np.arange(components)
-    for _ in range(_MOST_RESTARTS):
-        levels = [(*_OTHER_LEVELS, optimum.x[c] - _NEARBY, optimum.x[c] + _NEARBY) for c in component]
-        others = [
-            np.clip(np.where(component == c, level, optimum.x), low, high) for c in component for level in levels[c]
-        ]
-        costs = [cost(other) for other in others]
-        if min(costs) >= optimum.fun - _LIKELIHOOD_ACCURACY:
-            break
-        optimum = descend(others[int(np.argmin(costs))])
     return _solve(replace(system, ratios=ratios(optimum.x)), problem)
 
 
