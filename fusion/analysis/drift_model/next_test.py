@@ -94,7 +94,8 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
         tried = []
         for hold_min in _HOLDS_MIN:
             test, values = under(hours, hold_min)
-            after = [_after(one, test, values) for one in responses]
+            steps = record.block_s / test.block_s
+            after = [covariance_after(one, test.seconds, values, steps=steps) for one in responses]
             tried.append((_width(after, judged), hold_min, test))
         width, hold_min, test = min(tried, key=lambda one: one[0])
         sizes = np.array([record.driver_sizes[name][0] for name in test.drivers])
@@ -104,9 +105,8 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
         yield NextTest(hours, hold_min, _width(now, judged), width, largest, minutes, levels[changed])
 
 
-def _after(one: Response, test: Record, values: Array) -> Array:
-    """Return the covariance of a response after a test, whose steps need not be as long as the record's blocks, (n, p) as well."""
-    seconds, steps = test.seconds, test.block_s / float(test.seconds[1] - test.seconds[0])
+def covariance_after(one: Response, seconds: Array, values: Array, *, steps: float) -> Array:
+    """Return the covariance of a response after a test (n, p) as well, of which so many steps are as long as a block of the record."""
     # The noise of a block mean is that of so many steps.
     noise_um, ratio = one.noise_um * np.sqrt(steps), one.ratio / steps
     marginal = Marginal.of(seconds, np.zeros(seconds.size), np.ones((seconds.size, 1)), values, ratio=ratio)

@@ -8,11 +8,12 @@ import xarray as xr
 
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.attribution.duty import DutyPlanError
-from fusion.analysis.drift_model.next_test import propose_tests
+from fusion.analysis.drift_model.next_test import covariance_after, propose_tests
 from fusion.analysis.drift_model.record import close_record
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.drift_model.recursion import (
     Marginal,
+    Response,
     columns_of,
     evaluate_columns,
     events_of,
@@ -222,6 +223,15 @@ def test_a_longer_test_leaves_less_open_also_where_the_record_has_long_blocks(bl
     widths = [one.width_um for one in propose_tests(product, loop)]
     # Random duties differ: a longer one is worse by chance by a little at most.
     assert len(widths) == 4 and all(later < 1.2 * earlier for earlier, later in itertools.pairwise(widths))
+
+
+def test_a_next_test_in_shorter_steps_than_the_blocks_leaves_as_much_open(rng):
+    """Three steps of one level hold what a block of it holds: their noise is larger by the root of three."""
+    levels = rng.normal(size=(40, 2))
+    one = Response(np.zeros(2), np.diag([4.0, 1.0]), np.array([2.0, 1.0]), noise_um=0.5, ratio=0.0)
+    in_blocks = covariance_after(one, 900.0 * np.arange(40.0), levels, steps=1.0)
+    in_steps = covariance_after(one, 300.0 * np.arange(120.0), np.repeat(levels, 3, axis=0), steps=3.0)
+    np.testing.assert_allclose(in_steps, in_blocks, rtol=1e-9)
 
 
 def test_a_next_test_leaves_less_open_and_says_what_is_open_now(driven):
