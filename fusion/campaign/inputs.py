@@ -776,7 +776,6 @@ def _reason(item: Mapping[str, Any]) -> str:
 
 #: Time between runs that each count their seconds from zero, so that they can be laid one after the other: one day.
 _BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
-#: Times before this one count from a start that is not stated.
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:

@@ -402,9 +402,9 @@ def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) 
     """Return rows with the names of their columns, and their units, without the spaces around them."""
     names: list[str] = []
     for name in frame.columns:
-        stripped = str(name).strip()
+        plain = str(name).strip()
         # As pandas numbers headings that are alike.
-        names.append(next(one for one in chain([stripped], (f"{stripped}.{k}" for k in count(1))) if one not in names))
+        names.append(next(one for one in chain([plain], (f"{plain}.{k}" for k in count(1))) if one not in names))
     frame.columns = names
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
 

@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from fusion.campaign.config import CampaignError
 from fusion.results.results import Notice
-from interferometry.io.tables import NO_ZONE
-
-#: Earlier times are no dates, but count from zero.
-DATED = np.datetime64("1980-01-01", "ns")
+from interferometry.io.tables import DATED, NO_ZONE
 
 
 def utc(time: np.datetime64) -> str:

@@ -619,8 +619,6 @@ def _inspect_series(paths: Sequence[Path], *, label: str) -> Inspected:
 _FULL, _EMPTY = "█", "·"
 #: Samples further apart than this many times their usual distance have a gap between them.
 _GAP_STEPS = 10.0
-#: Times before this one count from a start that is not stated.
-_NO_DATE = np.datetime64("1980-01-01")
 
 
 @dataclass(frozen=True)
@@ -645,6 +643,8 @@ class Recording:
 
 def time_bars(recordings: Sequence[Recording], *, width: int = 60, zone: str = "UTC") -> list[str]:
     """Return a bar per recording, filled where it has samples, above one time axis in a zone."""
+    from interferometry.io.tables import DATED
+
     stretches = {recording.name: recording.stretches() for recording in recordings}
     ends = [end for parts in stretches.values() for part in parts for end in part]
     if not ends:
@@ -656,7 +656,7 @@ def time_bars(recordings: Sequence[Recording], *, width: int = 60, zone: str = "
         gaps = f"  {counted(len(parts) - 1, 'gap')}" if len(parts) > 1 else ""
         lines.append(f"{name:<{label}}  {_bar(parts, first, last, width)}{gaps}")
     length = duration(float((last - first) / np.timedelta64(1, "s")))
-    if first < _NO_DATE:
+    if first < DATED:
         return [*lines, f"{'':<{label}}  {'start':<{width - len(length)}}{length}"]
     left, right = (np.datetime_as_string(time, unit="m").replace("T", " ") for time in (first, last))
     middle = f"{length:^{max(width - len(left) - len(right), 0)}}"

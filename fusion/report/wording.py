@@ -19,7 +19,7 @@ from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.messages import cell, printable
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
-from fusion.results.loop import ChannelErrors, Loop, Range, RecordLoop
+from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.numbers import (
     alike,
     duration,
@@ -456,10 +456,6 @@ def beaten_by_repetition(loop: Loop) -> str:
     return "model" if plain < final else "declared" if plain < declared else ""
 
 
-#: Chance alone changes an error of prediction by this share.
-_BY_CHANCE = 1.02
-
-
 class PlainPrediction(NamedTuple):
     """A plain prediction in words with its error on the hold-out, beside that of the model, µm."""
 
@@ -477,7 +473,7 @@ def better_plain(loop: Loop) -> PlainPrediction | None:
     if final is None or not known:
         return None
     error, name = min(known)
-    return PlainPrediction(words[name], error, final) if error < _BY_CHANCE * final else None
+    return PlainPrediction(words[name], error, final) if error < ERROR_BY_CHANCE * final else None
 
 
 def variance_left(share: float | None) -> str:

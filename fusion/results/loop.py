@@ -14,6 +14,8 @@ BorneOut = Literal["yes", "no", "cannot tell"]
 Parameter = float | int | str
 #: Range of a parameter that fits equally well: its ends (None where the data set none), or the other words.
 Range = tuple[Number, ...] | tuple[str, ...]
+#: Ratio of two errors of prediction up to which chance alone may make them differ.
+ERROR_BY_CHANCE = 1.02
 
 
 class Nothing(ResultPart):

@@ -35,6 +35,8 @@ _VOCABULARY = vocabulary("headings")
 # Dates and times of a whole file: ISO 8601 and the usual other orders, refused where the file does not settle the
 # order.
 
+#: Earlier times are no dates, but count from a start that is not stated.
+DATED = np.datetime64("1980-01-01", "ns")
 #: Attribute ``reference`` of times from a file that gives no zone.
 NO_ZONE = "no zone in the file: taken as UTC"
 #: Years of measurements; others are damage, and the first and last years of the calendar have no UTC.
@@ -473,7 +475,7 @@ def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.da
 
 def _written(time: np.datetime64) -> str:
     """Return a time as a message writes it, in seconds where it counts from no date."""
-    if time < np.datetime64("1980"):
+    if time < DATED:
         return f"{(time - np.datetime64('1970')) / np.timedelta64(1, 's'):.10g} s"
     return str(time).removesuffix(".000000000").replace("T", " ")
 

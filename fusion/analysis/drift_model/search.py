@@ -1130,15 +1130,11 @@ def _at_nearest(values: Array, rows: NDArray[np.intp], instants: NDArray[np.intp
     )
 
 
-#: A forecast may be worse than the declared model's by this share at most: chance alone changes an error by as much.
-_WORSE = 1.02
-
-
 def left_out_of_forecast(problem: Problem[M], state: LoopState[M], contradicted: Collection[int]) -> set[int]:
     """Places of the steps that leave the forecast: contradicted ones, and those with which the hold-out set is predicted worse."""
     steps = range(len(state.errors_without_um))
     left = set(contradicted) & set(steps)
-    while left != set(steps) and problem.hold_out_error(state.kept(left)) > _WORSE * state.errors_um[0]:
+    while left != set(steps) and problem.hold_out_error(state.kept(left)) > schema.ERROR_BY_CHANCE * state.errors_um[0]:
         left.add(min(set(steps) - left, key=lambda place: problem.hold_out_error(state.kept(left | {place}))))
     return left
 
