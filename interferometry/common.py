@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, ParamSpec, TypeAlias, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
@@ -15,9 +13,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Array: TypeAlias = "NDArray[np.float64]"
-
-
-_log = logging.getLogger(__name__)
 
 
 class InterferometryError(ValueError):
@@ -34,31 +29,6 @@ _T = TypeVar("_T")
 def one_thread(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """Decorate a function that keeps linear algebra to one thread: several are slower on small matrices, and give other last digits."""
     return cast(Callable[_P, _T], threadpool_limits.wrap(limits=1, user_api="blas")(function))
-
-
-#: Tells this process, and those that it starts, that it was said.
-_SAID = "THERMOFUSE_COMPILES_IN_MEMORY"
-
-
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate a function that numba compiles: once where there is a folder that it can write to, else in every process."""
-    import numba
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        try:
-            return numba.njit(cache=True, **options)(function)
-        except RuntimeError as error:
-            if "no locator" not in str(error):  # for lack of a folder
-                raise
-            if not os.environ.get(_SAID):
-                os.environ[_SAID] = "1"
-                _log.warning(
-                    "no folder can be written in which compiled functions are kept, so that every command compiles them again (up to half "
-                    "a minute); let NUMBA_CACHE_DIR name one"
-                )
-            return numba.njit(**options)(function)
-
-    return compiled
 
 
 DIRECTIONS = ("positive", "negative")

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FILES = [path for name in ("fusion", "interferometry", "thermography") for path in (ROOT / name).rglob("*.py")]
+FILES = [
+    path for name in ("fusion", "interferometry", "thermofuse", "thermography") for path in (ROOT / name).rglob("*.py")
+]
 
 
 def holding(pattern: str) -> list[Path]:
@@ -23,7 +25,7 @@ COMPILED = holding(r"^@njit\(")
 
 def test_every_compiled_function_is_decorated_in_one_way():
     assert len(COMPILED) > 10
-    assert holding(r"^\s*(from|import) numba") == [ROOT / "interferometry/common.py", ROOT / "thermography/common.py"]
+    assert holding(r"^\s*(from|import) numba") == [ROOT / "thermofuse/compiled.py"]
 
 
 @pytest.mark.parametrize("named", [False, True])

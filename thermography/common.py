@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
@@ -16,7 +14,6 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = "NDArray[Any]"
 
-_log = logging.getLogger(__name__)
 
 ZERO_CELSIUS_K = 273.15
 #: Standard deviation of a normal distribution over its median absolute deviation, to five digits. The exact 1 / 0.67449 (as SciPy's
@@ -27,31 +24,6 @@ MAD_TO_SIGMA = 1.4826
 def usable_processors() -> int:
     """Return how many processors this process may use: where it is bound to some, these alone."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-#: Tells this process, and those that it starts, that it was said.
-_SAID = "THERMOFUSE_COMPILES_IN_MEMORY"
-
-
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate a function that numba compiles: once where there is a folder that it can write to, else in every process."""
-    import numba
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        try:
-            return numba.njit(cache=True, **options)(function)
-        except RuntimeError as error:
-            if "no locator" not in str(error):  # for lack of a folder
-                raise
-            if not os.environ.get(_SAID):
-                os.environ[_SAID] = "1"
-                _log.warning(
-                    "no folder can be written in which compiled functions are kept, so that every command compiles them again (up to half "
-                    "a minute); let NUMBA_CACHE_DIR name one"
-                )
-            return numba.njit(**options)(function)
-
-    return compiled
 
 
 #: Median absolute deviation of a standard normal distribution.

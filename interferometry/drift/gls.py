@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 from scipy.linalg import lapack
 
-from interferometry.common import Array, njit
+from interferometry.common import Array
 from interferometry.drift import kalman
 from interferometry.drift.kalman import (
     MANY_COLUMNS,
@@ -42,6 +42,7 @@ from interferometry.drift.kalman import (
     drift_system,
     start_columns,
 )
+from thermofuse.compiled import njit
 
 #: Search limits of log10(process noise over reading variance) of either order, in units that make the drift of one hour comparable to the
 #: noise of one reading: from a drift far below the noise to one that hides everything else. A random walk that is a hundred times the noise

@@ -25,7 +25,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from interferometry.common import Array, InterferometryError, njit
+from interferometry.common import Array, InterferometryError
+from thermofuse.compiled import njit
 
 #: Columns that are whitened together.
 _COLUMNS_AT_ONCE = 256

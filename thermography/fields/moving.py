@@ -13,7 +13,8 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from thermography.common import Array, njit
+from thermofuse.compiled import njit
+from thermography.common import Array
 from thermography.fields.blocks import (
     BLOCK_FRAMES,
     NO_CYCLE,

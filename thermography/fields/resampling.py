@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from thermography.common import Array, ThermographyError, njit
+from thermofuse.compiled import njit
+from thermography.common import Array, ThermographyError
 from thermography.io.sequence import usable_threads
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration

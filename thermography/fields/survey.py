@@ -15,7 +15,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thermography.common import MAD_TO_SIGMA, Array, ThermographyError, njit
+from thermofuse.compiled import njit
+from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
 from thermography.radiometry.planck import (

@@ -15,7 +15,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 import platformdirs
 
-from thermography.common import Array, njit
+from thermofuse.compiled import njit
+from thermography.common import Array
 from thermography.io.fff_record import (
     CAMERA_RECORD,
     ENTRY_SIZE,

@@ -10,7 +10,8 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import Array, ThermographyError, njit
+from thermofuse.compiled import njit
+from thermography.common import Array, ThermographyError
 
 #: Length of the signature, by which the samples were recognised.
 _SIGNATURE_BYTES = 8

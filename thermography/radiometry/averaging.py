@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import ZERO_CELSIUS_K, Array, njit
+from thermofuse.compiled import njit
+from thermography.common import ZERO_CELSIUS_K, Array
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import count_line
 

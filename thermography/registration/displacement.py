@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
-from thermography.common import Array, njit
+from thermofuse.compiled import njit
+from thermography.common import Array
 from thermography.registration.discs import LocatedDisc
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import Projection, parameter_jacobian

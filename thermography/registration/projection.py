@@ -24,7 +24,8 @@ import scipy
 import yaml
 from numpy.typing import NDArray
 
-from thermography.common import Array, ThermographyError, njit
+from thermofuse.compiled import njit
+from thermography.common import Array, ThermographyError
 
 # Intrinsic parameters of a lens from a calibration, and the file in which OpenCV writes them.
 

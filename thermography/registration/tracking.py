@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import Array, njit
+from thermofuse.compiled import njit
+from thermography.common import Array
 from thermography.registration.plan import PlanGrid
 from thermography.registration.projection import locate_point, project_point
 from thermography.registration.register import Registration

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fusion.common import Array
-from interferometry.common import njit
+from thermofuse.compiled import njit
 
 
 @njit()

@@ -26,8 +26,8 @@ from fusion.analysis.attribution.modes import Excitation, nuisance_columns
 from fusion.analysis.drift_model.gains import side_by_side
 from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array
-from interferometry.common import njit
 from interferometry.drift.kalman import DriftSystem, Order, drift_system
+from thermofuse.compiled import njit
 from thermography.fields.large_arrays import empty_array, give_back
 
 # Profile likelihood ratios of many regressors against one drift series, with the drift variance estimated again under
