@@ -261,7 +261,7 @@ def _run_or_keep(
 
 def _joining(campaigns: list[Path]) -> Callable[[Sequence[Path], Path], Iterable[tuple[str, str]]]:
     """Return what joins the results of two campaigns, or of two records."""
-    from fusion.pipeline.two_campaigns import are_records, compare_records, compare_runs
+    from fusion.pipeline.compare import are_records, compare_records, compare_runs
 
     return compare_records if are_records(campaigns) else compare_runs
 
@@ -286,7 +286,7 @@ def _place(text: str) -> Path | str:
 def _here(place: Path | str, what: str) -> Path:
     """Return a path; refuse an address, which `what` cannot use."""
     if isinstance(place, str):
-        from fusion.pipeline.remote import RemoteError
+        from fusion.campaign.remote import RemoteError
 
         raise RemoteError(f"{place}: {what} campaigns of this machine; name a path")
     return place
@@ -360,8 +360,8 @@ def init(
     several laser tests without frames each gets a folder with a campaign file, which fleet runs. An existing campaign.toml is never
     replaced.
     """
+    from fusion.campaign.draft import Asker, DraftError, unused_files, write_campaigns
     from fusion.pipeline.check import check_campaign
-    from fusion.pipeline.draft import Asker, DraftError, unused_files, write_campaigns
     from fusion.results.progress import counted
 
     def ask(question: str, default: str) -> str:
@@ -442,7 +442,7 @@ def _fetched(text: str, *, whole: bool, quiet: bool) -> tuple[Path, Callable[[st
     """Return a path as it is; of an address, the file that was fetched, or the `whole` campaign, and what puts the address in messages."""
     if "://" not in text:
         return Path(text), lambda line: line
-    from fusion.pipeline.remote import fetch_campaign, fetch_file
+    from fusion.campaign.remote import fetch_campaign, fetch_file
 
     with _progress(quiet=quiet) as report:
         mirror = (fetch_campaign if whole else fetch_file)(text, report=report)
@@ -526,7 +526,7 @@ def inspect(
     A series of frames is summed up. A file that cannot be used is named and does not stop the others; the exit code is 2 where it was named
     here, or is of a known kind, or where nothing can be used.
     """
-    from fusion.pipeline.inspect import inspect_paths, write_frames
+    from fusion.campaign.inspect import inspect_paths, write_frames
 
     with _answering():
         looked_into = []

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.pipeline.remote import DatasetError, fetch_sample
+from fusion.campaign.remote import DatasetError, fetch_sample
 
 
 @pytest.fixture

@@ -61,7 +61,7 @@ def run_cell(cell: str, names: dict[str, object]) -> None:
 
 def run_page(page: str) -> None:
     """Run the cells of a tutorial in this process and folder; where a measured file cannot be had, say so instead."""
-    from fusion.pipeline.remote import DatasetError, fetch_sample
+    from fusion.campaign.remote import DatasetError, fetch_sample
 
     try:
         for name in measured_files(page):

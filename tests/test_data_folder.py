@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import thermofuse as tf
-from fusion.pipeline.remote import REGISTRY
+from fusion.campaign.remote import REGISTRY
 from fusion.twin.recipe_file import packaged_recipe
 from thermofuse.resources import resource
 

@@ -16,7 +16,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from fusion.pipeline.remote import read_registry
+from fusion.campaign.remote import read_registry
 from tests.readme import measured_files
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.util import logging
 
-from fusion.pipeline.remote import DatasetError, fetch_sample
+from fusion.campaign.remote import DatasetError, fetch_sample
 
 _logger = logging.getLogger(__name__)
 _NOTE = """

@@ -16,7 +16,7 @@ import pandas as pd
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from fusion.pipeline.remote import fetch_sample, read_registry
+from fusion.campaign.remote import fetch_sample, read_registry
 from fusion.pipeline.run import run_campaign
 
 #: A README loads its pictures for every reader.

@@ -98,6 +98,28 @@ def role_of_unit(unit: str) -> Literal["temperature", "displacement", "driver"]:
     return "driver"
 
 
+def column_unit(heading: str) -> str:
+    """Return the unit in a heading such as ``"t1 [degC]"``; empty where it has none."""
+    return name_and_unit(heading)[1]
+
+
+def is_temperature(heading: str) -> bool:
+    """Return whether a heading is that of a temperature."""
+    return column_unit(heading) in ("degC", "K", "degF")
+
+
+def is_displacement(heading: str) -> bool:
+    """Return whether a heading is that of a displacement."""
+    return column_unit(heading) in ("um", "nm", "mm", "in", "mil")
+
+
+def is_time(heading: str) -> bool:
+    """Return whether a heading is that of the time: ``time`` or ``date`` in a language that is read, or a column in units of time."""
+    from interferometry.io.tables import read_heading
+
+    return read_heading(heading).role in ("time", "date") or column_unit(heading) in ("s", "ms", "min", "h")
+
+
 def read_quantity(value: object, target: str) -> float:
     """Return a number with unit, written as text, in the canonical unit."""
     example = f'write for example "{_EXAMPLES[target]}"'

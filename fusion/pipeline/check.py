@@ -17,10 +17,10 @@ from fusion.analysis.consistency.checks import Check, ContradictionError, Severi
 from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
+from fusion.campaign.inspect import Recording, time_bars
 from fusion.campaign.logs import NO_START, read_drivers
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.consistency import check_source
-from fusion.pipeline.inspect import Recording, time_bars
 from fusion.results.progress import counted
 from fusion.results.results import Notice
 from interferometry.io.readings import read_deviations, read_environment

@@ -32,8 +32,8 @@ from fusion.pipeline.stages import kept_results
 from fusion.pipeline.workers import start_module
 from fusion.report.charts.fleet import plot_history
 from fusion.report.charts.style import Chart, embed
-from fusion.report.conclusions import headline
 from fusion.report.exports.tables import Bars, Bound, Linked, conditions_of, write_workbook
+from fusion.report.findings import headline
 from fusion.report.page import render_page
 from fusion.report.wording import ISO230_TERMS
 from fusion.results.folder import MANIFEST, claim, open_folder

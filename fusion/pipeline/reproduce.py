@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fusion.campaign.config import load_campaign
+from fusion.campaign.remote import fetched_campaign, is_address
 from fusion.common import versions
-from fusion.pipeline.remote import fetched_campaign, is_address
 from fusion.pipeline.run import run_campaign
 from fusion.pipeline.stages import hash_files, noted_campaign
 from fusion.results.progress import Report, silent

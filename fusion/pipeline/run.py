@@ -27,6 +27,7 @@ from fusion.campaign.inputs import (
     read_source,
     window_notice,
 )
+from fusion.campaign.remote import fetched_campaign, is_address, require_outside_cache
 from fusion.campaign.time_zones import time_part
 from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, thermal
@@ -36,7 +37,6 @@ from fusion.pipeline.consistency import check_fields, check_loop, check_plan, ch
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.iso230_3 import evaluate_axis_test, evaluate_record_test, with_conditions
 from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
-from fusion.pipeline.remote import fetched_campaign, is_address, require_outside_cache
 from fusion.pipeline.stages import (
     STAGES,
     Run,

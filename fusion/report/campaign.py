@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS, ENTRY_LEVEL, REMAINDER_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
-from fusion.report.conclusions import first_screen, headline, next_steps, sharpen
+from fusion.report.findings import first_screen, headline, next_steps, sharpen
 from fusion.report.thermal_test import describe_thermal_tests
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (

@@ -20,7 +20,7 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import FusionError
 from fusion.report.campaign import describe_campaign
 from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
-from fusion.report.conclusions import headline
+from fusion.report.findings import headline
 from fusion.report.record import describe_record
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
 from fusion.results.loop import RecordLoop

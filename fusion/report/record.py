@@ -11,7 +11,7 @@ import xarray as xr
 from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL
 from fusion.report.campaign import DECIDED_BEFORE, MOST_STEPS, errors_table, refused_effects, steps_table
-from fusion.report.conclusions import first_screen, headline, next_steps
+from fusion.report.findings import first_screen, headline, next_steps
 from fusion.report.thermal_test import describe_thermal_tests
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import duration, join, moment

@@ -8,7 +8,7 @@ import numpy as np
 import rich.table
 
 from fusion.messages import cell
-from fusion.report.conclusions import conclude, headline, next_steps
+from fusion.report.findings import conclude, headline, next_steps
 from fusion.report.wording import baseline_words, condition, figures_of, say, untouched
 from fusion.results.axis import DriftPart, RegistrationPart
 from fusion.results.loop import Loop, RecordLoop

@@ -8,7 +8,7 @@ from urllib.parse import urlparse
 
 import pytest
 
-from fusion.pipeline.remote import FOLDER_VARIABLE, DatasetError, fetch_sample, read_registry
+from fusion.campaign.remote import FOLDER_VARIABLE, DatasetError, fetch_sample, read_registry
 
 NAME = "owner__project/folder/file.bin"
 

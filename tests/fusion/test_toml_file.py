@@ -9,8 +9,8 @@ import pytest
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.inspect import Kind, recognise
 from fusion.common import TomlError, describe, find_line, key_lines, read_toml, suggest
-from fusion.pipeline.inspect import Kind, recognise
 from fusion.twin.recipe_file import RecipeError, read_recipe
 
 

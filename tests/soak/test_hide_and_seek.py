@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 from scipy.signal import lfilter
 
-from fusion.pipeline.remote import FOLDER_VARIABLE
+from fusion.campaign.remote import FOLDER_VARIABLE
 from fusion.pipeline.run import run_campaign
 from fusion.results.loop import RecordLoop
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.pipeline.inspect import inspect_paths
+from fusion.campaign.inspect import inspect_paths
 from tests.soak.fuzz.harness import REFUSALS, _place
 from tests.soak.fuzz.stores import SECRET, hostile_stores, write_secret
 from thermography.io.other_cameras import StackOptions, index_recordings

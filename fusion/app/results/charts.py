@@ -39,7 +39,7 @@ from fusion.report.charts.plan import (
 from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
-from fusion.report.conclusions import action, conclude, next_steps, step_phrase
+from fusion.report.findings import action, conclude, next_steps, step_phrase
 from fusion.report.record import shown_channels
 from fusion.report.wording import (
     Table,

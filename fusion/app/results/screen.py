@@ -17,7 +17,7 @@ from fusion.common import FusionError, versions
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
-from fusion.report.conclusions import first_screen
+from fusion.report.findings import first_screen
 from fusion.report.page import ProductsError, print_pdf, report_of
 from fusion.report.sheet import describe_sheet, write_iso230, write_thermal_tests
 from fusion.report.wording import say

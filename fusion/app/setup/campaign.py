@@ -14,9 +14,9 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array
 
+from fusion.campaign.draft import DRAFTED, TO_FILL, Asker, draft_lines
+from fusion.campaign.inspect import scan_folder
 from fusion.common import FusionError
-from fusion.pipeline.draft import DRAFTED, TO_FILL, Asker, draft_lines
-from fusion.pipeline.inspect import scan_folder
 from fusion.results.store import write_atomically
 
 _FILE = "campaign.toml"

@@ -8,7 +8,7 @@ from typing import Any
 import panel as pn
 
 from fusion.app.parts import column, heading, note, table
-from fusion.pipeline.columns import ROLES, TableProposal
+from fusion.campaign.columns import ROLES, TableProposal
 from fusion.results.progress import counted
 
 

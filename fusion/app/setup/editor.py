@@ -28,12 +28,12 @@ from fusion.app.setup.form import (
 )
 from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView, corners_of
 from fusion.app.setup.times import TimesView, recordings_of
+from fusion.campaign.columns import TableProposal, propose_table
+from fusion.campaign.draft import separate_tests
+from fusion.campaign.inspect import FolderContent, Kind, Recording, scan_folder
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.check import CampaignCheck, check_campaign
-from fusion.pipeline.columns import TableProposal, propose_table
-from fusion.pipeline.draft import separate_tests
-from fusion.pipeline.inspect import FolderContent, Kind, Recording, scan_folder
 from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations
 from thermography.common import ThermographyError

@@ -7,8 +7,8 @@ from pathlib import Path
 import panel as pn
 
 from fusion.app.parts import PathError, allowed_folder, allowed_path, file_name, heading, paragraph, table
+from fusion.campaign.inspect import Inspected, Kind, inspect_paths
 from fusion.common import FusionError
-from fusion.pipeline.inspect import Inspected, Kind, inspect_paths
 from fusion.results.store import write_atomically
 
 

@@ -15,9 +15,9 @@ from fusion.app.parts import Parts, column, heading
 from fusion.app.setup.campaign import CampaignText
 from fusion.app.setup.labels import CHOICES, HINTS, LABELS, TITLES, UNITS
 from fusion.campaign.config import campaign_schema
+from fusion.campaign.draft import TO_FILL
 from fusion.campaign.values import read_quantity
 from fusion.common import FusionError
-from fusion.pipeline.draft import TO_FILL
 from fusion.results.numbers import print_unit
 from fusion.results.progress import counted
 

@@ -14,9 +14,9 @@ from bokeh.models import ColumnDataSource
 from fusion.analysis.alignment.align import camera_on_laser_clock, covered_share, likely_zone_shift
 from fusion.app.parts import column, heading, markup, paragraph_markup
 from fusion.app.setup.plan import TEAL
+from fusion.campaign.inspect import FolderContent, Kind, Recording
 from fusion.campaign.logs import read_drivers
 from fusion.common import FusionError
-from fusion.pipeline.inspect import FolderContent, Kind, Recording
 from fusion.report.charts.style import new_figure
 from interferometry.common import InterferometryError
 from interferometry.io.readings import read_deviations, read_environment

@@ -16,7 +16,6 @@ import xarray as xr
 
 from fusion.analysis.drift_model.recursion import make_recursion
 from fusion.messages import naming
-from fusion.report.conclusions import headline
 from fusion.report.exports import tables
 from fusion.report.exports.controls import (
     CONTROLS,
@@ -37,6 +36,7 @@ from fusion.report.exports.controls import (
     tabulate,
 )
 from fusion.report.exports.recursions import MODELS, emit, objections_to_model
+from fusion.report.findings import headline
 from fusion.report.wording import anomaly_cause, anomaly_place
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop

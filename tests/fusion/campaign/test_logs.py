@@ -13,10 +13,10 @@ import pytest
 import xarray as xr
 
 from fusion.campaign.config import CampaignError, DriversTable, load_campaign
+from fusion.campaign.draft import Asker, write_campaign
 from fusion.campaign.inputs import pipe_notices, read_record
 from fusion.campaign.logs import ContactSensors, TableError, read_drivers, read_sensors, split_heading
 from fusion.common import FusionError
-from fusion.pipeline.draft import Asker, write_campaign
 from interferometry.io.faults import LaserFormatError
 from tests.fusion.campaign_parts import without
 

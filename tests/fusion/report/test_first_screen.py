@@ -7,8 +7,8 @@ from playwright.sync_api import sync_playwright
 
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
-from fusion.report import conclusions
-from fusion.report.conclusions import in_brief, sharpen
+from fusion.report import findings
+from fusion.report.findings import in_brief, sharpen
 from fusion.report.page import render_report
 from fusion.results.results import assemble, read_results
 from interferometry.iso230 import SAMPLING
@@ -157,4 +157,4 @@ def test_the_sharper_uncertainty_is_what_the_statement_gives(reports):
 
 
 def test_more_cycles_lessen_the_contributions_of_the_evaluation_that_come_from_scatter() -> None:
-    assert conclusions._OF_SCATTER == SAMPLING
+    assert findings._OF_SCATTER == SAMPLING

@@ -16,7 +16,7 @@ from playwright.sync_api import sync_playwright
 from fusion.campaign.recompensation import ROTARY_BUDGET
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, files_of_run, read_test
 from fusion.report.campaign import describe_iso230
-from fusion.report.conclusions import sharpen
+from fusion.report.findings import sharpen
 from fusion.report.page import PageFileError
 from fusion.report.sheet import (
     describe_sheet,

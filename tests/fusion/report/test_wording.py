@@ -7,9 +7,9 @@ import pytest
 from rich.console import Console
 
 from fusion.analysis.consistency.checks import Check, inputs_part
-from fusion.report import conclusions as answers
+from fusion.report import findings as answers
 from fusion.report import wording
-from fusion.report.conclusions import action, next_steps, step_phrase
+from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import Row, Words, effect_words, print_table, say, table
 from fusion.results import numbers
 from fusion.results.axis import DutyPart, Evidence, Iso230Direction, Iso230Window, SourcePart

@@ -17,12 +17,12 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import load_campaign
+from fusion.campaign.draft import Asker, write_campaign
 from fusion.campaign.inputs import read_record
+from fusion.campaign.inspect import Kind as Contents
+from fusion.campaign.inspect import inspect_paths
 from fusion.campaign.logs import read_drivers
 from fusion.common import FusionError
-from fusion.pipeline.draft import Asker, write_campaign
-from fusion.pipeline.inspect import Kind as Contents
-from fusion.pipeline.inspect import inspect_paths
 from fusion.pipeline.record import read_source
 from interferometry.io.readings import read_environment
 from tests.soak.fuzz.harness import Kind

@@ -13,7 +13,7 @@ import pytest
 
 from fusion.app.results.data import Products
 from fusion.app.results.screen import _outcome, _pictures, _put, _write_sheet, _write_thermal_sheet
-from fusion.pipeline.draft import Asker, write_campaign
+from fusion.campaign.draft import Asker, write_campaign
 from fusion.pipeline.iso230_3 import StatedTests
 from fusion.pipeline.run import run_campaign
 from fusion.report.page import ProductsError

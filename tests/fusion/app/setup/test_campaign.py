@@ -23,7 +23,7 @@ from fusion.app.setup.form import (
     write_fields,
 )
 from fusion.campaign.config import campaign_schema, load_campaign
-from fusion.pipeline.draft import DraftError
+from fusion.campaign.draft import DraftError
 from fusion.results.numbers import print_unit
 
 

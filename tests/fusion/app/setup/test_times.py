@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fusion.app.setup.times import Bar, TimesView, coverage, estimate, recordings_of, shifted
-from fusion.pipeline.inspect import Recording, scan_folder
+from fusion.campaign.inspect import Recording, scan_folder
 
 MINUTES = np.datetime64("2026-03-09T06:00", "ns") + np.timedelta64(1, "m") * np.arange(121)
 

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.campaign.values import QuantityError, column_conversion, read_quantity, role_of_unit
-from fusion.common import FusionError
-from fusion.pipeline.columns import ROLES, ColumnsError, TableProposal, propose_runs
-from fusion.pipeline.inspect import (
+from fusion.campaign.columns import ROLES, ColumnsError, TableProposal, propose_runs
+from fusion.campaign.inspect import (
     FolderContent,
     Kind,
     Recognised,
     scan_folder,
 )
+from fusion.campaign.values import QuantityError, column_conversion, read_quantity, role_of_unit
+from fusion.common import FusionError
 from fusion.results.progress import counted
 from fusion.results.store import is_text, write_text
 from interferometry.common import InterferometryError

@@ -9,9 +9,9 @@ import pytest
 
 from fusion.analysis.attribution.two_sessions import SessionComparisonError
 from fusion.campaign.config import CampaignError
-from fusion.pipeline import two_campaigns as records
+from fusion.pipeline import compare as records
+from fusion.pipeline.compare import compare_runs
 from fusion.pipeline.run import run_campaign
-from fusion.pipeline.two_campaigns import compare_runs
 from fusion.results.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
 from tests.fusion.campaign_parts import change, record_of_rows, without
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.campaign.values import in_order, name_and_unit
+from fusion.campaign.values import column_unit, in_order, is_displacement, is_temperature, is_time
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.messages import unforeseen
 from fusion.results.folder import MANIFEST
@@ -41,7 +41,7 @@ from thermography.registration.plan import read_fiducials
 if TYPE_CHECKING:
     import xarray as xr
 
-    from fusion.pipeline.columns import TableProposal
+    from fusion.campaign.columns import TableProposal
 
 
 # What kind of file something is, recognised by its content: the campaign's own files, recordings, logs and plans.
@@ -158,28 +158,6 @@ def _by_content(path: Path) -> Recognised:
     return Recognised(path, kind, headings=headings)
 
 
-def column_unit(heading: str) -> str:
-    """Return the unit in a heading such as ``"t1 [degC]"``; empty where it has none."""
-    return name_and_unit(heading)[1]
-
-
-def is_temperature(heading: str) -> bool:
-    """Return whether a heading is that of a temperature."""
-    return column_unit(heading) in ("degC", "K", "degF")
-
-
-def is_displacement(heading: str) -> bool:
-    """Return whether a heading is that of a displacement."""
-    return column_unit(heading) in ("um", "nm", "mm", "in", "mil")
-
-
-def is_time(heading: str) -> bool:
-    """Return whether a heading is that of the time: ``time`` or ``date`` in a language that is read, or a column in units of time."""
-    from interferometry.io.tables import read_heading
-
-    return read_heading(heading).role in ("time", "date") or column_unit(heading) in ("s", "ms", "min", "h")
-
-
 def _of_a_laser(headings: Sequence[str]) -> bool:
     """Return whether headings are those of a table of readings, whatever it lacks."""
     from interferometry.io.tables import read_heading
@@ -190,7 +168,7 @@ def _of_a_laser(headings: Sequence[str]) -> bool:
 
 def _logged_table(path: Path) -> TableProposal | None:
     """Return the proposal for a table of something over time, None where a file is no table."""
-    from fusion.pipeline.columns import propose_table
+    from fusion.campaign.columns import propose_table
 
     try:
         return propose_table(path)
@@ -327,7 +305,7 @@ def _describe_log(found: Recognised) -> list[str]:
 
 
 def _describe_record(found: Recognised) -> list[str]:
-    from fusion.pipeline.columns import propose_table
+    from fusion.campaign.columns import propose_table
 
     table = propose_table(found.path)
     roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}

@@ -13,12 +13,12 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from fusion.campaign.columns import ColumnsError, propose_table
 from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.draft import Asker, DraftError, write_campaign
 from fusion.campaign.inputs import read_record
 from fusion.campaign.logs import TableError
 from fusion.pipeline.check import check_campaign
-from fusion.pipeline.columns import ColumnsError, propose_table
-from fusion.pipeline.draft import Asker, DraftError, write_campaign
 from fusion.results.progress import clock_notices
 from interferometry.io.faults import LaserFormatError
 

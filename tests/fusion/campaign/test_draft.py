@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import campaign_schema, load_campaign
+from fusion.campaign.draft import Asker, DraftError, draft_lines, unused_files, write_campaign, write_campaigns
+from fusion.campaign.inspect import scan_folder
 from fusion.campaign.values import QuantityError
 from fusion.pipeline.check import check_campaign
-from fusion.pipeline.draft import Asker, DraftError, draft_lines, unused_files, write_campaign, write_campaigns
 from fusion.pipeline.fleet import find_members
-from fusion.pipeline.inspect import scan_folder
 from interferometry.io.faults import LaserFormatError
 from tests.fusion.campaign_parts import write_laser
 from thermography.io.flir import index_frames

@@ -27,9 +27,8 @@ from fusion.campaign.logs import (
     within_a_day,
     written_times,
 )
-from fusion.campaign.values import is_unit, name_and_unit, role_of_unit, unit_name
+from fusion.campaign.values import column_unit, is_time, is_unit, name_and_unit, role_of_unit, unit_name
 from fusion.common import FusionError
-from fusion.pipeline.inspect import column_unit, is_time
 from fusion.results.progress import listed
 from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, RejectedLine
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells

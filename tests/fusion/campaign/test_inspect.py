@@ -9,22 +9,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fusion.pipeline.inspect import (
+from fusion.campaign.inspect import (
     Kind,
     Recording,
-    column_unit,
     describe_file,
     describe_series,
     input_files,
     inspect_paths,
-    is_displacement,
-    is_temperature,
-    is_time,
     recognise,
     scan_folder,
     time_bars,
     write_frames,
 )
+from fusion.campaign.values import column_unit, is_displacement, is_temperature, is_time
 from interferometry.io.faults import LaserFormatError
 from tests.thermography.flir_mutations import PARAMETERS, frame
 from thermography import inspection
@@ -138,9 +135,9 @@ def test_a_file_on_which_a_reader_fails_is_not_used_and_stops_no_other(tmp_path,
             raise error
         return Kind.REGIONS
 
-    monkeypatch.setattr("fusion.pipeline.inspect._by_headings", fails)
+    monkeypatch.setattr("fusion.campaign.inspect._by_headings", fails)
     # A table that one reader refuses may be one of another kind: here it is none.
-    monkeypatch.setattr("fusion.pipeline.inspect._logged_table", lambda path: None)
+    monkeypatch.setattr("fusion.campaign.inspect._logged_table", lambda path: None)
     content = scan_folder(tmp_path)
     assert [one.path.name for one in content.of(Kind.REGIONS)] == ["b.csv"]
     (unused,) = content.unknown

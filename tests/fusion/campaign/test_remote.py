@@ -18,10 +18,10 @@ import pytest
 from typer.testing import CliRunner
 
 from fusion import cli
+from fusion.campaign import remote
 from fusion.campaign.config import Campaign, load_campaign
+from fusion.campaign.remote import RemoteError, fetch_campaign, fetch_file, is_address
 from fusion.campaign.values import FILE_KEYS
-from fusion.pipeline import remote
-from fusion.pipeline.remote import RemoteError, fetch_campaign, fetch_file, is_address
 from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
 from tests.fusion.campaign_parts import change, keep_cycles, without
