@@ -195,7 +195,7 @@ def run(
     places = [_place(text) for text in campaigns]
     folders = _folders(places, out)
     if no_plugins:
-        from fusion.analysis.effects.effect import leave_plugins_out
+        from fusion.analysis.effects.plugins import leave_plugins_out
 
         leave_plugins_out()
     two = processes > 1 and not (resume or watch)

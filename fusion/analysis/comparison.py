@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
+from fusion.analysis.levels import CHANGE_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
@@ -337,8 +338,6 @@ def compare_scatters(
     ]  # fmt: skip
 
 
-#: Level at which something counts as changed, over everything that is compared.
-LEVEL = 0.05
 #: Inputs of the budget whose error is one and the same in all readings of a test.
 _OF_INSTRUMENTS = ("device", "alignment", "material_temperature", "expansion_coefficient")
 #: Values by ISO 230-2 that are compared.
@@ -397,7 +396,7 @@ class Change:
     @property
     def significant(self) -> bool:
         """Whether it differs by more than the uncertainties allow."""
-        return self.p_value <= LEVEL
+        return self.p_value <= CHANGE_LEVEL
 
 
 @dataclass(frozen=True)
@@ -552,7 +551,7 @@ def _profile(
         lacks.append(f"Profile and scatter: no estimate of the drift in {_either(without)}.")
         return None
     try:
-        found = compare_profiles(before.drift, after.drift, level=LEVEL / pairs, tests=tests)
+        found = compare_profiles(before.drift, after.drift, level=CHANGE_LEVEL / pairs, tests=tests)
     except ComparisonError as reason:
         lacks.append(f"Profile: {reason}.")
         return None

@@ -19,3 +19,13 @@ RECORD_ENTRY_LEVEL = 0.001
 REMAINDER_LEVEL = 0.01
 #: Of any position that is said to stand out.
 POSITION_LEVEL = 0.015
+#: Of taking another line on the plan for the declared one, over all lines that are tried.
+LINE_LEVEL = 2e-3
+#: Of naming any sensor of a sound record.
+SENSOR_LEVEL = 0.01
+#: Of the bootstrap tests of a cause; local temperature is the cause that costs most when it is wrong.
+CAUSE_LEVELS = {"step": 0.05, "local_temperature": 0.02}
+#: Above which a serial p-value is called not significant in a sentence; it takes no part in the choice of the cause.
+SERIAL_LEVEL = 0.05
+#: Of saying that campaigns of one machine differ, over everything that is compared.
+CHANGE_LEVEL = 0.05

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from fusion.analysis.alignment.align import describe_sensors, join_sensors
 from fusion.analysis.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.analysis.consistency.clocks import FOLLOWING_NOTICES, is_doubted_clock, without_consequences
-from fusion.analysis.effects.effect import plugins
+from fusion.analysis.effects.plugins import plugins
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import (
     CameraInputs,

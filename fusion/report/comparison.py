@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fusion.analysis.comparison import LEVEL, Achieved, Change, ComparedCampaign, PairComparison, common_to_all
+from fusion.analysis.comparison import Achieved, Change, ComparedCampaign, PairComparison, common_to_all
+from fusion.analysis.levels import CHANGE_LEVEL
 from fusion.common import versions
 from fusion.report.charts.comparison import (
     Trend,
@@ -146,8 +147,8 @@ def comparison_notes(pairs: Sequence[PairComparison]) -> list[str]:
     notes = []
     if levels:
         notes.append(
-            f"Each counts at {100 * LEVEL:.0f} % over {', and over '.join(levels)}. Positions are compared beyond offset, slope and bow of "
-            "the profile; that presumes that the laser measured along the same line."
+            f"Each counts at {100 * CHANGE_LEVEL:.0f} % over {', and over '.join(levels)}. Positions are compared beyond offset, slope and "
+            "bow of the profile; that presumes that the laser measured along the same line."
         )
     names = _letters(pairs)[1:]
     for common, whose in _shared([(pair.common, name) for pair, name in zip(pairs, names, strict=True) if pair.common]):

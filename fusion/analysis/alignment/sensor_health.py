@@ -17,6 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import sample_noise
+from fusion.analysis.levels import SENSOR_LEVEL
 from fusion.common import Array
 from fusion.results.loop import SensorFaultPart
 
@@ -273,8 +274,6 @@ def level_beyond_prediction(grid: Grid, sensor: int, others: list[int]) -> Array
     return np.asarray(own - grid.temperature[:, others] @ coefficients)
 
 
-#: Probability of naming any sensor of a sound record.
-FAMILY_LEVEL = 0.01
 #: Power with which the distribution of a sound sensor's largest excursions falls at the slowest: Student's t with 4 degrees of freedom.
 TAIL_INDEX = 4.0
 #: Readings outside are none, degC: colder than any shop, hotter than a motor winding of class H may be (180 degC, IEC 60085).
@@ -389,8 +388,8 @@ def describe_fault(fault: SensorFault | SensorFaultPart) -> str:
 
 
 def excursion_limit(tests: int) -> float:
-    """Ratio of the largest excursion to the next that a sound record exceeds with probability :data:`FAMILY_LEVEL`."""
-    return float((tests / FAMILY_LEVEL) ** (1.0 / TAIL_INDEX))
+    """Ratio of the largest excursion to the next that a sound record exceeds with probability :data:`SENSOR_LEVEL`."""
+    return float((tests / SENSOR_LEVEL) ** (1.0 / TAIL_INDEX))
 
 
 def examine_sensors(seconds: Array, temperature: Array, drivers: Array | None = None) -> list[SensorFault]:

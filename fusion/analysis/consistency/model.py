@@ -17,6 +17,7 @@ from fusion.analysis.alignment.readings import Series
 from fusion.analysis.consistency.checks import Check, judge
 from fusion.analysis.drift_model.fit import ModelFit, Term, place_of, refit_fixed
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
+from fusion.analysis.levels import LINE_LEVEL
 from fusion.common import Array
 from fusion.results.loop import AxisLine
 from interferometry.drift.kalman import DriftModelError
@@ -33,8 +34,8 @@ _LEAST_SHIFT = 0.1
 _CLOSER_LOOKS = 3
 #: Standard deviations from the expected expansion within which an alternative is an explanation.
 _PLAUSIBLE = 2.5
-#: Share of the tests with the right line in which an alternative may be taken for it, and number of simulated tests that show it.
-_FALSE_ALARMS, _DRAWS = 2e-3, 20_000
+#: Simulated tests with the right line, which show the gain of its alternatives.
+_DRAWS = 20_000
 #: Log-likelihood within which a line explains the readings as well as the declared one.
 _AS_WELL = 2.0
 #: Share of its whitened length that the other terms must leave of a line for its expansion to be determined.
@@ -132,9 +133,9 @@ class _Comparison:
         noise = np.random.default_rng(1).standard_normal((len(values), _DRAWS))
         spread = axes * np.sqrt(sigma2 * np.maximum(values, 0.0))
         simulated, _ = self._gains(np.diag(lines), plausible * lines[:, :1] + spread @ noise, sigma2)
-        limit = float(np.quantile(simulated.max(axis=0, initial=-np.inf), 1.0 - _FALSE_ALARMS, method="higher"))
+        limit = float(np.quantile(simulated.max(axis=0, initial=-np.inf), 1.0 - LINE_LEVEL, method="higher"))
         as_well = np.append(expansion[0], expansion[1:][gains >= -_AS_WELL])
-        return max(limit, -float(np.log(_FALSE_ALARMS))), (float(as_well.min()), float(as_well.max()))
+        return max(limit, -float(np.log(LINE_LEVEL))), (float(as_well.min()), float(as_well.max()))
 
     def _whitened(self, columns: Sequence[Array]) -> tuple[Array, float]:
         """Products of whitened lines (declared first) and readings given all other terms, and the variance about the declared line."""

@@ -15,7 +15,6 @@ from typing import Any, Protocol
 import numpy as np
 import xarray as xr
 
-from fusion.analysis.diagnosis.causes import CAUSES, undetermined_check
 from fusion.analysis.diagnosis.explanations import (
     LAGS_S,
     ProfileFit,
@@ -32,8 +31,51 @@ from fusion.analysis.diagnosis.explanations import (
     step_instant,
     warm_up_share,
 )
+from fusion.analysis.levels import CAUSE_LEVELS, SERIAL_LEVEL
 from fusion.results.axis import Cause
 from interferometry.common import one_thread
+
+
+@dataclass(frozen=True)
+class CauseRecord:
+    """A cause as a reader meets it.
+
+    Attributes
+    ----------
+    words : name in words
+    check : what to inspect on the machine, or how to repeat the test; one sentence
+    """
+
+    words: str
+    check: str
+
+
+CAUSES: dict[Cause, CauseRecord] = {
+    "structural": CauseRecord(
+        "mechanical scatter",
+        "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat the "
+        "test with small steps around it.",
+    ),
+    "local_temperature": CauseRecord(
+        "local temperature",
+        "Find what heats the table near this position (drive, pipe, chips, sun) and whether the fixture bends with it; repeat "
+        "the test with that source switched on and off.",
+    ),
+    "stick_slip": CauseRecord(
+        "stick-slip",
+        "Inspect lubrication, seals, wipers and the drive's gain at low speed around this position; repeat the test at another "
+        "feed rate and after lubrication.",
+    ),
+    "step": CauseRecord(
+        "sudden step",
+        "Inspect fixture, optics, clamps and the coupling of the scale, and look for an event at that time in the machine's log.",
+    ),
+    "undetermined": CauseRecord(
+        "undetermined",
+        "These data do not decide: repeat the test with more cycles in both directions, a varied duty cycle and a temperature "
+        "sensor at this position.",
+    ),
+}
 
 #: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
@@ -43,10 +85,6 @@ THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "st
 APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
 #: A local temperature that follows one warm-up to at least this share of its variance is collinear with every other slow cause.
 WARM_UP_SHARE = 0.98
-#: Levels of the bootstrap tests; local temperature is the cause that costs most when it is wrong.
-LEVELS = {"step": 0.05, "local_temperature": 0.02}
-#: Level above which a serial p-value is called not significant in a sentence; it takes no part in the choice of the cause.
-_SERIAL_LEVEL = 0.05
 
 
 class Flagged(Protocol):
@@ -222,7 +260,7 @@ def _probabilities(case: _Case) -> dict[str, float]:
     if case.temperature is not None:
         score["local_temperature"] = case.temperature.log_likelihood - parameter - float(np.log(len(LAGS_S)))
     for name, fit in case.tested.items():
-        if fit.p_value > LEVELS[name]:
+        if fit.p_value > CAUSE_LEVELS[name]:
             score[name] = -np.inf
     highest = max(score.values())
     weight = {name: float(np.exp(value - highest)) for name, value in score.items()}
@@ -241,7 +279,7 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
     against += [
         f"{_in_words(name)}: p = {fit.p_value:.2g}, ordinary slow drift would look the same"
         for name, fit in case.tested.items()
-        if fit.p_value > LEVELS[name]
+        if fit.p_value > CAUSE_LEVELS[name]
     ]
     return Diagnosis(
         target=case.residual.target,
@@ -253,6 +291,15 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
         against_it=tuple(against),
         check=undetermined_check(leading) if cause == "undetermined" else CAUSES[cause].check,
     )
+
+
+def undetermined_check(leading: str) -> str:
+    """Return what to do where no cause is named, and what to inspect if the leading explanation, unless it is none, holds after all."""
+    generic = CAUSES["undetermined"].check
+    candidate = None if leading == "undetermined" else CAUSES.get(leading)  # type: ignore[call-overload]
+    if candidate is None:
+        return generic
+    return f"{generic} If the cause is {candidate.words}: {candidate.check[0].lower()}{candidate.check[1:]}"
 
 
 def _in_words(explanation: str) -> str:
@@ -316,7 +363,7 @@ def _support(case: _Case, leading: str) -> list[str]:
 
 def _serial_sentence(p_value: float) -> str:
     """Return what the order of the readings in time shows."""
-    if p_value > _SERIAL_LEVEL:
+    if p_value > SERIAL_LEVEL:
         return f"no significant serial correlation (p = {p_value:.2g})"
     return f"serial correlation p = {p_value:.2g}"
 

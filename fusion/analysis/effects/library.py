@@ -1,15 +1,13 @@
 """The library of effects: what a measured drift may contain.
 
 Which candidate of an effect fits, and whether the effect deserves to be named, is decided in :mod:`fusion.analysis.drift_model.search`.
-Physics,
-columns and sources of every effect: docs/method/effects.md. A user's own effect is a :class:`fusion.analysis.effects.effect.Effect`
-under the
-entry-point group ``thermofuse.effects``.
+Physics, columns and sources of every effect: docs/method/effects.md. A user's own effect is a
+:class:`fusion.analysis.effects.effect.Effect` under the entry-point group ``thermofuse.effects``.
 """
 
 from __future__ import annotations
 
-from fusion.analysis.effects.effect import Effect, load_plugin, plugins
+from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.events import PERIODIC_DISTURBANCE, STEP_EVENT
 from fusion.analysis.effects.laser_and_camera import (
     AIR_INDEX,
@@ -20,6 +18,7 @@ from fusion.analysis.effects.laser_and_camera import (
     REFLECTED_SOURCE,
     SENSOR_FAULT,
 )
+from fusion.analysis.effects.plugins import load_plugin, plugins
 from fusion.analysis.effects.thermal import (
     ANGULAR_GROWTH,
     AXIS_EXPANSION,

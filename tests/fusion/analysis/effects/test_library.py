@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from fusion.analysis.alignment.readings import Readings, Series
-from fusion.analysis.effects import effect as module
 from fusion.analysis.effects import library as library_module
-from fusion.analysis.effects.effect import Effect, PluginError, describe_code, leave_plugins_out, load_plugin, plugins
+from fusion.analysis.effects import plugins as module
+from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.library import LIBRARY, describe_effect, library
+from fusion.analysis.effects.plugins import PluginError, describe_code, leave_plugins_out, load_plugin, plugins
 from fusion.analysis.effects.thermal import QUASI_STATIC_RESPONSE
 from fusion.results.parts import PluginPart
 from tests.fusion.small_campaign import campaign, logged
