@@ -8,13 +8,13 @@ Evaluation (:mod:`interferometry.iso230.evaluation`), the inputs of the budget (
 
 from interferometry.iso230.budget import CONTRIBUTIONS, SAMPLING, Iso230Budget
 from interferometry.iso230.evaluation import (
-    QUANTITIES,
     STANDARD_CYCLES,
     evaluate_iso230,
     evaluate_other_standards,
     evaluate_windows,
     settled_window,
 )
+from interferometry.iso230.quantities import QUANTITIES
 
 __all__ = [
     "CONTRIBUTIONS",

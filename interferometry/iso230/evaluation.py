@@ -8,8 +8,7 @@ deviation, B_i reversal error at a position, R_i repeatability at a position; of
 bidirectional repeatability R, bidirectional systematic positioning error E, mean bidirectional positioning error M, bidirectional
 accuracy A.
 
-In this order: the evaluation of one window; windows along a test and which of them is quoted; other standards; the quantities as
-numbers.
+In this order: the evaluation of one window; windows along a test and which of them is quoted; other standards.
 """
 
 from __future__ import annotations
@@ -22,17 +21,12 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
-from interferometry.common import Array, InterferometryError, check_dataset
+from interferometry.common import InterferometryError, check_dataset
 from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
 from interferometry.deviations import DIRECTIONS
 from interferometry.iso230.budget import CONTRIBUTIONS, SCATTER_ALONE, Iso230Budget
+from interferometry.iso230.quantities import AXIS, ONE_WAY, axis_quantities, target_quantities
 
-#: Quantities of the axis: reversal error, bidirectional repeatability, bidirectional systematic positioning error, mean bidirectional
-#: positioning error, bidirectional accuracy.
-QUANTITIES = ("B", "R", "E", "M", "A")
-#: What has an uncertainty: these, the signed mean of the reversal errors, and quantities of one direction.
-AXIS = (*QUANTITIES, "mean_reversal")
-ONE_WAY = ("R_unidirectional", "E_unidirectional", "A_unidirectional")
 STANDARD_CYCLES = 5
 #: Windows of a long test that are evaluated before their results become one.
 _WINDOWS_AT_ONCE = 64
@@ -101,6 +95,7 @@ def evaluate_iso230(
     --------
     >>> import numpy as np
     >>> from interferometry.deviations import build_deviations
+    >>> from interferometry.iso230 import QUANTITIES
     >>> deviation = np.array([[[0.0, 5.0], [2.0, 6.0]], [[0.0, 5.0], [2.0, 6.0]]])
     >>> time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
     >>> test = build_deviations([1, 2], [1, 2], np.array([0.0, 100.0]), deviation, time)
@@ -357,38 +352,3 @@ def _by_jis(x: np.ndarray) -> list[OtherQuantity]:
         OtherQuantity(JIS, "positioning repeatability (±)", float(repeatability), half_range),
         OtherQuantity(JIS, "lost motion", float(lost_motion), "largest difference of both approaches' means"),
     ]
-
-
-# The quantities of clause 3, from mean deviations and their standard deviations.
-
-
-def target_quantities(mean: Array, s: Array) -> tuple[Array, Array, Array]:
-    """Return mean bidirectional deviation, reversal error B_i and bidirectional repeatability R_i of every position."""
-    positive, negative = mean[..., 0, :], mean[..., 1, :]
-    s_positive, s_negative = s[..., 0, :], s[..., 1, :]
-    reversal = positive - negative
-    wide = np.fmax(2 * s_positive + 2 * s_negative + np.abs(reversal), np.fmax(4 * s_positive, 4 * s_negative))
-    return (positive + negative) / 2, reversal, np.where(np.isnan(reversal), np.nan, wide)
-
-
-def axis_quantities(mean: Array, s: Array) -> dict[str, Array]:
-    """Return the quantities of the axis: B, R, E, M and A of both directions, and R, E and A of each."""
-    both, reversal, repeatability = target_quantities(mean, s)
-    bidirectional = np.isfinite(reversal).any(axis=-1)
-    upper, lower = mean + 2 * s, mean - 2 * s
-    cells = (-2, -1)
-    return {
-        "B": _largest(np.abs(reversal)),
-        "R": _largest(repeatability),
-        "E": np.where(bidirectional, _largest(mean, cells) + _largest(-mean, cells), np.nan),
-        "M": _largest(both) + _largest(-both),
-        "A": np.where(bidirectional, _largest(upper, cells) + _largest(-lower, cells), np.nan),
-        "R_unidirectional": _largest(4 * s),
-        "E_unidirectional": _largest(mean) + _largest(-mean),
-        "A_unidirectional": _largest(upper) + _largest(-lower),
-    }
-
-
-def _largest(values: Array, axes: int | tuple[int, ...] = -1) -> Array:
-    """Return the largest finite value along axes, NaN where there is none."""
-    return np.asarray(np.fmax.reduce(values, axis=axes), dtype=float)

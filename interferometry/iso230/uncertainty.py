@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from interferometry.iso230.budget import CONTRIBUTIONS, Iso230Budget
-from interferometry.iso230.evaluation import AXIS, ONE_WAY, axis_quantities
+from interferometry.iso230.quantities import AXIS, ONE_WAY, axis_quantities
 
 #: Contributions to a quantity that was not measured.
 _UNKNOWN = [np.nan] * len(CONTRIBUTIONS)

@@ -13,7 +13,7 @@ import pytest
 from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.iso230 import Iso230Budget, evaluate_iso230
-from interferometry.iso230.evaluation import axis_quantities
+from interferometry.iso230.quantities import axis_quantities
 
 CYCLES, TARGETS, SCATTER_UM, RUNS = 5, 11, 0.5, 200
 NOTHING = {
