@@ -36,7 +36,6 @@ from fusion.results.results import Notice, Outcome
 from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
 from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
-from thermography.fields.large_arrays import in_pieces, piece_slices
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.fields.survey import (
@@ -60,6 +59,7 @@ from thermography.fields.total_uncertainty import (
 )
 from thermography.io.files import write_maps
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
+from thermography.large_arrays import in_pieces, piece_slices
 from thermography.radiometry.camera import (
     DEAD,
     NOISY,

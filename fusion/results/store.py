@@ -23,9 +23,9 @@ from pydantic import BaseModel
 from fusion.common import FusionError, own_name, place_within
 from interferometry.common import DEVIATIONS, DIRECTIONS
 from thermography.common import FIELDS
-from thermography.fields.large_arrays import IN_MEMORY_BYTES, in_pieces
 from thermography.io import files as atomic
 from thermography.io.hdf5 import hdf5_fault
+from thermography.large_arrays import IN_MEMORY_BYTES, in_pieces
 
 if TYPE_CHECKING:
     import xarray as xr

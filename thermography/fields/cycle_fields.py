@@ -14,8 +14,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from thermography.common import MAD_TO_SIGMA, Array
-from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
 from thermography.fields.resampling import PlanWeights
+from thermography.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
 from thermography.registration.plan import PlanGrid
 

@@ -35,12 +35,12 @@ from thermography.fields.blocks import (
     reduce_block,
 )
 from thermography.fields.cycle_fields import CyclePart, assemble_fields
-from thermography.fields.large_arrays import Spool, fill_array
 from thermography.fields.resampling import plan_weights, plan_window
 from thermography.fields.scheduling import Pool, in_order, open_pool
 from thermography.io.files import write_atomically
 from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.sequence import WindowReader
+from thermography.large_arrays import Spool, fill_array
 from thermography.radiometry.averaging import MeanTemperature
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import (

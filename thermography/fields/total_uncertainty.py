@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import PARTLY_SEEN_BELOW, SURFACE_EDGE, annotate, rate, reference_cycle
-from thermography.fields.large_arrays import empty_array, give_back, in_pieces
 from thermography.io.frame import CameraParameters
+from thermography.large_arrays import empty_array, give_back, in_pieces
 from thermography.radiometry.emissivity import EmissivityEstimate, KnownState, estimate_emissivity
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,

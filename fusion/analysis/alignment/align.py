@@ -19,7 +19,7 @@ from fusion.analysis.alignment.reflections import find_switching_patch, seen_thr
 from fusion.analysis.alignment.sensor_health import SensorFault
 from fusion.common import Array, FusionError
 from interferometry.deviations import resolution_um
-from thermography.fields.large_arrays import in_pieces, piece_slices
+from thermography.large_arrays import in_pieces, piece_slices
 
 _DIMS = ("cycle", "direction", "target")
 #: What is kept of the deviations.

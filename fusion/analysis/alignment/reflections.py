@@ -17,7 +17,7 @@ from scipy import linalg
 
 from fusion.common import Array
 from thermography.common import scatter_by_median
-from thermography.fields.large_arrays import in_pieces, piece_slices
+from thermography.large_arrays import in_pieces, piece_slices
 
 #: A change counts as a jump where it exceeds the usual change of its patch this many times (robust sigma).
 _JUMP_SIGMAS = 8.0

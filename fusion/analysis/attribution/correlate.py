@@ -52,7 +52,7 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array, FusionError
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart, Sensitivity
-from thermography.fields.large_arrays import piece_slices
+from thermography.large_arrays import piece_slices
 
 # Places on the plan as areas: the cells that belong together around a peak, and the rectangle that names them.
 

@@ -32,7 +32,7 @@ from fusion.analysis.attribution.drift_channels import DriftSeries, clock_readin
 from fusion.analysis.attribution.modes import thermal_modes
 from fusion.analysis.attribution.significance import LAGS_S, null_bank, whitening_grid
 from fusion.common import Array
-from thermography.fields.large_arrays import empty_array, give_back
+from thermography.large_arrays import empty_array, one_by_one
 
 #: The camera is represented by at most this many thermal modes.
 _CAMERA_MODES = 6
@@ -148,10 +148,9 @@ class _Part:
         # Of a long test all grid points together fill the memory: they are in a temporary file.
         self.projects = empty_array((len(grid.whitenings), self.values.size, self.values.size), float)
         self.white = np.empty(self.projects.shape[:2])
-        for g, point in enumerate(grid.whitenings):
-            project = point.project
-            self.projects[g], self.white[g] = project, project @ self.values
-            give_back(self.projects)
+        for g, (point, project) in enumerate(zip(grid.whitenings, one_by_one(self.projects), strict=True)):
+            exact = point.project
+            project[:], self.white[g] = exact, exact @ self.values
         self.penalty = np.array([point.log_penalty for point in grid.whitenings])
 
     def columns(self, temperatures: Array, lag: int) -> Array:
@@ -178,7 +177,7 @@ def _fit(part: _Part, temperatures: Array) -> _Fit:
     size = float(np.sqrt((columns[0] ** 2).mean())) + 1e-30
     freedom = part.freedom
     best = _Fit(0, 0, 0.0, np.zeros(temperatures.shape[1]), np.inf)
-    for drift, (project, white) in enumerate(zip(part.projects, part.white, strict=True)):
+    for drift, (project, white) in enumerate(zip(one_by_one(part.projects), part.white, strict=True)):
         whitened = project @ columns
         power, vectors = np.linalg.eigh(whitened.transpose(0, 2, 1) @ whitened)
         power = np.maximum(power, 0.0)
@@ -192,7 +191,6 @@ def _fit(part: _Part, temperatures: Array) -> _Fit:
             lag = int(np.argmin(score))
             if score[lag] < best.score:
                 best = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]), float(score[lag]))
-        give_back(project)
     return best
 
 
@@ -202,9 +200,8 @@ def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: i
     swing = contact.std(axis=0)
     states = []
     for part, fit in zip(parts, fits, strict=True):
-        project = part.projects[fit.drift]
-        states.append((project.T @ project, part.columns(contact, fit.lag)))
-        give_back(project)
+        for project in one_by_one([part.projects[fit.drift]]):
+            states.append((project.T @ project, part.columns(contact, fit.lag)))
     for _ in range(most):
         gain = np.zeros(contact.shape[1])
         for part, fit, (inverse, columns) in zip(parts, fits, states, strict=True):

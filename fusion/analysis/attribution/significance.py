@@ -28,7 +28,7 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array
 from interferometry.drift.kalman import DriftSystem, Order, drift_system
 from thermofuse.compiled import njit
-from thermography.fields.large_arrays import empty_array, give_back
+from thermography.large_arrays import empty_array, one_by_one
 
 # Profile likelihood ratios of many regressors against one drift series, with the drift variance estimated again under
 # each.
@@ -202,11 +202,11 @@ def whiten_series(bank: NullBank, series: Array) -> Whitened:
     projects = empty_array((count, n, n), np.float32)
     projected = empty_array((count, *series.shape), np.float32)
     squares = np.empty(projected.shape[:2])
-    for g, point in enumerate(bank.whitenings):
-        project = point.project
-        white = series @ project.T
-        projects[g], projected[g], squares[g] = project, white, (white**2).sum(axis=1)
-        give_back(projects, projected)
+    filled = zip(bank.whitenings, one_by_one(projects), one_by_one(projected), strict=True)
+    for g, (point, project, white) in enumerate(filled):
+        exact = point.project
+        whole = series @ exact.T
+        project[:], white[:], squares[g] = exact, whole, (whole**2).sum(axis=1)
     log_penalty = np.array([point.log_penalty for point in bank.whitenings])
     # Only ratios of scores count; a common factor keeps single precision away from its limits.
     reference = np.log(squares[:, 0]) + log_penalty
@@ -257,11 +257,9 @@ def likelihood_ratios(bank: NullBank, whitened: Whitened, regressors: Array32) -
     draws = whitened.series.shape[1]
     best = np.empty((draws, regressors.shape[1]), np.float32)
     best[:] = whitened.null_score[:, None]
-    for g in range(len(bank.whitenings)):
-        unit, _ = _unit_regressors(whitened.projects[g], regressors)
-        products = whitened.series[g] @ unit
-        _take_best(products, whitened.penalised[g], whitened.penalty[g], best)
-        give_back(whitened.projects, whitened.series)
+    for g, (project, series) in enumerate(zip(one_by_one(whitened.projects), one_by_one(whitened.series), strict=True)):
+        unit, _ = _unit_regressors(project, regressors)
+        _take_best(series @ unit, whitened.penalised[g], whitened.penalty[g], best)
     _log_ratio(whitened.null_score, best, float(whitened.freedom))
     return best
 
@@ -284,8 +282,9 @@ def estimate_effects(bank: NullBank, regressors: Array32, *, whitened: Whitened 
     coefficient = np.zeros(columns)
     uncertainty = np.full(columns, np.inf)
     null_u = np.full(columns, np.inf)
-    for g, point in enumerate(bank.whitenings):
-        project = point.project.astype(np.float32) if whitened is None else whitened.projects[g]
+    exact = (point.project.astype(np.float32) for point in bank.whitenings)
+    projects = exact if whitened is None else one_by_one(whitened.projects)
+    for g, (point, project) in enumerate(zip(bank.whitenings, projects, strict=True)):
         unit, length = _unit_regressors(project, regressors)
         series = bank.whitened[g]
         product = (series.astype(np.float32) @ unit).astype(float)
@@ -300,7 +299,6 @@ def estimate_effects(bank: NullBank, regressors: Array32, *, whitened: Whitened 
         uncertainty = np.where(better, spread, uncertainty)
         if g == bank.best:
             null_u = np.where(informative, np.sqrt(float(series @ series) / bank.freedom) / safe, np.inf)
-        give_back(project)
     return Estimate(coefficient, uncertainty, null_u)
 
 

@@ -19,9 +19,9 @@ from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evide
 from fusion.common import Array
 from thermography.common import ThermographyError
 from thermography.evaluation import share_outside_range, thermogram
-from thermography.fields.large_arrays import median_of_pieces, piece_slices
 from thermography.inspection import FileWarning, check_series
 from thermography.io.frame import Frame, FrameReference
+from thermography.large_arrays import median_of_pieces, piece_slices
 
 # Checks of the times that the camera writes: order of the frames, rate of its clock, place in the motion of the axis.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.reflections import seen_throughout
 from fusion.common import Array
-from thermography.fields.large_arrays import in_pieces, piece_slices
+from thermography.large_arrays import in_pieces, piece_slices
 
 #: Side of a coarse cell, mm: finer than heat spreads in the minutes between two frames.
 _COARSE_MM = 20.0

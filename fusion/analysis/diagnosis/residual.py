@@ -23,7 +23,7 @@ from fusion.analysis.levels import REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results.loop import ResidualPart
 from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
-from thermography.fields.large_arrays import empty_arrays, give_back
+from thermography.large_arrays import empty_arrays, one_by_one
 
 _PERMUTATIONS = 400
 _BLOCK = 5
@@ -389,11 +389,10 @@ def _waves(seconds: Array, periods_min: Array) -> list[NDArray[np.float32]]:
     """Return cosines and sines of some periods each, (n, 2 some), all sines after all cosines; those of a long test on disk."""
     parts = np.array_split(periods_min, 1 + 2 * periods_min.size * seconds.size // _WAVES_AT_ONCE)
     waves = empty_arrays([(seconds.size, 2 * some.size) for some in parts], np.float32)
-    for some, of_some in zip(parts, waves, strict=True):
+    for some, of_some in zip(parts, one_by_one(waves), strict=True):
         for k, period in enumerate(some):
             phase = 2 * np.pi * seconds / (60.0 * period)
             of_some[:, k], of_some[:, some.size + k] = np.cos(phase), np.sin(phase)
-        give_back(of_some)
     return waves
 
 
@@ -405,9 +404,8 @@ def _time_statistics(series: Array, window: int, waves: Sequence[NDArray[np.floa
     total = np.cumsum(np.pad(centred, ((0, 0), (1, 0))), axis=1)
     shift = np.abs(total[:, window:] - total[:, :-window]) / np.sqrt(window)
     single, powers = centred.astype(np.float32), []
-    for some in waves:
+    for some in one_by_one(waves):
         projected = np.asarray(single @ some, np.float64) ** 2
         half = some.shape[1] // 2
         powers.append((projected[:, :half] + projected[:, half:]) / (series.shape[1] * variance[:, None]))
-        give_back(some)
     return np.asarray(np.sum(np.square(lagged), axis=0)), shift, np.hstack(powers)

@@ -105,7 +105,7 @@ from fusion.results.parts import Number
 from interferometry.common import one_thread
 from interferometry.drift.gls import DriftFit
 from interferometry.drift.kalman import DriftModelError
-from thermography.fields.large_arrays import empty_array, fill_array, give_back, in_pieces
+from thermography.large_arrays import empty_array, fill_array, in_pieces
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -735,9 +735,8 @@ def correct_fields(fields: xr.Dataset, errors: list[FieldFault]) -> xr.Dataset:
         return fields
     frames = fields["frame_temperature"]
     corrected = empty_array(frames.shape, float)
-    for some, values in in_pieces(frames):
-        corrected[some] = values + _correction(errors, some)
-        give_back(corrected)
+    for (some, values), (_, right) in zip(in_pieces(frames), in_pieces(corrected), strict=True):
+        right[:] = values + _correction(errors, some)
     return fields.assign(frame_temperature=frames.copy(data=corrected))
 
 
@@ -761,10 +760,10 @@ def corrected_variables(fields: xr.Dataset, fused: xr.Dataset, errors: list[Fiel
         return np.asarray(_correction(errors, own).mean(axis=0)) if own.any() else np.zeros(errors[0].pattern.shape)
 
     start = of_cycle(fields["cycle"].values[0])
-    for (some, mean), (_, risen) in zip(in_pieces(cycles), in_pieces(fields["temperature_rise"]), strict=True):
+    pieces = (in_pieces(array) for array in (cycles, temperature, fields["temperature_rise"], rise))
+    for (some, mean), (_, right), (_, risen), (_, right_rise) in zip(*pieces, strict=True):
         added = np.stack([of_cycle(cycle) for cycle in fields["cycle"].values[some]])
-        temperature[some], rise[some] = mean + added, risen + added - start
-        give_back(temperature, rise)
+        right[:], right_rise[:] = mean + added, risen + added - start
     plan = ("plan_y", "plan_x")
     kelvin = {"units": "K", "units_metadata": "temperature: difference"}
     why = "; ".join(one.text for one in errors)

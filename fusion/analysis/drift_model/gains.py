@@ -21,7 +21,7 @@ from fusion.analysis.effects.effect import Candidate, Separable, Wave
 from fusion.common import Array
 from interferometry.drift.kalman import DriftSystem
 from thermography.common import usable_processors
-from thermography.fields.large_arrays import give_back
+from thermography.large_arrays import one_by_one
 
 #: Values that are whitened together, 4 MB: enough for products of whole matrices, few enough to stay in the processor's cache.
 _VALUES_AT_ONCE = 2**19
@@ -54,17 +54,12 @@ class Group:
         """Number of columns whose products are summed."""
         return self.width * self.places.size
 
-    @property
-    def stored(self) -> list[Array]:
-        """Columns that may be in temporary files: those that are not multiplied out."""
-        return [one.columns for one in self.candidates if isinstance(one.columns, np.ndarray)]
-
     def columns(self, rows: slice) -> Array:
         """Columns at some readings of the fit, (rows, held): the first of each candidate, then the second of each."""
         here = self.readings[rows]
         stacked = np.empty((here.size, self.width, self.places.size))
-        for k, candidate in enumerate(self.candidates):
-            own = candidate.columns[here]
+        for k, columns in enumerate(one_by_one(candidate.columns for candidate in self.candidates)):
+            own = columns[here]
             stacked[:, self.beside :, k] = own[:, : self.width - self.beside]
             stacked[:, : self.beside, k] = own[:, self.width - self.beside :]
         return stacked.reshape(here.size, -1)
@@ -306,16 +301,14 @@ def _sums_over(
     at_once = max(1, _VALUES_AT_ONCE // (columns + design.shape[1]))
     for start in range(0, design.shape[0], at_once):
         rows = slice(start, start + at_once)
-        measured, candidates = [some[rows] for some in responses], [group.columns(rows) for group in groups]
+        measured = [some[rows].copy() for some in one_by_one(responses)]
+        candidates = [group.columns(rows) for group in groups]
         for whitening, basis, of_parts in zip(whitenings, bases, sums, strict=True):
             here = np.concatenate([*measured, design[rows] @ basis, *candidates], axis=1)
             whitened, roots = whitening.whiten(here), whitening.roots[rows]
             for part, products in zip(parts, of_parts, strict=True):
                 counted = part[rows]
                 products.add(*((whitened, roots) if counted.all() else (whitened[counted], roots[counted])))
-        give_back(*measured)
-        for group in groups:
-            give_back(*group.stored)
     return sums
 
 

@@ -12,7 +12,7 @@ from fusion.analysis.drift_model.fit import plausible_ratios
 from fusion.common import Array
 from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
 from interferometry.drift.kalman import DriftSystem
-from thermography.fields.large_arrays import empty_array, give_back
+from thermography.large_arrays import empty_array, one_by_one
 
 DRAWS = 200
 #: Readings that are simulated together, 0.4 MB of random numbers, which stay in the cache of a processor.
@@ -35,27 +35,28 @@ def simulate_null(
     relative = fit.white_noise() * fit.sigma
     # Some readings at a time, and those of a long test on disk: these are its largest numbers.
     drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.independent)[:, None]
-    for rows in _blocks(system.seconds.size):
-        drawn[rows] = rng.choice(relative, size=(rows.stop - rows.start, draws)) * scale[rows]
-        give_back(drawn)
+    blocks = _blocks(system.seconds.size)
+
+    def parts() -> Iterator[tuple[slice, Array]]:
+        return zip(blocks, one_by_one(drawn[rows] for rows in blocks), strict=True)
+
+    for rows, some in parts():
+        some[:] = rng.choice(relative, size=some.shape) * scale[rows]
     if memory.weights.size and site is not None:
         for number in np.unique(site):
             drawn[site == number] = memory.with_memory(drawn[site == number])
-            give_back(drawn)
     if system.memory is not None:
         kept = np.exp(-np.diff(system.seconds, prepend=-np.inf) / system.memory.time_s)[:, None]
         shared = np.zeros((1, draws))
-        for rows in _blocks(system.seconds.size):
-            for k in range(rows.start, rows.stop):
-                shared = kept[k] * shared + np.sqrt(1.0 - kept[k] ** 2) * rng.standard_normal((1, draws))
-                drawn[k] += fit.sigma * np.sqrt(system.memory.share) * shared[0]
-            give_back(drawn)
+        for rows, some in parts():
+            for share, of_reading in zip(kept[rows], some, strict=True):
+                shared = share * shared + np.sqrt(1.0 - share**2) * rng.standard_normal((1, draws))
+                of_reading += fit.sigma * np.sqrt(system.memory.share) * shared[0]
     ratios = plausible_ratios(fit, rng, draws=draws)
     for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
         walks = random_walk(system, _normal_numbers(system, draws, rng))
-        for walk, rows in zip(walks, _blocks(system.seconds.size), strict=True):
-            drawn[rows] += walk * (fit.sigma * np.sqrt(ratio)) * loading[rows, None]
-            give_back(drawn)
+        for walk, (rows, some) in zip(walks, parts(), strict=True):
+            some += walk * (fit.sigma * np.sqrt(ratio)) * loading[rows, None]
     return drawn
 
 

@@ -29,7 +29,7 @@ from fusion.common import Array, FusionError
 from fusion.results import loop as schema
 from interferometry.drift.gls import estimate
 from interferometry.drift.kalman import DriftModelError
-from thermography.fields.large_arrays import IN_MEMORY_BYTES, copy_to_disk, give_back
+from thermography.large_arrays import IN_MEMORY_BYTES, copy_to_disk, one_by_one
 
 # Decisions of the search: which effect entered, was refused or was withdrawn, for which reason and on what evidence.
 
@@ -810,9 +810,7 @@ def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
             raise SearchError(f"columns have shape {columns.shape}; expected ({rows}, columns)")
         # Of columns that share courses these are looked at, and all columns only where one is not finite.
         parts = (*map(_made_of, columns.courses), columns.weights) if isinstance(columns, Separable) else (columns,)
-        finite = all(np.isfinite(part).all() for part in parts)
-        give_back(*parts)
-        if not finite:
+        if not all(np.isfinite(part).all() for part in one_by_one(parts)):
             not_finite = int((~np.isfinite(np.asarray(columns))).sum())
             raise SearchError(f"{not_finite} values are not finite at {dict(candidate.parameters)}")
         if len(candidate.units) != columns.shape[1]:

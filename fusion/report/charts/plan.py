@@ -30,7 +30,7 @@ from fusion.results.axis import HotspotPart
 from fusion.results.numbers import join, number, place
 from fusion.results.parts import AreaPart, ContactSensorPart
 from interferometry.plots import ACCENT, INK
-from thermography.fields.large_arrays import in_pieces
+from thermography.large_arrays import in_pieces
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32

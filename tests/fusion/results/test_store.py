@@ -43,7 +43,7 @@ from fusion.results.store import (
     write_dataset,
     write_json,
 )
-from thermography.fields.large_arrays import in_pieces
+from thermography.large_arrays import in_pieces
 
 
 def test_json_has_no_nan_and_times_are_utc(tmp_path: Path) -> None:
@@ -175,7 +175,7 @@ def test_large_arrays_are_written_in_pieces_and_stay_in_the_file(
 ) -> None:
     monkeypatch.setattr(store, "IN_MEMORY_BYTES", 50_000)
     monkeypatch.setattr(store, "_CHUNK_BYTES", 9_000)
-    monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 20_000)
+    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 20_000)
     rise = rng.normal(size=(100, 10, 20)).astype("f4")
     rise[3, 2] = np.nan
     whole = xr.Dataset(

@@ -9,8 +9,8 @@ import xarray as xr
 
 from tests.thermography.flir_mutations import PARAMETERS
 from tests.thermography.plan_scene import GRID, START, Scene, record, registered
+from thermography import large_arrays
 from thermography.common import ThermographyError
-from thermography.fields import large_arrays
 from thermography.fields.cycle_fields import SURFACE_EDGE, CyclePart, assemble_fields, noise_of_differences, pixel_noise
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames

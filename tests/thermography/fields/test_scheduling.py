@@ -12,8 +12,11 @@ import pytest
 import xarray as xr
 
 from tests.thermography.plan_scene import GRID, Scene, assert_equal_bits, edges, record, registered
-from thermography.fields import large_arrays, still
-from thermography.fields.large_arrays import (
+from thermography import large_arrays
+from thermography.fields import still
+from thermography.fields.scheduling import SchedulerError, in_order, open_pool, open_stored
+from thermography.fields.still import reduce_frames
+from thermography.large_arrays import (
     Spool,
     copy_to_disk,
     empty_array,
@@ -24,8 +27,6 @@ from thermography.fields.large_arrays import (
     median_of_pieces,
     piece_slices,
 )
-from thermography.fields.scheduling import SchedulerError, in_order, open_pool, open_stored
-from thermography.fields.still import reduce_frames
 
 pytestmark = pytest.mark.long
 

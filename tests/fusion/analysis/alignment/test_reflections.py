@@ -44,7 +44,7 @@ def test_a_switching_patch_is_found_with_its_size(lit):
 def test_a_patch_of_a_long_test_is_found_among_the_largest_changes(lit, monkeypatch):
     known = find_switching_patch(lit)
     monkeypatch.setattr("fusion.analysis.alignment.reflections._MOST_CHANGES", 15)
-    monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 7 * 8 * 12 * 20)
+    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 7 * 8 * 12 * 20)
     patch = find_switching_patch(lit)
     # The noise of 0.03 K is 2 % of the jump; the component of the fifteen largest changes differs by a part of that.
     np.testing.assert_allclose(patch.pattern, known.pattern, atol=0.02)
@@ -98,7 +98,7 @@ def test_the_course_of_a_patch_without_noise_is_exact():
 
 
 def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
-    monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 256 * 8 * 10 * 20)
+    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 256 * 8 * 10 * 20)
     frames = np.random.default_rng(4).standard_normal((6000, 10, 20)).astype(np.float32)
     tracemalloc.start()
     try:

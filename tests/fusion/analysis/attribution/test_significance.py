@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-import thermography.fields.large_arrays as spool_module
+import thermography.large_arrays as spool_module
 from fusion.analysis.alignment.first_order_lag import lag_operators
 from fusion.analysis.attribution import significance as module
 from fusion.analysis.attribution.drift_channels import DriftSeries, TargetSeries

@@ -367,7 +367,7 @@ def test_a_long_series_is_checked_piece_by_piece_with_the_same_result(monkeypatc
     lit[18:28, 2:6, 10:16] = 1.0
     lit[:, 0, :3] = np.nan
     at_once = [check_place(fields(change_K)) for change_K in (None, lit)]
-    monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 7 * 8 * ROWS * COLUMNS)
+    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 7 * 8 * ROWS * COLUMNS)
     assert [check_place(fields(change_K)) for change_K in (None, lit)] == at_once
 
 

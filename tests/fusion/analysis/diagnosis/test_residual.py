@@ -293,7 +293,7 @@ def test_waves_of_a_long_test_lie_in_parts_with_the_same_power(monkeypatch, rng)
     (whole,) = module._waves(seconds, periods)
     expected = module._time_statistics(series, 10, [whole])
     monkeypatch.setattr(module, "_WAVES_AT_ONCE", 1000)
-    monkeypatch.setattr("thermography.fields.large_arrays.IN_MEMORY_BYTES", 100)
+    monkeypatch.setattr("thermography.large_arrays.IN_MEMORY_BYTES", 100)
     parts = module._waves(seconds, periods)
     assert [part.shape for part in parts] == [(200, 4), (200, 4), (200, 2)]
     # Products in single precision.

@@ -443,8 +443,8 @@ def test_a_long_test_is_corrected_some_frames_at_a_time_with_the_same_bits(monke
     errors = [field_error(-0.1, -0.1, 0.0, -0.5, -0.5, -0.5), field_error(0.0, 0.0, 0.3, 0.3, 0.3, 0.0)]
     at_once = corrected_variables(small_fields(), small_fused(), errors)
     frames = correct_fields(small_fields(), errors)["frame_temperature"].values
-    monkeypatch.setattr("thermography.fields.large_arrays.PIECE_BYTES", 40)
-    monkeypatch.setattr("thermography.fields.large_arrays.IN_MEMORY_BYTES", 8)
+    monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 40)
+    monkeypatch.setattr("thermography.large_arrays.IN_MEMORY_BYTES", 8)
     for name, variable in corrected_variables(small_fields(), small_fused(), errors).items():
         assert variable.values.tobytes() == at_once[name].values.tobytes(), name
     assert correct_fields(small_fields(), errors)["frame_temperature"].values.tobytes() == frames.tobytes()

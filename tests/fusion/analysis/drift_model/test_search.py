@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import fusion
 import fusion.analysis.drift_model.search as scoring_module
-import thermography.fields.large_arrays as spool_module
+import thermography.large_arrays as spool_module
 from fusion.analysis.drift_model.fit import Term
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
 from fusion.analysis.drift_model.search import (

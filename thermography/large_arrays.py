@@ -55,7 +55,7 @@ def _take_room(file: int, size: int) -> None:
         os.ftruncate(file, size)
 
 
-def give_back(*arrays: Array) -> None:
+def give_back(*arrays: object) -> None:
     """Give the memory of arrays in mapped files back to the system; their values stay in the files and are read again when needed."""
     for array in arrays:
         mapped: Any = array
@@ -119,11 +119,16 @@ def piece_slices(shape: Sequence[int]) -> Iterator[slice]:
 
 
 def in_pieces(array: Array | xr.DataArray) -> Iterator[tuple[slice, Array]]:
-    """Go through an array piece by piece along its first dimension."""
-    for some in piece_slices(array.shape):
-        piece = np.asarray(array[some])
-        yield some, piece
-        give_back(piece)
+    """Go through an array piece by piece along its first dimension, to read or to fill it."""
+    pieces = piece_slices(array.shape)
+    return zip(pieces, one_by_one(np.asarray(array[some]) for some in piece_slices(array.shape)), strict=True)
+
+
+def one_by_one(arrays: Iterable[Item]) -> Iterator[Item]:
+    """Go through arrays, or along the first dimension of one, to read or to fill them; after each see `give_back`."""
+    for array in arrays:
+        yield array
+        give_back(array)
 
 
 def fill_array(
