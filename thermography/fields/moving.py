@@ -400,10 +400,8 @@ class _BlockStore:
     def load(self, blocks: Sequence[Block]) -> list[_BlockResult]:
         """Return the results of an earlier run, from the first block on."""
         results: list[_BlockResult] = []
-        for header, arrays in self.checkpoint.load_arrays():
-            if header["first_block"] != len(results):
-                break
-            stored = blocks[len(results) : len(results) + header["blocks"]]
+        for arrays in self.checkpoint.load("blocks_*"):
+            stored = blocks[len(results) : len(results) + len(arrays["count"])]
             ends = np.cumsum([block.stop - block.first for block in stored])
             per_frame = [np.split(arrays[name], ends[:-1]) for name in _PER_FRAME]
             per_cell = [arrays[name] for name in _PER_CELL]
@@ -419,7 +417,7 @@ class _BlockStore:
         new = results[self.saved :]
         arrays = {name: np.stack([getattr(result, name) for result in new]) for name in _PER_CELL}
         arrays |= {name: np.concatenate([getattr(result, name) for result in new]) for name in _PER_FRAME}
-        self.checkpoint.save_arrays(self.saved, {"first_block": self.saved, "blocks": len(new)}, arrays)
+        self.checkpoint.save(f"blocks_{self.saved:08d}", **arrays)
         self.saved = len(results)
 
 

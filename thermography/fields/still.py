@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,51 +61,13 @@ from thermography.registration.register import Registration
 # Finished cycles of a reduction on disk, to resume an interrupted run.
 
 _DESCRIPTION = "reduction.json"
-_KNOCKS = "knocks.json"
-_OPEN_CYCLE = "open.sums"
+_OPEN_CYCLE = "open"
+#: Of the pixels of a cycle that is open.
 _PIXELS = ("mean", "variance", "bound_K")
-_CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
-#: What is stored of a `CyclePart`, and of a `StoredCycle` as arrays and in the header.
-_PART = ("cycle", "span", "frames", "seconds")
-_PER_CYCLE = ("blocks", "stack", "shift_px")
-_REMARKS = ("first_frame", "stop_frame", "shaken", "obstructed", "baseline_px")
 
 
 class CheckpointError(ThermographyError):
     """A checkpoint does not belong to this reduction; the message names it and the remedy."""
-
-
-@dataclass(frozen=True)
-class StoredCycle:
-    """The frames of one cycle under one registration, with those before it that belong to no cycle; finished or open.
-
-    Attributes
-    ----------
-    part : CyclePart
-        Cells of a finished cycle, or pixels of an open one.
-    first_frame, stop_frame : int
-        Frames `first_frame` to ``stop_frame - 1``.
-    blocks : (blocks, 4) ndarray of int
-        First frame, stop frame, cycle and registration span of every block.
-    stack : (blocks, y, x) ndarray of float32, degC
-        Field of every block.
-    shift_px : (frames,) ndarray, px
-        Displacement of every frame against its registration; NaN where unchecked.
-    shaken, obstructed : tuple of int
-        Frames that were displaced alone; frames in which something stands before the table.
-    baseline_px : (column, row, growth, turn), px
-        Bias of the fiducial monitor after the last frame.
-    """
-
-    part: CyclePart
-    first_frame: int
-    stop_frame: int
-    blocks: Array
-    stack: Array
-    shift_px: Array
-    shaken: tuple[int, ...] = ()
-    obstructed: tuple[int, ...] = ()
-    baseline_px: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
 
 class Checkpoint:
@@ -137,44 +99,18 @@ class Checkpoint:
             )
         write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
-    def save(self, cycle: StoredCycle) -> None:
-        """Write a finished cycle, or replace the stored state of the open one."""
-        part = cycle.part
-        source, names = (part, _CELLS) if part.pixels is None else (part.pixels, _PIXELS)
-        arrays = {name: getattr(source, name) for name in names} | {name: getattr(cycle, name) for name in _PER_CYCLE}
-        header = {name: getattr(part, name) for name in _PART} | {"first_time": str(part.first_time)}
-        header |= {name: getattr(cycle, name) for name in _REMARKS}
-        name = f"frames_{cycle.first_frame:08d}.sums" if part.pixels is None else _OPEN_CYCLE
-        _write(self.folder / name, header, arrays)
+    def save(self, name: str, **arrays: Any) -> None:
+        """Write arrays, numbers and times by their names, in place of what has been saved under the same name."""
+        write_atomically(self.folder / f"{name}.npz", lambda temporary: np.savez(temporary, **arrays))
 
-    def save_arrays(self, first: int, header: dict[str, Any], arrays: dict[str, Array]) -> None:
-        """Write arrays by name, and a JSON header, that belong to the blocks from index `first` on."""
-        _write(self.folder / f"blocks_{first:08d}.sums", header, arrays)
-
-    def load_arrays(self) -> list[tuple[dict[str, Any], dict[str, Array]]]:
-        """Headers and arrays that `save_arrays` has written, in the order of the blocks."""
-        return [_read(path) for path in sorted(self.folder.glob("blocks_*.sums"))]
-
-    def save_knock(self, index: int, span: int, displacement_px: list[float], by_image: bool) -> None:
-        """Store that the table was registered again from frame `index` on: the span before, the displacement, and what showed it."""
-        knocks, knock = self.knocks(), [index, span, displacement_px, by_image]
-        if knock not in knocks:
-            text = json.dumps([*knocks, knock])
-            write_atomically(self.folder / _KNOCKS, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-    def knocks(self) -> list[list[Any]]:
-        """Knocks stored so far: frame, span before, displacement (column, row, growth, turn) px, whether the image showed it."""
-        path = self.folder / _KNOCKS
-        return list(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else []
-
-    def load(self) -> Iterator[StoredCycle]:
-        """Yield the finished cycles in the order of time."""
-        return map(_load, sorted(self.folder.glob("frames_*.sums")))
-
-    def load_open(self) -> StoredCycle | None:
-        """Stored state of the last open cycle, if there is one."""
-        path = self.folder / _OPEN_CYCLE
-        return _load(path) if path.exists() else None
+    def load(self, names: str) -> Iterator[dict[str, Any]]:
+        """Yield what was saved under the names of a pattern, in their order."""
+        for path in sorted(self.folder.glob(f"{names}.npz")):
+            with np.load(path) as stored:
+                yield {
+                    name: array[()] if array.ndim or array.dtype.kind == "M" else array.item()
+                    for name, array in stored.items()
+                }
 
 
 def describe_reduction(
@@ -198,40 +134,6 @@ def describe_reduction(
         "registrations": [{"first": first, "plan_to_sensor": matrix} for first, matrix in matrices],
         "block_s": block_s,
     }
-
-
-def _write(path: Path, header: dict[str, Any], arrays: dict[str, Array]) -> None:
-    """Write a line of JSON, which gives names, types and shapes of the arrays, then the arrays themselves, one after the other."""
-    layout = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
-
-    def write_arrays(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            file.write(json.dumps({**header, "arrays": layout}).encode() + b"\n")
-            for array in arrays.values():
-                np.ascontiguousarray(array).tofile(file)
-
-    write_atomically(path, write_arrays)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
-    with path.open("rb") as file:
-        header = json.loads(file.readline())
-        layout = header["arrays"].items()
-        return header, {
-            name: np.fromfile(file, kind, int(np.prod(shape))).reshape(shape) for name, (kind, shape) in layout
-        }
-
-
-def _load(path: Path) -> StoredCycle:
-    header, arrays = _read(path)
-    part = CyclePart(**{name: header[name] for name in _PART}, first_time=np.datetime64(header["first_time"]))
-    if all(name in arrays for name in _CELLS):
-        for name in _CELLS:
-            setattr(part, name, arrays[name])
-    else:
-        part.pixels = MeanTemperature(part.frames, *(arrays[name] for name in _PIXELS))
-    stored: dict[str, Any] = {name: arrays[name] for name in _PER_CYCLE} | {name: header[name] for name in _REMARKS}
-    return StoredCycle(part, **stored)
 
 
 # A still table followed over the frames: their displacements, a registration for every time between knocks, and
@@ -804,36 +706,37 @@ class StillReduction:
         done = 0
         if self.checkpoint is None:
             return done
-        for index, span, displacement_px, by_image in self.checkpoint.knocks():
-            self.register_again(Knock(index, span, np.array(displacement_px), by_image))
-        for cycle in self.checkpoint.load():
-            if cycle.first_frame != done:
-                break
-            done = self._restore(cycle)
-        self.stored_blocks, self.finished_frames = len(self.blocks), done
-        unfinished = self.checkpoint.load_open()
-        if unfinished is not None and unfinished.first_frame == done:
-            done = self._restore(unfinished)
+        for knock in self.checkpoint.load("knock_*"):
+            self.register_again(Knock(**knock))
+        for names in ("frames_*", _OPEN_CYCLE):
+            self.stored_blocks, self.finished_frames = len(self.blocks), done
+            for cycle in self.checkpoint.load(names):
+                if cycle["first_frame"] == done:
+                    done = self._restore(cycle)
         self.stored_frames = done
         return done
 
-    def _restore(self, cycle: StoredCycle) -> int:
-        """Take over a stored cycle; the first frame after it."""
-        for (first, stop, number, span), field in zip(cycle.blocks.tolist(), cycle.stack, strict=True):
+    def _restore(self, stored: Mapping[str, Any]) -> int:
+        """Take over a cycle that `_store` has stored; the first frame after it."""
+        for (first, stop, number, span), field in zip(stored["blocks"].tolist(), stored["stack"], strict=True):
             self.blocks.append(Block(first, stop, number, span, self.frames.override(self.frames.references[first])))
             self.fields.append(field)
-        self._add_part(cycle.part)
-        self.displacement.size_px[cycle.first_frame : cycle.stop_frame] = cycle.shift_px
-        self.displacement.shaken.update(cycle.shaken)
-        self.obstructions.found.update(cycle.obstructed)
-        self.displacement.baseline_px = np.array(cycle.baseline_px)
-        return cycle.stop_frame
+        part = CyclePart(**{each.name: stored[each.name] for each in fields(CyclePart) if each.name in stored})
+        if "pixel_mean" in stored:
+            part.pixels = MeanTemperature(part.frames, *(stored[f"pixel_{name}"] for name in _PIXELS))
+        self._add_part(part)
+        stop = int(stored["stop_frame"])
+        self.displacement.size_px[stored["first_frame"] : stop] = stored["shift_px"]
+        self.displacement.shaken.update(stored["shaken"].tolist())
+        self.obstructions.found.update(stored["obstructed"].tolist())
+        self.displacement.baseline_px = stored["baseline_px"]
+        return stop
 
     def register_again(self, knock: Knock) -> None:
         """Register the plan again from the frame of a knock on."""
         span = self.displacement.span_after(knock)
         if self.checkpoint is not None:
-            self.checkpoint.save_knock(knock.frame, knock.span, knock.displacement_px.tolist(), knock.by_image)
+            self.checkpoint.save(f"knock_{knock.frame:08d}", **vars(knock))
         self.registrations.insert(knock.span + 1, span)
 
     @property
@@ -914,18 +817,20 @@ class StillReduction:
             return
         blocks = self.blocks[self.stored_blocks :]
         first, stop = self.finished_frames, blocks[-1].stop
+        stored = {name: value for name, value in vars(part).items() if name != "pixels"}
+        if part.pixels is not None:
+            stored |= {f"pixel_{name}": getattr(part.pixels, name) for name in _PIXELS}
         self.checkpoint.save(
-            StoredCycle(
-                part=part,
-                first_frame=first,
-                stop_frame=stop,
-                blocks=np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks]),
-                stack=np.stack(self.fields[self.stored_blocks :]),
-                shift_px=self.displacement.size_px[first:stop],
-                shaken=tuple(sorted(i for i in self.displacement.shaken if first <= i < stop)),
-                obstructed=tuple(sorted(i for i in self.obstructions.found if first <= i < stop)),
-                baseline_px=tuple(self.displacement.baseline_px.tolist()),
-            )
+            _OPEN_CYCLE if part.pixels is not None else f"frames_{first:08d}",
+            **stored,
+            first_frame=first,
+            stop_frame=stop,
+            blocks=np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks]),
+            stack=np.stack(self.fields[self.stored_blocks :]),
+            shift_px=self.displacement.size_px[first:stop],
+            shaken=np.array(sorted(i for i in self.displacement.shaken if first <= i < stop), int),
+            obstructed=np.array(sorted(i for i in self.obstructions.found if first <= i < stop), int),
+            baseline_px=self.displacement.baseline_px,
         )
         self.stored_frames = stop
 

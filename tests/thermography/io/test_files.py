@@ -15,7 +15,7 @@ from thermography.io.files import ExrError, finished_path, partial_path, read_ma
 
 
 def test_the_old_file_stays_until_the_new_one_is_whole_and_on_the_disk(tmp_path, monkeypatch):
-    path = tmp_path / "frames_00000001.sums"
+    path = tmp_path / "frames_00000001.npz"
     path.write_text("old")
     steps = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: steps.append(path.read_text()))
@@ -23,7 +23,7 @@ def test_the_old_file_stays_until_the_new_one_is_whole_and_on_the_disk(tmp_path,
     def write(temporary):
         assert temporary.suffix == path.suffix
         temporary.write_text("new")
-        assert list(tmp_path.glob("frames_*.sums")) == [path]
+        assert list(tmp_path.glob("frames_*.npz")) == [path]
 
     assert write_atomically(path, write) == path
     # The content is brought to the disk before the name, and the name after it.
