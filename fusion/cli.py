@@ -203,7 +203,7 @@ def run(
     # The libraries may take seconds to load: something is seen before that.
     with _answering(written), _progress(quiet=quiet) as report:
         report("start", 0, 1)
-        from fusion.report.terminal import summary_table
+        from fusion.report.findings import summary_table
 
         if two:
             import_module("fusion.pipeline.run")
@@ -611,7 +611,7 @@ def verify(
     from dataclasses import asdict
 
     from fusion.pipeline.verify import verify_compensation
-    from fusion.report.thermal_test import verification_table
+    from fusion.report.campaign import verification_table
 
     with _answering():
         found = verify_compensation(before, after, applied)
@@ -644,8 +644,8 @@ def iso230_3(
     """
     from fusion.common import versions
     from fusion.pipeline.iso230_3 import read_thermal_tests
+    from fusion.report.campaign import thermal_test_tables
     from fusion.report.sheet import write_thermal_tests
-    from fusion.report.thermal_test import thermal_test_tables
 
     with _answering():
         title, tests, files = read_thermal_tests(test)

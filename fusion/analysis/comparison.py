@@ -16,10 +16,9 @@ from fusion.analysis.levels import CHANGE_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
-from fusion.results.parts import Quantity
+from fusion.results.parts import Quantity, TablePrediction, read_table_prediction
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, group, has, opened, read_json_object, require_kind, require_own
-from fusion.results.table_prediction import TablePrediction, read_table_prediction
 from interferometry.drift.estimate import COMPONENTS
 from thermography.common import scatter_by_median
 

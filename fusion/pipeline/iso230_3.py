@@ -16,9 +16,16 @@ from fusion.campaign.inputs import read_laser, read_record
 from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
 from fusion.pipeline.iso230 import date_of, files_of_run, hashed, identity
-from fusion.results.parts import Iso230Condition, Quantity
+from fusion.results.parts import (
+    Iso230Condition,
+    Quantity,
+    TestKind,
+    ThermalContribution,
+    ThermalCourse,
+    ThermalDistortion,
+    ThermalTest,
+)
 from fusion.results.results import read_results
-from fusion.results.thermal_test import TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
 from interferometry.deviations import ROUNDING, resolution
 from interferometry.iso230.thermal import (
     AVERAGED_S,

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import rich.table
 import xarray as xr
 
-from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS, ENTRY_LEVEL, REMAINDER_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
+from fusion.analysis.alignment.sensor_health import describe_fault
+from fusion.analysis.levels import (
+    ATTRIBUTION_LEVEL,
+    CHECKS,
+    ENTRY_LEVEL,
+    RECORD_ENTRY_LEVEL,
+    REMAINDER_LEVEL,
+    SEARCH_LEVEL,
+    SECOND_LEVEL,
+)
 from fusion.report.findings import first_screen, headline, next_steps, sharpen
-from fusion.report.thermal_test import describe_thermal_tests
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     ARROWS,
@@ -31,6 +40,7 @@ from fusion.report.wording import (
     figures_of,
     in_words,
     parameters,
+    print_table,
     quantity,
     randomised_causes,
     say,
@@ -39,10 +49,11 @@ from fusion.report.wording import (
     with_values,
 )
 from fusion.results.axis import CorrelationPart, Evidence, Iso230Direction, Iso230Part, Iso230Window, PlacePart
-from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RunnerUp, StepPart
+from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RecordLoop, RunnerUp, StepPart
 from fusion.results.numbers import (
     alike,
     decimals_of,
+    duration,
     exact,
     fixed,
     gain,
@@ -56,11 +67,15 @@ from fusion.results.numbers import (
     small,
     upper_first,
 )
-from fusion.results.parts import Figures
+from fusion.results.parts import Figures, ThermalDistortion, ThermalTest
+from fusion.results.progress import counted
 from fusion.results.results import Results
 from fusion.results.store import by_approach, group, has
 from interferometry.deviations import REGISTRY
 from interferometry.plots import time_span
+
+if TYPE_CHECKING:
+    from fusion.analysis.drift_model.verification import ChannelVerdict
 
 # Drift and field in the report: the facts that its templates state.
 
@@ -517,37 +532,59 @@ def describe_evidence(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-#: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
-_SECTIONS = (
-    ("next", "", "What to do"),
-    ("pictures", "regions", "Pictures"),
-    ("iso230", "iso230", "ISO 230-2"),
-    ("iso230-3", "iso230_3", "ISO 230-3"),
-    ("drift", "drift", "Drift"),
-    ("anomalies", "anomalies", "Positions"),
-    ("fields", "hotspots", "Heat"),
-    ("sensors", "sensors", "Contact sensors"),
-    ("cause", "loop", "Cause"),
-    ("place", "correlation", "Place"),
-    ("data", "", "Data"),
-    ("uncertainty", "", "Uncertainty"),
-    # ... then, in the appendix, what it rests on.
-    ("paper", "neighbours", "Neighbour differences"),
-    ("correlation", "correlation", "Drift and field"),
-    ("loop", "loop", "Model"),
-    ("registration", "registration", "Registration"),
-    ("glossary", "", "Glossary"),
-    ("provenance", "", "Provenance"),
-)
-#: Section of the report -> what its figures rest on.
-_RESTS_ON: dict[str, Figures] = {
-    "fields": "field", "drift": "positions", "paper": "positions", "iso230": "positions", "iso230-3": "positions", "anomalies": "positions",
-    "place": "attribution", "correlation": "attribution", "cause": "causes", "loop": "causes",
-}  # fmt: skip
+class Section(NamedTuple):
+    """A section of the report: its anchor, title in the contents, template, the fact without which it is absent, and what it rests on.
+
+    One of the appendix opens on a click on the line `opens`.
+    """
+
+    at: str
+    title: str
+    template: str
+    there: str = ""
+    rests_on: Figures | None = None
+    opens: str = ""
+
+
+#: First what a reader acts on, then in the appendix what it rests on.
+SECTIONS = (
+    Section("next", "What to do", "next.j2"),
+    Section("pictures", "Pictures", "thermograms.j2", "thermograms"),
+    Section("record", "Record", "record.j2", "record"),
+    Section("iso230", "ISO 230-2", "iso230.j2", "iso230", "positions"),
+    Section("iso230-3", "ISO 230-3", "iso230_3.j2", "thermal_tests", "positions"),
+    Section("drift", "Drift", "drift.j2", "positions", "positions"),
+    Section("anomalies", "Positions", "anomalies.j2", "anomalies", "positions"),
+    Section("fields", "Heat", "fields.j2", "camera", "field"),
+    Section("sensors", "Contact sensors", "sensors.j2", "sensors"),
+    Section("cause", "Cause", "cause.j2", "loop", "causes"),
+    Section("loop", "Cause", "record_loop.j2", "record", "causes"),
+    Section("chained", "Forward chaining", "record_chained.j2", "record"),
+    Section("place", "Place", "place.j2", "correlation", "attribution"),
+    Section("data", "Data", "data.j2"),
+    Section("uncertainty", "Uncertainty", "uncertainty.j2"),
+    Section("paper", "Neighbour differences", "neighbours.j2", "comparison", "positions", opens="Neighbour differences"),
+    Section(
+        "correlation", "Drift and field", "correlation.j2", "correlation", "attribution",
+        opens="Drift and field: modes, regions, maps of cells, contact sensors",
+    ),
+    Section(
+        "loop", "Model", "loop.j2", "loop", "causes", opens="Model: tests of the residual, detection limits, every candidate"
+    ),
+    Section(
+        "registration", "Registration", "registration.j2", "registration", opens="Registration of the thermograms to the table"
+    ),
+    Section("glossary", "Glossary", "glossary.j2"),
+    Section("provenance", "Provenance", "provenance.j2"),
+)  # fmt: skip
 _SIGNS = {"positive": "+", "negative": "−"}
 _LEVELS = {
     "search": SEARCH_LEVEL, "second": SECOND_LEVEL, "entry": ENTRY_LEVEL, "remainder": REMAINDER_LEVEL, "attribution": ATTRIBUTION_LEVEL,
+    "record_entry": RECORD_ENTRY_LEVEL,
 }  # fmt: skip
+#: Largest number of channels of a record with charts; all of them are in fusion.nc.
+_MOST_CHANNELS = 6
+_ERRORS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 #: Actions in the summary; all remedies stand with what was left out.
 MOST_STEPS = 6
 
@@ -555,27 +592,22 @@ MOST_STEPS = 6
 def describe_campaign(
     results: Results, provenance: Mapping[str, Any], datasets: Mapping[str, Any], joint: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """Return the facts of a campaign that the templates of its report state."""
+    """Return the facts of a campaign or a record that the templates of its report state."""
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
     figures = figures_of(results)
     doubts = results.inputs.doubts if results.inputs else ()
-    laser = None if deviations is None else _laser(deviations)
-    loop = None
-    if isinstance(results.loop, AxisLoop):
-        # The tables on the model that the application shows too.
-        tables = {
-            "steps": steps_table,
-            "errors": errors_table,
-            "model": describe_model,
-            "candidates": describe_candidates,
-        }
-        loop = {name: describe(results.loop) for name, describe in tables.items()}
-    axis = provenance["parameters"]["campaign"].get("axis", "") if deviations is not None else ""
-    camera = None if fields is None else _camera(fields)
+    stated = provenance["parameters"]
+    axis = stated["campaign"].get("axis", "") if deviations is not None else ""
     zone = results.time.zone if results.time else None
-    begun = [part["first"] for part in (laser, camera) if part and part["first"] is not None]
+    parts = {
+        "laser": None if deviations is None else _laser(deviations),
+        "camera": None if fields is None else _camera(fields),
+        "record": _record(results, datasets["record"]) if "record" in datasets else None,
+    }
+    begun = [part["first"] for part in parts.values() if part and part["first"] is not None]
     begun += [one.first for one in (results.thermograms.cameras if results.thermograms else ()) if one.first]
-    return {
+    facts = {
+        **parts,
         "zone": zone,
         "figures": figures,
         "verdict": results.loop.verdict if results.loop else "",
@@ -584,38 +616,98 @@ def describe_campaign(
         "doubts": [one for one in doubts if results.thermograms is None or one.code != "camera_range"],
         "unverified": results.inputs.unverified if results.inputs else (),
         "untouched": untouched(results.inputs, figures),
-        "assumptions": {section: assumption(results.inputs, rests) for section, rests in _RESTS_ON.items()},
-        "first_screen": first_screen(
-            results, provenance["parameters"].get("report", {}), axis, moment(begun[0], zone) if begun else ""
-        ),
+        "assumptions": {one.at: assumption(results.inputs, one.rests_on) for one in SECTIONS if one.rests_on},
+        "first_screen": first_screen(results, stated.get("report", {}), axis, moment(begun[0], zone) if begun else ""),
         "next": next_steps(results)[:MOST_STEPS],
-        "contents": [
-            (at, title) for at, part, title in _SECTIONS if not part or getattr(results, part) not in (None, ())
-        ],
-        "laser": laser,
-        "moved": None,
-        "camera": camera,
         "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
-        "drift_stated": (provenance["parameters"].get("thermography") or {}).get("camera_drift_u_K") is not None,
+        "drift_stated": (stated.get("thermography") or {}).get("camera_drift_u_K") is not None,
         "field_of": "cycle" if "positions" in figures else "window",
         "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
         "comparison": None if results.neighbours is None or deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
-        "thermal_tests": describe_thermal_tests(results.iso230_3 or ()),
-        "anomalies": [
+        "thermal_tests": describe_thermal_tests(results.iso230_3) if results.iso230_3 else None,
+        "anomalies": None
+        if results.anomalies is None
+        else [
             {
                 "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",
                 "sentence": say("anomaly_sentence", anomaly),
                 **describe_evidence(anomaly.evidence),
             }
-            for anomaly in results.anomalies or ()
+            for anomaly in results.anomalies
         ],
+        "sensors": results.sensors or None,
+        "registration": results.registration,
         "correlation": None if fused is None else describe_correlation(fused, results, joint),
         "joint": joint,
-        "loop": loop,
+        # The tables on the model that the application shows too.
+        "loop": {
+            "steps": steps_table(results.loop),
+            "errors": errors_table(results.loop),
+            "model": describe_model(results.loop),
+            "candidates": describe_candidates(results.loop),
+        }
+        if isinstance(results.loop, AxisLoop)
+        else None,
         "decided_before": DECIDED_BEFORE,
         "levels": _LEVELS,
     }
+    return {**facts, "sections": [one for one in SECTIONS if not one.there or facts[one.there] is not None]}
+
+
+def _record(results: Results, record: xr.Dataset) -> dict[str, Any]:
+    """What a record holds and how its model predicts it; `first` is None where the campaign file does not state the beginning."""
+    loop = results.loop
+    assert isinstance(loop, RecordLoop)
+    first, last = record["time"].values[[0, -1]]
+    block_s = float(record.attrs["block_s"])
+    span = duration(float((last - first) / np.timedelta64(1, "s")) + block_s)
+    start = first if first >= np.datetime64("1971-01-01") else None
+    begun = "start not stated" if start is None else moment(start, results.time.zone if results.time else None)
+    channels, drivers = (join([str(name) for name in record[dim].values]) for dim in ("channel", "driver_name"))
+    shown = shown_channels(record)
+    tested = results.iso230_3[0].distortions if results.iso230_3 else ()
+    return {
+        "first": start,
+        "measured": (
+            f"{counted(record.sizes['channel'], 'displacement')} and {counted(record.sizes['sensor'], 'temperature')} over "
+            f"{_measured_time(loop, span)}" + (f", with {drivers} as driver" if drivers else "")
+        ),
+        "data": [
+            ("Channels", channels),
+            ("Sensors", join([str(name) for name in record["sensor"].values])),
+            ("Time", f"{begun}, {span}; averaged over {record.sizes['time']} blocks of {duration(block_s)}"),
+        ],
+        "shown": list(enumerate(shown)),
+        "moved": max(
+            (one for one in tested if one.name in shown), key=lambda one: one.whole.value or 0.0, default=None
+        ),
+        "omitted": record.sizes["channel"] - len(shown),
+        "faults": [(one, describe_fault(one)) for one in loop.sensor_faults],
+        "steps": steps_table(loop),
+        "errors": errors_table(loop),
+        "refused": refused_effects(loop),
+        "chained_means": [_mean_chained(loop, name) for name in _ERRORS],
+    }
+
+
+def shown_channels(record: xr.Dataset) -> list[str]:
+    """Return the channels that get charts."""
+    return [str(name) for name in record["channel"].values[:_MOST_CHANNELS]]
+
+
+def _mean_chained(loop: RecordLoop, name: str) -> float | None:
+    """Return an error, mean over the forward-chained parts, um."""
+    values = [getattr(part, name) for part in loop.chained if getattr(part, name) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _measured_time(loop: RecordLoop, span: str) -> str:
+    """Return how long was measured; of several runs without the time between them."""
+    hours = [run.duration_h for run in loop.runs if run.duration_h is not None]
+    if not hours or len(hours) < len(loop.runs):
+        return span
+    return f"{duration(3600.0 * sum(hours))} in {counted(len(hours), 'run')}"
 
 
 def _laser(deviations: xr.Dataset) -> dict[str, Any]:
@@ -699,3 +791,88 @@ def rate_text(rate: float) -> str:
     """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
     u = np.sqrt(max(rate, 1.0 / CHECKS) * (1.0 - rate) / CHECKS)
     return f"{100 * rate:.1f} ± {200 * u:.1f} %"
+
+
+# A test by ISO 230-3 as report, page and terminal show it.
+
+_PERIODS = ("first_hour", "whole", "last_hour", "change")
+_TITLES = ("first 60 min", "whole test", "last 60 min", "last − first")
+_KINDS = {
+    "environment": "Environmental temperature variation (ETVE)",
+    "spindle": "Distortion by the rotating spindle",
+    "linear axis": "Distortion by a moving linear axis",
+    "rotary axis": "Distortion by rotary motion",
+    "not stated": "Kind of test not stated",
+}
+
+#: Curves of one chart of a test; the others are in the table.
+DRAWN = 8
+
+
+def describe_thermal_tests(tests: Sequence[ThermalTest]) -> list[dict[str, Any]]:
+    """Return what the templates state of every test."""
+    return [
+        {
+            "title": f"{_KINDS[test.kind]}{', run ' + test.run if test.run else ''}, {number(test.duration_h)} h",
+            "distortions": _distortions(test.distortions, "Displacement or tilt"),
+            "temperatures": _distortions(test.temperatures, "Temperature") if test.temperatures else None,
+            "budget": _budget(test),
+            "remarks": test.remarks,
+            "drawn": DRAWN,
+        }
+        for test in tests
+    ]
+
+
+def _budget(test: ThermalTest) -> Table:
+    units = {one.name: print_unit(one.unit) for one in test.distortions}
+    rows = [
+        [
+            one.name,
+            one.source,
+            "–" if one.u is None else f"{small(one.u)} {units.get(one.name, '')}".strip(),
+            one.origin,
+        ]
+        for one in test.contributions
+    ]
+    return table([Words("Quantity"), Words("Source"), "u (k = 1)", Words("Origin")], rows)
+
+
+def _distortions(found: Sequence[ThermalDistortion], title: str) -> Table:
+    rows = [
+        [
+            one.name,
+            print_unit(one.unit),
+            *(quantity(getattr(one, period)) for period in _PERIODS),
+            "–" if one.settling_min is None else number(one.settling_min, 3),
+        ]
+        for one in found
+    ]
+    return table([Words(title), Words("Unit"), *_TITLES, "settled after / min"], rows)
+
+
+def thermal_test_tables(tests: Sequence[ThermalTest], *, title: str) -> list[rich.table.Table]:
+    """Return the tables of tests for the terminal."""
+    return [
+        print_table(shown, f"{title}, {described['title']}" if name == "distortions" else name)
+        for described in describe_thermal_tests(tests)
+        for name in ("distortions", "temperatures", "budget")
+        if (shown := described[name]) is not None
+    ]
+
+
+def verification_table(verdicts: Sequence[ChannelVerdict], *, title: str) -> rich.table.Table:
+    """Return what was predicted and achieved for the terminal."""
+    rows = [
+        [
+            one.name,
+            "–" if one.before_um is None else number(one.before_um),
+            f"{number(one.predicted_um)} [{number(one.predicted_low_um)} to {number(one.predicted_high_um)}]",
+            number(one.achieved_um),
+            measured(one.gain, one.gain_u),
+            one.fault or "as predicted",
+        ]
+        for one in verdicts
+    ]
+    titles = ["without / µm", "predicted [95 %] / µm", "achieved / µm", "gain (k = 2)"]
+    return print_table(table([Words("Displacement"), *titles, Words("Verdict")], rows), title)

@@ -21,7 +21,6 @@ from fusion.common import FusionError
 from fusion.report.campaign import describe_campaign
 from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
 from fusion.report.findings import headline
-from fusion.report.record import describe_record
 from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import moment, number, place
@@ -117,25 +116,15 @@ def render_report(
     >>> from pathlib import Path
     >>> page = render_report(read_results(Path("results")), provenance, datasets)  # doctest: +SKIP
     """
-    context: dict[str, Any] = {"results": results, "provenance": provenance, "thermal_map": None}
-    if "record" in datasets:
-        from fusion.report.charts.record import draw_record, draw_thermal_tests
-        from fusion.report.charts.style import embed
-
-        context["summary"] = describe_record(results, datasets["record"], provenance)
-        return render_page(
-            "record.html.j2",
-            embed({**draw_record(datasets["record"]), **draw_thermal_tests(results.iso230_3 or ())}),
-            **context,
-        )
-    context["summary"] = describe_campaign(results, provenance, datasets, joint)
     if drawn is None:
         # Its library is loaded where charts are made.
         from fusion.report.charts.campaign import draw_campaign
 
         drawn = partial(draw_campaign, results, datasets)
-    charts, context["thermal_map"] = drawn()
-    return render_page("report.html.j2", charts, **context)
+    summary = describe_campaign(results, provenance, datasets, joint)
+    charts, thermal_map = drawn()
+    found = {"results": results, "provenance": provenance, "summary": summary, "thermal_map": thermal_map}
+    return render_page("report.html.j2", charts, **found)
 
 
 def report_of(folder: Path) -> str:

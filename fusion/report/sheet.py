@@ -15,17 +15,15 @@ import pandas as pd
 import rich.table
 import xarray as xr
 
-from fusion.report.campaign import describe_iso230, values_to_sign
+from fusion.report.campaign import DRAWN, describe_iso230, describe_thermal_tests, values_to_sign
 from fusion.report.charts.readings import has_windows, plot_test, plot_windows
 from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed, of_rank
 from fusion.report.page import page_format, render_page, write_page
-from fusion.report.thermal_test import DRAWN, describe_thermal_tests
 from fusion.report.wording import Table, Words, print_table, table
 from fusion.results.axis import Iso230Part
-from fusion.results.parts import Iso230Condition
+from fusion.results.parts import Iso230Condition, ThermalTest
 from fusion.results.store import group, write_atomically
-from fusion.results.thermal_test import ThermalTest
 from interferometry.plots import new_axes, plot_iso230
 from thermography.common import ACTING
 

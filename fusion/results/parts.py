@@ -7,17 +7,22 @@ that does not apply is never set, and absent.
 from __future__ import annotations
 
 import ast
+import json
 import math
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from inspect import cleandoc, getsource
 from itertools import pairwise
+from pathlib import Path
 from textwrap import dedent
 from typing import Annotated, Literal, TypeGuard
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
+
+from fusion.common import FusionError
 
 Number = float | None
 
@@ -495,3 +500,119 @@ class ContactSensorPart(ResultPart):
     """What is wrong with it, in words; empty where it is sound."""
     fault_time: str | None
     """From when on, UTC; null where it is sound."""
+
+
+# What a compensation table is predicted to leave, as it is stored beside the table.
+
+#: What the name of the file adds to that of the table.
+ENDING = ".prediction.json"
+
+
+class TablePredictionError(FusionError):
+    """A prediction that cannot be read; the message names the file and what to do."""
+
+
+class TablePrediction(ResultPart):
+    """Values by ISO 230-2 that a test of the same axis with an active table is predicted to show."""
+
+    schema_version: Literal[1] = 1
+    """Version of this layout."""
+    table: str
+    """Name of the file of the table."""
+    campaign: str
+    """Title of the test that the table was made from."""
+    results_sha256: str
+    """SHA-256 of its results.json."""
+    cycles: int
+    """Cycles of the test that is predicted."""
+    predicted_um: Mapping[str, Quantity]
+    """A, E, M and B of ISO 230-2, um; their uncertainty is that of table and readings, without what both tests have in common."""
+
+
+def read_table_prediction(path: Path) -> TablePrediction:
+    """Read the prediction of a table; either file may be named."""
+    file = path if path.name.endswith(ENDING) else path.with_name(path.name + ENDING)
+    try:
+        return TablePrediction.model_validate(json.loads(file.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise TablePredictionError(
+            f"{file} is missing; name the table that was loaded, as thermofuse export wrote it with its prediction beside it"
+        ) from None
+    except (OSError, ValueError, RecursionError, ValidationError) as error:
+        raise TablePredictionError(
+            f"{file}: is damaged or no prediction of a table ({type(error).__name__}); export the table again"
+        ) from None
+
+
+# The part ``iso230_3``: distortion by temperature over the test.
+
+TestKind = Literal["environment", "spindle", "linear axis", "rotary axis", "not stated"]
+
+
+class ThermalCourse(ResultPart):
+    """A quantity over time, thinned."""
+
+    name: str
+    """Name of the displacement, tilt or sensor."""
+    unit: str
+    """Unit: um, um/m, arcsec or degC."""
+    hours: tuple[float, ...]
+    """Time since the start of the test, h."""
+    values: tuple[Number, ...]
+    """Values."""
+
+
+class ThermalDistortion(ResultPart):
+    """How far a displacement, a tilt or a temperature moved: largest minus smallest value, in its unit."""
+
+    name: str
+    """Name."""
+    unit: str
+    """Unit: um, um/m, arcsec or K."""
+    first_hour: Quantity
+    """Over the first 60 min; null of a shorter test."""
+    whole: Quantity
+    """Over the whole test."""
+    last_hour: Quantity
+    """Over the last 60 min; null of a shorter test."""
+    change: Quantity
+    """Last value less the first."""
+    settling_min: Number
+    """Time after which it stays within a tenth of its range about its mean of the last 60 min; null where it does not for two hours at
+    least."""
+
+
+class ThermalContribution(ResultPart):
+    """A source of the uncertainty of one quantity over the whole test."""
+
+    name: str
+    """Displacement or tilt."""
+    source: str
+    """Name of the source."""
+    u: Number
+    """Contribution to the standard uncertainty, in the unit of the quantity; null where it is not known, and then it is not contained."""
+    origin: str
+    """Whether it was stated, assumed or measured, and how."""
+
+
+class ThermalTest(ResultPart):
+    """A test by ISO 230-3."""
+
+    run: str = ""
+    """Run of the record; absent where there is one."""
+    kind: TestKind
+    """Which of the four tests."""
+    duration_h: Number
+    """Length of the test, h."""
+    distortions: tuple[ThermalDistortion, ...]
+    """Displacements and tilts."""
+    temperatures: tuple[ThermalDistortion, ...]
+    """Temperatures."""
+    contributions: tuple[ThermalContribution, ...]
+    """Budget of the distortions over the whole test."""
+    courses: tuple[ThermalCourse, ...]
+    """Displacements, tilts and temperatures over time."""
+    remarks: tuple[str, ...]
+    """What is computed where no open text states a definition, and what was not evaluated."""
+    conditions: tuple[Iso230Condition, ...] = ()
+    """Whose test of which machine it was, with what, and under which conditions."""

@@ -38,11 +38,11 @@ from fusion.results.parts import (
     RadiometryPart,
     ResultPart,
     TemperatureRegionPart,
+    ThermalTest,
     ThermogramsPart,
     TimePart,
 )
 from fusion.results.store import Product, plain, require_own
-from fusion.results.thermal_test import ThermalTest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,7 @@ from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.library import LIBRARY
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import RECORD_EFFECTS, load_campaign
-from fusion.report.terminal import summary_rows
+from fusion.report.findings import summary_rows
 from fusion.results.axis import CorrelationPart, SourcePart
 from fusion.results.results import Notice, assemble
 from fusion.twin.recipe_file import read_recipe

@@ -26,7 +26,7 @@ from fusion.app.results.screen import results_screen
 from fusion.app.setup.screen import SetUpScreen
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.fleet import Row, as_csv, find_members, render_fleet, with_findings, write_book
-from fusion.report.exports.recursions import emit
+from fusion.report.exports.controls import emit
 from fusion.results.recursion import read_recursion
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import change, simulated

@@ -22,7 +22,7 @@ import pytest
 
 from fusion.common import FusionError
 from fusion.pipeline.run import run_campaign
-from fusion.report.terminal import summary_table
+from fusion.report.findings import summary_table
 from interferometry.common import InterferometryError
 from tests.soak.random_campaigns import broken_invariants, strict, write_random_campaign
 from thermography.common import ThermographyError

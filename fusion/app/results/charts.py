@@ -23,6 +23,7 @@ from fusion.report.campaign import (
     describe_evidence,
     describe_model,
     errors_table,
+    shown_channels,
     steps_table,
 )
 from fusion.report.charts import readings
@@ -40,7 +41,6 @@ from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
 from fusion.report.findings import action, conclude, next_steps, step_phrase
-from fusion.report.record import shown_channels
 from fusion.report.wording import (
     Table,
     anomaly_cause,

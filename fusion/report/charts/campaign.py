@@ -15,7 +15,7 @@ from fusion.report.campaign import leading_region
 from fusion.report.charts import model, plan, readings
 from fusion.report.charts.embedded import Drawn
 from fusion.report.charts.plan import plot_thermal_map
-from fusion.report.charts.record import draw_thermal_tests
+from fusion.report.charts.record import draw_record, draw_thermal_tests
 from fusion.report.charts.style import Chart, embed
 from fusion.report.charts.thermograms import draw_thermograms
 from fusion.results.results import Results
@@ -24,7 +24,9 @@ from interferometry.plots import evaluate_common_start, hours_since_start
 
 
 def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
-    """Draw all charts of a campaign's report."""
+    """Draw all charts of the report of a campaign or a record."""
+    if "record" in datasets:
+        return Drawn(embed({**draw_record(datasets["record"]), **draw_thermal_tests(results.iso230_3 or ())}))
     fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
     drawn = draw_measured(fields, deviations, None if fused is None else fused.to_dataset())
     if results.regions and "thermograms" in datasets:

@@ -11,6 +11,7 @@ from bokeh.models import Plot
 from bokeh.plotting import figure
 
 from fusion.common import own_name
+from fusion.report.campaign import DRAWN, shown_channels
 from fusion.report.charts.model import plot_block_errors
 from fusion.report.charts.style import (
     BEFORE,
@@ -27,11 +28,9 @@ from fusion.report.charts.style import (
     shared_range,
     span_words,
 )
-from fusion.report.record import shown_channels
-from fusion.report.thermal_test import DRAWN
 from fusion.report.wording import effect_words
 from fusion.results.numbers import join, number, print_unit
-from fusion.results.thermal_test import ThermalTest
+from fusion.results.parts import ThermalTest
 from interferometry.plots import COLOURS, INK
 
 _TIME, _AFTER, _PALE = "time since start / h", COLOURS["positive"], "#b3bdc2"

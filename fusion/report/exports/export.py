@@ -19,14 +19,17 @@ from fusion.messages import naming
 from fusion.report.exports import tables
 from fusion.report.exports.controls import (
     CONTROLS,
+    MODELS,
     Array,
     Control,
     ErrorTable,
     ExportError,
     Origin,
     Profile,
+    emit,
     fit_temperature_line,
     header_lines,
+    objections_to_model,
     path_variance,
     read_origin,
     read_profile,
@@ -35,16 +38,14 @@ from fusion.report.exports.controls import (
     siemens_temperature,
     tabulate,
 )
-from fusion.report.exports.recursions import MODELS, emit, objections_to_model
 from fusion.report.findings import headline
 from fusion.report.wording import anomaly_cause, anomaly_place
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import number
-from fusion.results.parts import Quantity
+from fusion.results.parts import ENDING, Quantity, TablePrediction
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically
-from fusion.results.table_prediction import ENDING, TablePrediction
 from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import write_csv
 

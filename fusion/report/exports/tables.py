@@ -20,7 +20,7 @@ from openpyxl.styles import Alignment, Font
 from openpyxl.utils import get_column_letter
 
 from fusion.common import own_name
-from fusion.report.terminal import summary_rows
+from fusion.report.findings import summary_rows
 from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import print_unit

@@ -18,10 +18,9 @@ from fusion.analysis.comparison import (
     compare_profiles,
     compare_scatters,
 )
-from fusion.results.parts import Quantity
+from fusion.results.parts import ENDING, Quantity, TablePrediction
 from fusion.results.results import ResultsError
 from fusion.results.store import file_sha256
-from fusion.results.table_prediction import ENDING, TablePrediction
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 

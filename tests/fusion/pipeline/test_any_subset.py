@@ -14,9 +14,9 @@ from fusion.pipeline.fleet import Row, with_findings
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import ExportError, export_results
+from fusion.report.findings import summary_rows
 from fusion.report.page import report_of
 from fusion.report.sheet import describe_sheet, render_iso230
-from fusion.report.terminal import summary_rows
 from fusion.results.folder import claim, read_manifest
 from fusion.results.results import Results, read_results
 from fusion.results.store import read_dataset, read_tree

@@ -13,7 +13,7 @@ from fusion.campaign.inputs import read_source
 from fusion.pipeline.check import check_campaign
 from fusion.pipeline.consistency import check_source
 from fusion.pipeline.run import run_campaign
-from fusion.report.terminal import summary_rows
+from fusion.report.findings import summary_rows
 from fusion.results.results import read_results
 from tests.fusion.analysis.consistency import lies
 from tests.fusion.campaign_parts import change, keep_cycles, record_of_rows, without

@@ -8,8 +8,8 @@ import pytest
 
 from fusion.campaign.config import CampaignError, ThermalTestTable
 from fusion.pipeline.iso230_3 import evaluate_record_test, read_thermal_tests
+from fusion.report.campaign import describe_thermal_tests
 from fusion.report.sheet import describe_thermal_sheet, write_thermal_tests
-from fusion.report.thermal_test import describe_thermal_tests
 from fusion.results.store import file_sha256
 from tests.fusion.record_tables import runs_table, table_of
 

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.report.campaign import describe_campaign
 from fusion.report.charts.record import draw_record
 from fusion.report.page import render_page
-from fusion.report.record import describe_record
 from fusion.results.loop import RecordLoop
 from fusion.results.results import assemble
 from tests.fusion.report.page_tables import tables_of
@@ -43,8 +43,8 @@ def page_of(**changes: Any) -> str:
     results = assemble("R", {"loop": {**RECORD_LOOP, **changes}}, [])
     assert isinstance(results.loop, RecordLoop)
     return render_page(
-        "record.html.j2", {}, results=results, provenance=ORIGIN, thermal_map=None,
-        summary=describe_record(results, record(), ORIGIN),
+        "report.html.j2", {}, results=results, provenance=ORIGIN, thermal_map=None,
+        summary=describe_campaign(results, ORIGIN, {"record": record()}, None),
     )  # fmt: skip
 
 
@@ -63,7 +63,9 @@ def test_a_record_is_told_with_its_channels_and_its_driver():
 
 
 def test_the_page_stays_readable_with_many_channels():
-    told = describe_record(assemble("R", {"loop": RECORD_LOOP}, []), record(channels=9, drivers=0), ORIGIN)
+    told = describe_campaign(
+        assemble("R", {"loop": RECORD_LOOP}, []), ORIGIN, {"record": record(channels=9, drivers=0)}, None
+    )["record"]
     assert (len(told["shown"]), told["omitted"]) == (6, 3)
     assert "driver" not in told["measured"]
     charts = draw_record(record(channels=9, drivers=0))

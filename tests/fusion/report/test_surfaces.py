@@ -24,11 +24,11 @@ from fusion.pipeline.fleet import Row, render_fleet, with_findings, write_book
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.pipeline.run import run_campaign
+from fusion.report.campaign import thermal_test_tables
 from fusion.report.comparison import render_comparison
 from fusion.report.exports.export import export_results
+from fusion.report.findings import summary_table
 from fusion.report.sheet import describe_sheet, iso230_tables, write_iso230, write_thermal_tests
-from fusion.report.terminal import summary_table
-from fusion.report.thermal_test import thermal_test_tables
 from fusion.report.wording import ISO230_TERMS, ONE_WAY_TERMS
 from fusion.results.numbers import measured
 from fusion.results.results import read_results

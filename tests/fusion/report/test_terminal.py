@@ -3,7 +3,7 @@
 import pytest
 
 from fusion.analysis.consistency.checks import Check, inputs_part, judge
-from fusion.report.terminal import summary_rows
+from fusion.report.findings import summary_rows
 from fusion.results.results import Notice, assemble
 from tests.fusion.results_sample import PARTS
 

@@ -23,8 +23,8 @@ from fusion.campaign.logs import read_drivers
 from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import export_results
+from fusion.report.findings import summary_rows
 from fusion.report.page import report_of
-from fusion.report.terminal import summary_rows
 from fusion.results.results import read_results
 from fusion.twin.recipe_file import read_recipe
 from interferometry.io.readings import is_environment_log, read_deviations, read_environment

@@ -17,8 +17,8 @@ from fusion.campaign.draft import Asker, write_campaign
 from fusion.pipeline.iso230_3 import StatedTests
 from fusion.pipeline.run import run_campaign
 from fusion.report.page import ProductsError
+from fusion.results.parts import ThermalTest
 from fusion.results.store import file_sha256
-from fusion.results.thermal_test import ThermalTest
 from tests.fusion.app.texts import texts
 
 

@@ -16,9 +16,9 @@ from fusion.report.exports import tables
 from fusion.report.exports.controls import ExportError, header_lines, read_origin, read_thermal_state
 from fusion.report.exports.export import FORMATS, _frame_writer, export_results, objections, remarks
 from fusion.report.exports.tables import profile_table, readings_table, write_workbook
+from fusion.results.parts import TablePredictionError, read_table_prediction
 from fusion.results.results import Results, ResultsError, assemble, read_results
 from fusion.results.store import read_dataset, write_dataset, write_json
-from fusion.results.table_prediction import TablePredictionError, read_table_prediction
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.report.exports.controls import ErrorTable, linuxcnc
-from fusion.report.exports.recursions import emit
+from fusion.report.exports.controls import ErrorTable, emit, linuxcnc
 from fusion.results.recursion import run_recursion
 from tests.fusion.recursions import some_model
 

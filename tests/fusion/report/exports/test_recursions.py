@@ -9,8 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from fusion.report.exports.controls import ExportError
-from fusion.report.exports.recursions import emit
+from fusion.report.exports.controls import ExportError, emit
 from fusion.results.recursion import Recursion, run_recursion
 from tests.fusion.recursions import STEPS, some_model, some_readings
 
