@@ -6,8 +6,8 @@ from .analysis.drift_model.axis import LoopResult, close_loop
 from .analysis.effects.effect import Candidate, Effect
 from .campaign.config import load_campaign
 from .campaign.logs import read_drivers
-from .common import FusionError
 from .campaign.remote import fetch_sample
+from .common import FusionError
 from .pipeline.run import run_campaign
 from .report.exports.export import export_results
 from .report.page import render_report
