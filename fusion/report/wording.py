@@ -155,9 +155,10 @@ EVIDENCE = {
 
 
 class EffectWords(NamedTuple):
-    """An effect as a reader meets it: its name, and what to check where it was missing (empty where nothing is stated)."""
+    """An effect as a reader meets it: its name, alone and within a sentence, and what to check where it was missing."""
 
     name: str
+    phrase: str
     remedy: str
 
 
@@ -165,7 +166,9 @@ class EffectWords(NamedTuple):
 def effect_words(name: str) -> EffectWords:
     """Return the words of an effect."""
     effect = describe_effect(name)
-    return EffectWords(name.replace("_", " "), "") if effect is None else EffectWords(effect.words, effect.remedy)
+    if effect is None:  # of a distribution that is not installed here
+        return EffectWords(name.replace("_", " "), name.replace("_", " "), "")
+    return EffectWords(effect.words, effect.phrase or effect.words, effect.remedy)
 
 
 def quantity(found: Quantity, unit: str = "") -> str:

@@ -165,6 +165,8 @@ class Effect:
         ``limitation(readings)`` says what these readings hide of it, or returns an empty text.
     label : str
         Its name in words; by default the name with spaces.
+    phrase : str
+        What it is called within a sentence; by default its name in words.
     remedy : str
         What to check on the machine or the measurement where the effect was missing.
 
@@ -198,6 +200,7 @@ class Effect:
     longest_min: float = np.inf
     limitation: Callable[[Readings], str] = field(default=lambda readings: "")
     label: str = ""
+    phrase: str = ""
     remedy: str = ""
 
     @property

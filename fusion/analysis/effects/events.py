@@ -193,6 +193,7 @@ STEP_EVENT = Effect(
     candidates=_step_event,
     repeats=True,
     label="sudden step or new zero",
+    phrase="a sudden step",
     remedy="Ask whether the laser was zeroed or its beam broken at that time; if not, look at the clamping of optics and laser head.",
 )
 PERIODIC_DISTURBANCE = Effect(
@@ -202,5 +203,6 @@ PERIODIC_DISTURBANCE = Effect(
     candidates=_periodic_disturbance,
     repeats=True,
     label="periodic disturbance",
+    phrase="a periodic disturbance",
     remedy="Compare its period with coolant, hydraulics and air conditioning.",
 )

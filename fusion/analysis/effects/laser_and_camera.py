@@ -65,6 +65,7 @@ CAMERA_OFFSET = Effect(
     repeats=True,
     errs_camera=True,
     label="jump of the camera's zero",
+    phrase="a step of the camera's zero",
     remedy="Let the camera warm up and watch its flat-field corrections; the fields before and after the jump differ.",
 )
 REFLECTED_SOURCE = Effect(
@@ -75,6 +76,7 @@ REFLECTED_SOURCE = Effect(
     needs=_needs_patch,
     errs_camera=True,
     label="reflection in the thermogram",
+    phrase="a reflection in the thermograms",
     remedy="Shield the reflecting source, or paint the reflecting part.",
 )
 
@@ -152,6 +154,7 @@ DEAD_PATH = Effect(
     needs=_needs_air,
     declarable=True,
     label="dead path of the laser",
+    phrase="the laser's dead path",
     remedy="Shorten the dead path or enter it, and zero the laser where the optics are closest.",
 )
 AIR_INDEX = Effect(
@@ -162,6 +165,7 @@ AIR_INDEX = Effect(
     needs=_needs_air,
     declarable=True,
     label="refractive index of the air",
+    phrase="the refractive index of the air",
     remedy="Check that the weather station was on, and that its air sensor is in the beam's air.",
 )
 MATERIAL_COMPENSATION = Effect(
@@ -173,6 +177,7 @@ MATERIAL_COMPENSATION = Effect(
     masked_by=unmeasured_expansion,
     declarable=True,
     label="material compensation",
+    phrase="the laser's material compensation",
     remedy="Check the coefficient that was entered and where the material probe sat.",
 )
 LASER_WARM_UP = Effect(
@@ -183,6 +188,7 @@ LASER_WARM_UP = Effect(
     masked_by=unmeasured_expansion,
     longest_min=_WARM_UPS_MIN[-1],
     label="warm-up of the laser",
+    phrase="the laser's warm-up",
     remedy="Let the laser warm up longer before the first cycle.",
 )
 SENSOR_FAULT = Effect(
@@ -193,5 +199,6 @@ SENSOR_FAULT = Effect(
     needs=_needs_sensor_episode,
     repeats=True,
     label="faulty sensor",
+    phrase="a faulty sensor",
     remedy="Check the sensor named, and its cable and time stamps.",
 )

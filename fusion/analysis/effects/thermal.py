@@ -120,6 +120,7 @@ ANGULAR_GROWTH = Effect(
     masked_by=unmeasured_expansion,
     patterned=True,
     label="growing pitch or yaw of the axis",
+    phrase="a growing pitch or yaw of the axis",
     remedy="Measure pitch and yaw while the machine warms up; keep the Abbe offset short.",
 )
 REVERSAL_DRIFT = Effect(
@@ -129,6 +130,7 @@ REVERSAL_DRIFT = Effect(
     candidates=_reversal_drift,
     patterned=True,
     label="reversal that changes with time",
+    phrase="a reversal error that changes",
     remedy="Check screw preload, gibs and the scale's coupling; measure the reversal warm and cold.",
 )
 PITCH_ERROR = Effect(
@@ -139,6 +141,7 @@ PITCH_ERROR = Effect(
     patterned=True,
     limitation=_hidden_leads,
     label="pitch error of the screw",
+    phrase="a changing pitch error of the screw",
     remedy="Repeat with a target spacing that is no multiple of the screw's lead.",
 )
 
@@ -259,6 +262,7 @@ AXIS_EXPANSION = Effect(
     prior=Prior(11.7, EXPANSION_U_PPM_PER_K),
     declarable=True,
     label="expansion of the axis",
+    phrase="the expansion of the axis",
     remedy="Check the expansion coefficient and the probe place that the laser's compensation uses.",
 )
 TABLE_OFFSET = Effect(
@@ -272,6 +276,7 @@ TABLE_OFFSET = Effect(
     follows_field=True,
     declarable=True,
     label="shift with the table's mean temperature",
+    phrase="a shift with the table's mean temperature",
     remedy="Look at the thermal path from table to scale and at the table's clamping.",
 )
 THERMAL_LAG = Effect(
@@ -286,6 +291,7 @@ THERMAL_LAG = Effect(
     follows_field=True,
     excited_by="field",
     label="thermal lag of a remote structure",
+    phrase="a part of the machine that follows the measured temperatures with a lag",
     remedy="Wait longer before measuring, or log the temperature of the column and the bed.",
 )
 UNSEEN_HEAT_SOURCE = Effect(
@@ -300,6 +306,7 @@ UNSEEN_HEAT_SOURCE = Effect(
     masked_by=unmeasured_expansion,
     excited_by="driver",
     label="unseen heat source",
+    phrase="a heat source that the camera does not see",
     remedy=(
         "Look for the source where neither camera nor sensors reach: spindle, motor, drive, screw bearing, hydraulics; log its duty."
     ),
@@ -316,6 +323,7 @@ LOGGED_INFLUENCE = Effect(
     masked_by=unmeasured_expansion,
     excited_by="driver",
     label="influence of a logged quantity",
+    phrase="a part that follows a logged quantity late",
     remedy="Keep that quantity steady, or let a compensation follow it; look for the part that it reaches so late.",
 )
 QUASI_STATIC_RESPONSE = Effect(
@@ -325,5 +333,6 @@ QUASI_STATIC_RESPONSE = Effect(
     candidates=_quasi_static,
     declarable=True,
     label="quasi-static response to the temperatures",
+    phrase="thermal expansion in proportion to the measured temperatures",
     remedy="Check that the sensors sit on the parts that move the tool and the work.",
 )
