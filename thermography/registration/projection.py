@@ -270,6 +270,11 @@ class Projection:
     focal_length_px: float
     principal_point_px: tuple[float, float]
 
+    @classmethod
+    def ideal(cls, shape: tuple[int, int]) -> Projection:
+        """Projection by a lens without distortion, whose focal length is the width of the frame: only k1 over its square is determined."""
+        return cls(np.eye(3), np.zeros(4), float(shape[1]), ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
+
     @cached_property
     def as_array(self) -> Array:
         """Parameters for the kernels, (16,): homography by rows, focal length, principal point, k1, k2, p1, p2."""
@@ -383,87 +388,86 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
     return parametrisation.unpack(found.x)
 
 
-def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:
+@dataclass(frozen=True)
+class DiscFit:
+    """A projection fitted to discs, with the number of distortion coefficients among its parameters."""
+
+    observations: DiscObservations
+    projection: Projection
+    coefficients: int
+
+    def leave_one_out_mm(self) -> Array:
+        """Distance by which each disc is missed by the fit to all other discs, (n,) mm; NaN of four, which determine the fit."""
+        count = len(self.observations.u_px)
+        if 2 * (count - 1) < 8:
+            return np.full(count, np.nan)
+        missed_px = self.prediction_errors_px()[0][..., None]
+        jacobian = self.projection.jacobian(self.observations.centres_mm)
+        return np.asarray(np.linalg.norm(np.linalg.solve(jacobian, missed_px)[..., 0], axis=1))
+
+    def prediction_errors_px(self, *, fitted: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
+        """Error by which each disc is missed by a fit that it takes no part in, and the covariance of that error."""
+        fitted = np.ones(len(self.observations.u_px), bool) if fitted is None else fitted
+        jacobian = self._weighted_jacobian()
+        part = jacobian[fitted].reshape(2 * int(fitted.sum()), -1)
+        parameters = np.linalg.pinv(part.T @ part + self._prior_information())
+        leverage = jacobian @ parameters @ np.swapaxes(jacobian, 1, 2)
+        covariances = np.where(fitted[:, None, None], np.eye(2) - leverage, np.eye(2) + leverage)
+        errors = self.observations.residuals_px(self.projection)
+        covariances[fitted] = np.linalg.inv(covariances[fitted])
+        errors[fitted] = (covariances[fitted] @ errors[fitted, :, None])[..., 0]
+        return errors, covariances
+
+    def variance_factor(self) -> tuple[float, float]:
+        """Reduced chi-square of the residuals, and its degrees of freedom."""
+        information = self._information()
+        used = float(np.trace(np.linalg.pinv(information + self._prior_information()) @ information))
+        freedom = 2 * len(self.observations.u_px) - used
+        if freedom < 0.5:
+            return 1.0, 0.0
+        weighted = self.observations.residuals_px(self.projection) / self.observations.u_px[:, None]
+        return max(float((weighted**2).sum()) / freedom, 1.0), freedom
+
+    def covariance(self, factor: float) -> Array:
+        """Covariance of the parameters."""
+        return np.linalg.pinv(self._information() / factor + self._prior_information())
+
+    def _information(self) -> Array:
+        """Products of the weighted derivatives with one another, (parameters, parameters)."""
+        jacobian = self._weighted_jacobian().reshape(2 * len(self.observations.u_px), -1)
+        return np.asarray(jacobian.T @ jacobian)
+
+    def _prior_information(self) -> Array:
+        """Inverse covariance of the parameters before any disc: nothing is known of the homography."""
+        return np.diag(np.concatenate([np.zeros(8), LENS_SPREAD[: self.coefficients] ** -2.0]))
+
+    def _weighted_jacobian(self) -> Array:
+        """Derivative of the discs' sensor positions by the parameters over their uncertainty, (n, 2, parameters)."""
+        centres_mm = self.observations.centres_mm
+        derivative = parameter_jacobian(self.projection, centres_mm, self.coefficients)(centres_mm)
+        return derivative / self.observations.u_px[:, None, None]
+
+
+def select_lens_model(observations: DiscObservations, start: Projection) -> DiscFit:
     """Fit every lens model that the discs determine, and choose the simplest that no richer one clearly improves on."""
-    best, best_count, best_error = fit_projection(observations, fit_projection(observations, start, 0), 0), 0, np.inf
+    plain = fit_projection(observations, fit_projection(observations, start, 0), 0)
+    best, best_error = DiscFit(observations, plain, 0), np.inf
     if len(observations.u_px) < _LEAST_FOR_CHOICE:
-        return fit_projection(observations, best, 1), 1
+        return DiscFit(observations, fit_projection(observations, plain, 1), 1)
     for _, count in LENS_MODELS:
         if count > 0 and 2 * (len(observations.u_px) - 2) < 8 + count:
             break
-        projection = fit_projection(observations, best, count)
-        weighted = leave_one_out_mm(observations, projection, count) / observations.u_px
-        error = float(np.sqrt(np.mean(weighted**2)))
+        fit = DiscFit(observations, fit_projection(observations, best.projection, count), count)
+        error = float(np.sqrt(np.mean((fit.leave_one_out_mm() / observations.u_px) ** 2)))
         if error < _REQUIRED_GAIN * best_error:
-            best, best_count, best_error = projection, count, error
-    return best, best_count
-
-
-def leave_one_out_mm(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
-    """Distance by which each disc is missed by the fit to all other discs."""
-    count = len(observations.u_px)
-    if 2 * (count - 1) < 8:
-        return np.full(count, np.nan)
-    missed_px = prediction_errors_px(observations, projection, coefficients)[0][..., None]
-    missed_mm = np.linalg.solve(projection.jacobian(observations.centres_mm), missed_px)[..., 0]
-    return np.asarray(np.linalg.norm(missed_mm, axis=1))
-
-
-def prediction_errors_px(
-    observations: DiscObservations,
-    projection: Projection,
-    coefficients: int,
-    *,
-    fitted: NDArray[np.bool_] | None = None,
-) -> tuple[Array, Array]:
-    """Error by which each disc is missed by a fit that it takes no part in, and the covariance of that error."""
-    fitted = np.ones(len(observations.u_px), bool) if fitted is None else fitted
-    jacobian = _weighted_jacobian(observations, projection, coefficients)
-    part = jacobian[fitted].reshape(2 * int(fitted.sum()), -1)
-    parameters = np.linalg.pinv(part.T @ part + _prior_information(coefficients))
-    leverage = jacobian @ parameters @ np.swapaxes(jacobian, 1, 2)
-    covariances = np.where(fitted[:, None, None], np.eye(2) - leverage, np.eye(2) + leverage)
-    errors = observations.residuals_px(projection)
-    covariances[fitted] = np.linalg.inv(covariances[fitted])
-    errors[fitted] = (covariances[fitted] @ errors[fitted, :, None])[..., 0]
-    return errors, covariances
+            best, best_error = fit, error
+    return best
 
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
     """Derivative of the sensor position by the fitted parameters, as a function of the plan point."""
     parametrisation = _Parametrisation.of(projection, centres_mm, coefficients)
     return partial(parametrisation.jacobian, parametrisation.pack(projection))
-
-
-def variance_factor(observations: DiscObservations, projection: Projection, coefficients: int) -> tuple[float, float]:
-    """Reduced chi-square of the residuals, and its degrees of freedom."""
-    jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
-    information = jacobian.T @ jacobian
-    used = float(np.trace(np.linalg.pinv(information + _prior_information(coefficients)) @ information))
-    freedom = 2 * len(observations.u_px) - used
-    if freedom < 0.5:
-        return 1.0, 0.0
-    weighted = observations.residuals_px(projection) / observations.u_px[:, None]
-    return max(float((weighted**2).sum()) / freedom, 1.0), freedom
-
-
-def parameter_covariance(
-    observations: DiscObservations, projection: Projection, coefficients: int, *, factor: float
-) -> Array:
-    """Covariance of the parameters."""
-    jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
-    return np.linalg.pinv(jacobian.T @ jacobian / factor + _prior_information(coefficients))
-
-
-def _prior_information(coefficients: int) -> Array:
-    """Inverse covariance of the parameters before any disc: nothing is known of the homography."""
-    return np.diag(np.concatenate([np.zeros(8), LENS_SPREAD[:coefficients] ** -2.0]))
-
-
-def _weighted_jacobian(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
-    """Derivative of the discs' sensor positions by the parameters over their uncertainty, (n, 2, parameters)."""
-    derivative = parameter_jacobian(projection, observations.centres_mm, coefficients)(observations.centres_mm)
-    return derivative / observations.u_px[:, None, None]
 
 
 @dataclass(frozen=True)

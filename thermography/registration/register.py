@@ -19,17 +19,14 @@ from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import (
     LENS_MODELS,
     LENS_SPREAD,
+    DiscFit,
     DiscObservations,
     Lens,
     Projection,
     fit_homography,
     fit_projection,
-    leave_one_out_mm,
-    parameter_covariance,
     parameter_jacobian,
-    prediction_errors_px,
     select_lens_model,
-    variance_factor,
 )
 
 # Quadruples of points, and the homographies that map four points exactly: the smallest sets that locate a plan.
@@ -98,43 +95,43 @@ _MISPLACED_MM = 0.2
 
 def fit_agreeing(
     observations: DiscObservations, ideal: Projection, *, calibrated: bool
-) -> tuple[Projection, int, NDArray[np.bool_]]:
+) -> tuple[DiscFit, NDArray[np.bool_]]:
     """Fit one plane behind one lens to the discs whose listed places agree with it."""
     count = len(observations.u_px)
     agreeing = np.ones(count, bool)
     if count < _LEAST_FOR_TEST:
-        return *_fit_lens(observations, ideal, calibrated=calibrated), agreeing
+        return _fit_lens(observations, ideal, calibrated=calibrated), agreeing
     agreeing = _robust_start(observations, ideal, calibrated=calibrated)
     for _ in range(count):
-        projection, coefficients = _fit_lens(observations.select(agreeing), ideal, calibrated=calibrated)
-        tested = _passes(observations, agreeing, projection, coefficients)
+        fit = _fit_lens(observations.select(agreeing), ideal, calibrated=calibrated)
+        tested = _passes(observations, agreeing, fit)
         if tested.sum() < 4 or (tested == agreeing).all():
             break
         agreeing = tested
     else:
-        projection, coefficients = _fit_lens(observations.select(agreeing), ideal, calibrated=calibrated)
-    return projection, coefficients, agreeing
+        fit = _fit_lens(observations.select(agreeing), ideal, calibrated=calibrated)
+    return fit, agreeing
 
 
-def _fit_lens(observations: DiscObservations, ideal: Projection, *, calibrated: bool) -> tuple[Projection, int]:
-    """Homography and distortion fitted to discs that agree, and the number of distortion coefficients."""
+def _fit_lens(observations: DiscObservations, ideal: Projection, *, calibrated: bool) -> DiscFit:
+    """Homography and distortion fitted to discs that agree."""
     start = fit_homography(observations, ideal)
-    return (fit_projection(observations, start, 0), 0) if calibrated else select_lens_model(observations, start)
+    if calibrated:
+        return DiscFit(observations, fit_projection(observations, start, 0), 0)
+    return select_lens_model(observations, start)
 
 
-def _passes(
-    observations: DiscObservations, agreeing: NDArray[np.bool_], projection: Projection, coefficients: int
-) -> NDArray[np.bool_]:
+def _passes(observations: DiscObservations, agreeing: NDArray[np.bool_], fit: DiscFit) -> NDArray[np.bool_]:
     """Discs whose prediction by the agreeing ones (the others among them) is as good as that of the rest."""
-    factor, freedom = variance_factor(observations.select(agreeing), projection, coefficients)
-    errors, covariances = prediction_errors_px(observations, projection, coefficients, fitted=agreeing)
+    factor, freedom = fit.variance_factor()
+    errors, covariances = replace(fit, observations=observations).prediction_errors_px(fitted=agreeing)
     weighted = (errors / observations.u_px[:, None])[..., None]
     squares = (np.swapaxes(weighted, 1, 2) @ np.linalg.solve(covariances, weighted))[:, 0, 0]
     # An agreeing disc is held against the scatter of the others: its own share of the chi-square is taken out.
     others = np.where(agreeing, np.maximum((factor * freedom - squares) / max(freedom - 2, 1), 1.0), factor)
     degrees = np.where(agreeing, max(freedom - 2, 1), max(freedom, 1))
     unlikely = squares / 2 / others > special.fdtri(2, degrees, 1.0 - _FALSE_ALARM / len(squares))
-    missed = np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0]
+    missed = np.linalg.solve(fit.projection.jacobian(observations.centres_mm), errors[..., None])[..., 0]
     missed_mm = np.linalg.norm(missed, axis=1)
     # Where the others alone determine the fit and no more, nothing tells whether an agreeing disc is wrong.
     untold = agreeing & (freedom - 2 < _LEAST_FREEDOM)
@@ -556,16 +553,17 @@ def _chance(
 ) -> float:
     """Chance of the agreement of the matched spots on a plane seen through a lens, one hypothesis."""
     plan, image = _pairs(matched, fiducials)
-    ideal = Projection(np.eye(3), np.zeros(4), float(shape[1]), ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
     observations = DiscObservations(image, plan, np.ones(len(plan)), np.full(len(plan), SPOT_U_PX))
     try:
-        projection, coefficients, agreeing = fit_agreeing(observations, ideal, calibrated=False)
+        fit, agreeing = fit_agreeing(observations, Projection.ideal(shape), calibrated=False)
     except ThermographyError:
         return np.inf
-    distance = np.linalg.norm(projection.to_sensor(plan) - image, axis=1)[agreeing]
+    distance = np.linalg.norm(fit.projection.to_sensor(plan) - image, axis=1)[agreeing]
     misfit = max(float(np.sqrt(np.mean(distance**2))), _LEAST_MISFIT_PX)
     missed, area = np.full(len(distance), misfit), float(shape[0] * shape[1])
-    return chance_of_arrangement(len(fiducials), spots, missed, hypotheses=1, coefficients=coefficients, area_px=area)
+    return chance_of_arrangement(
+        len(fiducials), spots, missed, hypotheses=1, coefficients=fit.coefficients, area_px=area
+    )
 
 
 def _pairs(matched: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> tuple[Array, Array]:
@@ -780,8 +778,8 @@ def register(
         located = matched
         for _ in range(2):
             discs = [disc for disc in listed if disc.name in located]
-            projection, _, _ = _fit(_observations(located, discs), shape, lens)
-            located, missed = locate_fiducials(frame, listed, projection, grid=grid, reach_px=_REACH_PX)
+            fit, _ = _fit(_observations(located, discs), shape, lens)
+            located, missed = locate_fiducials(frame, listed, fit.projection, grid=grid, reach_px=_REACH_PX)
             if len(located) < 4:
                 raise RegistrationError(
                     f"only {len(located)} of {len(listed)} fiducials are located, a plan needs 4: {_reasons(missed)}"
@@ -896,8 +894,8 @@ def _registration(
 ) -> Registration:
     """Fit the fiducials that agree; leave out the others, with where they are (`apart`: those that were detected but not located)."""
     discs = [disc for disc in listed if disc.name in located]
-    observations = _observations(located, discs)
-    projection, coefficients, agree = _fit(observations, shape, lens)
+    fit, agree = _fit(_observations(located, discs), shape, lens)
+    observations, projection = fit.observations, fit.projection
     left_out, observed = dict(left_out), {}
     misplaced = {disc.name: located[disc.name] for disc, agrees in zip(discs, agree, strict=True) if not agrees}
     for disc in listed:
@@ -909,26 +907,26 @@ def _registration(
                 f"({x_mm:.1f}, {y_mm:.1f}) mm; check its x_mm, y_mm, and that nothing covers a part of it"
             )
     discs = [disc for disc in discs if disc.name not in misplaced]
-    names, observations = [disc.name for disc in discs], observations.select(agree)
+    names = [disc.name for disc in discs]
     residual = np.linalg.norm(observations.residuals_mm(projection), axis=1)
-    factor, freedom = variance_factor(observations, projection, coefficients)
+    factor, freedom = fit.variance_factor()
     # Half-width of Student's t that holds 68 %: few residuals tell their scatter badly (JCGM 100:2008, annex G).
     factor_u = factor * (float(special.stdtrit(freedom, special.ndtr(1.0))) ** 2 if freedom >= 1.0 else 1.0)
     px_per_mm = projection.px_per_mm(observations.centres_mm)
-    unchecked = _unchecked(observations, projection, coefficients, discs, factor)
+    unchecked = _unchecked(fit, discs, factor)
     # The place of an unchecked disc may err unnoticed by up to its diameter, rectangular (JCGM 100:2008, 4.3.7).
     reach_mm = np.array([disc.diameter_mm if disc.name in unchecked else 0.0 for disc in discs])
     hidden_px = reach_mm * px_per_mm / np.sqrt(3.0 * factor_u)
-    leave_one_out = leave_one_out_mm(observations, projection, coefficients)
+    hidden = replace(observations, u_px=np.hypot(observations.u_px, hidden_px))
     return Registration(
         homography=np.linalg.inv(projection.plan_to_sensor),
         distortion=projection.distortion,
-        model=_MODEL_NAMES[coefficients] if lens is None else "calibrated lens + homography",
+        model=_MODEL_NAMES[fit.coefficients] if lens is None else "calibrated lens + homography",
         projection=projection,
         fiducials=dict(zip(names, discs, strict=True)),
         located={name: located[name] for name in names},
         residual_mm=dict(zip(names, residual.tolist(), strict=True)),
-        leave_one_out_mm=dict(zip(names, leave_one_out.tolist(), strict=True)),
+        leave_one_out_mm=dict(zip(names, fit.leave_one_out_mm().tolist(), strict=True)),
         rms_mm=float(np.sqrt(np.mean(residual**2))) if freedom > 0 else float("nan"),
         scatter_mm=float(np.sqrt(factor) * np.median(observations.u_px / px_per_mm)),
         scatter_px=float(np.sqrt(factor) * np.median(observations.u_px)),
@@ -938,25 +936,19 @@ def _registration(
         masked=tuple(observed.get(disc.name, disc) for disc in listed),
         shape=shape,
         lens=lens,
-        covariance=parameter_covariance(
-            replace(observations, u_px=np.hypot(observations.u_px, hidden_px)),
-            projection,
-            len(LENS_SPREAD) if lens is None else 0,
-            factor=factor_u,
-        ),
+        covariance=DiscFit(hidden, projection, len(LENS_SPREAD) if lens is None else 0).covariance(factor_u),
     )
 
 
-def _unchecked(
-    observations: DiscObservations, projection: Projection, coefficients: int, discs: Sequence[Fiducial], factor: float
-) -> tuple[str, ...]:
+def _unchecked(fit: DiscFit, discs: Sequence[Fiducial], factor: float) -> tuple[str, ...]:
     """Fiducials whose place the others predict with a standard uncertainty above a quarter of their diameter."""
     if len(discs) == 4:
         return tuple(disc.name for disc in discs)
-    _, covariances = prediction_errors_px(observations, projection, coefficients)
-    to_mm = np.linalg.inv(projection.jacobian(observations.centres_mm)) * observations.u_px[:, None, None]
+    _, covariances = fit.prediction_errors_px()
+    centres_mm, projection = fit.observations.centres_mm, fit.projection
+    to_mm = np.linalg.inv(projection.jacobian(centres_mm)) * fit.observations.u_px[:, None, None]
     variances = factor * np.trace(to_mm @ covariances @ np.swapaxes(to_mm, 1, 2), axis1=1, axis2=2)
-    px_per_mm = projection.px_per_mm(observations.centres_mm)
+    px_per_mm = projection.px_per_mm(centres_mm)
     # Where the others lie on a line, rounding decides the sign of what has no bound.
     return tuple(
         disc.name
@@ -967,16 +959,15 @@ def _unchecked(
 
 def _fit(
     observations: DiscObservations, shape: tuple[int, int], lens: Lens | None
-) -> tuple[Projection, int, NDArray[np.bool_]]:
-    """Projection fitted to the discs that agree, its number of distortion coefficients, and which discs agree."""
+) -> tuple[DiscFit, NDArray[np.bool_]]:
+    """Projection fitted to the discs that agree, and which these are."""
     if lens is not None:
         if lens.size_px is not None and lens.size_px != shape[::-1]:
             sizes = "calibrated with frames of {} x {} pixels, these have {} x {}".format(*lens.size_px, *shape[::-1])
             raise RegistrationError(f"the lens was {sizes}; calibrate with frames of this size")
         ideal = Projection(np.eye(3), np.array(lens.distortion), lens.focal_length_px, lens.principal_point_px)
     else:
-        # Only k1 over the squared focal length is determined: the frame's width serves as focal length, its middle as centre.
-        ideal = Projection(np.eye(3), np.zeros(4), float(shape[1]), ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
+        ideal = Projection.ideal(shape)
     try:
         return fit_agreeing(observations, ideal, calibrated=lens is not None)
     except ValueError as error:

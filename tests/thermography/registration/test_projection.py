@@ -7,6 +7,7 @@ import pytest
 from tests.thermography.plan_scene import DISCS, FOCAL_PX, Scene
 from thermography.registration.projection import (
     LENS_SPREAD,
+    DiscFit,
     DiscObservations,
     Lens,
     LensError,
@@ -14,14 +15,11 @@ from thermography.registration.projection import (
     _Parametrisation,
     fit_homography,
     fit_projection,
-    leave_one_out_mm,
     locate_point,
-    parameter_covariance,
     parameter_jacobian,
     project_point,
     read_lens,
     select_lens_model,
-    variance_factor,
 )
 
 PLAN = np.array([(disc.x_mm, disc.y_mm) for disc in DISCS], float)
@@ -83,13 +81,13 @@ def test_centroid_of_a_disc_is_the_centre_of_its_conic():
 
 def test_exact_points_give_the_exact_projection_and_the_simplest_model():
     observations = DiscObservations(TRUE.disc_centroids(PLAN, RADII), PLAN, RADII, np.full(len(PLAN), 0.01))
-    fitted, coefficients = select_lens_model(observations, fit_homography(observations, TRUE))
-    assert coefficients == 0
-    np.testing.assert_allclose(fitted.to_sensor(PLAN), TRUE.to_sensor(PLAN), atol=1e-6)
+    fit = select_lens_model(observations, fit_homography(observations, TRUE))
+    assert fit.coefficients == 0
+    np.testing.assert_allclose(fit.projection.to_sensor(PLAN), TRUE.to_sensor(PLAN), atol=1e-6)
     bent = DiscObservations(BENT.disc_centroids(PLAN, RADII), PLAN, RADII, np.full(len(PLAN), 0.01))
-    fitted, coefficients = select_lens_model(bent, fit_homography(bent, TRUE))
-    assert coefficients == 4
-    np.testing.assert_allclose(fitted.to_sensor(PLAN), BENT.to_sensor(PLAN), atol=1e-3)
+    fit = select_lens_model(bent, fit_homography(bent, TRUE))
+    assert fit.coefficients == 4
+    np.testing.assert_allclose(fit.projection.to_sensor(PLAN), BENT.to_sensor(PLAN), atol=1e-3)
 
 
 def test_covariance_is_that_of_repeated_observations(rng):
@@ -98,7 +96,7 @@ def test_covariance_is_that_of_repeated_observations(rng):
     observed = [exact + rng.normal(0, u_px[:, None], PLAN.shape) for _ in range(200)]
     fits = [fit_projection(DiscObservations(points, PLAN, RADII, u_px), TRUE, 0) for points in observed]
     scatter = np.std([fit.to_sensor(places) for fit in fits], axis=0)
-    covariance = parameter_covariance(DiscObservations(exact, PLAN, RADII, u_px), TRUE, 0, factor=1.0)
+    covariance = DiscFit(DiscObservations(exact, PLAN, RADII, u_px), TRUE, 0).covariance(1.0)
     derivative = parameter_jacobian(TRUE, PLAN, 0)(places)
     stated = np.sqrt(np.diagonal(derivative @ covariance @ np.swapaxes(derivative, 1, 2), axis1=1, axis2=2))
     # 200 fits give a standard deviation to 5 %.
@@ -108,20 +106,20 @@ def test_covariance_is_that_of_repeated_observations(rng):
 def test_variance_factor_is_the_reduced_chi_square(rng):
     points = TRUE.disc_centroids(PLAN, RADII) + rng.normal(0, 0.1, PLAN.shape)
     observations = DiscObservations(points, PLAN, RADII, np.full(len(PLAN), 0.02))
-    factor, freedom = variance_factor(observations, fit_projection(observations, TRUE, 1), 1)
+    factor, freedom = DiscFit(observations, fit_projection(observations, TRUE, 1), 1).variance_factor()
     # 24 coordinates less 9 parameters, of which the discs determine all; their scatter is five times the stated one.
     assert freedom == pytest.approx(15.0, abs=0.01)
     assert 12 < factor < 45
     four = observations.select(np.isin(np.arange(12), [0, 4, 5, 9]))
-    assert variance_factor(four, fit_projection(four, TRUE, 1), 1) == (1.0, 0.0)
+    assert DiscFit(four, fit_projection(four, TRUE, 1), 1).variance_factor() == (1.0, 0.0)
 
 
 def test_where_discs_are_few_the_spread_among_lenses_is_the_uncertainty():
     four = np.isin(np.arange(12), [0, 4, 5, 9])
     observations = DiscObservations(TRUE.to_sensor(PLAN), PLAN, np.full(12, 1e-6), np.full(12, 0.02)).select(four)
-    fitted, coefficients = select_lens_model(observations, fit_homography(observations, TRUE))
-    assert (coefficients, fitted.distortion[0]) == (1, pytest.approx(0.0, abs=1e-6))
-    covariance = parameter_covariance(observations, fitted, 4, factor=1.0)
+    fit = select_lens_model(observations, fit_homography(observations, TRUE))
+    assert (fit.coefficients, fit.projection.distortion[0]) == (1, pytest.approx(0.0, abs=1e-6))
+    covariance = DiscFit(observations, fit.projection, 4).covariance(1.0)
     np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)[8:]), LENS_SPREAD, rtol=1e-3)
 
 
@@ -137,7 +135,9 @@ def test_leave_one_out_equals_leaving_one_out(rng, coefficients):
         others = fit_projection(observations.select(np.arange(12) != i), projection, coefficients)
         refitted.append(np.linalg.norm(observations.residuals_mm(others)[i]))
     # The homography alone leaves 3 px of distortion, over which the projection is not quite linear.
-    np.testing.assert_allclose(leave_one_out_mm(observations, projection, coefficients), refitted, rtol=0.05, atol=0.01)
+    np.testing.assert_allclose(
+        DiscFit(observations, projection, coefficients).leave_one_out_mm(), refitted, rtol=0.05, atol=0.01
+    )
 
 
 MATRIX = np.array([[900.0, 0, 319.5], [0, 900.0, 239.5], [0, 0, 1]])
