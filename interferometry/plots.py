@@ -269,20 +269,7 @@ def plot_drift(
 
 
 def plot_iso230(settled: xr.Dataset, position: xr.DataArray, ax: Axes | None = None) -> Axes:
-    """Plot the chart of ISO 230-2: mean deviation of each approach with its 2 s.
-
-    Parameters
-    ----------
-    settled : xarray.Dataset
-        Result of `interferometry.iso230.evaluate_iso230`, um (arcsec).
-    position : (target) DataArray
-        Target positions, mm (deg).
-    ax : matplotlib Axes, optional
-
-    Returns
-    -------
-    matplotlib Axes
-    """
+    """Plot the chart of ISO 230-2: mean deviation of each approach with its 2 s, um (arcsec), over the positions, mm (deg)."""
     axes, order = new_axes(ax), np.argsort(position.values, kind="stable")
     for direction in settled["direction"].values:
         one = settled.sel(direction=direction).isel(target=order)

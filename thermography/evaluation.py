@@ -110,16 +110,8 @@ def share_outside_range(frame: Frame) -> float:
 
 @dataclass(frozen=True)
 class _Picture:
-    """What the pixels of a frame say, and how that becomes a temperature: counts, or temperatures where the file holds those.
-
-    Attributes
-    ----------
-    signal : (row, column) ndarray
-        Grows with the temperature; NaN where a file of temperatures holds none.
-    calibrated : CountRange
-        Within which the signal is calibrated.
-    stored, parameters : CameraParameters
-        Those of the file, and those to calibrate with.
+    """What the pixels of a frame say, (row, column): counts, or temperatures in degC where the file holds those (NaN: none); the range in
+    which they are calibrated, and the parameters of the file and those to calibrate with.
     """
 
     signal: Array
@@ -348,18 +340,8 @@ def evaluate_regions(
 
 @dataclass(frozen=True, eq=False)
 class RegionTable:
-    """What `evaluate_regions` finds, as arrays.
-
-    Attributes
-    ----------
-    headers : list of FrameReference
-        Of the frames that were read, (time,).
-    kinds : dict of str to str
-        Regions by name, (region,), and their kinds.
-    columns : dict of str to (time, region) ndarray
-        Variables of the Dataset.
-    rejected : list of RejectedFrame
-        Frames whose pixels could not be read.
+    """What `evaluate_regions` finds, as arrays: the frames that were read (time,), kind of every region by name, variables (time, region),
+    and the frames whose pixels could not be read.
     """
 
     headers: list[FrameReference]

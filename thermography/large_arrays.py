@@ -68,13 +68,7 @@ def give_back(*arrays: object) -> None:
 
 
 class Spool(Sequence[Item]):
-    """A list in a temporary file that the system removes; of a short recording, in memory.
-
-    Parameters
-    ----------
-    folder : Path or None
-        For the file; None for that of the system.
-    """
+    """A list in a temporary file of a folder (None: that of the system), which ends with it; of a short recording, in memory."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = folder

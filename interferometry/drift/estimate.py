@@ -238,22 +238,9 @@ def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
 
 @dataclass(frozen=True)
 class JointFit:
-    """The joint estimate as numbers: readings in measuring order, and the fit.
-
-    Attributes
-    ----------
-    readings : xarray.Dataset
-        What `sort_readings` returns, without gross outliers.
-    cells : (n_cells, 2) ndarray of int
-        Direction and target index of each profile column of the design.
-    cell : (n_readings,) ndarray of int
-        Profile column of each reading.
-    components : tuple of str
-        Names of the drift components, in the order of the loadings; shapes from the readings are the last of them.
-    shapes : (n_positions, k) ndarray
-        Shapes from the readings, over the positions in ascending order.
-    fit : DriftFit
-        In um; its first n_cells coefficients are the profile at the start of the drift.
+    """The joint estimate as numbers: readings in measuring order without gross outliers, direction and target index of every profile column
+    and the column of each reading, names of the drift components, the last of them shapes from the readings over the positions, and the
+    fit in um, whose first coefficients are the profile at the start of the drift.
     """
 
     readings: xr.Dataset

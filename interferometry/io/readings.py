@@ -78,20 +78,8 @@ class Reading:
 
 @dataclass
 class Readings:
-    """What a table gives, before it is checked.
-
-    Attributes
-    ----------
-    left_out : LeftOut
-        Lines that cannot be used.
-    zones : dict of str to int
-        Number of the first line with each time zone; empty where the file gives no times.
-    unreadable : set of (int, str, int)
-        Cells for which there is a line that cannot be used.
-    ignored : list of str
-        Columns that were not read.
-    notes : list of str
-        What the reader assumed, in sentences.
+    """What a table gives, before it is checked: readings, lines left out, first line with each time zone (none of a file without times),
+    cells with a line that cannot be used, columns not read, and what the reader assumed, in sentences.
     """
 
     path: Path
@@ -300,20 +288,8 @@ _NOT_FROM_ONE = "is not a whole number from 1"
 
 @dataclass(frozen=True)
 class LongTable:
-    """A table with one reading per line whose header was understood.
-
-    Attributes
-    ----------
-    line : int
-        Of the header.
-    columns : dict of str to int
-        Index of the column of each role.
-    units : dict of str to str
-        Unit of ``position`` and of ``deviation`` or ``measured``; key of `headings.UNITS`.
-    width : int
-        Number of columns.
-    ignored : list of str
-        Headings that name nothing known.
+    """A table with one reading per line whose header, on a line, was understood: column of each role, unit of positions and deviations
+    (keys of `UNITS`), and headings that name nothing known.
     """
 
     grid: Grid
@@ -552,20 +528,8 @@ _MOST_CELLS = 5_000_000
 
 @dataclass(frozen=True)
 class Run:
-    """A column (or row) of deviations.
-
-    Attributes
-    ----------
-    text : str
-        Its headings, joined.
-    number : int or None
-        Of the run or cycle; None where none stands there.
-    signed : bool
-        Whether the word for the direction names the sign of the travel.
-    unit : str or None
-        Key of `headings.UNITS`.
-    values : list of (int, str)
-        Line and text of each reading, in the order of the positions.
+    """A column (or row) of deviations: its headings joined, number of the run or cycle, whether the word for the direction names the sign
+    of the travel, unit (a key of `UNITS`), and line and text of each reading in the order of the positions.
     """
 
     text: str
@@ -578,20 +542,8 @@ class Run:
 
 @dataclass
 class WideTable:
-    """A table of position by run whose headings were understood.
-
-    Attributes
-    ----------
-    grid : Grid
-    line : int
-        Of the row that names the positions.
-    positions : list of (int, str)
-        Line and text of each target position.
-    position_unit, deviation_unit : str or None
-        Keys of `headings.UNITS`.
-    runs : list of Run
-    ignored : list of str
-        Headings of columns that are no runs.
+    """A table of position by run whose headings, beside or below the positions' line, were understood: line and text of each position,
+    units (keys of `UNITS`), runs, and headings of columns that are none.
     """
 
     grid: Grid

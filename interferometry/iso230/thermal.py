@@ -37,16 +37,8 @@ SETTLED_FOR_S = 2.0 * HOUR_S
 
 @dataclass(frozen=True)
 class Distortion:
-    """How far a quantity moved, in its own unit.
-
-    Attributes
-    ----------
-    first_hour, whole, last_hour : float
-        Largest minus smallest value over the period; NaN where the test is shorter than it or the period holds fewer than two values.
-    change : float
-        Last value less the first.
-    settling_s : float
-        Time from the start after which it has settled, s; NaN where it has not, two hours before the end at the latest.
+    """How far a quantity moved, in its own unit: largest less smallest value in the first hour, the whole test and the last hour, NaN where
+    the test is shorter, last value less the first, and time after which it has settled, s, NaN where it has not.
     """
 
     first_hour: float
@@ -57,21 +49,8 @@ class Distortion:
 
 
 def average(seconds: Array, values: Array, *, length_s: float = AVERAGED_S) -> tuple[Array, Array]:
-    """Average values (samples, n) over pieces of time; NaN counts as missing.
-
-    Parameters
-    ----------
-    seconds : (samples,) ndarray
-        Time since the start, s.
-    values : (samples, n) ndarray
-        Any unit.
-    length_s : float
-        Length of a piece, s.
-
-    Returns
-    -------
-    (pieces,) and (pieces, n) ndarray
-        Mean time and mean values of the pieces that hold samples.
+    """Average values (samples, n) over pieces of time, s; NaN counts as missing. Return mean time and means of the pieces that hold
+    samples.
     """
     number = np.floor(seconds / length_s).astype(int)
     numbers, place = np.unique(number, return_inverse=True)
@@ -92,19 +71,8 @@ def with_start(seconds: Array, values: Array) -> tuple[Array, Array]:
 
 
 def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
-    """Evaluate the course of one quantity.
-
-    Parameters
-    ----------
-    seconds : (n,) ndarray
-        Time since the start of the test, s; the last one is its end for all quantities.
-    values : (n,) ndarray
-        The quantity, averaged; NaN where it is missing.
-
-    Returns
-    -------
-    Distortion
-        In the unit of the values.
+    """Evaluate the course of one quantity, (n,), NaN where it is missing; the last of the times, s, is the end of the test for all
+    quantities.
     """
     known = np.isfinite(values)
     since, end_s = (seconds - seconds[0])[known], float(seconds[-1] - seconds[0])
@@ -146,21 +114,8 @@ def tilt(first_um: Array, second_um: Array, *, distance_mm: float) -> Array:
 
 
 def axis_courses(deviations: xr.Dataset) -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """Return the drift of zero and scale of a linear axis.
-
-    Parameters
-    ----------
-    deviations : Dataset
-        Readings (cycle, direction, target), um, with their times.
-
-    Returns
-    -------
-    seconds : (cycles,) ndarray
-        Mean time of each cycle since the first reading, s; NaN of a cycle without times.
-    courses : dict of str to (cycles,) ndarray
-        ``zero`` and ``end``, um: drift at the first and at the last target by the straight line; ``scale``, um/m.
-    u : dict of str to (cycles,) ndarray
-        Their standard uncertainties from the scatter about the line.
+    """Return the drift of a linear axis by a straight line through each cycle: mean times of the cycles, s (NaN without times), ``zero``
+    and ``end`` at the first and last target, um, and ``scale``, um/m, and their standard uncertainties from the scatter about the line.
     """
     readings = deviations["deviation"].transpose("cycle", "direction", "target")
     values = readings.values.reshape(readings.sizes["cycle"], -1)

@@ -20,23 +20,10 @@ _DRAWS, _SEED = 400, 230
 class UncertainTest:
     """The quantities of one evaluation as GTC numbers.
 
-    A mean deviation is that of its readings, plus the environmental variation during them, plus the errors that grow with position and
-    are the same in every cycle and direction. The latter cancel in the reversal error and in repeatability. Every quantity but the mean
-    reversal error is the largest of noisy values, which is too large on average: that excess is not corrected and enters the uncertainty.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        Quantities of the standard, see `interferometry.iso230.evaluation.evaluate_iso230`.
-    position_mm : (target,) ndarray
-        Target positions, mm.
-    budget : Iso230Budget
-        Its environmental variation is a number.
-
-    References
-    ----------
-    JCGM 100:2008, clauses 5 and F.2.4.5 (a known bias that is not corrected); GUM Tree Calculator (GTC); Efron and Tibshirani 1993, *An
-    introduction to the bootstrap*, chapters 6 and 10 (parametric bootstrap, bias of an estimate).
+    A mean deviation is that of its readings, plus the environmental variation during them, plus the errors that grow with position and are
+    the same in every cycle and direction, which cancel in the reversal error and in repeatability. Every quantity but the mean reversal
+    error is the largest of noisy values, which is too large on average: that excess is not corrected and enters the uncertainty (JCGM
+    100:2008, F.2.4.5; parametric bootstrap after Efron and Tibshirani 1993, *An introduction to the bootstrap*, chapters 6 and 10).
     """
 
     def __init__(self, result: xr.Dataset, position_mm: np.ndarray, budget: Iso230Budget) -> None:

@@ -40,22 +40,9 @@ class ReductionError(ThermographyError):
 
 @dataclass(frozen=True)
 class FrameSeries:
-    """Frames of one size in the order of time, and the cycles that they belong to.
-
-    Attributes
-    ----------
-    references : sequence of FrameReference
-        Where the frames are stored.
-    times : (frames,) ndarray of datetime64[ns]
-        Rising.
-    bounds : (cycles, 2) ndarray of datetime64[ns]
-        Start and end of every cycle on the frames' clock; the end is excluded.
-    cycles : (frames,) ndarray of int
-        Index of the cycle of every frame, `NO_CYCLE` for none.
-    correction_K : (frames,) ndarray, K
-        Added to the temperature of every frame.
-    override : callable
-        From a frame reference to the camera parameters to calibrate it with.
+    """Frames of one size in the order of time: their times (UTC), start and end of every cycle (cycles, 2) on their clock, the end
+    excluded, the cycle of every frame (`NO_CYCLE` for none), what is added to its temperature, K, and its camera parameters by
+    `override`.
     """
 
     references: Sequence[FrameReference]
@@ -151,18 +138,8 @@ _CORRECTION_STEP_K = 2e-3
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive frames that are reduced together: same cycle, registration and camera parameters, close in time.
-
-    Attributes
-    ----------
-    first, stop : int
-        Frames `first` to ``stop - 1``.
-    cycle : int
-        Index of their cycle, `thermography.fields.blocks.NO_CYCLE` for none.
-    span : int
-        Index of their registration span.
-    parameters : CameraParameters
-        To calibrate them with.
+    """Frames `first` to ``stop - 1``, which are reduced together: same cycle (`NO_CYCLE` for none), registration span and camera
+    parameters, close in time.
     """
 
     first: int
@@ -174,14 +151,8 @@ class Block:
 
 @dataclass(frozen=True)
 class RegisteredSensor:
-    """What block reduction needs of a registration.
-
-    Attributes
-    ----------
-    weights : PlanWeights
-        From pixels to the cells of the plan.
-    monitor : FiducialMonitor
-        Of the fiducials within the window of `weights`.
+    """What block reduction needs of a registration: weights from pixels to the cells of the plan, and the monitor of the fiducials in their
+    window.
     """
 
     weights: PlanWeights
@@ -199,20 +170,9 @@ class RegisteredSensor:
 
 @dataclass(frozen=True)
 class BlockResult:
-    """The reduction of one block.
-
-    Attributes
-    ----------
-    cells : (y, x) ndarray, degC
-        Mean temperature on the plan.
-    displacement_px : (frames, 4) ndarray, px
-        Displacement of the fiducials in every frame, see `thermography.registration.displacement`; NaN where they have no contrast.
-    samples : (frames, points) ndarray, degC
-        Temperature of the sampled pixels in every frame.
-    noise_K : float, K
-        Standard deviation of the noise of a pixel.
-    temperature : MeanTemperature or None
-        Mean and variance over the frames for the pixels of the window, degC; None once they are added to those of the cycle.
+    """The reduction of one block: mean of the cells (y, x), degC; displacement of the fiducials in every frame (frames, 4), px, NaN without
+    contrast; sampled pixels (frames, points), degC; noise of a pixel, K; and the pixels of the window until they are added to those of
+    the cycle.
     """
 
     cells: Array
@@ -308,13 +268,7 @@ def _calibrate_per_frame(
 
 
 class FrameRun(Sequence[StoredPixels]):
-    """Some frames in order; sent to another process, frames of plain samples in one file become a table of their places.
-
-    Parameters
-    ----------
-    frames : sequence of StoredPixels
-        For example `thermography.io.frame.FrameReference`.
-    """
+    """Some frames in order; sent to another process, frames of plain samples in one file become a table of their places."""
 
     def __init__(self, frames: Sequence[StoredPixels]) -> None:
         self._frames = frames

@@ -123,28 +123,9 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
 
 @dataclass
 class CyclePart:
-    """The frames of one cycle under one registration: means over pixels while it is open, cells of the plan once it is finished.
-
-    Attributes
-    ----------
-    cycle, span : int
-        Index of the cycle and of the registration span.
-    frames : int
-        Number of frames.
-    first_time : datetime64
-        Of the first frame.
-    seconds : float, s
-        Sum over the frames of the time since the first one.
-    pixels : MeanTemperature or None
-        Mean and variance of every pixel of the window; None before the first block and once finished.
-    mean, spread : (y, x) ndarray, degC and K
-        Mean temperature, and standard deviation of a pixel's temperature over the frames (root mean square over the cell).
-    noise_variance : (y, x) ndarray, K2
-        Variance of the mean from pixel noise.
-    fell_back : (y, x) ndarray of bool
-        Cells with pixels that were calibrated frame by frame.
-    count : (y, x) ndarray of int
-        Frames averaged.
+    """The frames of one cycle under one registration: means over pixels while it is open, cells (y, x) once it is finished, with mean,
+    degC, spread of a pixel over the frames, K, variance of the mean from noise, K2, whether pixels were calibrated frame by frame, and
+    frames averaged; `seconds` sums the times since the first frame.
     """
 
     cycle: int

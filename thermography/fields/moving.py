@@ -51,18 +51,8 @@ _NARROW_COUNTS = 600
 
 @dataclass(frozen=True)
 class Samples:
-    """Points of every cell at which the frames are sampled.
-
-    Attributes
-    ----------
-    points_mm : (cells, points, 2) ndarray, mm
-        Plan points (x, y).
-    valid : (cells, points) ndarray of bool
-        False near fiducials and the plan's edge.
-    coverage : (y, x) ndarray
-        Share of the points of every cell that are valid.
-    centring : (cells, cells) CSR array
-        Moves cells with masked points to their centre, see `thermography.fields.resampling.centring_matrix`.
+    """Points of every cell at which the frames are sampled, (cells, points, 2) mm; which are valid, away from fiducials and the plan's
+    edge, their share of every cell (y, x), and what moves cells with masked points to their centre.
     """
 
     points_mm: Array
@@ -72,15 +62,8 @@ class Samples:
 
 
 class CellSums(NamedTuple):
-    """Running mean and squared deviation of every cell over the frames that show it, changed in place.
-
-    Attributes
-    ----------
-    frames : (cells,) ndarray of int
-        Number of frames.
-    mean : (cells,) ndarray, degC
-    squares : (cells,) ndarray, K2
-        Sum of the squared deviations from the mean.
+    """Number of frames, mean, degC, and squared deviation from it, K2, of every cell over the frames that show it, (cells,) each, changed
+    in place.
     """
 
     frames: Array
@@ -111,15 +94,9 @@ def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: floa
 
 
 class CellWeights(NamedTuple):
-    """Weights of the pixels in the mean of every cell, for one place of the table.
-
-    Attributes
-    ----------
-    windows : (cells, 5) ndarray of unsigned int
-        First column, first row, number of columns and of rows of the pixels around a cell's points, and the place of the first one's
-        weight; no columns where an unmasked point is out of view.
-    weights : (pixels of all windows,) ndarray
-        Cell by cell, row by row; those of a cell sum to 1.
+    """Weights of the pixels in the mean of every cell, for one place of the table, cell by cell and row by row; `windows` (cells, 5) are
+    first column and row, columns and rows of a cell's pixels, no columns where a point is out of view, and the place of its first
+    weight.
     """
 
     windows: Array
@@ -365,17 +342,8 @@ def reduce_moving_frames(
 
 @dataclass(frozen=True)
 class _BlockResult:
-    """The reduction of one block: the cells as of `CellSums`, and the place of the table in every frame.
-
-    Attributes
-    ----------
-    count, mean, squares : (cells,) ndarray
-    shift_mm : (frames, 2) ndarray, mm
-        Displacement (x, y) of the table; NaN where it is not located.
-    u_mm : (frames,) ndarray, mm
-        Its standard uncertainty.
-    discs : (frames,) ndarray of int
-        Discs used, 0 where the table is not located.
+    """The reduction of one block: the cells as of `CellSums`; per frame the displacement (x, y) of the table with its standard uncertainty,
+    mm, NaN where it is not located, and the discs used.
     """
 
     count: Array

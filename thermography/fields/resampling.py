@@ -28,20 +28,9 @@ LEAST_COVERAGE = 0.5
 
 @dataclass(frozen=True)
 class PlanWeights:
-    """Weights of the pixels in every cell of the plan.
-
-    Attributes
-    ----------
-    areas : (cells, pixels of the window) CSR array
-        Share of every cell's seen area that lies in a pixel; rows sum to 1, and are empty where a cell is not seen.
-    centring : (cells, cells) CSR array
-        Correction that moves partly seen cells to their own centre, see `centring_matrix`.
-    window : (slice, slice)
-        Rows and columns of the sensor that contain every pixel with a weight.
-    coverage : (y, x) ndarray
-        Share of every cell's area that is seen unmasked, 0 to 1.
-    grid : PlanGrid
-        The plan.
+    """Weights of the pixels in every cell of the plan: shares of its seen area (cells, pixels of the window), whose rows sum to 1, the
+    correction that moves partly seen cells to their centre (see `centring_matrix`), the window of the sensor, and the share of every
+    cell (y, x) that is seen unmasked.
     """
 
     areas: sparse.csr_array

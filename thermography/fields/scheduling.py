@@ -36,18 +36,8 @@ class SchedulerError(ThermographyError):
 
 @dataclass(frozen=True)
 class Pool:
-    """Workers to which function calls are submitted.
-
-    Attributes
-    ----------
-    submit : callable
-        ``submit(function, *arguments)`` returns a future with the methods `result` and `cancel`.
-    share : callable
-        Sends an object that many calls need to the workers once; returns what to pass to `submit` in its place.
-    in_flight : int
-        Number of calls to keep waiting or running.
-    result : callable
-        Waits for a future and returns its result; raises what the call raised.
+    """Workers: ``submit(function, *arguments)`` returns a future that can be cancelled, `share` sends an object to all of them once and
+    returns what stands for it, `result` waits for a future; so many calls are kept `in_flight`.
     """
 
     submit: Callable[..., Any]

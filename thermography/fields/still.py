@@ -71,19 +71,8 @@ class CheckpointError(ThermographyError):
 
 
 class Checkpoint:
-    """A folder to which finished cycles are written, each file complete or absent.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Created if it does not exist.
-    description : dict
-        Everything on which the result depends, as JSON; stored with the cycles, and compared before any of them is used again.
-
-    Raises
-    ------
-    CheckpointError
-        The folder holds cycles of another reduction.
+    """A folder to which finished cycles are written, each file complete or absent, with a description of everything on which they depend;
+    raises a CheckpointError where it holds cycles of another reduction.
     """
 
     def __init__(self, folder: str | Path, description: dict[str, Any]) -> None:
@@ -159,18 +148,8 @@ _LEAST_PIXELS = 30
 
 @dataclass(frozen=True)
 class Knock:
-    """A lasting displacement from a frame on.
-
-    Attributes
-    ----------
-    frame : int
-        Index of the first displaced frame.
-    span : int
-        Registration span in which it occurs.
-    displacement_px : (4,) ndarray, px
-        (column, row, growth, turn), see `thermography.registration.displacement`.
-    by_image : bool
-        Whether the image of the table showed it, because the fiducials have no contrast.
+    """A lasting displacement (column, row, growth, turn), px, from a frame on, in a registration span; shown by the image of the table
+    where the fiducials have no contrast.
     """
 
     frame: int
@@ -180,22 +159,8 @@ class Knock:
 
 
 class Registrations:
-    """Registration spans in the order of time, and what is derived from each of them.
-
-    Parameters
-    ----------
-    spans : sequence of RegistrationSpan
-        In order, the first one from frame 0 on.
-    grid : PlanGrid
-        The plan.
-
-    Attributes
-    ----------
-    spans : list of RegistrationSpan
-    sensors : list of RegisteredSensor
-        Weights and fiducial monitor for the reduction of blocks.
-    covariances : list of (y, x, 2, 2) ndarray, mm2
-        Of the position of every cell.
+    """Registration spans in the order of time, and of each the weights and the monitor for the reduction of blocks, and the covariance of
+    the position of every cell (y, x, 2, 2), mm2.
     """
 
     def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid) -> None:
@@ -224,23 +189,8 @@ class Registrations:
 
 
 class Displacements:
-    """Displacement of every frame against its registration.
-
-    Parameters
-    ----------
-    frames : FrameSeries
-        All frames.
-    registrations : Registrations
-        Their registrations, which grow by one for every knock.
-
-    Attributes
-    ----------
-    size_px : (frames,) ndarray, px
-        Root mean square displacement of the fiducials in every frame; NaN where it is not measured.
-    shaken : set of int
-        Frames that are displaced alone.
-    baseline_px : (4,) ndarray, px
-        Bias of the fiducial monitor against the exact displacement, from temperature gradients on the table.
+    """Displacement of every frame against its registration, root mean square of the fiducials (frames,), px, NaN where it is not measured;
+    frames that are displaced alone; and the bias of the fiducial monitor from temperature gradients on the table, (4,) px.
     """
 
     def __init__(self, frames: FrameSeries, registrations: Registrations) -> None:
@@ -348,20 +298,7 @@ def pixels_off(values: Array, lowest: Array, highest: Array, noise_K: float) -> 
 
 
 class Obstructions:
-    """Frames of a series in which something stands before the table.
-
-    Parameters
-    ----------
-    frames : FrameSeries
-        All frames.
-    registrations : Registrations
-        Their registrations.
-
-    Attributes
-    ----------
-    found : set of int
-        Those frames so far.
-    """
+    """Frames of a series in which something stands before the table."""
 
     def __init__(self, frames: FrameSeries, registrations: Registrations) -> None:
         self.frames, self.registrations = frames, registrations
@@ -657,29 +594,8 @@ def _reduce_until_knock(
 
 
 class StillReduction:
-    """State of a reduction under way: what has been gathered, in the order of time.
-
-    Parameters
-    ----------
-    frames : FrameSeries
-        All frames.
-    grid : PlanGrid
-        The plan.
-    spans : sequence of RegistrationSpan
-        As given, before knocks.
-    checkpoint : Checkpoint or None
-        Where finished cycles are stored.
-
-    Attributes
-    ----------
-    registrations : Registrations
-        Including those after knocks.
-    blocks, fields : list of Block, Spool of (y, x) ndarray, degC
-        Blocks so far, and the field of each.
-    finished, open : Spool of CyclePart, CyclePart or None
-        Finished cycles, and the last one as long as it has pixels.
-    stored_blocks, stored_frames, finished_frames : int
-        Blocks of finished cycles, frames, and frames up to the end of the last finished cycle that the checkpoint holds.
+    """State of a reduction under way: what has been gathered in the order of time, and how many blocks and frames of it the checkpoint
+    holds; `open` is the last cycle as long as it has pixels.
     """
 
     def __init__(

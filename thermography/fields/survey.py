@@ -60,26 +60,9 @@ _MARGIN_PX = 4
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Frames of a series whose pixels are intact, and what one pass over them shows.
-
-    Attributes
-    ----------
-    frames : list of FrameReference
-        The n intact frames in the order of time.
-    levels : (n, rows, columns) ndarray of float32, degC
-        Mean temperature of every block of pixels.
-    edge_px : int, px
-        Side of a block.
-    patch : (n,) ndarray, degC, or None
-        Mean temperature of the patch; None where none was asked for.
-    repeated : (n,) ndarray of bool
-        True where all counts equal those of the previous frame.
-    outside : (n,) ndarray of int
-        Pixels outside the range in which the camera is calibrated.
-    off : dict of int to (rows, columns) ndarray of int
-        By index of the frame: pixels of every block that are off the frames before and after.
-    damaged : list of RejectedFrame
-        Frames whose pixels cannot be read or differ from their checksum.
+    """Frames of a series whose pixels are intact, and what one pass over them shows: mean of every block of pixels (n, rows, columns),
+    degC, and of a patch where one was asked for, frames that equal the one before, pixels outside the calibrated range, pixels of every
+    block that are off the frames before and after, by frame, and the damaged frames.
     """
 
     frames: list[FrameReference]
@@ -149,12 +132,8 @@ def _read_counts(reference: FrameReference) -> NDArray[np.uint16] | str:
 
 
 class _Neighbours:
-    """Comparison of every frame with the nearest frames before and after that are not off themselves.
-
-    Attributes
-    ----------
-    off : dict of int to (rows, columns) ndarray of int
-        By index of the frame: pixels of every block that are off.
+    """Comparison of every frame with the nearest frames before and after that are not off themselves; `off` holds, by index of the frame,
+    the pixels of every block that are.
     """
 
     def __init__(self, edge_px: int) -> None:
@@ -248,16 +227,8 @@ def _sum_blocks(image: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Blocks of a survey by what they show.
-
-    Attributes
-    ----------
-    table : (rows, columns) ndarray of bool
-        Blocks that the plan covers.
-    surroundings : (rows, columns) ndarray of bool
-        Blocks that show nothing of the table in any frame.
-    plan_px : (sensor rows, sensor columns) ndarray of bool
-        Pixels that show a part of the plan in some frame.
+    """Blocks (rows, columns) that the plan covers, blocks that show nothing of the table in any frame, and pixels that show a part of the
+    plan in some frame.
     """
 
     table: NDArray[np.bool_]
@@ -368,20 +339,8 @@ _SMOOTHED = 5
 
 @dataclass(frozen=True, eq=False)
 class DiscCourses:
-    """What n frames of a series show on k discs beyond the warming of the table.
-
-    Attributes
-    ----------
-    index : (n,) ndarray of int
-        Places of the frames in the series.
-    common_K : (n,) ndarray, K
-        Change since the first that all discs share: of the camera's zero, or of what the discs reflect.
-    pattern_K : (n, k) ndarray, K
-        What differs from disc to disc, apart from noise: a pattern that grows in the picture, or a reflection on single discs.
-    warming_K : float, K
-        Largest change of the table around a disc: the lens mixes some per cent of it into the disc, not the same for all.
-    names : tuple of str
-        Of the discs.
+    """What n frames of a series show on k discs beyond the warming of the table, K: the change since the first that all discs share, what
+    differs from disc to disc (n, k), and the largest change of the table around a disc, of which the lens mixes some per cent into it.
     """
 
     index: NDArray[np.intp]

@@ -89,23 +89,8 @@ def _room(size: int) -> NDArray[np.uint8]:
 
 
 class FffSource:
-    """Bytes of one FFF record, which may lie in several segments of an open file.
-
-    Parameters
-    ----------
-    file : binary file
-        Opened unbuffered; it stays open.
-    path : Path
-        Path of the file, for messages.
-    segments : tuple of (offset, length)
-        Segments of the record in their order, bytes in the file.
-    front : bytes, optional
-        First bytes of the record, read already.
-
-    Attributes
-    ----------
-    size : int
-        Length of the record, bytes.
+    """Bytes of one FFF record, which may lie in several segments (offset, length) of an open, unbuffered file; `front` holds its first
+    bytes where they were read already.
     """
 
     def __init__(self, file: BinaryIO, path: Path, segments: Segments, front: bytes = b"") -> None:
@@ -158,16 +143,8 @@ class FffSource:
 
 @dataclass(frozen=True)
 class Directory:
-    """Directory of one FFF record.
-
-    Attributes
-    ----------
-    records, slots : mapping of int
-        Place (offset, length) of the first record of each type, bytes from the start of the FFF record, and the slot that lists it.
-    order : {"<", ">"}
-        Byte order of header and directory, which `table` holds as stored.
-    end, declared_length : int
-        End of the last record, and length of the FFF record as its header declares it, bytes; 0 for none.
+    """Directory of one FFF record: place (offset, length) of the first record of each type, bytes, and the slot that lists it; byte order;
+    the table as stored; end of the last record, and length of the whole as declared, 0 for none.
     """
 
     records: Mapping[int, tuple[int, int]]

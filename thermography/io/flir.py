@@ -366,14 +366,8 @@ _LARGEST_TOOLS, _LARGEST_PICTURE = 1 << 16, 1 << 26
 
 @dataclass(frozen=True, eq=False)
 class VisiblePicture:
-    """The visible-light picture of a frame, (row, column, 3) uint8 red, green, blue.
-
-    Attributes
-    ----------
-    scale : float
-        Field of view of the picture over that of the sensor; 0 where the file does not say it.
-    offset_px : (int, int)
-        Shift (column, row) of the sensor's middle in the picture, as stored.
+    """The visible-light picture of a frame, (row, column, 3) uint8 red, green, blue; its field of view over that of the sensor, 0 where not
+    stored, and the shift (column, row) of the sensor's middle in it, px.
     """
 
     pixels: NDArray[np.uint8]

@@ -162,18 +162,8 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class SampleLocation:
-    """Location and packing of the pixels in one FFF record.
-
-    Attributes
-    ----------
-    offset, length : int
-        First byte, counted from the start of the FFF record, and number of bytes.
-    shape : tuple of int
-        (rows, columns).
-    record : (offset, length)
-        Place of the raw-image record with its header in the FFF record, bytes.
-    checksum : int
-        CRC-32 of the raw-image record as stored in the directory; 0 where none is stored.
+    """Location and packing of the pixels in one FFF record: first byte and number of bytes, (rows, columns), place (offset, length) of the
+    raw-image record with its header, and its CRC-32, 0 where none is stored.
     """
 
     encoding: Encoding
@@ -291,16 +281,7 @@ class FrameReference(FrameHeader, ABC):
 
 @dataclass(frozen=True)
 class PlainFrame:
-    """A frame whose pixels stand in a file as they are.
-
-    Attributes
-    ----------
-    path : Path
-    index : int
-    shape : (int, int)
-    plain_samples : PlainSamples
-        As of `FrameReference`.
-    """
+    """A frame whose pixels stand in a file as they are; attributes as of `FrameReference`."""
 
     path: Path
     index: int

@@ -129,22 +129,9 @@ _NO_TIME = np.iinfo(np.int64).min
 
 
 class _Layout(NamedTuple):
-    """Where the headers stand in a frame, and in the row of bytes that is read of it; what they have in common with the first frame.
-
-    Attributes
-    ----------
-    big : bool
-        Whether the directory is big-endian.
-    directory, camera, raw : int
-        Offset of the directory and of the two records in the frame, bytes.
-    raw_length : int
-        Length of the record of plain samples, bytes; 0 for packed samples, whose length varies.
-    samples : int
-        Place of the first sample in the row.
-    template, compared : (bytes,) ndarray of uint8
-        Row of the first frame, and 255 for every byte that all frames share with it.
-    copied : (m,) ndarray of int
-        Places in the row of what differs from frame to frame: time, parameters, settings, temperatures inside the camera.
+    """Where the headers stand in a frame, and in the row of bytes that is read of it, bytes: `template` is the row of the first frame,
+    `compared` 255 where all frames share it, `copied` the places of what differs; `raw_length` is 0 for packed samples, whose length
+    varies, `samples` the place of the first one in the row.
     """
 
     big: bool
@@ -174,18 +161,8 @@ class _Columns(NamedTuple):
 
 
 class FlirTable(FrameTable):
-    """Frames of a SEQ or CSQ file that share the layout of a first frame, which is not among them.
-
-    Parameters
-    ----------
-    first : FlirFrameReference
-        The frame before.
-    order : {"<", ">"}
-        Byte order of the camera information.
-    names : list of str
-        Of the sensors inside the camera.
-    columns : _Columns
-        The frames.
+    """Frames of a SEQ or CSQ file that share the layout of a first frame, which is not among them; `order` is the byte order of the camera
+    information, `names` are those of the sensors inside the camera.
     """
 
     def __init__(self, first: FlirFrameReference, order: str, names: list[str], columns: _Columns) -> None:

@@ -54,17 +54,9 @@ _IN_MEMORY = 1
 
 
 class WindowReader:
-    """Context manager that reads a window of the sensor from many frames.
-
-    Of plain samples only the rows of the window are read; packed samples are decoded as whole frames. A file in the page cache of the
-    system is copied from there. Any other file is read directly from disk (O_DIRECT), which is half as fast again as through the cache
-    and does not evict the data of other programs, neighbouring windows in one piece; where the system has no direct reads, the cache is
-    used.
-
-    Parameters
-    ----------
-    window : tuple of slice
-        Rows and columns of the sensor, both with start and stop.
+    """Context manager that reads a window (rows, columns) of the sensor from many frames: of plain samples its rows alone, from the page
+    cache of the system or else directly from disk (O_DIRECT), neighbouring windows in one piece, which does not evict the data of other
+    programs.
     """
 
     def __init__(self, window: tuple[slice, slice]) -> None:

@@ -150,16 +150,8 @@ def _sums(frames: int, first: Array, deviations: Array, squares: Array, far_squa
 
 @dataclass(frozen=True)
 class MeanTemperature:
-    """Mean and variance of the temperature of each pixel over frames.
-
-    Attributes
-    ----------
-    mean : ndarray of float64
-        degC, over the frames in which the pixel had a temperature; NaN where it had one in none.
-    variance : ndarray of float64
-        Mean squared deviation from the mean (divided by the number of frames), K^2.
-    bound_K : ndarray of float64
-        Bound on the error of the mean, K; beyond `AVERAGING_LIMIT_K` the frames should be calibrated one by one.
+    """Mean of the temperature of each pixel over the frames in which it had one, degC, mean squared deviation from it, K2, and bound on the
+    error of the mean, K, beyond `AVERAGING_LIMIT_K` of which the frames are calibrated one by one.
     """
 
     frames: int

@@ -106,16 +106,8 @@ ROOM_LAGS_S = (600.0, 3600.0)
 
 @dataclass(frozen=True, eq=False)
 class LevelSeries:
-    """Levels of n frames, and what was logged with them.
-
-    Attributes
-    ----------
-    background, table : (n,) ndarray, degC
-        Level of the surroundings of the table, and of the table, which has to share every step of the camera.
-    housing : (n, k) ndarray, K
-        Temperatures inside the camera; k may be 0.
-    room : (n, m) ndarray, degC
-        Temperatures that the background follows: of the air, and of it through first-order lags; m is 0 where none was logged.
+    """Levels of n frames: of the surroundings of the table and of the table, degC; temperatures inside the camera (n, k), K, and those that
+    the background follows, of the air and of it through lags (n, m), degC, where they were logged.
     """
 
     seconds: Array
@@ -140,20 +132,8 @@ class CameraStep:
 
 @dataclass(frozen=True, eq=False)
 class CameraCorrection:
-    """Correction of the camera's zero in n frames, relative to the first one.
-
-    Attributes
-    ----------
-    correction_K : (n,) ndarray, K
-        To be added to the temperature of every frame; 0 throughout where nothing is significant.
-    u_K : (n,) ndarray, K
-        Standard uncertainty of the camera's zero after the correction, common to the whole frame; 0 for the first.
-    steps : tuple of CameraStep
-        Steps that were corrected.
-    drift_K : (n,) ndarray, K
-        Drift with the temperature of the housing that was corrected; 0 where it is not significant.
-    unexplained_K : (n,) ndarray, K
-        Slow change of the background that neither room nor camera explains.
+    """Correction of the camera's zero in n frames relative to the first, K: what is added to every temperature and its standard
+    uncertainty, the steps and the drift with the housing that were corrected, and the slow change that neither room nor camera explains.
     """
 
     correction_K: Array
@@ -239,14 +219,8 @@ def hold_constant(level: Array) -> CameraCorrection:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Generalised least squares on the changes of the level.
-
-    Attributes
-    ----------
-    shocks : (n - 1,) ndarray
-        Ratio of every change to its standard deviation, given all other changes.
-    limit : float
-        Ratio from which one of the shocks is a step.
+    """Generalised least squares on the changes of the level; `shocks` (n - 1,) are the ratios of the changes to their standard deviation,
+    given all others, `limit` that from which one is a step.
     """
 
     values: Array

@@ -52,20 +52,9 @@ class ClockError(ThermographyError):
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """Time of the camera's clock minus time of the machine's clock.
-
-    Attributes
-    ----------
-    offset_s, offset_u_s : float, s
-        At the middle of the frames, with its standard uncertainty.
-    rate, rate_u : float, s/s
-        Seconds that the camera's clock gains per second; zero where the record is shorter than an hour.
-    start_mm, feed_mm_per_min : float
-        Axis position at which the table was registered, and feed between target positions; fitted where it was not given.
-    rms_mm : float, mm
-        Root mean square of observed minus commanded position.
-    rivals_s : tuple of float, s
-        Other offsets that fit about equally well (periodic test); the nearest to the expected one was taken.
+    """Time of the camera's clock minus that of the machine's at the middle of the frames, s, and its rate, 0 in records shorter than an
+    hour, with standard uncertainties; zero (mm) and feed of the axis, fitted where not given; rms of observed minus commanded position,
+    mm; and other offsets that fit about as well (periodic test), s.
     """
 
     offset_s: float

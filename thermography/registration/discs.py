@@ -28,16 +28,8 @@ _LEAST_AREA_PX = 12
 
 @dataclass(frozen=True)
 class LocatedDisc:
-    """An elliptic spot detected in a frame, or a disc fiducial located there.
-
-    Attributes
-    ----------
-    column_px, row_px : float, px
-        Centroid of the image.
-    u_px : float, px
-        Standard uncertainty of either coordinate: of a disc from pixel noise, of a spot `SPOT_U_PX`.
-    area_px, contrast_K : float, px and K
-        Number of pixels, and apparent temperature against the surroundings, negative where colder; NaN where not measured.
+    """An elliptic spot detected in a frame, or a disc fiducial located there: centroid and its standard uncertainty, px; number of pixels,
+    and temperature against the surroundings, K, NaN where not measured.
     """
 
     column_px: float

@@ -299,19 +299,7 @@ class PolygonError(ThermographyError):
 
 @dataclass(frozen=True, eq=False)
 class Polygon:
-    """A named simple polygon on the table plan.
-
-    Attributes
-    ----------
-    corners_mm : (n, 2) ndarray, mm
-        Corners (x, y) in order, at least three, either sense; the last one is joined to the first.
-
-    Examples
-    --------
-    >>> triangle = Polygon("triangle", [(0, 0), (100, 0), (0, 50)])
-    >>> triangle.contains([(20, 20), (90, 40)])
-    array([ True, False])
-    """
+    """A named simple polygon on the table plan: at least three corners (n, 2), mm, in order and in either sense."""
 
     name: str
     corners_mm: Array

@@ -251,18 +251,8 @@ def _each(kernel: Callable[[Array, Array], Array], points: Array, parameters: Ar
 
 @dataclass(frozen=True)
 class Projection:
-    """Map from the table plan to the sensor: ``pixel = distort(plan_to_sensor @ plan)``.
-
-    Attributes
-    ----------
-    plan_to_sensor : (3, 3) ndarray
-        Homography from plan mm to undistorted px.
-    distortion : (4,) ndarray
-        k1, k2, p1, p2 of the normalised coordinates.
-    focal_length_px : float, px
-        Unit of the normalised coordinates; a plane in one position determines k1 / focal_length_px**2 only.
-    principal_point_px : (column, row), px
-        Centre of the distortion.
+    """Map from the table plan to the sensor: ``pixel = distort(plan_to_sensor @ plan)``, with k1, k2, p1, p2 of coordinates divided by the
+    focal length about the principal point, px; a plane in one position determines k1 / focal_length_px**2 only.
     """
 
     plan_to_sensor: Array
@@ -327,16 +317,8 @@ class Projection:
 
 @dataclass(frozen=True)
 class DiscObservations:
-    """Disc centroids observed on the sensor, and the discs on the plan.
-
-    Attributes
-    ----------
-    points_px : (n, 2) ndarray, px
-        Observed centroids (column, row).
-    centres_mm, radii_mm : (n, 2) and (n,) ndarray, mm
-        The discs on the plan.
-    u_px : (n,) ndarray, px
-        Standard uncertainty of either coordinate of a centroid: weights of the fit.
+    """Disc centroids observed on the sensor (n, 2) with the standard uncertainty of either coordinate (n,), px, and the discs on the plan,
+    mm.
     """
 
     points_px: Array
@@ -472,13 +454,8 @@ def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: 
 
 @dataclass(frozen=True)
 class _Parametrisation:
-    """Well-conditioned parameters: eight homography entries between centred unit coordinates, then the distortion.
-
-    Attributes
-    ----------
-    start : what is not fitted
-    to_unit, to_pixels : (3, 3) from the plan, mm, to the unit coordinates, and from normalised coordinates to px
-    coefficients : number of distortion coefficients that are fitted
+    """Well-conditioned parameters: eight homography entries between centred unit coordinates (`to_unit` leads to them from the plan,
+    `to_pixels` from them to the sensor), then the distortion coefficients that are fitted; the others are those of `start`.
     """
 
     start: Projection

@@ -33,28 +33,9 @@ _COARSE_POINTS = 8
 
 @dataclass(frozen=True)
 class TableTracker:
-    """A registration prepared for locating the table displaced along one direction.
-
-    Attributes
-    ----------
-    registration : Registration
-        Of the table in one position.
-    discs : (n, 3) ndarray, mm
-        x, y and radius of the fiducials on the plan.
-    lens : (16,) ndarray
-        The projection, as `thermography.registration.projection.Projection.as_array`.
-    direction : (2,) ndarray
-        Unit vector on the plan along which the table is displaced.
-    size_mm : (width, height), mm
-        Of the plan.
-    reach_mm : float, mm
-        Largest displacement either way.
-    bias_px : (n, 2) ndarray, px
-        Perspective shift of every disc's centroid from the image of its centre: nearly the same for every displacement.
-    margin_px : (n, 2) ndarray, px
-        Distance of a disc from the frame's edge below which it is not located.
-    common_mm, common_u_mm : (m,) ndarray, mm
-        Displacements along the direction, and the standard uncertainty that the registration adds there to all discs together.
+    """A registration prepared for locating the table displaced along one direction by up to `reach_mm`: discs (n, 3), mm, as x, y and
+    radius, perspective shift of their centroids and least distance from the frame's edge (n, 2), px, and displacements (m,), mm, with
+    the standard uncertainty that the registration adds there to all discs together.
     """
 
     registration: Registration
@@ -71,16 +52,8 @@ class TableTracker:
 
 @dataclass(frozen=True)
 class TablePosition:
-    """Position of the table in one frame.
-
-    Attributes
-    ----------
-    shift_mm : (2,) ndarray, mm
-        Displacement (x, y) on the plan from the registered position.
-    u_mm, scatter_u_mm : float, mm
-        Standard uncertainty along either coordinate, and its part from the scatter of the discs, without that of the registration.
-    discs : int
-        Number of discs used.
+    """Displacement (x, y) of the table in one frame from its registered position, mm, with its standard uncertainty along either coordinate
+    and the part of it from the scatter of the discs used.
     """
 
     shift_mm: Array
