@@ -6,6 +6,8 @@ import os
 import re
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from thermofuse.resources import vocabulary
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -72,20 +74,13 @@ def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> 
 #: Contract of the products, on which other packages rely: name of a variable -> (dims, units, kind), kind being a NumPy dtype kind
 #: (``f``, ``i``, ``u``, ``M``).
 Contract = dict[str, tuple[tuple[str, ...], str, str]]
-
+#: Variables of every product with their attributes, and with dims and kind those of its contract.
+VARIABLES = vocabulary("variables")
 #: Fields on the table plan; ``x`` and ``y`` are plan coordinates in mm, ``cycle`` counts from 1.
 FIELDS: Contract = {
-    "temperature": (("cycle", "y", "x"), "degC", "f"),
-    "temperature_u": (("cycle", "y", "x"), "K", "f"),
-    "temperature_noise_u": (("cycle", "y", "x"), "K", "f"),
-    "temperature_rise": (("cycle", "y", "x"), "K", "f"),
-    "temperature_rise_u": (("cycle", "y", "x"), "K", "f"),
-    "temperature_rise_noise_u": (("cycle", "y", "x"), "K", "f"),
-    "rise_scale_u": (("y", "x"), "1", "f"),
-    "temperature_spread": (("cycle", "y", "x"), "K", "f"),
-    "count": (("cycle", "y", "x"), "1", "i"),
-    "cycle_time": (("cycle",), "", "M"),
-    "frame_temperature": (("time", "y", "x"), "degC", "f"),
+    name: (tuple(one["dims"]), one.get("units", ""), one["kind"])
+    for name, one in VARIABLES["fields"].items()
+    if "kind" in one
 }
 
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import Array, ThermographyError
+from thermography.common import VARIABLES, Array, ThermographyError
 from thermography.io.flir import FlirFrameReference, read_measurement_regions
 from thermography.io.frame import CameraIdentity, CameraParameters, Frame, FrameHeader, FrameReference, RejectedFrame
 from thermography.io.other_cameras import TemperatureFrame
@@ -52,32 +52,6 @@ OVERRANGE, UNDERRANGE = 1, 2
 _DEGC = {"units": "degC", "units_metadata": "temperature: on_scale"}
 _KELVIN = {"units": "K", "units_metadata": "temperature: difference"}
 _PIXELS = {"units": "1"}
-#: Variable of an evaluation -> attributes.
-_VARIABLES = {
-    "maximum": {
-        "long_name": "highest temperature; the limit of the calibrated range where pixels are beyond it",
-        **_DEGC,
-    },
-    "maximum_u": {"long_name": "standard uncertainty of the maximum", **_KELVIN},
-    "minimum": {
-        "long_name": "lowest temperature; the limit of the calibrated range where pixels are beyond it",
-        **_DEGC,
-    },
-    "minimum_u": {"long_name": "standard uncertainty of the minimum", **_KELVIN},
-    "mean": {"long_name": "mean temperature of the pixels within the calibrated range", **_DEGC},
-    "mean_u": {"long_name": "standard uncertainty of the mean", **_KELVIN},
-    "standard_deviation": {"long_name": "standard deviation of the pixels within the calibrated range", **_KELVIN},
-    "maximum_column": {"long_name": "column of the maximum", **_PIXELS},
-    "maximum_row": {"long_name": "row of the maximum", **_PIXELS},
-    "minimum_column": {"long_name": "column of the minimum", **_PIXELS},
-    "minimum_row": {"long_name": "row of the minimum", **_PIXELS},
-    "pixels": {"long_name": "pixels of the region, those outside the calibrated range included", **_PIXELS},
-    "overrange": {"long_name": "pixels above the calibrated range", **_PIXELS},
-    "underrange": {"long_name": "pixels below the calibrated range", **_PIXELS},
-    "emissivity": {"long_name": "emissivity", "units": "1"},
-    "difference": {"long_name": "mean temperature minus that of the reference region", **_KELVIN},
-    "difference_u": {"long_name": "standard uncertainty of the difference", **_KELVIN},
-}
 
 
 def measures_temperature(camera: CameraIdentity) -> bool:
@@ -202,7 +176,7 @@ def thermogram(frame: Frame | FrameReference, parameters: CameraParameters | Non
 
 
 class _Row(NamedTuple):
-    """Statistics of a region in one frame; names as in `_VARIABLES`."""
+    """Statistics of a region in one frame; names as in the product's variables."""
 
     maximum: float
     minimum: float
@@ -362,7 +336,7 @@ class RegionTable:
         left_out = [{"path": str(one.path), "index": one.index, "reason": one.reason} for one in self.rejected]
         time = {"standard_name": "time", "units_metadata": "leap_seconds: utc"}
         return xr.Dataset(
-            {name: (("time", "region"), values, _VARIABLES[name]) for name, values in self.columns.items()},
+            {name: (("time", "region"), values, VARIABLES["regions"][name]) for name, values in self.columns.items()},
             coords={
                 "time": ("time", frame_times(self.headers), time),
                 "region": ("region", np.array(list(self.kinds), object)),

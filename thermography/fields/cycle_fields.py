@@ -13,7 +13,7 @@ import scipy
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography.common import MAD_TO_SIGMA, Array
+from thermography.common import MAD_TO_SIGMA, VARIABLES, Array
 from thermography.fields.resampling import PlanWeights
 from thermography.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
@@ -36,89 +36,6 @@ PARTLY_SEEN_BELOW = 0.99
 _LARGE_PX = 60_000
 #: ... this number of rows on either side of the middle determines the noise to a per cent.
 _NOISE_ROWS = 32
-
-_DEGREES = {"units": "degC", "units_metadata": "temperature: on_scale"}
-_KELVIN = {"units": "K", "units_metadata": "temperature: difference"}
-_ATTRIBUTES: dict[str, dict[str, Any]] = {
-    "temperature": {
-        "standard_name": "surface_temperature",
-        "long_name": "mean surface temperature over the frames of the cycle",
-        "ancillary_variables": "temperature_u temperature_noise_u count quality_flag",
-        **_DEGREES,
-    },
-    "temperature_u": {
-        "long_name": "standard uncertainty of the mean temperature",
-        "comment": "pixel noise and registration, and what all cells share: emissivity, reflections, air, accuracy of the camera",
-        **_KELVIN,
-    },
-    "temperature_noise_u": {
-        "long_name": "standard uncertainty of the mean temperature from pixel noise and registration",
-        "comment": "the part of temperature_u that differs from cell to cell",
-        **_KELVIN,
-    },
-    "temperature_rise": {
-        "long_name": "rise of the mean temperature since the first cycle",
-        "ancillary_variables": "temperature_rise_u temperature_rise_noise_u rise_scale_u count quality_flag",
-        **_KELVIN,
-    },
-    "temperature_rise_u": {
-        "long_name": "standard uncertainty of the rise",
-        "comment": "pixel noise and registration, the scale of the rise, and the drift of the camera's zero",
-        **_KELVIN,
-    },
-    "temperature_rise_noise_u": {
-        "long_name": "standard uncertainty of the rise from pixel noise and registration",
-        "comment": "the part of temperature_rise_u that differs from cell to cell",
-        **_KELVIN,
-    },
-    "rise_scale_u": {
-        "long_name": "standard uncertainty of the scale of the rise",
-        "comment": "emissivity, reflections, air and camera: the same share of all rises of a cell",
-        "units": "1",
-    },
-    "temperature_rate": {
-        "long_name": "rate of the mean temperature over neighbouring cycles",
-        "units": "K h-1",
-        "units_metadata": "temperature: difference",
-    },
-    "temperature_spread": {
-        "long_name": "standard deviation of a pixel's temperature over the frames of the cycle, root mean square over the cell",
-        **_KELVIN,
-    },
-    "count": {"long_name": "frames averaged", "units": "1"},
-    "quality_flag": {
-        "standard_name": "quality_flag",
-        "long_name": "limitations of the temperature of the cell",
-        "flag_masks": np.array(list(_FLAGS.values()), np.uint8),
-        "flag_meanings": " ".join(_FLAGS),
-    },
-    "position_u": {
-        "long_name": "standard uncertainty of the position of a cell on the plan from the registration",
-        "units": "mm",
-    },
-    "coverage": {"long_name": "share of the cell's area that is seen unmasked", "units": "1"},
-    "frame_temperature": {
-        "standard_name": "surface_temperature",
-        "long_name": "mean surface temperature over a frame or a short block of frames",
-        **_DEGREES,
-    },
-    "frame_cycle": {"long_name": "cycle that the frames belong to, 0 for none", "units": "1"},
-    "frame_shift": {
-        "long_name": "largest shift of the fiducials of a frame of the block against its registration",
-        "units": "1",
-        "comment": "pixels of the sensor",
-    },
-    "frame_count": {"long_name": "frames in the block", "units": "1"},
-    "cycle_time": {"long_name": "mean time of the frames of the cycle", "units_metadata": "leap_seconds: utc"},
-    "time": {
-        "standard_name": "time",
-        "long_name": "mean time of the frames of the block",
-        "units_metadata": "leap_seconds: utc",
-    },
-    "cycle": {"long_name": "measurement cycle", "units": "1"},
-    "x": {"standard_name": "projection_x_coordinate", "long_name": "table plan along x", "units": "mm", "axis": "X"},
-    "y": {"standard_name": "projection_y_coordinate", "long_name": "table plan along y", "units": "mm", "axis": "Y"},
-}
 
 
 @dataclass
@@ -298,8 +215,10 @@ def _rate_of(mean: Array, time: Array, some: slice) -> Array:
 
 def annotate(dataset: xr.Dataset) -> xr.Dataset:
     """Set the CF attributes of every listed variable, and no fill value for coordinates."""
+    flags = {"flag_masks": np.array(list(_FLAGS.values()), np.uint8), "flag_meanings": " ".join(_FLAGS)}
     for name, variable in dataset.variables.items():
-        variable.attrs.update(_ATTRIBUTES.get(str(name), {}))
+        described = VARIABLES["fields"].get(name, {}) | (flags if name == "quality_flag" else {})
+        variable.attrs.update({key: text for key, text in described.items() if key not in ("dims", "kind")})
         if "ancillary_variables" in variable.attrs:
             listed = variable.attrs["ancillary_variables"].split()
             variable.attrs["ancillary_variables"] = " ".join(each for each in listed if each in dataset.variables)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from thermofuse.compiled import njit
-from thermography.common import Array
+from thermography.common import VARIABLES, Array
 from thermography.fields.blocks import (
     BLOCK_FRAMES,
     NO_CYCLE,
@@ -235,28 +235,6 @@ _LARGEST_U_MM = 1.0
 #: A table whose place differs by no more than this stands, and its frames are sampled alike, mm: the place of one frame is known no better.
 _STANDING_MM = 0.02
 
-_ATTRIBUTES: dict[str, dict[str, Any]] = {
-    "temperature_spread": {"long_name": "standard deviation of the cell's temperature over the frames of the cycle"},
-    "table_position": {
-        "long_name": "displacement of the table along the axis since the registered frame, counted like the axis position",
-        "units": "mm",
-        "ancillary_variables": "table_position_u",
-    },
-    "table_position_u": {
-        "long_name": "standard uncertainty of table_position from the scatter of the fiducials",
-        "units": "mm",
-    },
-    "table_across": {
-        "long_name": "displacement of the table across the axis since the registered frame",
-        "units": "mm",
-    },
-    "table_discs": {
-        "long_name": "fiducials that locate the table in the frame, 0 where it is not located",
-        "units": "1",
-    },
-    "frame_time": {"standard_name": "time", "long_name": "time of the frame", "units_metadata": "leap_seconds: utc"},
-}
-
 
 def reduce_moving_frames(
     references: Sequence[FrameReference],
@@ -474,7 +452,7 @@ def _assemble(
         frames=_frame_variables(blocks, results, axis, samples, grid),
         frame_coordinates={"time": block_times, "frame_time": frames.times},
     )
-    for name, attributes in _ATTRIBUTES.items():
+    for name, attributes in VARIABLES["moving"].items():
         fields[name].attrs.update(attributes)
     return fields.assign_attrs(
         frames_outside_cycles=json.dumps(frames.names(frames.cycles == NO_CYCLE)),
