@@ -211,15 +211,18 @@ def run(
     with second_process(wanted=two) as worker, _answering(written):
         if watch:
             _watch(_here(places[0], "--watch follows"), until_idle_s=until_idle, wanted=wanted, quiet=quiet)
-        join = _joining([_here(place, "two are joined from") for place in places]) if len(folders) == 2 else None
+        if len(folders) == 2:
+            from fusion.pipeline.compare import compare_runs, require_one_kind
+
+            require_one_kind([_here(place, "two are joined from") for place in places])
         for campaign, folder in folders:
             with _progress(quiet=quiet) as report:
                 results = _run_or_keep(campaign, folder, worker, resume=resume, scheduler=scheduler, report=report)
             if not quiet:
                 console.print(summary_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
-        if join is not None:
-            for name, text in join(written, folders[0][1].parent):
+        if len(folders) == 2:
+            for name, text in compare_runs(written, folders[0][1].parent):
                 if not quiet:
                     console.print(f"both campaigns, {name}: {text}", soft_wrap=True)
 
@@ -257,13 +260,6 @@ def _run_or_keep(
     from fusion.pipeline.run import run_campaign
 
     return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report, worker=worker)
-
-
-def _joining(campaigns: list[Path]) -> Callable[[Sequence[Path], Path], Iterable[tuple[str, str]]]:
-    """Return what joins the results of two campaigns, or of two records."""
-    from fusion.pipeline.compare import are_records, compare_records, compare_runs
-
-    return compare_records if are_records(campaigns) else compare_runs
 
 
 @contextmanager
@@ -775,7 +771,7 @@ def compare(
 
     Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first.
     """
-    from fusion.analysis.comparison import compare_campaigns
+    from fusion.pipeline.compare import compare_campaigns
     from fusion.report.charts.comparison import follow_trends
     from fusion.report.comparison import (
         achieved_table,
@@ -785,6 +781,7 @@ def compare(
         comparison_notes,
         conclude_comparison,
         conclude_table,
+        describe_places,
         render_comparison,
         side_by_side,
         trend_sentences,
@@ -807,7 +804,10 @@ def compare(
                 wide.print(print_table(changes_table(pairs, pair), f"{names[0]} -> {name}"))
             if pair.achieved:
                 wide.print(print_table(achieved_table(pair), "Predicted and achieved"))
-            _print_lines([conclude_comparison(pair), *conclude_table(pair)])
+            found = describe_places(pairs, pair)
+            if found and found["table"].rows:
+                wide.print(print_table(found["table"], "Places that the drift follows"))
+            _print_lines([conclude_comparison(pair), *conclude_table(pair), *found.get("said", ())])
         _print_lines([*trend_sentences(follow_trends(pairs)), *comparison_notes(pairs)])
 
 

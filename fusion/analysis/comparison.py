@@ -1,4 +1,4 @@
-"""Results folders of one machine compared: profile, scatter, drift per kelvin, ISO 230-2 values, positions that stand out."""
+"""Campaigns of one machine compared: profile, scatter, drift per kelvin, ISO 230-2 values, places that the drift follows."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
 from scipy import special
 
+from fusion.analysis.attribution.places import ComparisonError, PlaceComparison, compare_places
 from fusion.analysis.levels import CHANGE_LEVEL
-from fusion.common import Array, FusionError
+from fusion.common import Array
 from fusion.results.axis import Iso230Part
 from fusion.results.loop import AxisLoop, Coefficient
-from fusion.results.parts import Quantity, TablePrediction, read_table_prediction
-from fusion.results.results import Results, read_results
-from fusion.results.store import file_sha256, group, has, opened, read_json_object, require_kind, require_own
+from fusion.results.parts import Quantity, TablePrediction
+from fusion.results.results import Results
 from interferometry.drift.estimate import COMPONENTS
 from thermography.common import scatter_by_median
 
@@ -34,10 +34,6 @@ _LEAST_SHARE = 1e-6
 _MOST_WITH_RUNS = 2
 #: Shapes that the thermal state of a test may take, by drift component.
 _STATE = {"shift": "offset", "stretch": "slope", "bend": "bow"}
-
-
-class ComparisonError(FusionError):
-    """Campaigns that cannot be compared; the message says in what they differ."""
 
 
 @dataclass(frozen=True)
@@ -349,20 +345,30 @@ class ComparedCampaign:
 
     Attributes
     ----------
+    sha256 : SHA-256 of its results.json
     axis : name of the measured axis; empty where the run does not tell
     drift : joint estimate with ``position`` (target; mm); None where there are no readings with times
+    maps : which part of the field the drift follows, as `fusion.analysis.attribution.correlate` returns it; None where that was not tested
     """
 
-    folder: Path
     results: Results
+    sha256: str
     axis: str
     drift: xr.Dataset | None
+    maps: xr.DataTree | None = None
 
     @property
     def name(self) -> str:
         """Title of the campaign, with the day of its first reading."""
         time = self.results.time
         return self.results.campaign + (f", {time.day}" if time else "")
+
+
+class Lack(NamedTuple):
+    """What cannot be compared, or was taken for granted, by the code of its sentence, and what that names."""
+
+    code: str
+    named: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -414,15 +420,16 @@ class Achieved:
         return abs(self.difference.value or 0.0) <= 2.0 * (self.difference.u or 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairComparison:
     """One campaign against the reference.
 
     Attributes
     ----------
     profile : difference of the profiles; None where they cannot be compared
-    not_compared : what cannot be compared, and why, one sentence each
+    not_compared : what cannot be compared, and why
     tests : tests of profile, scatter and drift per kelvin, over all campaigns, which share one level; the values by ISO 230-2 share another
+    places : what both say of the places that the drift follows; None where that was not tested in both
     common : inputs of both budgets of ISO 230-2 whose error is the same in both tests
     achieved : values with a table that was loaded between the tests, beside what was predicted of it
     """
@@ -431,56 +438,28 @@ class PairComparison:
     after: ComparedCampaign
     changes: tuple[Change, ...]
     profile: ProfileChange | None
-    not_compared: tuple[str, ...]
+    not_compared: tuple[Lack, ...]
     tests: int
+    places: PlaceComparison | None = None
     common: tuple[str, ...] = ()
     achieved: tuple[Achieved, ...] = ()
 
 
-def read_campaign(folder: Path) -> ComparedCampaign:
-    """Read what a comparison needs of a results folder; the fields of the camera are not read."""
-    results = read_results(folder)
-    return ComparedCampaign(folder, results, _axis(folder), _drift(folder / "deviations.nc"))
-
-
-def compare_campaigns(
-    folders: Sequence[Path], *, same_setup: bool = False, applied: Path | None = None
+def compare_tests(
+    reference: ComparedCampaign, others: Sequence[ComparedCampaign], *, same_setup: bool = False
 ) -> list[PairComparison]:
-    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them.
-
-    `applied` is the table that was loaded between two tests, see `read_table_prediction`.
-    """
-    unique = {folder.resolve() for folder in folders}
-    if len(unique) < 2 or len(unique) < len(folders):
-        raise ComparisonError(
-            f"{len(folders)} results folders are named, {len(unique)} of them different: name at least two, each once"
-        )
-    if applied is not None and len(unique) != 2:
-        raise ComparisonError(
-            f"{applied.name}: a table stands between two tests; name the one before it and the one after it"
-        )
-    reference, *others = [read_campaign(folder) for folder in folders]
-    pairs = [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
-    if applied is None:
-        return pairs
-    return [replace(pair, achieved=hold_against(pair, read_table_prediction(applied), applied)) for pair in pairs]
+    """Compare tests with one of the same machine; `same_setup` where laser and sensors stood untouched between them."""
+    return [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
 
 
-def hold_against(pair: PairComparison, prediction: TablePrediction, applied: Path) -> tuple[Achieved, ...]:
+def hold_against(pair: PairComparison, prediction: TablePrediction) -> tuple[Achieved, ...]:
     """Hold the values with an active table against what was predicted of it.
 
     The table holds the errors of the instruments in the test that it was made from; those that both tests have in common cancel.
     """
-    if prediction.results_sha256 != file_sha256(pair.before.folder / "results.json"):
-        raise ComparisonError(
-            f"{applied.name} was not made from the results in {pair.before.folder}: name first the results that the table was exported from"
-        )
-    parts = [campaign.results.iso230 for campaign in (pair.before, pair.after)]
-    one, other = parts
+    one, other = pair.before.results.iso230, pair.after.results.iso230
     if one is None or other is None:
-        raise ComparisonError(
-            f"{applied.name}: there are no values by ISO 230-2 in both tests to hold against its prediction"
-        )
+        raise ComparisonError("there are no values by ISO 230-2 in both tests to hold against its prediction")
     found = []
     for symbol, predicted in prediction.predicted_um.items():
         first, second = (getattr(part, f"{symbol}_um") for part in (one, other))
@@ -498,21 +477,31 @@ def hold_against(pair: PairComparison, prediction: TablePrediction, applied: Pat
 
 def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int, same_setup: bool) -> PairComparison:
     """Compare one campaign with the reference; `pairs` campaigns share the family."""
-    if before.axis and after.axis and before.axis != after.axis:
-        reason = f"the axes differ ({before.axis} and {after.axis}): nothing is compared"
-        return PairComparison(before, after, (), None, (f"Everything: {reason}.",), 0)
-    lacks: list[str] = []
-    if before.axis != after.axis:
-        stated, silent = (before, after) if before.axis else (after, before)
-        lacks.append(f"Axis: {stated.name} is of {stated.axis}, {silent.name} states none; taken as the same.")
+    stated, silent = sorted((before, after), key=lambda one: not one.axis)
+    differ = [Lack("axis", (stated.name, stated.axis, silent.name))] if before.axis != after.axis else []
+    if differ and silent.axis:
+        return PairComparison(before, after, (), None, (Lack("axes", (before.axis, after.axis)),), 0)
     common = common_inputs(before, after, same_setup=same_setup)
-    others = [*_scatters(before, after), *_coefficients(before, after, lacks)]
-    standard = list(_standard(before, after, lacks, common))
-    profile = _profile(before, after, lacks, pairs=pairs, tests=len(others) + 2)
-    shapes: tuple[Change, ...] = () if profile is None else profile.shapes
-    tests = pairs * (len(others) + (0 if profile is None else 2 + profile.tests))
-    changes = (*_in_family([*shapes, *others], tests), *_in_family(standard, pairs * len(standard)))
-    return PairComparison(before, after, changes, profile, tuple(lacks), tests, common)
+    others = [*_scatters(before, after), *_coefficients(before, after)]
+    standard = [*_standard(before, after, common)]
+    judged, values = _of_type(Change, others), _of_type(Change, standard)
+    profiles = [*_profile(before, after, level=CHANGE_LEVEL / pairs, tests=len(judged) + 2)]
+    profile = next(iter(_of_type(ProfileChange, profiles)), None)
+    tests = pairs * (len(judged) + (0 if profile is None else 2 + profile.tests))
+    shapes = () if profile is None else profile.shapes
+    changes = (*_in_family([*shapes, *judged], tests), *_in_family(values, pairs * len(values)))
+    places = [*_places(before, after)]
+    lacks = _of_type(Lack, [*differ, *others, *standard, *profiles, *places])
+    agreement = next(iter(_of_type(PlaceComparison, places)), None)
+    return PairComparison(before, after, changes, profile, tuple(lacks), tests, agreement, common)
+
+
+_Found = TypeVar("_Found")
+
+
+def _of_type(kind: type[_Found], found: Sequence[object]) -> list[_Found]:
+    """Return what is of one type."""
+    return [one for one in found if isinstance(one, kind)]
 
 
 def _in_family(changes: Sequence[Change], tests: int) -> Iterator[Change]:
@@ -521,47 +510,38 @@ def _in_family(changes: Sequence[Change], tests: int) -> Iterator[Change]:
         yield replace(change, p_value=min(1.0, change.p_value * tests), family=tests)
 
 
-def _axis(folder: Path) -> str:
-    """Return the name of the axis as the run noted it."""
-    try:
-        return str(read_json_object(folder / "provenance.json")["parameters"]["campaign"].get("axis") or "")
-    except (KeyError, TypeError, AttributeError):
-        return ""
-
-
-def _drift(path: Path) -> xr.Dataset | None:
-    """Return the joint estimate of deviations.nc with its positions, without what belongs to single readings."""
-    if not path.is_file():
-        return None
-    require_own(path.parent, [path.name])
-    with opened(path) as stored:
-        if not has(require_kind(stored, "deviations", path), "drift"):
-            return None
-        drift = group(stored, "drift").assign(position=stored["position"])
-        return drift.drop_dims("cycle").load()
+def _without(code: str, tests: Sequence[ComparedCampaign], parts: Sequence[object]) -> Lack:
+    """Return that one test or both lack a part."""
+    names = [test.name for test, part in zip(tests, parts, strict=True) if part is None]
+    return Lack(code, (names[0] if len(names) == 1 else "either test",))
 
 
 def _profile(
-    before: ComparedCampaign, after: ComparedCampaign, lacks: list[str], *, pairs: int, tests: int
-) -> ProfileChange | None:
+    before: ComparedCampaign, after: ComparedCampaign, *, level: float, tests: int
+) -> Iterator[ProfileChange | Lack]:
     """Compare the profiles, or say why not."""
-    without = [one.name for one in (before, after) if one.drift is None]
     if before.drift is None or after.drift is None:
-        lacks.append(f"Profile and scatter: no estimate of the drift in {_either(without)}.")
-        return None
+        yield _without("drift", (before, after), (before.drift, after.drift))
+        return
     try:
-        found = compare_profiles(before.drift, after.drift, level=CHANGE_LEVEL / pairs, tests=tests)
+        found = compare_profiles(before.drift, after.drift, level=level, tests=tests)
     except ComparisonError as reason:
-        lacks.append(f"Profile: {reason}.")
-        return None
+        yield Lack("profile", (str(reason),))
+        return
+    yield found
     if found.left_out:
-        lacks.append(f"Profile: {found.left_out} positions were measured in one of the two campaigns only.")
-    return found
+        yield Lack("left_out", (str(found.left_out),))
 
 
-def _either(names: Sequence[str]) -> str:
-    """Name the test, or both tests, that lack something."""
-    return names[0] if len(names) == 1 else "either test"
+def _places(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[PlaceComparison | Lack]:
+    """Compare the places that the drift follows, or say why not; nothing where neither test has a field."""
+    if before.maps is not None and after.maps is not None:
+        try:
+            yield compare_places(before.maps, after.maps)
+        except ComparisonError as reason:
+            yield Lack("places", (str(reason),))
+    elif before.maps is not None or after.maps is not None:
+        yield _without("field", (before, after), (before.maps, after.maps))
 
 
 def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]:
@@ -578,25 +558,19 @@ def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]
     )
 
 
-def _coefficients(before: ComparedCampaign, after: ComparedCampaign, lacks: list[str]) -> Iterator[Change]:
+def _coefficients(before: ComparedCampaign, after: ComparedCampaign) -> Iterator[Change | Lack]:
     """The coefficients per kelvin of both models, where both hold the same effects."""
-    loops = [campaign.results.loop for campaign in (before, after)]
-    without = [
-        campaign.name for campaign, loop in zip((before, after), loops, strict=True) if not isinstance(loop, AxisLoop)
-    ]
-    if without:
-        lacks.append(f"Drift per kelvin: no model of the axis in {_either(without)}.")
+    loops = [one.results.loop if isinstance(one.results.loop, AxisLoop) else None for one in (before, after)]
+    models = [loop for loop in loops if loop is not None]
+    if len(models) < 2:
+        yield _without("model", (before, after), loops)
         return
-    one, other = (loop for loop in loops if isinstance(loop, AxisLoop))
-    models = [{*loop.declared, *(step.effect for step in loop.steps)} for loop in (one, other)]
-    if models[0] != models[1]:
-        differing = " and ".join(", ".join(sorted(models[k] - models[1 - k])) or "nothing more" for k in (0, 1))
-        lacks.append(
-            f"Drift per kelvin: the models hold different effects ({differing.replace('_', ' ')}), so that a coefficient does not mean the "
-            "same in both."
-        )
+    first, second = ({*loop.declared, *(step.effect for step in loop.steps)} for loop in models)
+    if first != second:
+        more = (", ".join(sorted(effects)).replace("_", " ") for effects in (first - second, second - first))
+        yield Lack("effects", tuple(effects or "nothing more" for effects in more))
         return
-    found = [dict(_per_kelvin(loop)) for loop in (one, other)]
+    found = [dict(_per_kelvin(loop)) for loop in models]
     for name in found[0]:
         if name in found[1] and found[0][name].unit == found[1][name].unit:
             before_and_after = (Quantity(value=model[name].value, u=model[name].u) for model in found)
@@ -615,33 +589,26 @@ def _per_kelvin(loop: AxisLoop) -> Iterator[tuple[str, Coefficient]]:
                 yield step.effect, coefficient
 
 
-def _standard(
-    before: ComparedCampaign, after: ComparedCampaign, lacks: list[str], common: Sequence[str]
-) -> Iterator[Change]:
+def _standard(before: ComparedCampaign, after: ComparedCampaign, common: Sequence[str]) -> Iterator[Change | Lack]:
     """The values by ISO 230-2 of the window that each campaign quotes."""
-    parts = [campaign.results.iso230 for campaign in (before, after)]
-    one, other = parts
+    one, other = before.results.iso230, after.results.iso230
     if one is None or other is None:
-        missing = [campaign.name for campaign, part in zip((before, after), parts, strict=True) if part is None]
-        lacks.append(f"ISO 230-2: no readings in {_either(missing)}.")
+        yield _without("readings", (before, after), (one, other))
         return
     if one.unit != other.unit:
-        lacks.append("ISO 230-2: one axis is linear, the other a rotary one.")
+        yield Lack("rotary")
         return
-    travels = [
-        np.sort(np.array(campaign.results.drift.position_mm, float))
-        for campaign in (before, after)
-        if campaign.results.drift
-    ]
+    drifts = [test.results.drift for test in (before, after)]
+    travels = [np.sort(np.array(drift.position_mm, float)) for drift in drifts if drift]
     if len(travels) == 2 and not (
         travels[0].size == travels[1].size and np.allclose(travels[0], travels[1], rtol=0.0, atol=SAME_POSITION_MM)
     ):
-        lacks.append("ISO 230-2: the values belong to the targets of a test, and the campaigns have different ones.")
+        yield Lack("targets")
         return
     for symbol in _ISO230:
         first, second = (getattr(part, f"{symbol}_um") for part in (one, other))
         if None in (first.value, second.value, first.u, second.u):
-            lacks.append(f"ISO 230-2, {symbol}: not measured with its uncertainty in both campaigns.")
+            yield Lack("value", (symbol,))
             continue
         shared = sum(math.prod(contributions((one, other), name, symbol)) for name in common)
         yield _difference(symbol, "ISO 230-2", one.unit, first, second, machine=False, covariance=shared)

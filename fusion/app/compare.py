@@ -8,11 +8,12 @@ from pathlib import Path
 
 import panel as pn
 
-from fusion.analysis.comparison import PairComparison, compare_campaigns
+from fusion.analysis.comparison import PairComparison
 from fusion.app import parts as ui
 from fusion.app.results.charts import shown_if, table_of
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
+from fusion.pipeline.compare import compare_campaigns
 from fusion.report.charts.comparison import draw_trend, follow_trends, plot_profiles, plot_remaining, plot_scatters
 from fusion.report.comparison import (
     campaign_names,
@@ -20,6 +21,7 @@ from fusion.report.comparison import (
     compared_tests,
     comparison_notes,
     conclude_comparison,
+    describe_places,
     short_names,
     side_by_side,
     trend_caption,
@@ -138,6 +140,10 @@ def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
     for name, pair in compared:
         left = f"{name} minus {names[0]}, beyond offset, slope and bow, with 95 % intervals; ringed or shaded: changed."
         parts += shown_if(plot_remaining(pair), left)
+        if pair.places is not None:
+            found = describe_places(pairs, pair)
+            parts += [ui.heading("Places that the drift follows", level=3), ui.paragraph(" ".join(found["said"]))]
+            parts.append(table_of(found["table"], "Sources that either test shows"))
         if pair.changes:
             every = f"Everything that was compared, {names[0]} before and {name} after"
             parts.append(table_of(changes_table(pairs, pair), every))

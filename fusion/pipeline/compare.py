@@ -1,119 +1,160 @@
-"""Compare the finished runs of two campaigns of one machine: joint.json, joint.nc, a page joint.html, and both reports."""
+"""Results folders of one machine read and compared, with the table that was loaded between two tests, and two runs told together."""
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from fusion.analysis.attribution.two_sessions import SessionComparisonError, compare_sessions
+import xarray as xr
+
+from fusion.analysis.comparison import ComparedCampaign, ComparisonError, PairComparison, compare_tests, hold_against
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.messages import naming
-from fusion.report.page import (
-    channel_sentence,
-    conclude_sessions,
-    describe_sources,
-    render_joint,
-    render_report,
-    session_names,
-    sources_table,
+from fusion.report.comparison import (
+    campaign_names,
+    conclude_comparison,
+    describe_places,
+    lacks_in_words,
+    places_json,
+    render_comparison,
 )
-from fusion.report.wording import CHANNELS, effect_words
+from fusion.report.page import report_of
+from fusion.report.wording import effect_words
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import number
+from fusion.results.parts import read_table_prediction
 from fusion.results.results import read_results
-from fusion.results.store import read_fusion, read_product, write_dataset, write_json, write_text
+from fusion.results.store import (
+    StageStamps,
+    file_sha256,
+    group,
+    has,
+    opened,
+    read_fusion,
+    read_json_object,
+    require_kind,
+    require_own,
+    write_dataset,
+    write_json,
+    write_text,
+)
 
 
-def compare_runs(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
-    """Compare the correlation of two finished runs and enter the comparison in both reports."""
-    products: list[dict[str, Any]] = [
-        {**{name: read_product(folder, name) for name in ("fields", "deviations")}, "fusion": read_fusion(folder)}
-        for folder in folders
-    ]
-    for folder, product in zip(folders, products, strict=True):
-        if "correlation" not in product["fusion"].children:
-            raise SessionComparisonError(
-                f"{folder}: its field was not correlated with its drift, for which it holds too little (its report says what), so that "
-                "there is nothing to compare; measure more cycles and targets"
-            )
-    with naming(Path(f"{folders[0]}, {folders[1]}")):
-        comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
-    results = [read_results(folder) for folder in folders]
-    sessions = session_names(results)
-    described = describe_sources(comparison, sessions)
-    write_dataset(out / "joint.nc", comparison.maps)
-    agreement = [
-        {**asdict(source), "cause": source.cause, "name": words.name, "verdict": words.verdict}
-        for source, words in zip(comparison.sources, described, strict=True)
-    ]
-    found = {"sources": [asdict(channel) for channel in comparison.channels], "agreement": agreement}
-    write_json(out / "joint.json", {"campaigns": [one.campaign for one in results], **found})
-    seen_from = [Path(os.path.relpath(folder, out)).as_posix() for folder in folders]
-    write_text(out / "joint.html", render_joint(results, seen_from, comparison))
-    joint = {
-        "rows": [(CHANNELS.get(one.channel, one.channel), channel_sentence(one)) for one in comparison.channels],
-        "causes": [words.where for source, words in zip(comparison.sources, described, strict=True) if source.cause],
-        "table": sources_table(described, sessions),
-    }
-    for folder, product, other, own in zip(folders, products, reversed(sessions), results, strict=True):
-        provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-        write_text(folder / "report.html", render_report(own, provenance, product, joint={"other": other, **joint}))
-    rows = [("together", " ".join(conclude_sessions(comparison, described, sessions)))]
-    for words in described:
-        shown = "; ".join(f"{session}: {text}" for session, text in zip(sessions, words.shown, strict=True))
-        rows.append((f"{words.name} ({words.where})", f"{words.verdict}; {shown}"))
-    return [*rows, ("report", str((out / "joint.html").resolve()))]
+def compare_campaigns(
+    folders: Sequence[Path], *, same_setup: bool = False, applied: Path | None = None
+) -> list[PairComparison]:
+    """Compare campaigns of one machine with the first of them; `same_setup` where laser and sensors stood untouched between them.
+
+    `applied` is the table that was loaded between two tests, see `read_table_prediction`.
+    """
+    unique = {folder.resolve() for folder in folders}
+    if len(unique) < 2 or len(unique) < len(folders):
+        raise ComparisonError(
+            f"{len(folders)} results folders are named, {len(unique)} of them different: name at least two, each once"
+        )
+    if applied is not None and len(unique) != 2:
+        raise ComparisonError(
+            f"{applied.name}: a table stands between two tests; name the one before it and the one after it"
+        )
+    reference, *others = [read_campaign(folder) for folder in folders]
+    pairs = compare_tests(reference, others, same_setup=same_setup)
+    if applied is None:
+        return pairs
+    prediction = read_table_prediction(applied)
+    if prediction.results_sha256 != reference.sha256:
+        raise ComparisonError(
+            f"{applied.name} was not made from the results in {folders[0]}: name first the results that the table was exported from"
+        )
+    with naming(Path(applied.name)):
+        return [replace(pair, achieved=hold_against(pair, prediction)) for pair in pairs]
 
 
-# Compare the finished runs of two records of one machine: which effects both show, in joint.json.
+def read_campaign(folder: Path) -> ComparedCampaign:
+    """Read what a comparison needs of a results folder; the fields of the camera are not read."""
+    results = read_results(folder)
+    maps = None if results.correlation is None else read_fusion(folder).children.get("correlation")
+    drift = _drift(folder / "deviations.nc")
+    return ComparedCampaign(results, file_sha256(folder / "results.json"), _axis(folder), drift, maps)
+
+
+def _axis(folder: Path) -> str:
+    """Return the name of the axis as the run noted it."""
+    try:
+        return str(read_json_object(folder / "provenance.json")["parameters"]["campaign"].get("axis") or "")
+    except (KeyError, TypeError, AttributeError):
+        return ""
+
+
+def _drift(path: Path) -> xr.Dataset | None:
+    """Return the joint estimate of deviations.nc with its positions, without what belongs to single readings."""
+    if not path.is_file():
+        return None
+    require_own(path.parent, [path.name])
+    with opened(path) as stored:
+        if not has(require_kind(stored, "deviations", path), "drift"):
+            return None
+        drift = group(stored, "drift").assign(position=stored["position"])
+        return drift.drop_dims("cycle").load()
+
+
+# Two campaigns that `thermofuse run` ran: joint.json, joint.nc, the page joint.html, and what both agree on in either report.
 
 #: What joint.json holds of each record.
 _FIGURES = ("verdict", "rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 
 
-def are_records(paths: Sequence[Path]) -> bool:
-    """Return whether campaigns are records; checked before any of them is run."""
-    campaigns = {path: load_campaign(path) for path in paths}
-    records = {campaign.record is not None: path for path, campaign in reversed(campaigns.items())}
+def require_one_kind(paths: Sequence[Path]) -> None:
+    """Refuse a record beside a campaign of instruments before any of them is run."""
+    records = {load_campaign(path).record is not None: path for path in paths}
     if len(records) > 1:
         raise CampaignError(
             f"{records[True]} holds a [record], {records[False]} instruments; two campaigns of one kind can be compared, run these one by "
             "one"
         )
-    if True in records:
-        return True
-    for path, campaign in campaigns.items():
-        if campaign.thermography is None or campaign.interferometry is None:
-            lacking = "[thermography]" if campaign.thermography is None else "[interferometry]"
-            raise CampaignError(
-                f"{path} has no {lacking}; two campaigns are compared by the part of the field that explains the drift, which needs both "
-                "instruments in both of them: run these one by one"
-            )
-    return False
 
 
-def compare_records(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
-    """Compare the effects that the loops of two finished records named."""
-    results = [read_results(folder) for folder in folders]
-    loops = [one.loop for one in results if isinstance(one.loop, RecordLoop)]
-    confirmed = [[step.effect for step in loop.named] for loop in loops]
-    names = list(dict.fromkeys(name for shown in confirmed for name in shown))
-    shown_by = {name: [k for k, shown in enumerate(confirmed) if name in shown] for name in names}
-    titles = [one.campaign for one in results]
-    agreement = [
-        {"effect": name, "shown_by": who, "agrees": len(who) == len(results)} for name, who in shown_by.items()
-    ]
+def compare_runs(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
+    """Compare two finished runs and enter the places on which they agree in both reports."""
+    pairs = compare_campaigns(folders)
+    (pair,), names = pairs, campaign_names(pairs)
+    if isinstance(pair.before.results.loop, RecordLoop):
+        return _compare_records(pair, out)
+    rows, titles = [], [one.results.campaign for one in (pair.before, pair.after)]
+    write_json(out / "joint.json", {"campaigns": titles, **places_json(pairs, pair)})
+    reports = [Path(os.path.relpath(folder, out), "report.html").as_posix() for folder in folders]
+    write_text(out / "joint.html", render_comparison(pairs, reports=reports))
+    if pair.places is not None:
+        write_dataset(out / "joint.nc", pair.places.maps)
+        found = describe_places(pairs, pair)
+        for folder, other in zip(folders, reversed(names), strict=True):
+            page = write_text(folder / "report.html", report_of(folder, joint={"other": other, **found}))
+            StageStamps(folder).renew(page)
+        rows = [("together", " ".join(found["said"]))]
+        for place, where, *shown, verdict in (row.cells for row in found["table"].rows):
+            each = "; ".join(f"{name}: {text}" for name, text in zip(names, shown, strict=True))
+            rows.append((f"{place} ({where})", f"{verdict}; {each}"))
+    rows += [("changes", conclude_comparison(pair)), *(("not compared", lack) for lack in lacks_in_words(pair))]
+    return [*rows, ("report", str((out / "joint.html").resolve()))]
+
+
+def _compare_records(pair: PairComparison, out: Path) -> list[tuple[str, str]]:
+    """Compare the effects that the loops of two records named."""
+    results = [pair.before.results, pair.after.results]
+    loops = [(one.campaign, one.loop) for one in results if isinstance(one.loop, RecordLoop)]
+    named = [(step.effect, k) for k, (_, loop) in enumerate(loops) for step in loop.named]
+    shown_by = {effect: sorted({k for other, k in named if other == effect}) for effect, _ in named}
     rows, records = [], []
-    for title, loop in zip(titles, loops, strict=True):
+    for title, loop in loops:
         records.append({"title": title, **{key: getattr(loop, key) for key in _FIGURES}})
         errors = f"{number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"
         rows.append((title, f"{loop.verdict}, held-out error {errors}"))
-    write_json(out / "joint.json", {"campaigns": titles, "records": records, "agreement": agreement})
+    agreement = [{"effect": name, "shown_by": who, "agrees": len(who) == 2} for name, who in shown_by.items()]
+    write_json(
+        out / "joint.json", {"campaigns": [title for title, _ in loops], "records": records, "agreement": agreement}
+    )
     for name, who in shown_by.items():
-        confirmed_by = "both records" if len(who) == len(results) else f"{titles[who[0]]} alone"
+        confirmed_by = "both records" if len(who) == 2 else f"{loops[who[0]][0]} alone"
         rows.append((effect_words(name).name, f"confirmed by {confirmed_by}"))
     return rows

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
-from fusion.analysis.comparison import Achieved, Change, ComparedCampaign, PairComparison, common_to_all
-from fusion.analysis.levels import CHANGE_LEVEL
+from fusion.analysis.comparison import Change, ComparedCampaign, PairComparison, common_to_all
+from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHANGE_LEVEL
 from fusion.common import versions
 from fusion.report.charts.comparison import (
     Trend,
@@ -20,6 +21,7 @@ from fusion.report.charts.style import embed
 from fusion.report.page import render_page
 from fusion.report.sheet import Sheet, Stated
 from fusion.report.wording import (
+    CHANNELS,
     ISO230_TERMS,
     Row,
     Table,
@@ -30,12 +32,13 @@ from fusion.report.wording import (
     iso230_values,
     quantity,
     say,
+    sentences,
     table,
 )
 from fusion.results.loop import AxisLoop
-from fusion.results.numbers import fixed, join, measured, number, p_cell, print_unit
+from fusion.results.numbers import fixed, join, measured, number, p_cell, place, print_unit
 from fusion.results.parts import Quantity
-from fusion.results.store import file_sha256, plain
+from fusion.results.store import plain
 
 #: Quantities of a comparison in words; others are effects.
 _WORDS = {
@@ -157,11 +160,16 @@ def comparison_notes(pairs: Sequence[PairComparison]) -> list[str]:
         notes.append(
             f"Common to the tests{which}, and therefore not counted twice in the differences by ISO 230-2: {inputs}."
         )
-    lacks = [(lack, name) for pair, name in zip(pairs, names, strict=True) for lack in pair.not_compared]
+    lacks = [(lack, name) for pair, name in zip(pairs, names, strict=True) for lack in lacks_in_words(pair)]
     for lack, whose in _shared(lacks):
         which = "" if len(whose) == len(pairs) else f" ({join(whose)})"
         notes.append(f"Not compared{which}: {lack}")
     return notes
+
+
+def lacks_in_words(pair: PairComparison) -> list[str]:
+    """Return what cannot be compared, and why, one sentence each."""
+    return [say("not_compared", lack) for lack in pair.not_compared]
 
 
 def _shared(told: Sequence[tuple[Any, str]]) -> list[tuple[Any, list[str]]]:
@@ -265,6 +273,53 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
     return figures
 
 
+# Places that the drift follows: what both tests show, and what only one shows.
+
+
+def describe_places(pairs: Sequence[PairComparison], pair: PairComparison) -> dict[str, Any]:
+    """Return what two tests agree on: in sentences, the places of causes, a table of the sources, and every part of the drift.
+
+    A row of the table is a source that either shows: its name, where it is, what either test shows there, and whether it is a cause.
+    """
+    if pair.places is None:
+        return {}
+    names = campaign_names(pairs)
+    tests = (names[0], names[1 + list(pairs).index(pair)])
+    numbers = {(one.channel, one.x_mm, one.y_mm): f"place {k}" for k, one in enumerate(pair.places.sources, start=1)}
+    rows: list[list[str]] = []
+    for source, name in zip(pair.places.sources, numbers.values(), strict=True):
+        near = numbers.get((source.channel, *source.agreed_near_mm[:2])) if source.agreed_near_mm else None
+        of_tests = (source.sensitivity_um_per_K, source.sensitivity_u_um_per_K, source.lag_s)
+        shown = [say("source_shown", *one) for one in zip(source.p_value, pair.places.least_p, *of_tests, strict=True)]
+        verdict = say("source_verdict", source, tests, near, ATTRIBUTION_LEVEL)
+        where = f"{place(source.x_mm, source.y_mm)}, {CHANNELS.get(source.channel, source.channel)}"
+        rows.append([name, where, *shown, verdict])
+    found = list(zip(pair.places.sources, rows, strict=True))
+    titles = [Words(title) for title in ("Place", "Where, and part of the drift", *tests, "Verdict")]
+    return {
+        "said": sentences("joint_outcome", pair.places, found, tests),
+        "causes": [row[1] for source, row in found if source.cause],
+        "table": table(titles, rows, stacked=True),
+        "rows": [
+            (CHANNELS.get(one.channel, one.channel), say("channel_agreement", one, ATTRIBUTION_LEVEL))
+            for one in pair.places.channels
+        ],
+    }
+
+
+def places_json(pairs: Sequence[PairComparison], pair: PairComparison) -> dict[str, Any]:
+    """Return the agreement of two tests on every part of the drift and on every source in JSON's own types."""
+    if pair.places is None:
+        return {"sources": [], "agreement": []}
+    rows = [row.cells for row in describe_places(pairs, pair)["table"].rows]
+    agreement = [
+        {**asdict(source), "cause": source.cause, "name": cells[0], "verdict": cells[-1]}
+        for source, cells in zip(pair.places.sources, rows, strict=True)
+    ]
+    sources = [{**asdict(one), "reason": say("channel_reason", one, ATTRIBUTION_LEVEL)} for one in pair.places.channels]
+    return {"sources": plain(sources), "agreement": plain(agreement)}
+
+
 # As found and as left: the sheet to sign.
 
 
@@ -282,10 +337,7 @@ def describe_pair(pair: PairComparison) -> Sheet:
             identity += [(f"{name}, {which}", text) for which, text in zip(("as found", "as left"), both, strict=True)]
     remarks = [{row.name: row.text for row in rows}.get("Remarks", "") for rows in conditions]
     done = remarks[1] if remarks[1] != remarks[0] else ""
-    files = {
-        f"results.json {which}": file_sha256(one.folder / "results.json")
-        for which, one in (("as found", pair.before), ("as left", pair.after))
-    }
+    files = {f"results.json {which}": one.sha256 for which, one in (("as found", pair.before), ("as left", pair.after))}
     return Sheet(
         title="As found, as left",
         standard="Accuracy and repeatability of positioning by ISO 230-2:2014, two tests of one axis",
@@ -402,8 +454,11 @@ def _in_width(wide: Table, most: int) -> list[Table]:
     ]
 
 
-def render_comparison(pairs: Sequence[PairComparison]) -> str:
-    """Return a comparison as a document: of two tests the sheet to sign, of more their trend; then what changed, then everything."""
+def render_comparison(pairs: Sequence[PairComparison], *, reports: Sequence[str] = ()) -> str:
+    """Return a comparison as a document: of two tests the sheet to sign, of more their trend; then what changed, then everything.
+
+    `reports` are the places of their reports, to which the page links.
+    """
     tests, names = compared_tests(pairs), short_names(pairs)
     trends = follow_trends(pairs)
     charts = {
@@ -423,6 +478,10 @@ def render_comparison(pairs: Sequence[PairComparison]) -> str:
         short=changes_table(pairs, pairs[0], short=True),
         every=[changes_table(pairs, pairs[0])] if len(pairs) == 1 else _in_width(changes_of_all(pairs), _MOST_COLUMNS),
         notes=comparison_notes(pairs),
+        compared_places=[
+            (name, describe_places(pairs, pair)) for name, pair in zip(names[1:], pairs, strict=True) if pair.places
+        ],
+        reports=list(zip(campaign_names(pairs), reports, strict=False)),
         figures_tables=_in_width(side_by_side(pairs), _MOST_COLUMNS + 1),
         others=names[1:],
         trends=[f"trend_{trend.name}" for trend in trends],
@@ -437,30 +496,12 @@ def comparison_json(pairs: Sequence[PairComparison]) -> dict[str, Any]:
     """Return a comparison in JSON's own types."""
     compared = []
     for pair in pairs:
-        said = [conclude_comparison(pair), *comparison_notes([pair])]
-        found = {"conclusions": said, "changes": [_change_json(change) for change in pair.changes]}
         about: dict[str, Any] = {"campaign": pair.after.name, "tests": pair.tests}
         if pair.achieved:
-            about["achieved"] = [_achieved_json(one) for one in pair.achieved]
-        compared.append({**about, **found, "not_compared": list(pair.not_compared)})
-    return {"reference": pairs[0].before.name, "compared": compared}
-
-
-def _achieved_json(one: Achieved) -> dict[str, Any]:
-    named = {"before": one.before, "predicted": one.predicted, "achieved": one.achieved, "difference": one.difference}
-    values = {name: {"value": found.value, "u": found.u} for name, found in named.items()}
-    return plain({"quantity": one.quantity, **values, "as_predicted": one.as_predicted})
-
-
-def _change_json(change: Change) -> dict[str, Any]:
-    values = {
-        name: None if found is None else {"value": found.value, "u": found.u}
-        for name, found in (("before", change.before), ("after", change.after), ("change", change.change))
-    }
-    return plain(
-        {
-            "quantity": change.quantity, "group": change.group, "position_mm": change.position_mm, "until_mm": change.until_mm,
-            "unit": change.unit, **values,
-            "p_value": change.p_value, "family": change.family, "significant": change.significant, "machine": change.machine,
-        }
-    )  # fmt: skip
+            about["achieved"] = [{**asdict(one), "as_predicted": one.as_predicted} for one in pair.achieved]
+        if pair.places is not None:
+            about["places"] = places_json(pairs, pair)
+        about["conclusions"] = [conclude_comparison(pair), *comparison_notes([pair])]
+        about["changes"] = [{**asdict(change), "significant": change.significant} for change in pair.changes]
+        compared.append({**about, "not_compared": lacks_in_words(pair)})
+    return {"reference": pairs[0].before.name, "compared": plain(compared)}

@@ -12,23 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from markupsafe import Markup
 
-from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.common import FusionError
 from fusion.report.campaign import describe_campaign
 from fusion.report.charts.embedded import Drawn, EmbeddedChart, chart_scripts
-from fusion.report.findings import headline
-from fusion.report.wording import CHANNELS, TEMPLATES, Table, Words, environment, say, sentences, table
+from fusion.report.wording import TEMPLATES, environment
 from fusion.results.loop import RecordLoop
-from fusion.results.numbers import moment, number, place
 from fusion.results.results import Results, read_results
 from fusion.results.store import is_file_list, read_fusion, read_product, write_atomically, write_text
-
-if TYPE_CHECKING:
-    from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
 
 # Pages: the template, the charts in it and the scripts that draw them, as one file that needs no other and no
 # network.
@@ -90,8 +84,8 @@ def render_report(
         ``fields`` and ``deviations`` (Dataset) and ``fusion`` (DataTree) as they were written; those that a campaign does not
         have may be absent. A ``record`` (Dataset) stands alone.
     joint : mapping, optional
-        What this campaign and another one of the machine agree on: ``other`` (its title), ``causes`` (places in words),
-        ``table`` (Table of the places, None without any), ``rows`` (name and text of every part of the drift).
+        What this campaign and another one of the machine agree on: ``other`` (what the other is called), and what
+        `fusion.report.comparison.describe_places` returns.
     drawn : callable, optional
         Returns the charts of a campaign as `fusion.report.charts.campaign.draw_campaign` does, where another process draws them; called
         when everything else is written. Left out: they are drawn here.
@@ -127,8 +121,8 @@ def render_report(
     return render_page("report.html.j2", charts, **found)
 
 
-def report_of(folder: Path) -> str:
-    """Return the report of a finished run, made again from its products."""
+def report_of(folder: Path, *, joint: Mapping[str, Any] | None = None) -> str:
+    """Return the report of a finished run, made again from its products; `joint` as in `render_report`."""
     results = read_results(folder)
     origin = folder / "provenance.json"
     again = "run the campaign again, with --resume to keep what is finished"
@@ -148,7 +142,7 @@ def report_of(folder: Path) -> str:
         raise ProductsError(f"{folder / missing[0]} is missing; put the file back, or {again}")
     there = [name for name in _DRAWN if (folder / f"{name}.nc").is_file()]
     read = {name: read_fusion(folder) if name == "fusion" else read_product(folder, name) for name in there}
-    return render_report(results, provenance, read)
+    return render_report(results, provenance, read, joint=joint)
 
 
 def _is_provenance(content: Any) -> bool:
@@ -251,88 +245,3 @@ def _print(program: str, address: str, out: Path, profile: str) -> None:
             f"{program} ended with {done.returncode} and printed nothing{': ' + said[-1] if said else ''}; name another browser with "
             "--browser FILE"
         )
-
-
-# Two campaigns of one machine on a page of their own: which session is which, what both show, and what only one
-# shows.
-
-_LETTERS = ("A", "B")
-
-
-class SourceWords(NamedTuple):
-    """A source in words: name of its place, where it is, what either session shows there, and whether it is a cause, or why not."""
-
-    name: str
-    where: str
-    shown: tuple[str, ...]
-    verdict: str
-
-
-def session_names(results: Sequence[Results]) -> list[str]:
-    """Return the names of two sessions: a letter and the title of the campaign."""
-    return [f"{letter} ({one.campaign})" for letter, one in zip(_LETTERS, results, strict=True)]
-
-
-def describe_sources(comparison: SessionComparison, sessions: Sequence[str]) -> list[SourceWords]:
-    """Return every source that either session shows, in words; places are numbered."""
-    names = {_key(source): f"place {k}" for k, source in enumerate(comparison.sources, start=1)}
-    described = []
-    for source in comparison.sources:
-        near = names.get((source.channel, *source.agreed_near_mm[:2])) if source.agreed_near_mm else None
-        of_sessions = (source.sensitivity_um_per_K, source.sensitivity_u_um_per_K, source.lag_s)
-        found = zip(source.p_value, comparison.least_p, *of_sessions, strict=True)
-        where = f"{place(source.x_mm, source.y_mm)}, {CHANNELS.get(source.channel, source.channel)}"
-        shown = tuple(say("session_source", *one) for one in found)
-        verdict = say("source_verdict", source, sessions, near, ATTRIBUTION_LEVEL)
-        described.append(SourceWords(names[_key(source)], where, shown, verdict))
-    return described
-
-
-def _key(source: SourceAgreement) -> tuple[str, float, float]:
-    return source.channel, source.x_mm, source.y_mm
-
-
-def conclude_sessions(
-    comparison: SessionComparison, described: Sequence[SourceWords], sessions: Sequence[str]
-) -> list[str]:
-    """Return what two sessions say together: on what both show, and on what each shows alone."""
-    return sentences("joint_outcome", comparison, list(zip(comparison.sources, described, strict=True)), sessions)
-
-
-def sources_table(described: Sequence[SourceWords], sessions: Sequence[str]) -> Table | None:
-    """Return the sources that either of two sessions shows; None where neither shows one."""
-    columns = [Words(title) for title in ("Place", "Where, and part of the drift", *sessions, "Verdict")]
-    rows = [[one.name, one.where, *one.shown, one.verdict] for one in described]
-    return table(columns, rows, stacked=True) if rows else None
-
-
-def channel_sentence(channel: ChannelAgreement) -> str:
-    """Return the agreement on one part of the drift as a sentence."""
-    return say("channel_agreement", channel)
-
-
-def render_joint(results: Sequence[Results], folders: Sequence[str], comparison: SessionComparison) -> str:
-    """Return the page of two campaigns as HTML text."""
-    sessions = session_names(results)
-    described = describe_sources(comparison, sessions)
-    return render_page(
-        "joint.html.j2",
-        {},
-        title=f"{results[0].campaign} and {results[1].campaign}",
-        sentences=conclude_sessions(comparison, described, sessions),
-        sessions=_sessions_table(results, sessions),
-        reports=[(name, f"{folder}/report.html") for name, folder in zip(sessions, folders, strict=True)],
-        sources=sources_table(described, sessions),
-        channels=[(CHANNELS.get(one.channel, one.channel), channel_sentence(one)) for one in comparison.channels],
-        summary={"assumptions": {}},
-    )
-
-
-def _sessions_table(results: Sequence[Results], sessions: Sequence[str]) -> Table:
-    """Return which session is which: when it was, what it found by itself, and its prediction error."""
-    rows = []
-    for name, one in zip(sessions, results, strict=True):
-        when = f"{moment(one.time.first, one.time.zone)} to {moment(one.time.last, one.time.zone)}" if one.time else "–"
-        error = number(one.loop.rmse_final_um, 2) if one.loop else "–"
-        rows.append([name, when, headline(one), error])
-    return table([Words("Session"), Words("Time"), Words("By itself"), "Prediction error / µm"], rows, stacked=True)

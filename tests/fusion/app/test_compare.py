@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.analysis.comparison import compare_campaigns
 from fusion.app.compare import (
     CompareScreen,
     comparison_parts,
@@ -16,6 +15,7 @@ from fusion.app.compare import (
     label_of,
 )
 from fusion.app.parts import State
+from fusion.pipeline.compare import compare_campaigns
 from fusion.report.charts.comparison import plot_profiles, plot_remaining, plot_scatters
 from fusion.results.store import write_json
 from tests.fusion.app.texts import texts

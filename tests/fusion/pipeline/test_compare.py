@@ -1,4 +1,4 @@
-"""Two finished runs of one machine told together: in joint.json and in both reports."""
+"""Two finished runs of one machine told together: in joint.json, on a page of their own, and in both reports."""
 
 import json
 import shutil
@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.analysis.attribution.two_sessions import SessionComparisonError
 from fusion.campaign.config import CampaignError
-from fusion.pipeline import compare as records
-from fusion.pipeline.compare import compare_runs
+from fusion.pipeline import compare
+from fusion.pipeline.compare import compare_campaigns, compare_runs, require_one_kind
 from fusion.pipeline.run import run_campaign
 from fusion.results.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
-from tests.fusion.campaign_parts import change, record_of_rows, without
+from tests.fusion.campaign_parts import change, record_of_rows
+from tests.fusion.compared_tests import readings_of, write_results
 
 
 @pytest.fixture
@@ -37,27 +37,39 @@ def test_both_reports_tell_what_the_sessions_agree_on(folders, tmp_path):
     document = json.loads((tmp_path / "joint.json").read_text())
     assert document["campaigns"] == ["Small campaign", "Second campaign"]
     assert len(document["sources"]) == 4
-    assert len(rows) == len(document["agreement"]) + 2
-    assert rows[0][0] == "together" and rows[-1] == ("report", str((tmp_path / "joint.html").resolve()))
+    assert len(rows) == len(document["agreement"]) + 3
+    assert rows[0][0] == "together" and rows[-2][0] == "changes"
+    assert rows[-1] == ("report", str((tmp_path / "joint.html").resolve()))
     page = (tmp_path / "joint.html").read_text(encoding="utf-8")
-    assert "A (Small campaign)" in page and "B (Second campaign)" in page and 'href="tuesday/report.html"' in page
+    assert "as found (Small campaign" in page and "as left (Second campaign" in page
+    assert 'href="tuesday/report.html"' in page
     # A session agrees with itself on whatever it shows.
     assert all(one["agrees"] and one["shown_by"] == [0, 1] for one in document["agreement"])
     assert read_dataset(tmp_path / "joint.nc")["p_value"].dims == ("channel", "y", "x")
     first, second = ((folder / "report.html").read_text() for folder in folders)
-    assert "Together with B (Second campaign)" in first
-    assert "Together with A (Small campaign)" in second
+    assert "Together with the test as left (Second campaign" in first
+    assert "Together with the test as found (Small campaign" in second
 
 
-def test_other_grids_are_refused(folders, tmp_path):
+def test_other_grids_are_not_compared(folders):
     fusion = read_tree(folders[1] / "fusion.nc")
     for group in fusion["correlation"].subtree:
         if "x" in group.to_dataset(inherit=False).coords:
             group.coords["x"] = group["x"] + 7.0
     write_dataset(folders[1] / "fusion.nc", fusion)
     as_if_run(folders[1], "fusion.nc")
-    with pytest.raises(SessionComparisonError, match="the plan grids differ along x"):
-        compare_runs(folders, tmp_path)
+    (pair,) = compare_campaigns(folders)
+    assert pair.places is None
+    (places,) = [lack for lack in pair.not_compared if lack.code == "places"]
+    assert places.named[0].startswith("the plan grids differ along x")
+
+
+def test_two_tests_without_a_camera_are_compared_without_places(tmp_path):
+    folders = [write_results(tmp_path / f"{seed}", readings_of(seed)) for seed in (31, 32)]
+    rows = compare_runs(folders, tmp_path)
+    assert [name for name, _ in rows] == ["changes", "report"]
+    assert json.loads((tmp_path / "joint.json").read_text())["agreement"] == []
+    assert "As found, as left" in (tmp_path / "joint.html").read_text() and not (tmp_path / "joint.nc").exists()
 
 
 @pytest.mark.parametrize("name", ["results.json", "fusion.nc"])
@@ -81,11 +93,11 @@ def write_record(folder: Path, title: str) -> Path:
 @pytest.mark.chain
 def test_two_records_are_told_together(tmp_path):
     paths = [write_record(tmp_path, title) for title in ("Monday", "Tuesday")]
-    assert records.are_records(paths)
+    require_one_kind(paths)
     folders = [tmp_path / "results" / path.stem for path in paths]
     for path, folder in zip(paths, folders, strict=True):
         run_campaign(path, folder)
-    rows = records.compare_records(folders, tmp_path)
+    rows = compare_runs(folders, tmp_path)
     document = json.loads((tmp_path / "joint.json").read_text())
     assert document["campaigns"] == [name for name, _ in rows[:2]] == ["Monday", "Tuesday"]
     assert document["records"][0]["rmse_final_um"] == document["records"][1]["rmse_final_um"]
@@ -98,17 +110,6 @@ def test_a_record_beside_both_instruments_is_refused(tmp_path, monkeypatch):
         def __init__(self, path):
             self.record = path.stem if path.stem == "record" else None
 
-    monkeypatch.setattr(records, "load_campaign", Loaded)
+    monkeypatch.setattr(compare, "load_campaign", Loaded)
     with pytest.raises(CampaignError, match=r"record\.toml holds a \[record\], axis\.toml instruments"):
-        records.are_records([Path("axis.toml"), Path("record.toml")])
-
-
-def test_two_campaigns_without_both_instruments_are_refused_before_any_is_run(copied):
-    whole = copied / "campaign.toml"
-    laser = without(whole, "thermography", "plan", "model", name="laser.toml")
-    camera = without(whole, "interferometry", "model", name="camera.toml")
-    assert records.are_records([whole, whole]) is False
-    with pytest.raises(CampaignError, match=r"laser\.toml has no \[thermography\]; two campaigns are compared by the"):
-        records.are_records([whole, laser])
-    with pytest.raises(CampaignError, match=r"camera\.toml has no \[interferometry\]"):
-        records.are_records([camera, whole])
+        require_one_kind([Path("axis.toml"), Path("record.toml")])

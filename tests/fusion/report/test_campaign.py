@@ -12,7 +12,7 @@ from fusion.report import campaign as model_section
 from fusion.report.campaign import describe_campaign, describe_correlation, rate_text
 from fusion.report.charts.embedded import MapControls
 from fusion.report.page import render_page
-from fusion.report.wording import environment, region_words
+from fusion.report.wording import environment, region_words, table
 from fusion.results.results import AxisLoop, CorrelationPart, Results, assemble, read_results
 from fusion.results.store import group, read_dataset, read_tree
 from tests.fusion.report.page_tables import tables_of
@@ -125,13 +125,13 @@ def test_a_further_mode_is_named_with_the_part_of_the_drift_that_it_explains(par
     assert "for the drift of the reversal, p = 0.004)" in page and "significant conditional on the leading mode" in page
 
 
-def test_two_sessions_decide_what_is_a_cause(parts):
+def test_two_tests_decide_what_is_a_cause(parts):
     fused, results = parts
     attributable = correlation_of(results).model_copy(update={"verdict": "attributable"})
     leading = results.model_copy(update={"correlation": attributable})
-    joint = {"other": "Tuesday", "causes": ["x 1 mm, y 2 mm"], "rows": [], "table": None}
-    assert "a cause where Tuesday agrees: x 1 mm, y 2 mm (below)" in page_of(fused, leading, joint)
-    assert "Tuesday does not show the same" in page_of(fused, leading, {**joint, "causes": []})
+    joint = {"other": "Tuesday", "causes": ["x 1 mm, y 2 mm"], "rows": [], "table": table([], [])}
+    assert "a cause where the test Tuesday agrees: x 1 mm, y 2 mm (below)" in page_of(fused, leading, joint)
+    assert "the test Tuesday does not show the same" in page_of(fused, leading, {**joint, "causes": []})
     assert "Causation is not shown yet: in one session" in page_of(fused, leading)
 
 

@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
-from fusion.analysis.comparison import Achieved, compare_campaigns
+from fusion.analysis.attribution.places import ChannelAgreement, PlaceComparison, SourceAgreement
+from fusion.analysis.comparison import Achieved
+from fusion.pipeline.compare import compare_campaigns
 from fusion.report.charts.comparison import control_limits, draw_trend, follow, follow_trends, plot_profiles
 from fusion.report.comparison import (
     achieved_table,
@@ -18,6 +21,8 @@ from fusion.report.comparison import (
     conclude_comparison,
     conclude_table,
     describe_pair,
+    describe_places,
+    places_json,
     render_comparison,
     short_names,
     side_by_side,
@@ -244,3 +249,85 @@ def test_a_last_value_outside_its_limits_leads_the_document(tmp_path):
     said = "A of the last test, 12.0 µm, lies outside the control limits"
     assert page.count(said) == 1
     assert page.index(said) < page.index("figure-trend_A") < page.index("figure-profiles")
+
+
+AGREED = SourceAgreement(
+    "joint", 330.0, 90.0, (0, 1), (0.004, 0.004), (4.04, 5.75), (0.5, 0.6), (0.0, 0.0), True, False
+)
+ALONE = replace(
+    replace(AGREED, x_mm=405.0, y_mm=95.0, shown_by=(0,), agrees=False, power=0.97, agreed_near_mm=(330.0, 90.0, 75.2)),
+    p_value=(0.002, 0.006),
+    sensitivity_um_per_K=(3.76, 7.8),
+    sensitivity_u_um_per_K=(0.08, 0.85),
+    lag_s=(0.0, 600.0),
+    separate=True,
+)
+CHANNEL = ChannelAgreement("joint", "attributable", 330.0, 90.0, 0.004, (4.04, 5.75), (0.0, 0.0))
+FOUND = "as found (before the repair)"
+
+
+def with_places(pairs, *sources):
+    """The first comparison alone, of tests that show these sources."""
+    return [replace(pairs[0], places=PlaceComparison(xr.Dataset(), [CHANNEL], list(sources)))]
+
+
+def described(pairs, *sources):
+    compared = with_places(pairs, *sources)
+    found = describe_places(compared, compared[0])
+    return found, [row.cells for row in found["table"].rows]
+
+
+def test_a_neighbouring_place_is_told_apart_and_reconciled(pairs):
+    found, (first, second) = described(pairs, ALONE, AGREED)
+    assert (first[0], second[0]) == ("place 1", "place 2")
+    assert first[-1].startswith(f"shown by the test {FOUND} only; ") and "a different one: 3.8 and 7.8" in first[-1]
+    assert "75 mm both agree (place 2)" in first[-1]
+    assert second[-1].startswith("both tests agree here, but it is not a separate source")
+    assert found["said"][0] == "The two tests show no cause in common."
+    assert found["said"][1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
+    assert found["said"][2] == f"Only the test {FOUND} shows place 1." and found["causes"] == []
+
+
+def test_what_one_test_shows_alone_has_the_chance_of_the_other(pairs):
+    missed = replace(ALONE, p_value=(0.002, 0.6), agreed_near_mm=None, shown_by=(0,), power=0.31)
+    _, ((*_, shown, verdict),) = described(pairs, missed)
+    assert verdict.startswith(f"shown by the test {FOUND} only; ") and verdict.endswith("a probability of 31 %")
+    assert shown == "p 0.6, 7.8 ± 1.7 µm/K, lag 10 min"
+
+
+def test_a_cause_is_what_both_tests_show(pairs):
+    found, ((*_, verdict),) = described(pairs, replace(AGREED, separate=True))
+    assert verdict.startswith("a cause: both tests agree") and len(found["causes"]) == 1
+    assert found["said"][0].startswith("Both tests show the same cause: place 1")
+    assert found["rows"][0][1].endswith("larger p of both 0.004, 4.0 and 5.8 µm/K")
+    nothing, rows = described(pairs)
+    assert rows == [] and nothing["said"][0].startswith("Neither test shows a source")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "p", "reason"),
+    [
+        ("not separable", 0.004, "both tests are one warm-up each"),
+        ("attributable", 0.004, "both tests find this place"),
+        (
+            "not attributable",
+            0.004,
+            "both tests find a source near here, but not with the same place and size: +4.04 and",
+        ),
+        ("not attributable", 0.4, "no place is found by both tests"),
+    ],
+)
+def test_a_part_of_the_drift_has_the_reason_of_its_verdict(pairs, verdict, p, reason):
+    (compared,) = with_places(pairs)
+    compared.places.channels[:] = [replace(CHANNEL, verdict=verdict, p_value=p)]
+    assert places_json([compared], compared)["sources"][0]["reason"].startswith(reason)
+
+
+def test_the_page_escapes_titles_and_links_both_reports(pairs):
+    titled = pairs[0].before.results.model_copy(update={"campaign": "Monday <1>"})
+    (pair,) = with_places(pairs, ALONE, AGREED)
+    pair = replace(pair, before=replace(pair.before, results=titled))
+    page = render_comparison([pair], reports=["monday/report.html", "tuesday/report.html"])
+    assert "Monday &lt;1&gt;" in page and "<1>" not in page
+    assert 'href="monday/report.html"' in page and 'href="tuesday/report.html"' in page
+    assert "The two tests show no cause in common." in page

@@ -5,27 +5,13 @@ import re
 import shutil
 import stat
 import tempfile
-from dataclasses import replace
 
 import pytest
-import xarray as xr
 from playwright.sync_api import sync_playwright
 
-from fusion.analysis.attribution.two_sessions import ChannelAgreement, SessionComparison, SourceAgreement
 from fusion.report import page as pdf
-from fusion.report.page import (
-    ProductsError,
-    channel_sentence,
-    conclude_sessions,
-    describe_sources,
-    render_joint,
-    report_of,
-    session_names,
-    sources_table,
-)
-from fusion.results.results import assemble
+from fusion.report.page import ProductsError, report_of
 from tests.browser import CHROMIUM, record_faults
-from tests.fusion.results_sample import PARTS
 
 
 @pytest.fixture(scope="module")
@@ -215,69 +201,6 @@ def test_no_link_of_the_contents_hides_behind_the_button(opened):
         left, _, top, bottom = boxes[-1]
         assert all(right <= left or low <= top or high >= bottom for _, right, high, low in boxes[:-1])
         assert max(right for _, right, _, _ in boxes) <= width
-
-
-RESULTS = [assemble(title, PARTS, []) for title in ("Monday <1>", "Tuesday")]
-SESSIONS = session_names(RESULTS)
-AGREED = SourceAgreement(
-    "joint", 330.0, 90.0, (0, 1), (0.004, 0.004), (4.04, 5.75), (0.5, 0.6), (0.0, 0.0), True, False
-)
-ALONE = replace(
-    replace(AGREED, x_mm=405.0, y_mm=95.0, shown_by=(0,), agrees=False, power=0.97, agreed_near_mm=(330.0, 90.0, 75.2)),
-    p_value=(0.002, 0.006),
-    sensitivity_um_per_K=(3.76, 7.8),
-    sensitivity_u_um_per_K=(0.08, 0.85),
-    lag_s=(0.0, 600.0),
-    separate=True,
-)
-CHANNEL = ChannelAgreement(
-    "joint", "attributable", 330.0, 90.0, 0.004, (4.04, 5.75), (0.0, 0.0), "both sessions find this place"
-)
-
-
-def compared(*sources: SourceAgreement) -> SessionComparison:
-    return SessionComparison(xr.Dataset(), [CHANNEL], list(sources))
-
-
-def test_a_neighbouring_place_is_told_apart_and_reconciled():
-    both = compared(ALONE, AGREED)
-    first, second = describe_sources(both, SESSIONS)
-    assert (first.name, second.name) == ("place 1", "place 2")
-    assert (
-        first.verdict.startswith("shown by A (Monday <1>) only; ") and "a different one: 3.8 and 7.8" in first.verdict
-    )
-    assert "75 mm both agree (place 2)" in first.verdict
-    assert second.verdict.startswith("both sessions agree here, but it is not a separate source")
-    told = conclude_sessions(both, [first, second], SESSIONS)
-    assert told[0] == "The two sessions show no cause in common."
-    assert told[1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
-    assert told[2] == "Only A (Monday <1>) shows place 1."
-
-
-def test_what_one_session_shows_alone_has_the_chance_of_the_other():
-    missed = replace(ALONE, p_value=(0.002, 0.6), agreed_near_mm=None, shown_by=(0,), power=0.31)
-    (one,) = describe_sources(compared(missed), SESSIONS)
-    assert one.verdict.startswith("shown by A (Monday <1>) only; ") and one.verdict.endswith("a probability of 31 %")
-    assert one.shown[1] == "p 0.6, 7.8 ± 1.7 µm/K, lag 10 min"
-
-
-def test_a_cause_is_what_both_sessions_show():
-    cause = replace(AGREED, separate=True)
-    both = compared(cause)
-    words = describe_sources(both, SESSIONS)
-    assert words[0].verdict.startswith("a cause: both sessions agree")
-    assert conclude_sessions(both, words, SESSIONS)[0].startswith("Both sessions show the same cause: place 1")
-    assert channel_sentence(CHANNEL).endswith("larger p of both 0.004, 4.0 and 5.8 µm/K")
-    nothing = compared()
-    assert sources_table([], SESSIONS) is None
-    assert conclude_sessions(nothing, [], SESSIONS)[0].startswith("Neither session shows a source")
-
-
-def test_the_page_escapes_titles_and_links_both_reports():
-    page = render_joint(RESULTS, ["monday", "tuesday"], compared(ALONE, AGREED))
-    assert "Monday &lt;1&gt;" in page and "<1>" not in page
-    assert 'href="monday/report.html"' in page and 'href="tuesday/report.html"' in page
-    assert "The two sessions show no cause in common." in page
 
 
 def test_the_browser_that_is_named_must_exist():

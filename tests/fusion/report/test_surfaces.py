@@ -16,10 +16,10 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from fusion.analysis.comparison import compare_campaigns
 from fusion.app.results.charts import anomaly_cards, laser_charts, loop_steps
 from fusion.app.results.data import Linker, Products, Selection
 from fusion.app.results.screen import _outcome
+from fusion.pipeline.compare import compare_campaigns
 from fusion.pipeline.fleet import Row, render_fleet, with_findings, write_book
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests

@@ -16,10 +16,10 @@ import tifffile
 import xarray as xr
 
 from fusion.analysis.attribution.modes import read_regions
-from fusion.analysis.comparison import compare_campaigns
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_record
 from fusion.campaign.logs import read_drivers
+from fusion.pipeline.compare import compare_campaigns
 from fusion.pipeline.reproduce import reproduce
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import export_results
