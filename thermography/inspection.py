@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from thermography.common import ThermographyError
 from thermography.evaluation import RegionTable, measures_temperature, tabulate_regions
-from thermography.io.flir import FlirFrameReference, FlirReader, index_frames
-from thermography.io.frame import CalibratedRange, FlirFormatError, FrameReference, RejectedFrame
-from thermography.io.other_cameras import START_BYTES, StackOptions, TemperatureReader, find_reader, plug_ins
+from thermography.io.flir import FlirFrameReference, index_frames
+from thermography.io.frame import CalibratedRange, CameraParameters, FlirFormatError, FrameReference, RejectedFrame
+from thermography.io.other_cameras import Stack
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
@@ -90,11 +90,9 @@ class FlirInspection:
     def lines(self) -> list[str]:
         """Return the content as lines of text, the warnings last."""
         first, last = self.frames[0], self.frames[-1]
-        camera, p = first.camera, first.parameters
+        p = first.parameters
         rows, columns = first.shape
         count = f"{len(self.frames)} frames" if len(self.frames) > 1 else "1 frame"
-        lens = f", lens {camera.lens_model}" if camera.lens_model else ""
-        serial = f", serial {camera.serial}" if camera.serial else ""
         times = f"{first.time} UTC" if len(self.frames) == 1 else f"{first.time} to {last.time} UTC"
         zone = f"{first.utc_offset_minutes / 60:+g} h" if first.utc_offset_minutes else "UTC"
         housekeeping = ", ".join(
@@ -105,11 +103,9 @@ class FlirInspection:
         packing = f", samples {first.samples.encoding}" if isinstance(first, FlirFrameReference) else ""
         lines = [
             f"{self.path}: FLIR, {count} of {columns} x {rows}{packing}",
-            f"  camera {camera.model or 'unknown'}{serial}{lens}",
+            f"  {describe_camera(self.frames[:1])}",
             f"  time {times} (camera set to {zone})",
-            f"  emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
-            f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
-            f"relative humidity {p.relative_humidity:.0%}, window transmission {p.window_transmission:.3g}",
+            f"  {describe_scene(p)}, window transmission {p.window_transmission:.3g}",
             f"  R1 {p.planck_r1:.9g}, B {p.planck_b:.7g}, F {p.planck_f:.7g}, O {p.planck_o:g}, R2 {p.planck_r2:.8g}",
             *(f"  {line}" for line in describe_evaluation(self.evaluation)),
         ]
@@ -119,13 +115,6 @@ class FlirInspection:
             lines.append(f"  inside the camera, °C: {housekeeping}")
         lines += [f"  note: {note}" for note in dict.fromkeys(note for frame in self.frames for note in frame.notes)]
         return lines + [f"  warning: {each.message} {each.remedy}" for each in self.warnings]
-
-
-def is_flir_file(path: Path) -> bool:
-    """Return whether a run reads a file as one of FLIR: it starts as a JPEG or an FFF record, and no plug-in recognises it."""
-    with Path(path).open("rb") as file:
-        start = file.read(START_BYTES)
-    return FlirReader().recognises(path, start) and not any(reader.recognises(path, start) for reader in plug_ins())
 
 
 def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
@@ -191,6 +180,22 @@ def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
         *(_check_transmission(evaluation) if evaluation else ()),
     ]
     return FlirInspection(path, tuple(references), tuple(rejected), evaluation, tuple(warnings))
+
+
+def describe_camera(frames: Sequence[FrameReference]) -> str:
+    """Say which camera, with serial number and lenses, recorded frames."""
+    camera = frames[0].camera
+    lenses = " and ".join(sorted({frame.camera.lens_model for frame in frames} - {""}))
+    return f"camera {camera.model or 'unknown'}{f', serial {camera.serial}' if camera.serial else ''}{f', lens {lenses}' if lenses else ''}"
+
+
+def describe_scene(p: CameraParameters) -> str:
+    """Say what a camera was told of the scene."""
+    return (
+        f"emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
+        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
+        f"relative humidity {p.relative_humidity:.0%}"
+    )
 
 
 def describe_range(limits: CalibratedRange) -> str:
@@ -267,34 +272,28 @@ def _describe_region(evaluation: RegionTable, rows: NDArray[np.intp], place: int
     return f"maximum {highest}; minimum {extreme('minimum', coldest, 'at most', 'underrange')}; mean {mean}"
 
 
-def describe_stack(path: Path) -> list[str]:
+def describe_stack(stack: Stack) -> list[str]:
     """Return the content of a file of temperatures as lines of text, and the remarks on it."""
-    reader = find_reader(path)
-    if not isinstance(reader, TemperatureReader):
-        raise ThermographyError(f"{path}: not a known file of temperatures; docs/formats.md lists them")
-    # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
-    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
-    contents = reader.frame_contents(path, stored)
+    contents, values = stack.contents, np.asarray(stack.first, float)
     rows, columns = contents.shape
     count = f"{contents.frames} frames" if contents.frames > 1 else "1 frame"
-    values = np.asarray(reader.read_values(path, 0, stored), float)
     finite = values[np.isfinite(values)]
     span = f"{finite.min():.6g} to {finite.max():.6g}" if finite.size else "no number"
     lines = [
-        f"{path}: {reader.name}, {count} of {columns} x {rows}",
-        f"  values of the first frame {span} {contents.unit}".rstrip(),
+        f"{stack.reader.name}, {count} of {columns} x {rows}",
+        f"values of the first frame {span} {contents.unit}".rstrip(),
     ]
     if finite.size < values.size:
-        lines.append(f"  {values.size - finite.size} of {values.size} pixels of the first frame are not numbers")
+        lines.append(f"{values.size - finite.size} of {values.size} pixels of the first frame are not numbers")
     if contents.emissivity is not None:
-        lines.append(f"  calculated with the emissivity {contents.emissivity:g}")
+        lines.append(f"calculated with the emissivity {contents.emissivity:g}")
     if contents.times is not None:
-        lines.append(f"  {contents.times[0]} to {contents.times[-1]} {'UTC' if contents.zoned else 'without zone'}")
+        lines.append(f"{contents.times[0]} to {contents.times[-1]} {'UTC' if contents.zoned else 'without zone'}")
     missing = [] if contents.unit else ["unit"]
     if contents.times is None:
         series = "" if contents.frames > 1 else "of a series "
         missing.append(f"{series}time_in_name, times, or start and interval")
-    return lines + ([f"  state under [thermography.stack]: {'; '.join(missing)}"] if missing else [])
+    return lines + ([f"state under [thermography.stack]: {'; '.join(missing)}"] if missing else [])
 
 
 def _warning(code: str, message: str) -> FileWarning:

@@ -19,6 +19,7 @@ from sphinx.application import Sphinx
 import thermofuse
 from fusion import cli
 from fusion.campaign.config import campaign_schema
+from fusion.campaign.inspect import Kind
 from fusion.results.results import results_schema
 from fusion.twin.recipe_file import recipe_schema
 
@@ -222,6 +223,13 @@ def command_page() -> str:
     return text.partition("\n")[2]
 
 
+def kinds_of_file() -> str:
+    """Return a table of the kinds of files that are recognised, with the key of the campaign file that names one."""
+    kinds = [kind.value for kind in Kind if kind not in (Kind.UNKNOWN, Kind.UNREADABLE)]
+    rows = [f"| {kind.words} | {f'`{kind.key}`' if kind.key else ''} |" for kind in kinds]
+    return "\n".join(["| kind | key |", "|---|---|", *rows]) + "\n"
+
+
 def measured_table(rows: Sequence[Mapping[str, str]]) -> str:
     """Return the figures of one section that are shown in `measured.md`; the last column is the aim where any row has one."""
     last = "aim" if any(row["aim"] for row in rows) else "n"
@@ -272,6 +280,7 @@ def write_pages(app: Sphinx) -> None:
             campaign_schema(), (reference / "campaign-file.md").read_text(encoding="utf-8")
         ),
         generated / "recipe.md": schema_page(recipe_schema()),
+        generated / "kinds.md": kinds_of_file(),
         generated / "results.md": schema_page(results_schema()),
     }
     for path, text in pages.items():

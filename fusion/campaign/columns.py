@@ -204,9 +204,9 @@ class TableProposal:
         return replace(self, columns=tuple(columns), keys=keys, asked=asked)
 
 
-def propose_runs(paths: Sequence[Path]) -> TableProposal:
+def propose_runs(tables: Sequence[TableProposal]) -> TableProposal:
     """Propose for several tables with the same headings: as for the first, without the columns that one of them cannot give."""
-    first, *others = map(propose_table, paths)
+    first, *others = tables
     lost = {column.heading for other in others for column in other.of("out") if column.remark == _NO_NUMBERS}
     columns = [
         replace(one, role="out", remark="not in every run") if one.heading in lost else one for one in first.columns

@@ -14,21 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from fusion.campaign.columns import ROLES, ColumnsError, TableProposal, propose_runs
-from fusion.campaign.inspect import (
-    FolderContent,
-    Kind,
-    Recognised,
-    scan_folder,
-)
+from fusion.campaign.inspect import FolderContent, Kind, Recognised, scan_folder
 from fusion.campaign.values import QuantityError, column_conversion, read_quantity, role_of_unit
 from fusion.common import FusionError
 from fusion.results.progress import counted
 from fusion.results.store import is_text, write_text
 from interferometry.common import InterferometryError
-from interferometry.io.readings import read_deviations
 from interferometry.io.tables import NO_ZONE
-from thermography.io.other_cameras import StackOptions, TemperatureReader, find_reader
-from thermography.registration.plan import Fiducial, read_fiducials
+from thermography.io.other_cameras import read_stack
+from thermography.registration.plan import Fiducial
 
 # What the files of a folder cannot tell: asked at the terminal, or left as a marked line to be filled in.
 
@@ -94,13 +88,6 @@ _PLACES = ("pixels", "fiducials")
 _NOT_USED = "# Files in this folder that are not used:"
 #: Kinds that no campaign reads.
 _NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE)
-#: What can be done with a file that is not used.
-_HINTS = {
-    Kind.DEVIATIONS: "; one campaign takes one file of deviations: join the tables of one test",
-    Kind.STACK: ", not mixed with the frames of a FLIR camera",
-    Kind.RECORD: "; the runs of one record have the same columns, another record is a campaign of its own",
-    Kind.PLACES: ", for [sensors] together with [plan]: docs/reference/campaign-file.md",
-}
 #: Values above this are kelvins and no temperatures of a machine table in degC.
 _WARMEST_DEGC = 150.0
 #: The name of an axis as a word of its own, and the line of a header that holds it: its heading, or the channel of an ecmc log's targets.
@@ -240,7 +227,7 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     if not (content.frames or readings or records):
         others = [one for kind, files in content.files.items() if kind not in _NO_INPUT for one in files]
         told = [*content.unknown, *others][:3]
-        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason or one.kind}" for one in told)
+        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason or one.kind.value.words}" for one in told)
         raise DraftError(
             f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
             + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
@@ -251,14 +238,14 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield "[campaign]"
     yield f"title = {_quoted(asker.text(_TITLE, content.folder.name or 'Campaign'))}"
     if readings:
-        yield from _axis(readings[0].path, asker)
+        yield from _axis(readings[0], asker)
     yield from _time_zone(readings, asker)
     if content.frames:
         yield from _thermography(content, asker, along_axis=bool(readings))
         yield from _plan(content, asker, along_axis=bool(readings))
     if readings:
         yield from _interferometry(content, asker)
-        yield from _report(asker, linear=_attributes(readings[0].path).get("units") != "arcsec")
+        yield from _report(asker, linear=_attributes(readings[0]).get("units") != "arcsec")
     if content.frames or readings:
         yield from _drivers(content)
     else:
@@ -281,15 +268,18 @@ def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
     left = [one for one in measured if _quoted(content.relative(one.path)) not in active]
     if left or content.unknown:
         yield from ("", _NOT_USED)
-        yield from (f"#   {_plain(content.relative(one.path))}: {one.kind}{_HINTS.get(one.kind, '')}" for one in left)
+        yield from (
+            f"#   {_plain(content.relative(one.path))}: {one.kind.value.words}{one.kind.value.unused}" for one in left
+        )
         yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
 
 
-def _axis(path: Path, asker: Asker) -> Iterator[str]:
+def _axis(readings: Recognised, asker: Asker) -> Iterator[str]:
     """Yield the axis of a file of deviations: as its header, its name or its folder says, else as answered."""
+    path = readings.path
     with path.open("rb") as stream:
         header = " ".join(_AXIS_LINE.findall(stream.read(_HEADER).decode("utf-8", errors="replace")))
-    stated = json.loads(_attributes(path).get("user_text", "{}")).get("axis", "")
+    stated = json.loads(_attributes(readings).get("user_text", "{}")).get("axis", "")
     for source in (stated, header, path.stem, path.parent.name):
         found = {name.upper() for name in _AXIS.findall(source)}
         if len(found) == 1:
@@ -301,7 +291,7 @@ def _axis(path: Path, asker: Asker) -> Iterator[str]:
 
 def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
     """Yield the zone of times that the readings give without one."""
-    without = [one.path.name for one in readings if _attributes(one.path).get("reference") == NO_ZONE]
+    without = [one.path.name for one in readings if _attributes(one).get("reference") == NO_ZONE]
     if not without:
         yield '# time_zone = "Europe/Vienna"            # only where files give times without their zone'
         return
@@ -334,15 +324,11 @@ def _thermography(content: FolderContent, asker: Asker, *, along_axis: bool) -> 
 def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
     """Yield what files of temperatures do not hold themselves."""
     first = content.frame_files[0]
-    reader = find_reader(first)
-    assert isinstance(reader, TemperatureReader)
-    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
-    contents = reader.frame_contents(first, stored)
+    _, contents, values = read_stack(first)
     yield '# camera_offset_u = "1 K"                  # accuracy in the camera\'s data sheet; left out = that of an uncooled camera'
     yield from [_STILL] if along_axis else []
     yield from _optional("lens", content, Kind.LENS)
     yield from ("", "[thermography.stack]                     # temperatures of another camera: docs/formats.md")
-    values = reader.read_values(first, 0, stored)
     if values.dtype.kind in "iu":
         yield f'scale = {_quoted(TO_FILL)}   # of one count, for example 0.04 with unit = "K"'
     if not contents.unit:
@@ -382,7 +368,7 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
             return
     yield ""
     yield "[plan]                                   # the table in mm: x to the right, y down, from one corner"
-    fiducials = read_fiducials(listed[0].path) if listed else []
+    fiducials: list[Fiducial] = listed[0].content if listed else []
     width, height = _extent(fiducials)
     sides = {"Width (x)": width, "Height (y)": height}
     size = [asker.quantity(f"{name} of the plan", "mm", default) for name, default in sides.items()]
@@ -407,16 +393,15 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
 
 
 def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
-    readings = content.of(Kind.DEVIATIONS)
-    names = tuple(content.relative(one.path) for one in readings)
-    chosen = asker.choice("Which file holds the deviations", names)
+    readings = {content.relative(one.path): one for one in content.of(Kind.DEVIATIONS)}
+    chosen = asker.choice("Which file holds the deviations", tuple(readings))
     yield from ("", "[interferometry]")
     yield f"deviations = {_quoted(chosen)}"
-    yield from (f"# deviations = {_quoted(name)}   # also found" for name in names if name != chosen)
+    yield from (f"# deviations = {_quoted(name)}   # also found" for name in readings if name != chosen)
     yield from _optional(
         "environment", content, Kind.ENVIRONMENT, lacking='# environment = "environment.csv"   # none was found'
     )
-    known = _attributes(content.folder / chosen)
+    known = _attributes(readings[chosen])
     if known.get("units") == "arcsec":
         yield "# a rotary axis: neither expansion nor dead path enter its angles"
         return
@@ -452,10 +437,10 @@ def _material_sensor(asker: Asker) -> str:
     return example
 
 
-def _attributes(path: Path) -> dict[str, str]:
+def _attributes(readings: Recognised) -> dict[str, str]:
     """Return what is known of a file of deviations and of its times; nothing where it cannot be read, which the check says."""
     try:
-        deviations = read_deviations(path, rotary=True)
+        deviations = readings.content
         known = {**deviations.attrs, **deviations["time"].attrs, "units": deviations["deviation"].attrs["units"]}
         return {str(name): str(value) for name, value in known.items()}
     except InterferometryError:
@@ -550,11 +535,9 @@ def _calibrated(asker: Asker) -> str:
 
 
 def _drivers(content: FolderContent) -> Iterator[str]:
-    listed = content.of(Kind.DRIVERS)
-    if listed:
+    if content.of(Kind.DRIVERS):
         yield from ("", "[drivers]")
-        yield f"file = {_quoted(content.relative(listed[0].path))}"
-        yield from _others("file", content, listed)
+        yield from _optional("file", content, Kind.DRIVERS)
     if content.frames and content.of(Kind.DEVIATIONS):
         yield from ("", "[model]", 'declared = ["axis_expansion", "table_offset"]')
 
@@ -564,7 +547,7 @@ def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker)
     first = records[0]
     runs = [one for one in records if sorted(one.headings) == sorted(first.headings)]
     name = content.relative(first.path)
-    table = _confirmed(propose_runs([one.path for one in runs]), name, asker)
+    table = _confirmed(propose_runs([one.content for one in runs]), name, asker)
     yield from ("", "[record]                                 # temperatures and displacements over time")
     names = [_quoted(content.relative(one.path)) for one in runs]
     yield f"files = [{', '.join(names)}]" if len(names) > 1 else f"file = {names[0]}"

@@ -336,16 +336,16 @@ def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
         if campaign.interferometry is not None:
             common |= read_laser(campaign)
         _refuse_mixed_logs(campaign, common)
+        source: LaserInputs | CameraInputs | Source
         if campaign.thermography is None:
-            laser = LaserInputs(**common)
-            laser.notices[:0] = _laser_notices(laser)
-            return laser
-        if campaign.interferometry is None:
-            camera = CameraInputs(**common, **_read_camera(campaign, None))
-            camera.notices[:0] = [*_camera_notices(camera), *_log_notices(camera)]
-            return camera
-        source = _read_both(campaign, common)
-        source.notices[:0] = [*_camera_notices(source), *_laser_notices(source)]
+            source = LaserInputs(**common)
+            source.notices[:0] = _laser_notices(source)
+        elif campaign.interferometry is None:
+            source = CameraInputs(**common, **_read_camera(campaign, None))
+            source.notices[:0] = [*_camera_notices(source), *_log_notices(source)]
+        else:
+            source = _read_both(campaign, common)
+            source.notices[:0] = [*_camera_notices(source), *_laser_notices(source)]
         return source
 
 
@@ -523,32 +523,34 @@ def _read_frames(campaign: Campaign, *, several_cameras: bool) -> tuple[FrameLis
     ]
 
 
+def _by_camera(frames: FrameList) -> tuple[NDArray[np.str_], dict[str, int]]:
+    """Return camera and size of every frame, and how many frames each has, the one with most of them first."""
+    names = camera_names(frames).astype(str)
+    listed_names, first, counts = np.unique(names, return_index=True, return_counts=True)
+    return names, {str(listed_names[k]): int(counts[k]) for k in np.lexsort((first, -counts))}
+
+
 def _series(pictures: FrameList) -> FrameList:
     """Return the frames of the camera that took most of them, which have a time; none where it took no more than the others."""
     if len(pictures) == 1:
         return pictures
-    names, timed = camera_names(pictures), ~np.isnat(pictures.times)
-    listed, first, counted = np.unique(names.astype(str), return_index=True, return_counts=True)
-    most = min(range(listed.size), key=lambda k: (-counted[k], first[k])) if listed.size else 0
-    chosen = timed & (names == listed[most]) if listed.size else timed
+    names, counts = _by_camera(pictures)
+    chosen = ~np.isnat(pictures.times) & (names == next(iter(counts), ""))
     return pictures.choose(chosen & (2 * chosen.sum() > chosen.size))
 
 
 def _of_one_camera(frames: FrameList, path: Path) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
     """Keep the frames of the camera and size that took most of them; the others with camera and time as the reason."""
-    names = camera_names(frames).astype(str)
-    listed_names, first, counts = np.unique(names, return_index=True, return_counts=True)
-    if listed_names.size < 2:
+    names, counts = _by_camera(frames)
+    if len(counts) < 2:
         return frames, []
-    order = np.lexsort((first, -counts))
-    cameras = {name.rpartition(",")[0] for name in listed_names}
-    if len(cameras) > 1 and 2 * counts.max() <= len(frames):
-        of_each = "; ".join(f"{counts[k]} of {listed_names[k]}" for k in order)
+    cameras, most = {name.rpartition(",")[0] for name in counts}, next(iter(counts))
+    if len(cameras) > 1 and 2 * counts[most] <= len(frames):
+        of_each = "; ".join(f"{count} of {name}" for name, count in counts.items())
         raise SourceError(
             f"{path}: thermography.frames matches {len(frames)} frames of {len(cameras)} cameras, none of which took most of them, so they "
             f"are no series: {of_each}; name the frames of one camera"
         )
-    most = listed_names[order[0]]
     return frames.choose(names == most), [
         (frame, f"{name}, taken {utc(frame.time)}, {_OTHER_CAMERA} {most}")
         for frame, name in zip(frames.choose(names != most), names[names != most], strict=True)

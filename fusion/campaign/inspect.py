@@ -6,16 +6,20 @@ import codecs
 import itertools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
-from enum import StrEnum
+from enum import Enum
+from errno import EINVAL, ENOENT
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.campaign.values import column_unit, in_order, is_displacement, is_temperature, is_time
+import fusion
+import interferometry
+from fusion.campaign.values import column_unit, in_order, is_time
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.messages import unforeseen
 from fusion.results.folder import MANIFEST
@@ -23,18 +27,27 @@ from fusion.results.numbers import duration, join, moment, print_unit
 from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
 from interferometry.common import InterferometryError
 from interferometry.io.faults import LaserFormatError
-from thermography.common import ZERO_CELSIUS_K, ThermographyError
+from thermography.common import ThermographyError
 from thermography.evaluation import tabulate_regions
 from thermography.inspection import (
     check_series,
+    describe_camera,
     describe_evaluation,
+    describe_scene,
     describe_stack,
     inspect_file,
-    is_flir_file,
 )
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CameraParameters
-from thermography.io.other_cameras import TemperatureReader, TextReader, find_reader, name_unread
+from thermography.io.other_cameras import (
+    FrameReader,
+    TemperatureReader,
+    TextReader,
+    find_reader,
+    is_of_flir,
+    name_unread,
+    read_stack,
+)
 from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 
@@ -44,7 +57,7 @@ if TYPE_CHECKING:
     from fusion.campaign.columns import TableProposal
 
 
-# What kind of file something is, recognised by its content: the campaign's own files, recordings, logs and plans.
+# What kind of file something is: each kind declared once, with how it is recognised by its content, read and described.
 
 #: Bytes that are read to tell the kind of a text.
 _START = 65_536
@@ -52,223 +65,287 @@ _START = 65_536
 _LONGEST_REASON = 160
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
-
-
-class Kind(StrEnum):
-    """Kinds of files, in the words of a message."""
-
-    CAMPAIGN = "campaign file"
-    RECIPE = "recipe of a simulation"
-    FRAMES = "thermal frames"
-    STACK = "frames of temperatures"
-    DEVIATIONS = "deviations"
-    ENVIRONMENT = "environment log"
-    FIDUCIALS = "fiducials"
-    REGIONS = "regions of the plan"
-    PLACES = "places of contact sensors"
-    LENS = "lens calibration"
-    DRIVERS = "log of drivers"
-    RECORD = "record of temperatures and displacements"
-    UNKNOWN = "not understood"
-    UNREADABLE = "cannot be opened"
+#: Units of the temperatures and of the displacements of a record.
+_OF_A_RECORD = ({"degC", "K", "degF"}, {"um", "nm", "mm", "in", "mil"})
+#: Columns of a table of places on the plan.
+_PLACE = {"name", "x_mm", "y_mm"}
 
 
 @dataclass(frozen=True)
+class FileKind:
+    """A kind of file, in the words of a message, and how it is recognised, read and described.
+
+    ``sniff`` recognises it; ``read`` returns its content; ``describe`` says in lines what was read; ``key`` of the campaign file names such
+    a file; ``may_be`` recognises what no kind sniffs; ``unused`` is what can be done with a file that a campaign does not use.
+    """
+
+    words: str
+    sniff: Callable[[Recognised], bool] = lambda found: False
+    read: Callable[[Path], Any] = lambda path: None
+    describe: Callable[[Recognised], list[str]] = lambda found: []
+    key: str = ""
+    may_be: Callable[[Recognised], bool] = lambda found: False
+    unused: str = ""
+
+
+@dataclass(eq=False)
 class Recognised:
-    """A file and its kind, why it is not understood or cannot be opened, and of a table the headings of its columns."""
+    """A file and its kind, or why it is not understood or cannot be opened; each of its parts is read once, when it is needed."""
 
     path: Path
     kind: Kind
     reason: str = ""
-    headings: tuple[str, ...] = ()
+
+    @cached_property
+    def content(self) -> Any:
+        """What the reader of its kind returns."""
+        return (self.kind is Kind.RECORD and self.logged) or self.kind.value.read(self.path)
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """Headings of a record, as its first line or, where that holds none, its proposed columns have them."""
+        return self.first_line if _names_a_record(self) else tuple(one.heading for one in self.content.columns)
+
+    @cached_property
+    def tables(self) -> Container[str]:
+        """Names of the tables of a TOML file; none of another one."""
+        try:
+            return read_toml(self.path)[0] if self.path.suffix.lower() == ".toml" else ()
+        except (TomlError, UnicodeDecodeError) as error:
+            raise FusionError(f"this is not TOML: {error}") from None
+
+    @cached_property
+    def reader(self) -> FrameReader | None:
+        """Reader of frames that recognises the file."""
+        return find_reader(self.path)
+
+    @cached_property
+    def text(self) -> str | None:
+        """Beginning of a text; None where the file is no text."""
+        # Not before: frames are looked into without xarray.
+        from interferometry.io.tables import decode_text
+
+        with self.path.open("rb") as file:
+            start = file.read(_START)
+        if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return start.decode("utf-16", errors="ignore")
+        if b"\0" in start:
+            return None
+        if len(start) == _START and b"\n" in start:
+            # A character may be cut in two by the end of what was read.
+            start = start[: start.rindex(b"\n")]
+        try:
+            return decode_text(self.path, start)
+        except LaserFormatError:
+            return None
+
+    @cached_property
+    def first_line(self) -> tuple[str, ...]:
+        """Fields of the first line that is neither empty nor a comment, or of the first line of a spreadsheet; none of other files."""
+        from interferometry.io.spreadsheets import is_workbook, read_sheets
+        from interferometry.io.tables import delimiter_of, fields_of, find_header
+
+        if self.text is not None:
+            _, line = find_header(self.text.splitlines())
+            fields = fields_of(line, delimiter_of(line) or ",")
+        elif is_workbook(self.path.read_bytes()):
+            fields = next(iter(read_sheets(self.path).values()))[0][1]
+        else:
+            fields = []
+        return tuple(name.strip() for name in fields)
+
+    @cached_property
+    def logged(self) -> TableProposal | None:
+        """Proposal for a table of something over time; None where the file is none, or one of readings, whatever it lacks."""
+        from interferometry.io.tables import read_heading
+
+        try:
+            roles = {read_heading(name).role for name in self.first_line}
+            of_a_laser = len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
+            return None if of_a_laser else _read_record(self.path)
+        except (FusionError, InterferometryError):
+            return None
 
 
-def recognise(path: Path) -> Recognised:
-    """Tell the kind of a file by its content; one on which a reader fails, in whatever way, is not understood and stops no other."""
-    try:
-        return _by_content(path)
-    except Exception as error:
-        kind, reason = _why_not(path, error)
-        return Recognised(path, kind, reason)
+def _is_recipe(found: Recognised) -> bool:
+    return any(name in found.tables for name in _RECIPE)
 
 
-def _why_not(path: Path, error: Exception) -> tuple[Kind, str]:
-    """Return the kind of a file that a reader failed on, and why in words: its own, or that nobody has foreseen it."""
-    if isinstance(error, OSError):
-        return Kind.UNREADABLE, str(error.strerror or error)
-    if isinstance(error, (FusionError, ThermographyError, InterferometryError)):
-        return Kind.UNKNOWN, str(error).removeprefix(str(path)).lstrip(":, ")
-    return Kind.UNKNOWN, f"{unforeseen(error)}; please report it with the file"
+def _is_campaign(found: Recognised) -> bool:
+    if found.tables != () and not any(name in found.tables for name in _TABLES):
+        raise FusionError("neither a campaign nor a recipe: no table of either")
+    return found.tables != ()
 
 
-def _by_content(path: Path) -> Recognised:
-    """Tell the kind of a file by its content; raise what its readers do not expect."""
-    if path.is_symlink() and not path.exists():
-        return Recognised(path, Kind.UNREADABLE, f"a link to {path.readlink()}, where there is no file")
-    if path.exists() and not path.is_file():
-        return Recognised(path, Kind.UNREADABLE, "is a pipe, a socket or a device; name a file")
-    if path.suffix.lower() == ".toml":
-        return _toml(path)
-    if is_flir_file(path):
-        references, rejected = index_frames([path])
-        return Recognised(path, Kind.FRAMES) if references else Recognised(path, Kind.UNKNOWN, rejected[0].reason)
-    reader = find_reader(path)
-    if isinstance(reader, TemperatureReader) and not isinstance(reader, TextReader):
-        return Recognised(path, Kind.STACK)
-    if reader is not None and not isinstance(reader, TextReader):
-        reason = f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
-        return Recognised(path, Kind.UNKNOWN, reason)
-    if reader is None and (what := name_unread(path)):
-        return Recognised(path, Kind.UNKNOWN, what)
-    text = _text_start(path)
-    if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
-        return Recognised(path, Kind.LENS)
-    if text is not None and isinstance(reader, TextReader) and reader.begins_a_frame(text):
-        return Recognised(path, Kind.STACK)
-    # Not before: frames are looked into without xarray.
-    from interferometry.io.readings import is_environment_log, read_deviations
-    from interferometry.io.tables import read_table
-
-    headings: tuple[str, ...] = ()
-    try:
-        headings = _headings(text) if text is not None else _sheet_headings(path)
-        kind = _by_headings(headings)
-        if kind is Kind.REGIONS:
-            # A sensor has one place; a region has a line for each of its corners.
-            names = [
-                fields["name"].strip() for _, fields in read_table(path, ("name",)).records() if fields is not None
-            ]
-            kind = Kind.PLACES if 1 < len(names) == len(set(names)) else kind
-        if kind is None:
-            kind = Kind.ENVIRONMENT if is_environment_log(path) else Kind.DEVIATIONS
-        if kind is Kind.DEVIATIONS and not _holds_deviations(path):
-            read_deviations(path, rotary=True)
-    except InterferometryError as error:
-        # Text may be one frame of temperatures; what is neither is refused as the table that it is not.
-        if isinstance(reader, TextReader) and reader.holds_a_frame(path):
-            return Recognised(path, Kind.STACK)
-        table = None if _of_a_laser(headings) else _logged_table(path)
-        if table is not None and table.may_be_record:
-            return Recognised(path, Kind.RECORD, headings=tuple(column.heading for column in table.columns))
-        if table is not None:
-            return Recognised(path, Kind.UNKNOWN, table.lacks)
-        reason = str(error).removeprefix(f"{path}").lstrip(":, ")
-        shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
-        return Recognised(path, Kind.UNKNOWN, shortened)
-    return Recognised(path, kind, headings=headings)
+def _holds_counts(found: Recognised) -> bool:
+    reader = found.reader
+    if reader is None and (what := name_unread(found.path)):
+        raise FusionError(what)
+    if reader is None or isinstance(reader, TemperatureReader):
+        return False
+    if not is_of_flir(reader):
+        raise FusionError(
+            f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run reads them"
+        )
+    references, rejected = index_frames([found.path])
+    if not references:
+        raise ThermographyError(rejected[0].reason)
+    return True
 
 
-def _of_a_laser(headings: Sequence[str]) -> bool:
-    """Return whether headings are those of a table of readings, whatever it lacks."""
-    from interferometry.io.tables import read_heading
-
-    roles = {read_heading(name).role for name in headings}
-    return len(roles & {"cycle", "direction", "target", "position", "measured", "deviation"}) > 1
+def _holds_temperatures(found: Recognised) -> bool:
+    if isinstance(found.reader, TextReader):
+        return found.text is not None and found.reader.begins_a_frame(found.text)
+    return isinstance(found.reader, TemperatureReader)
 
 
-def _logged_table(path: Path) -> TableProposal | None:
-    """Return the proposal for a table of something over time, None where a file is no table."""
+def _is_lens(found: Recognised) -> bool:
+    return any(name in (found.text or "") for name in ("camera_matrix", "cameraMatrix"))
+
+
+def _lists_fiducials(found: Recognised) -> bool:
+    return {*_PLACE, "diameter_mm"} <= set(found.first_line)
+
+
+def _lists_places(found: Recognised) -> bool:
+    return set(found.first_line) >= _PLACE
+
+
+def _lists_sensors(found: Recognised) -> bool:
+    # A sensor has one place; a region has a line for each of its corners.
+    names = _read_names(found.path) if _lists_places(found) else []
+    return 1 < len(names) == len(set(names))
+
+
+def _names_a_record(found: Recognised) -> bool:
+    units = {column_unit(name) for name in found.first_line}
+    return any(map(is_time, found.first_line)) and all(units & of_role for of_role in _OF_A_RECORD)
+
+
+def _logs_drivers(found: Recognised) -> bool:
+    units = [column_unit(name) for name in found.first_line if name != "time"]
+    return "time" in found.first_line and len(found.first_line) > 1 and all(units)
+
+
+def _logs_environment(found: Recognised) -> bool:
+    from interferometry.io.readings import is_environment_log
+
+    return is_environment_log(found.path)
+
+
+def _holds_deviations(found: Recognised) -> bool:
+    from interferometry.io.readings import holds_deviations
+
+    if not holds_deviations(found.path):
+        interferometry.read_deviations(found.path, rotary=True)  # says what is missing
+    return True
+
+
+def _read_record(path: Path) -> TableProposal:
     from fusion.campaign.columns import propose_table
 
-    try:
-        return propose_table(path)
-    except (FusionError, InterferometryError):
-        return None
+    return propose_table(path)
 
 
-def _holds_deviations(path: Path) -> bool:
-    """Whether a file has the columns of deviations, whatever is in them; where not, its reader says what is missing."""
-    from interferometry.io.readings import find_long_table, find_wide_table
-    from interferometry.io.renishaw import is_ecmc_log
-    from interferometry.io.tables import read_grids
+def _read_names(path: Path) -> list[str]:
+    from interferometry.io.tables import read_table
 
-    with path.open("rb") as stream:
-        start = stream.read(4096)
-    if b"HEADER::" in start or is_ecmc_log(start):
-        return True
-    return any(find_long_table(grid) is not None or find_wide_table(grid) is not None for grid in read_grids(path))
+    return [fields["name"].strip() for _, fields in read_table(path, ("name",)).records() if fields is not None]
 
 
-def _toml(path: Path) -> Recognised:
-    """Tell campaign files from recipes by their tables."""
-    try:
-        content, _ = read_toml(path)
-    except (TomlError, UnicodeDecodeError) as error:
-        return Recognised(path, Kind.UNKNOWN, f"this is not TOML: {error}")
-    if any(name in content for name in _RECIPE):
-        return Recognised(path, Kind.RECIPE)
-    if any(name in content for name in _TABLES):
-        return Recognised(path, Kind.CAMPAIGN)
-    return Recognised(path, Kind.UNKNOWN, "neither a campaign nor a recipe: no table of either")
+def _read_regions(path: Path) -> Any:
+    from fusion.analysis.attribution.modes import read_regions
+
+    return read_regions(path)
 
 
-def _text_start(path: Path) -> str | None:
-    """Return the beginning of a text; None where the file is no text."""
-    from interferometry.io.tables import decode_text
+def _read_lens(path: Path) -> Any:
+    from thermography.registration.projection import read_lens  # compiled: other files are described without it
 
-    with path.open("rb") as file:
-        start = file.read(_START)
-    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return start.decode("utf-16", errors="ignore")
-    if b"\0" in start:
-        return None
-    if len(start) == _START and b"\n" in start:
-        # A character may be cut in two by the end of what was read.
-        start = start[: start.rindex(b"\n")]
-    try:
-        return decode_text(path, start)
-    except LaserFormatError:
-        return None
+    return read_lens(path)
 
 
-def _headings(text: str) -> tuple[str, ...]:
-    """Return the fields of the first line that is neither empty nor a comment."""
-    from interferometry.io.tables import fields_of
-
-    line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    return tuple(name.strip() for name in fields_of(line, max(",;\t", key=line.count)))
+def _describe_recipe(found: Recognised) -> list[str]:
+    title = found.content.get("campaign", {}).get("title", "")
+    return [f"recipe of a simulation, {title}".rstrip(", "), f"thermofuse simulate {found.path} --out FOLDER"]
 
 
-def _by_headings(headings: tuple[str, ...]) -> Kind | None:
-    """Return the kind whose columns these are, None where they are of no kind of its own."""
-    names = set(headings)
-    if {"name", "x_mm", "y_mm"} <= names:
-        return Kind.FIDUCIALS if "diameter_mm" in names else Kind.REGIONS
-    if all(any(map(of_kind, headings)) for of_kind in (is_time, is_temperature, is_displacement)):
-        return Kind.RECORD
-    if "time" in names and len(headings) > 1 and all(column_unit(name) for name in headings if name != "time"):
-        return Kind.DRIVERS
-    return None
+def _describe_campaign(found: Recognised) -> list[str]:
+    campaign = found.content
+    named = ("thermography", "plan", "interferometry", "drivers", "record")
+    tables = [f"[{name}]" for name in named if getattr(campaign, name) is not None]
+    frames = len(campaign.frame_paths())
+    files = f"{counted(frames, 'file')} of thermal frames, {len(campaign.input_files())} files in all"
+    return [
+        f"campaign, {campaign.campaign.title}",
+        f"{join(tables)}, every key is understood",
+        *([files] if frames else []),
+        f"thermofuse check {campaign.path} checks them",
+    ]
 
 
-def _sheet_headings(path: Path) -> tuple[str, ...]:
-    """Return the headings of the first sheet of a spreadsheet; none where the file is neither that nor text."""
-    from interferometry.io.spreadsheets import is_workbook, read_sheets
-
-    if not is_workbook(path.read_bytes()):
-        return ()
-    first, *_ = read_sheets(path).values()
-    return tuple(name.strip() for name in first[0][1])
+def _describe_frames(found: Recognised) -> list[str]:
+    return [line.removeprefix(f"{found.path}: ").removeprefix("  ") for line in found.content.lines()]
 
 
-# What a file holds, in lines of text: every kind that a run reads, with warnings about implausible content.
+def _describe_lens(found: Recognised) -> list[str]:
+    lens = found.content
+    column, row = lens.principal_point_px
+    return [f"lens, focal length {lens.focal_length_px:.1f} px, centre {column:.1f}, {row:.1f} px"]
 
 
-def describe_file(found: Recognised) -> list[str]:
-    """Return what a file holds, with warnings about implausible content."""
-    if found.kind is Kind.FRAMES:
-        return inspect_file(found.path).lines()
-    if found.kind is Kind.STACK:
-        return describe_stack(found.path)
-    first, *lines = _DESCRIBERS[found.kind](found)
-    return [f"{found.path}: {first}", *(f"  {line}" for line in lines)]
+def _describe_fiducials(found: Recognised) -> list[str]:
+    listed = found.content
+    points = sum(one.is_point for one in listed)
+    markers = sum(one.marker is not None for one in listed)
+    kinds = ((len(listed) - points - markers, "disc"), (points, "point"), (markers, "marker"))
+    columns, rows = [one.x_mm for one in listed], [one.y_mm for one in listed]
+    return [
+        f"fiducials, {join([counted(count, noun) for count, noun in kinds if count])}, "
+        f"x {min(columns):g} to {max(columns):g} mm, y {min(rows):g} to {max(rows):g} mm",
+        f"{sum(one.hint_px is not None for one in listed)} with a rough place in the frame",
+    ]
+
+
+def _describe_places(found: Recognised) -> list[str]:
+    return [
+        f"places of {counted(len(found.content), 'contact sensor')} on the plan: {join(found.content)}",
+        "[sensors] of a campaign file names it as places, with the file of their temperatures",
+    ]
+
+
+def _describe_regions(found: Recognised) -> list[str]:
+    names = [region.name for region in found.content]
+    return [f"{counted(len(names), 'region')} of the plan: {join(names)}"]
+
+
+def _describe_record(found: Recognised) -> list[str]:
+    table = found.content
+    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}
+    columns = {kind: [column.heading for column in table.of(role)] for role, kind in roles.items()}
+    described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
+    held = join([column.heading for column in table.of("time")])
+    time = (
+        f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
+    )
+    return [f"record, {counted(table.rows, 'row')}, {time}", *described, *_warnings(table)]
+
+
+def _describe_log(found: Recognised) -> list[str]:
+    log = found.content
+    name = "drivers" if found.kind is Kind.DRIVERS else "environment"
+    first, last = log["time"].values[0], log["time"].values[-1]
+    lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}{_zone(log)}"]
+    for variable, values in log.data_vars.items():
+        unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
+        lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
+    return lines + _warnings(log)
 
 
 def _describe_deviations(found: Recognised) -> list[str]:
     from interferometry.inspection import describe_test
-    from interferometry.io.readings import read_deviations
 
-    deviations = read_deviations(found.path, rotary=True)
+    deviations = found.content
     values, time, position = (deviations[name] for name in ("deviation", "time", "position"))
     timed = time.values[~np.isnat(time.values)]
     when = (
@@ -287,110 +364,6 @@ def _describe_deviations(found: Recognised) -> list[str]:
     ]
 
 
-def _describe_log(found: Recognised) -> list[str]:
-    if found.kind is Kind.DRIVERS:
-        from fusion.campaign.logs import read_drivers
-
-        name, log = "drivers", read_drivers(found.path)
-    else:
-        from interferometry.io.readings import read_environment
-
-        name, log = "environment", read_environment(found.path)
-    first, last = log["time"].values[0], log["time"].values[-1]
-    lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}{_zone(log)}"]
-    for variable, values in log.data_vars.items():
-        unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
-        lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
-    return lines + _warnings(log)
-
-
-def _describe_record(found: Recognised) -> list[str]:
-    from fusion.campaign.columns import propose_table
-
-    table = propose_table(found.path)
-    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}
-    columns = {kind: [column.heading for column in table.of(role)] for role, kind in roles.items()}
-    described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
-    held = join([column.heading for column in table.of("time")])
-    time = (
-        f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
-    )
-    return [f"record, {counted(table.rows, 'row')}, {time}", *described, *_warnings(table)]
-
-
-def _describe_fiducials(found: Recognised) -> list[str]:
-    listed = read_fiducials(found.path)
-    points = sum(one.is_point for one in listed)
-    markers = sum(one.marker is not None for one in listed)
-    kinds = ((len(listed) - points - markers, "disc"), (points, "point"), (markers, "marker"))
-    columns, rows = [one.x_mm for one in listed], [one.y_mm for one in listed]
-    return [
-        f"fiducials, {join([counted(count, noun) for count, noun in kinds if count])}, "
-        f"x {min(columns):g} to {max(columns):g} mm, y {min(rows):g} to {max(rows):g} mm",
-        f"{sum(one.hint_px is not None for one in listed)} with a rough place in the frame",
-    ]
-
-
-def _describe_regions(found: Recognised) -> list[str]:
-    from fusion.analysis.attribution.modes import read_regions
-
-    names = [region.name for region in read_regions(found.path)]
-    return [f"{counted(len(names), 'region')} of the plan: {join(names)}"]
-
-
-def _describe_places(found: Recognised) -> list[str]:
-    from interferometry.io.tables import read_table
-
-    rows = [fields for _, fields in read_table(found.path, ("name",)).records() if fields is not None]
-    return [
-        f"places of {counted(len(rows), 'contact sensor')} on the plan: {join([row['name'].strip() for row in rows])}",
-        "[sensors] of a campaign file names it as places, with the file of their temperatures",
-    ]
-
-
-def _describe_lens(found: Recognised) -> list[str]:
-    from thermography.registration.projection import read_lens  # compiled: other files are described without it
-
-    lens = read_lens(found.path)
-    column, row = lens.principal_point_px
-    return [f"lens, focal length {lens.focal_length_px:.1f} px, centre {column:.1f}, {row:.1f} px"]
-
-
-def _describe_campaign(found: Recognised) -> list[str]:
-    from fusion.campaign.config import load_campaign
-
-    campaign = load_campaign(found.path)
-    named = ("thermography", "plan", "interferometry", "drivers", "record")
-    tables = [f"[{name}]" for name in named if getattr(campaign, name) is not None]
-    frames = len(campaign.frame_paths())
-    files = f"{counted(frames, 'file')} of thermal frames, {len(campaign.input_files())} files in all"
-    return [
-        f"campaign, {campaign.campaign.title}",
-        f"{join(tables)}, every key is understood",
-        *([files] if frames else []),
-        f"thermofuse check {campaign.path} checks them",
-    ]
-
-
-def _describe_recipe(found: Recognised) -> list[str]:
-    title = read_toml(found.path)[0].get("campaign", {}).get("title", "")
-    return [f"recipe of a simulation, {title}".rstrip(", "), f"thermofuse simulate {found.path} --out FOLDER"]
-
-
-_DESCRIBERS: dict[Kind, Callable[[Recognised], list[str]]] = {
-    Kind.DEVIATIONS: _describe_deviations,
-    Kind.ENVIRONMENT: _describe_log,
-    Kind.DRIVERS: _describe_log,
-    Kind.RECORD: _describe_record,
-    Kind.FIDUCIALS: _describe_fiducials,
-    Kind.REGIONS: _describe_regions,
-    Kind.PLACES: _describe_places,
-    Kind.LENS: _describe_lens,
-    Kind.CAMPAIGN: _describe_campaign,
-    Kind.RECIPE: _describe_recipe,
-}
-
-
 def _zone(table: xr.Dataset) -> str:
     """Say how times came to UTC, where the reader says it."""
     reference = table["time"].attrs.get("reference", "")
@@ -400,6 +373,79 @@ def _zone(table: xr.Dataset) -> str:
 def _warnings(table: Read) -> list[str]:
     notices = [*left_out_notices(table, "left_out"), *clock_notices(table)]
     return [f"warning: {notice.message} {notice.remedy}" for notice in notices]
+
+
+class Kind(Enum):
+    """Kinds of files, in the order in which a file is held against them."""
+
+    RECIPE = FileKind("recipe of a simulation", _is_recipe, lambda path: read_toml(path)[0], _describe_recipe)
+    CAMPAIGN = FileKind("campaign file", _is_campaign, lambda path: fusion.load_campaign(path), _describe_campaign)
+    FRAMES = FileKind("thermal frames", _holds_counts, inspect_file, _describe_frames, "thermography.frames")
+    STACK = FileKind(
+        "frames of temperatures", _holds_temperatures, read_stack, lambda found: describe_stack(found.content), "thermography.frames",
+        may_be=lambda found: isinstance(found.reader, TextReader) and found.reader.holds_a_frame(found.path),
+        unused=", not mixed with the frames of a FLIR camera",
+    )  # fmt: skip
+    LENS = FileKind("lens calibration", _is_lens, _read_lens, _describe_lens, "thermography.lens")
+    FIDUCIALS = FileKind("fiducials", _lists_fiducials, read_fiducials, _describe_fiducials, "plan.fiducials")
+    PLACES = FileKind(
+        "places of contact sensors", _lists_sensors, _read_names, _describe_places, "sensors.places",
+        unused=", for [sensors] together with [plan]: docs/reference/campaign-file.md",
+    )  # fmt: skip
+    REGIONS = FileKind("regions of the plan", _lists_places, _read_regions, _describe_regions, "plan.regions")
+    RECORD = FileKind(
+        "record of temperatures and displacements", _names_a_record, _read_record, _describe_record, "record.file",
+        may_be=lambda found: found.logged is not None and found.logged.may_be_record,
+        unused="; the runs of one record have the same columns, another record is a campaign of its own",
+    )  # fmt: skip
+    DRIVERS = FileKind("log of drivers", _logs_drivers, lambda path: fusion.read_drivers(path), _describe_log, "drivers.file")  # fmt: skip
+    ENVIRONMENT = FileKind(
+        "environment log", _logs_environment, lambda path: interferometry.read_environment(path), _describe_log,
+        "interferometry.environment",
+    )  # fmt: skip
+    DEVIATIONS = FileKind(
+        "deviations", _holds_deviations, lambda path: interferometry.read_deviations(path, rotary=True), _describe_deviations,
+        "interferometry.deviations", unused="; one campaign takes one file of deviations: join the tables of one test",
+    )  # fmt: skip
+    UNKNOWN = FileKind("not understood")
+    UNREADABLE = FileKind("cannot be opened")
+
+
+def recognise(path: Path) -> Recognised:
+    """Tell the kind of a file by its content; one on which a reader fails, in whatever way, is not understood and stops no other."""
+    found = Recognised(path, Kind.UNKNOWN)
+    try:
+        found.kind = _kind_of(found)
+    except Exception as error:
+        found.kind, found.reason = _why_not(path, error)
+    return found
+
+
+def _why_not(path: Path, error: Exception) -> tuple[Kind, str]:
+    """Return the kind of a file that a reader failed on, and why in words: its own, or that nobody has foreseen it."""
+    if isinstance(error, OSError):
+        return Kind.UNREADABLE, str(error.strerror or error)
+    if isinstance(error, (FusionError, ThermographyError, InterferometryError)):
+        return Kind.UNKNOWN, str(error).removeprefix(str(path)).lstrip(":, ")
+    return Kind.UNKNOWN, f"{unforeseen(error)}; please report it with the file"
+
+
+def _kind_of(found: Recognised) -> Kind:
+    """Return the kind of a file by its content; raise why it has none."""
+    path = found.path
+    if path.is_symlink() and not path.exists():
+        raise FileNotFoundError(ENOENT, f"a link to {path.readlink()}, where there is no file")
+    if path.exists() and not path.is_file():
+        raise OSError(EINVAL, "is a pipe, a socket or a device; name a file")
+    try:
+        return next(kind for kind in Kind if kind.value.sniff(found))
+    except InterferometryError as error:
+        kind = next((kind for kind in Kind if kind.value.may_be(found)), None)
+        if kind is not None:
+            return kind
+        _, reason = _why_not(path, error)
+        shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
+        raise FusionError(shortened if found.logged is None else found.logged.lacks) from error
 
 
 # What a folder holds for a campaign: frames by pattern, readings, logs, the plan, and what is not understood.
@@ -438,7 +484,7 @@ class FolderContent:
 def scan_folder(folder: Path) -> FolderContent:
     """Look at every file of a folder and its subfolders."""
     paths = list(input_files(folder))
-    series = thermal_series(path for path in paths if path.suffix.lower() != ".toml")
+    series = thermal_series(paths)
     thermal = {path for members in series.values() for path in members}
     patterns, frames = [], []
     found = [recognise(path) for path in paths if path not in thermal]
@@ -474,7 +520,7 @@ def thermal_series(paths: Iterable[Path]) -> dict[tuple[Path, str], list[Path]]:
 def is_thermal(path: Path) -> bool:
     """Return whether a path is a file of a FLIR camera that can be opened."""
     try:
-        return path.is_file() and is_flir_file(path)
+        return path.is_file() and is_of_flir(find_reader(path))
     except OSError:
         return False
 
@@ -524,18 +570,28 @@ class Inspected:
         """Whether something that was asked for, or that is of a known kind, cannot be used."""
         return bool(self.fault) and (self.named or self.kind is not Kind.UNKNOWN)
 
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings among the lines."""
+        return [line for line in map(str.strip, self.lines) if line.startswith("warning: ")]
+
+    @property
+    def content(self) -> list[str]:
+        """The other lines."""
+        return [line for line in map(str.strip, self.lines) if not line.startswith("warning: ")]
+
     def shown(self, *, quiet: bool = False) -> list[str]:
         """Return the lines for the terminal; `quiet` leaves faults and warnings, each with its file."""
         if self.fault:
-            return [f"{self.label}: {self.kind.value}: {self.fault}"] if self.fails or not quiet else []
-        if not quiet:
-            return list(self.lines)
-        return [f"{self.label}: {line.strip()}" for line in self.lines if line.startswith("  warning")]
+            return [f"{self.label}: {self.kind.value.words}: {self.fault}"] if self.fails or not quiet else []
+        if quiet:
+            return [f"{self.label}: {line}" for line in self.warnings]
+        return [f"{self.label}: {self.lines[0]}", *(f"  {line}" for line in self.lines[1:])]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as a mapping of JSON's own types."""
-        lines = [line.strip() for line in self.lines]
-        return {"file": self.label, "kind": self.kind.value, "lines": lines, "fault": self.fault}
+        lines = [] if self.fault else [line.strip() for line in self.shown()]
+        return {"file": self.label, "kind": self.kind.value.words, "lines": lines, "fault": self.fault}
 
 
 def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
@@ -577,7 +633,7 @@ def _inspect(path: Path, *, named: bool) -> Inspected:
     if found.reason:
         return Inspected(str(path), found.kind, fault=found.reason, named=named)
     try:
-        return Inspected(str(path), found.kind, tuple(describe_file(found)), named=named)
+        return Inspected(str(path), found.kind, tuple(found.kind.value.describe(found)), named=named)
     except Exception as error:
         kind, fault = _why_not(path, error)
         return Inspected(str(path), found.kind if kind is Kind.UNKNOWN else kind, fault=fault, named=named)
@@ -666,39 +722,32 @@ def describe_series(paths: Sequence[Path], *, label: str) -> list[str]:
     names = camera_names(frames).astype(str)
     cameras = Counter(names.tolist())
     size = f"{frames[0].shape[1]} x {frames[0].shape[0]}" if len(cameras) == 1 else f"{len(cameras)} cameras or sizes"
-    lines = [f"{label}: thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} of {size}"]
+    lines = [f"thermal frames, {counted(len(paths), 'file')}, {counted(len(frames), 'frame')} of {size}"]
     for name, count in cameras.most_common():
         chosen = frames.choose(names == name)
         if len(cameras) > 1:
-            lines.append(f"  {counted(count, 'frame')} of {name}")
+            lines.append(f"{counted(count, 'frame')} of {name}")
         try:
             evaluation = tabulate_regions(chosen)
             rejected += evaluation.rejected
         except ThermographyError:
             evaluation = None
         about = [
-            f"camera {_camera(chosen)}",
+            describe_camera(chosen),
             *_times(chosen),
             f"settings {_settings(chosen)}",
             *describe_evaluation(evaluation),
         ]
-        lines += [f"  {'' if len(cameras) == 1 else '  '}{line}" for line in about]
+        lines += [f"{'' if len(cameras) == 1 else '  '}{line}" for line in about]
     if len(cameras) > 1:
         lines.append(
-            "  warning: frames of several cameras or sizes are no series; beside a laser those of the one with most of them are taken"
+            "warning: frames of several cameras or sizes are no series; beside a laser those of the one with most of them are taken"
         )
     if rejected:
         reasons = listed(f"{one.path.name}: {one.reason.removeprefix(f'{one.path}').lstrip(': ')}" for one in rejected)
-        lines.append(f"  warning: {counted(len(rejected), 'frame')} left out: {reasons}")
+        lines.append(f"warning: {counted(len(rejected), 'frame')} left out: {reasons}")
     of_series = check_series(frames) if len(cameras) == 1 else []
-    return lines + [f"  warning: {each.message} {each.remedy}" for each in of_series]
-
-
-def _camera(frames: Sequence[FrameReference]) -> str:
-    """Say which camera, with serial number and lenses, recorded the frames."""
-    camera = frames[0].camera
-    lenses = join(sorted({frame.camera.lens_model for frame in frames} - {""}))
-    return f"{camera.model or 'unknown'}{f', serial {camera.serial}' if camera.serial else ''}{f', lens {lenses}' if lenses else ''}"
+    return lines + [f"warning: {each.message} {each.remedy}" for each in of_series]
 
 
 def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
@@ -727,12 +776,7 @@ def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
 
 def _settings(frames: Sequence[FrameReference]) -> str:
     """Say which settings are stored, and which of them vary."""
-    p = frames[0].parameters
-    stored = (
-        f"emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
-        f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} °C, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} °C, "
-        f"relative humidity {p.relative_humidity:.0%}"
-    )
+    stored = describe_scene(frames[0].parameters)
     # Each camera has its own calibration: what differs in it is no setting.
     names = [each.name for each in fields(CameraParameters) if not each.name.startswith(("planck", "atmosphere_"))]
     varying = [name for name in names if len({getattr(frame.parameters, name) for frame in frames}) > 1]

@@ -103,16 +103,6 @@ def column_unit(heading: str) -> str:
     return name_and_unit(heading)[1]
 
 
-def is_temperature(heading: str) -> bool:
-    """Return whether a heading is that of a temperature."""
-    return column_unit(heading) in ("degC", "K", "degF")
-
-
-def is_displacement(heading: str) -> bool:
-    """Return whether a heading is that of a displacement."""
-    return column_unit(heading) in ("um", "nm", "mm", "in", "mil")
-
-
 def is_time(heading: str) -> bool:
     """Return whether a heading is that of the time: ``time`` or ``date`` in a language that is read, or a column in units of time."""
     from interferometry.io.tables import read_heading

@@ -17,16 +17,14 @@ from fusion.analysis.consistency.checks import Check, ContradictionError, Severi
 from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
-from fusion.campaign.inspect import Recording, time_bars
+from fusion.campaign.inspect import Kind, Recording, time_bars
 from fusion.campaign.logs import NO_START, read_drivers
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.consistency import check_source
 from fusion.results.progress import counted
 from fusion.results.results import Notice
-from interferometry.io.readings import read_deviations, read_environment
+from interferometry.io.readings import read_deviations
 from thermography.io.sequence import camera_names
-from thermography.registration.plan import read_fiducials
-from thermography.registration.projection import read_lens
 
 #: Bars of runs that are drawn.
 _MOST_BARS = 10
@@ -186,18 +184,16 @@ def _recordings(source: Inputs) -> Iterator[Recording]:
 
 def _faults_of_files(campaign: Campaign) -> Iterator[str]:
     """Read every file of a campaign by itself, and yield why it cannot be used."""
-    readers: tuple[tuple[Callable[[Path], object], object, str], ...] = (
-        (partial(read_deviations, rotary=campaign.thermography is None), campaign.interferometry, "deviations"),
-        (read_environment, campaign.interferometry, "environment"),
-        (partial(read_drivers, layout=campaign.drivers and campaign.drivers.layout), campaign.drivers, "file"),
-        (read_fiducials, campaign.plan, "fiducials"),
-        (read_lens, campaign.thermography, "lens"),
-    )
-    for read, table, key in readers:
-        name = getattr(table, key, None)
-        if name is not None:
+    stated: dict[Kind, Callable[[Path], object]] = {
+        Kind.DEVIATIONS: partial(read_deviations, rotary=campaign.thermography is None),
+        Kind.DRIVERS: partial(read_drivers, layout=campaign.drivers and campaign.drivers.layout),
+    }
+    for kind in reversed(Kind):
+        table, _, key = kind.value.key.partition(".")
+        name = getattr(getattr(campaign, table, None), key, None)
+        if isinstance(name, str):
             try:
-                read(campaign.resolve(name))
+                stated.get(kind, kind.value.read)(campaign.resolve(name))
             except BAD_INPUT as error:
                 yield _words(error)
 

@@ -6,11 +6,11 @@ import itertools
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -26,7 +26,7 @@ from interferometry.deviations import (
     set_flag,
 )
 from interferometry.io.faults import BadReading, LaserFormatError, LeftOut, Numerals, raise_if_mostly_invalid
-from interferometry.io.renishaw import is_ecmc_log, read_ecmc_log, read_rtl
+from interferometry.io.renishaw import START_BYTES, is_ecmc_log, read_ecmc_log, read_rtl
 from interferometry.io.tables import (
     UNIT_WORDS,
     UNITS,
@@ -771,6 +771,28 @@ def _cycles(table: WideTable) -> list[int]:
 # Readers of deviations and environment: the kind of file is recognised, and every unusable line is listed in the
 # result.
 
+
+class Layout(NamedTuple):
+    """A layout of deviations: its row in docs/formats.md, what finds it in the first bytes of a file or in a grid, and what reads it.
+
+    A file is read by its path and what was stated of feed (mm/min) and dwell (s), a table by what was found.
+    """
+
+    name: str
+    find: Callable[[Any], Any]
+    read: Callable[..., Any]
+
+
+#: What `read_deviations` reads, in the order in which a file is held against it: files of laser programs, and tables.
+FILES = (
+    Layout("Renishaw linear test, .rtl", lambda start: b"HEADER::" in start, read_rtl),
+    Layout("logs of the ecmc test tools, .dat", is_ecmc_log, lambda path, feed, dwell: read_ecmc_log(path)),
+)
+TABLES = (
+    Layout("table, one reading per line", find_long_table, read_long_table),
+    Layout("table of position by run", find_wide_table, read_wide_table),
+)
+
 DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "deviation_um")
 
 #: Heading of the tables of averages that laser programs write as a report.
@@ -850,17 +872,9 @@ def read_deviations(
     [[0.12, 1.48]]
     """
     path = Path(path)
-    with path.open("rb") as stream:
-        start = stream.read(4096)
-    if b"HEADER::" in start and b"\nData:" in start:
-        raise LaserFormatError(
-            f"{path}: a dynamic capture (.rtx) has no target positions; name the file of a linear test (.rtl)"
-        )
-    if b"HEADER::" in start:
-        return read_rtl(path, feed_mm_per_min=feed_mm_per_min, dwell_s=dwell_s)
-    if is_ecmc_log(start):
-        return read_ecmc_log(path)
-    if _AVERAGES in start:
+    if (program := _of_a_program(path)) is not None:
+        return program.read(path, feed_mm_per_min, dwell_s)
+    if _AVERAGES in path.read_bytes()[:START_BYTES]:
         raise LaserFormatError(
             f"{path}: a report of averages over runs holds no single reading; export the readings of every run"
         )
@@ -873,17 +887,22 @@ def read_deviations(
     return deviations
 
 
+def _of_a_program(path: Path) -> Layout | None:
+    """Return the layout of a laser program that a file begins with."""
+    with path.open("rb") as stream:
+        start = stream.read(START_BYTES)
+    return next((one for one in FILES if one.find(start)), None)
+
+
 def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
     """Read delimited text or a spreadsheet: one reading per line, or position by run."""
     grids = read_grids(path, sheet=sheet)
     found: dict[str, Readings] = {}
     for grid in grids:
-        long = find_long_table(grid)
-        wide = find_wide_table(grid) if long is None else None
-        if long is not None:
-            found.setdefault(grid.sheet, read_long_table(long))
-        elif wide is not None:
-            found.setdefault(grid.sheet, read_wide_table(wide))
+        for one in TABLES:
+            if (table := one.find(grid)) is not None:
+                found.setdefault(grid.sheet, one.read(table))
+                break
     if len(found) > 1:
         raise LaserFormatError(
             f"{path}: the sheets {', '.join(map(repr, found))} each hold a table of deviations; name one of them (sheet = ...), or save it "
@@ -897,11 +916,15 @@ def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
     return check_and_assemble(next(iter(found.values())))
 
 
+def holds_deviations(path: Path) -> bool:
+    """Return whether a file has a layout of deviations, whatever is in it."""
+    return _of_a_program(path) is not None or any(one.find(grid) for grid in read_grids(path) for one in TABLES)
+
+
 def is_environment_log(path: Path) -> bool:
     """Return whether a file is a table of air and material conditions, and not one of deviations."""
-    with path.open("rb") as stream:
-        if b"HEADER::" in stream.read(4096):
-            return False
+    if _of_a_program(path) is not None:
+        return False
     roles = [
         {read_heading(text).role for text in fields}
         for grid in read_grids(path)

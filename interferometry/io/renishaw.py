@@ -15,6 +15,9 @@ from interferometry.deviations import DIRECTIONS, build_deviations
 from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, LeftOut, parse_number
 from interferometry.io.tables import NO_ZONE, decode_text
 
+#: Bytes by which the file of a laser program is told.
+START_BYTES = 4096
+
 # Logs of positioning tests as the ecmc test tools write them: assignments such as
 # ``REF_DATA_FWD[target,cycle]=value``.
 
@@ -123,9 +126,14 @@ class _Run:
         return not any(math.isfinite(value) for value in self.deviations)
 
 
-def read_rtl(path: Path, *, feed_mm_per_min: float | None = None, dwell_s: float | None = None) -> xr.Dataset:
+def read_rtl(path: Path, feed_mm_per_min: float | None = None, dwell_s: float | None = None) -> xr.Dataset:
     """Read a Renishaw linear test."""
-    sections = _split_sections(path, path.read_bytes().decode("latin-1"))
+    content = path.read_bytes()
+    if b"\nData:" in content[:START_BYTES]:
+        raise LaserFormatError(
+            f"{path}: a dynamic capture (.rtx) has no target positions; name the file of a linear test (.rtl)"
+        )
+    sections = _split_sections(path, content.decode("latin-1"))
     kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
     if kind.lower() != "rtl":
         raise LaserFormatError(

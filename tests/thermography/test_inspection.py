@@ -13,14 +13,14 @@ from tests.thermography.flir_mutations import (
     PARAMETERS,
     TIME,
     frame,
-    jpeg,
     patch,
     sequence,
 )
 from thermography.common import ThermographyError
-from thermography.inspection import describe_stack, inspect_file, is_flir_file
+from thermography.inspection import describe_stack, inspect_file
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, FlirFormatError
+from thermography.io.other_cameras import read_stack
 from thermography.radiometry.planck import override
 
 
@@ -144,13 +144,6 @@ def test_a_file_without_a_frame_raises(tmp_path):
         inspect_file(tmp_path / "a.jpg")
 
 
-def test_files_are_distinguished_by_their_first_bytes(tmp_path):
-    jpeg(tmp_path / "a.jpg")
-    sequence(tmp_path / "a.seq")
-    (tmp_path / "laser.csv").write_text("cycle,direction\n", encoding="utf-8")
-    assert [is_flir_file(tmp_path / name) for name in ("a.jpg", "a.seq", "laser.csv")] == [True, True, False]
-
-
 def test_sensors_at_zero_degc_are_placeholders(tmp_path):
     each = replace(frame(), housekeeping={**HOUSEKEEPING, "Internal": 273.15})
     write_sequence(tmp_path / "a.seq", [each])
@@ -171,14 +164,14 @@ def test_real_files_give_the_warnings_of_their_known_faults(real_file):
 
 def test_a_file_of_temperatures_is_described_with_what_must_be_stated(tmp_path):
     np.save(tmp_path / "a.npy", np.full((3, 8, 9), 7329, np.uint16))
-    assert describe_stack(tmp_path / "a.npy") == [
-        f"{tmp_path / 'a.npy'}: NumPy array, 3 frames of 9 x 8",
-        "  values of the first frame 7329 to 7329",
-        "  state under [thermography.stack]: unit; time_in_name, times, or start and interval",
+    assert describe_stack(read_stack(tmp_path / "a.npy")) == [
+        "NumPy array, 3 frames of 9 x 8",
+        "values of the first frame 7329 to 7329",
+        "state under [thermography.stack]: unit; time_in_name, times, or start and interval",
     ]
     (tmp_path / "b.npy").write_bytes(b"nothing\0")
     with pytest.raises(ThermographyError, match="not a known file of temperatures"):
-        describe_stack(tmp_path / "b.npy")
+        read_stack(tmp_path / "b.npy")
 
 
 def test_what_no_camera_writes_is_told_and_not_made(tmp_path):
@@ -190,7 +183,7 @@ def test_what_no_camera_writes_is_told_and_not_made(tmp_path):
     ]:
         np.lib.format.open_memmap(tmp_path / "a.npy", mode="w+", dtype=np.float32, shape=shape).flush()
         with pytest.raises(ThermographyError, match=told):
-            describe_stack(tmp_path / "a.npy")
+            read_stack(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize(

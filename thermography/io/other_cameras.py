@@ -24,7 +24,7 @@ from itertools import takewhile
 from math import prod
 from pathlib import Path
 from textwrap import shorten
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -753,6 +753,29 @@ def find_reader(path: Path) -> FrameReader | None:
         with path.open("rb") as file:
             start = file.read(START_BYTES)
     return next((reader for reader in readers() if reader.recognises(path, start)), None)
+
+
+def is_of_flir(reader: FrameReader | None) -> bool:
+    """Return whether files that a reader recognises hold counts of a FLIR camera, and no plug-in reads them."""
+    return isinstance(reader, FlirReader) and reader not in plug_ins()
+
+
+class Stack(NamedTuple):
+    """A file of temperatures as it is stored: what it holds, and the values of its first frame (row, column)."""
+
+    reader: TemperatureReader
+    contents: StackContents
+    first: NDArray[np.floating]
+
+
+def read_stack(path: Path) -> Stack:
+    """Read what a file of temperatures holds, before anything is stated of it."""
+    reader = find_reader(path)
+    if not isinstance(reader, TemperatureReader):
+        raise ThermographyError(f"{path}: not a known file of temperatures; docs/formats.md lists them")
+    # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
+    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
+    return Stack(reader, reader.frame_contents(path, stored), reader.read_values(path, 0, stored))
 
 
 #: First byte and bytes, or ending, of files of thermal cameras that are not read -> what they are and what to do instead.

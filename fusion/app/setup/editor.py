@@ -28,14 +28,13 @@ from fusion.app.setup.form import (
 )
 from fusion.app.setup.plan import FrameView, Placed, Plan, PlanView, RegionsView, corners_of
 from fusion.app.setup.times import TimesView, recordings_of
-from fusion.campaign.columns import TableProposal, propose_table
+from fusion.campaign.columns import TableProposal
 from fusion.campaign.draft import separate_tests
 from fusion.campaign.inspect import FolderContent, Kind, Recording, scan_folder
 from fusion.campaign.values import QuantityError, read_quantity
 from fusion.messages import BAD_INPUT
 from fusion.pipeline.check import CampaignCheck, check_campaign
 from interferometry.common import InterferometryError
-from interferometry.io.readings import read_deviations
 from thermography.common import ThermographyError
 from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 
@@ -75,7 +74,7 @@ def open_folder(root: Path, folder: Path) -> Opened:
             remarks.append(str(error))
     table = None
     if campaign.value("record", "columns") is not None and content.of(Kind.RECORD):
-        table = propose_table(content.of(Kind.RECORD)[0].path)
+        table = content.of(Kind.RECORD)[0].content
     return Opened(folder, campaign, frame, placed, recordings_of(content), positions_of(content), table, remarks)
 
 
@@ -99,7 +98,7 @@ def positions_of(content: FolderContent) -> tuple[float, ...]:
     """Return the axis positions of the targets in a folder, mm; none where its deviations cannot be read."""
     for one in content.of(Kind.DEVIATIONS)[:1]:
         with suppress(InterferometryError):
-            return tuple(np.unique(read_deviations(one.path, rotary=True)["position"].values).tolist())
+            return tuple(np.unique(one.content["position"].values).tolist())
     return ()
 
 

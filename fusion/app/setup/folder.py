@@ -20,14 +20,14 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
     usable = [one for one in looked_into if not one.fault]
     parts = [heading("What was recognised", level=3)]
     if usable:
-        rows = [(name_in(folder, one), one.kind.value, content_of(one)) for one in usable]
+        rows = [(name_in(folder, one), one.kind.value.words, "; ".join(one.content)) for one in usable]
         parts.append(table(("file or series", "kind", "content"), rows, caption=f"Files in {folder}", stacked=True))
     for one in looked_into:
         name = name_in(folder, one)
         if one.kind is Kind.CAMPAIGN and Path(name).parent != Path():
             told = f"{name} is the campaign file of a folder below; to open it, look into {folder / Path(name).parent}"
             parts.append(paragraph(told, kind="warning"))
-        parts += [paragraph(f"{name}: {line}", kind="warning") for line in warnings_of(one)]
+        parts += [paragraph(f"{name}: {line.removeprefix('warning: ')}", kind="warning") for line in one.warnings]
         if one.fault:
             parts.append(paragraph(f"{name} is not used: {one.fault}", kind="fault" if one.fails else "warning"))
     return parts
@@ -36,18 +36,6 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
 def name_in(folder: Path, one: Inspected) -> str:
     """Return the name of a file or a series within its folder."""
     return one.label.removeprefix(str(folder)).lstrip("/\\")
-
-
-def content_of(one: Inspected) -> str:
-    """Return what a file holds as sentences on one line, without its path and its warnings."""
-    first, *rest = one.lines
-    told = [first.removeprefix(one.label).lstrip(": "), *rest]
-    return "; ".join(line.strip() for line in told if not line.startswith("  warning"))
-
-
-def warnings_of(one: Inspected) -> list[str]:
-    """Return the warnings of a file without the word."""
-    return [line.strip().removeprefix("warning: ") for line in one.lines if line.startswith("  warning")]
 
 
 # Files that are dropped on the page.

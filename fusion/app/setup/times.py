@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import panel as pn
@@ -15,13 +14,10 @@ from fusion.analysis.alignment.align import camera_on_laser_clock, covered_share
 from fusion.app.parts import column, heading, markup, paragraph_markup
 from fusion.app.setup.plan import TEAL
 from fusion.campaign.inspect import FolderContent, Kind, Recording
-from fusion.campaign.logs import read_drivers
 from fusion.common import FusionError
 from fusion.report.charts.style import new_figure
 from interferometry.common import InterferometryError
-from interferometry.io.readings import read_deviations, read_environment
 from interferometry.plots import ACCENT
-from thermography.common import ThermographyError
 from thermography.io.other_cameras import index_recordings
 
 FRAMES, READINGS = "frames", "readings"
@@ -41,15 +37,10 @@ def recordings_of(content: FolderContent) -> list[Recording]:
     if content.frames and not content.of_temperatures:
         frames, _ = index_recordings(content.frame_files)
         found.append(Recording(FRAMES, np.array([frame.time for frame in frames], "datetime64[ns]")))
-    readers: tuple[tuple[str, Kind, Callable[[Path], Any]], ...] = (
-        (READINGS, Kind.DEVIATIONS, read_deviations),
-        ("environment", Kind.ENVIRONMENT, read_environment),
-        ("drivers", Kind.DRIVERS, read_drivers),
-    )
-    for name, kind, read in readers:
+    for name, kind in ((READINGS, Kind.DEVIATIONS), ("environment", Kind.ENVIRONMENT), ("drivers", Kind.DRIVERS)):
         for one in content.of(kind)[:1]:
-            with suppress(FusionError, InterferometryError, ThermographyError):
-                found.append(Recording(name, read(one.path)["time"].values.astype("datetime64[ns]").ravel()))
+            with suppress(FusionError, InterferometryError):
+                found.append(Recording(name, one.content["time"].values.astype("datetime64[ns]").ravel()))
     return [one for one in found if one.stretches()]
 
 

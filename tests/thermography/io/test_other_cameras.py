@@ -15,7 +15,6 @@ import xarray as xr
 
 from tests.thermography.plan_scene import SC660
 from thermography.common import ThermographyError
-from thermography.inspection import describe_stack
 from thermography.io import flir
 from thermography.io import other_cameras as frame_readers
 from thermography.io.flir import FlirReader, read_frame
@@ -35,6 +34,7 @@ from thermography.io.other_cameras import (
     find_reader,
     index_recordings,
     plug_ins,
+    read_stack,
     readers,
 )
 from thermography.radiometry.planck import calibrate, counts_from_temperature, override
@@ -135,7 +135,7 @@ def test_a_variable_of_no_numbers_is_refused(tmp_path, kind):
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file.create_dataset("temperature", (3, 4, 5), kind)
     with pytest.raises(ThermographyError, match="are not temperatures; write real numbers"):
-        describe_stack(tmp_path / "a.nc")
+        read_stack(tmp_path / "a.nc")
 
 
 def test_of_many_variables_a_message_names_some(tmp_path):
@@ -143,7 +143,7 @@ def test_of_many_variables_a_message_names_some(tmp_path):
         for number in range(300):
             file.create_dataset(f"v{number}", (3, 4, 5), "f4")
     with pytest.raises(StackError, match=r"the variables v0, v1, .*v\d+, \[\.\.\.\] over three dimensions"):
-        describe_stack(tmp_path / "a.nc")
+        read_stack(tmp_path / "a.nc")
 
 
 def test_what_a_library_says_of_a_long_attribute_is_cut(tmp_path):
@@ -151,7 +151,7 @@ def test_what_a_library_says_of_a_long_attribute_is_cut(tmp_path):
     values = xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), coords={"time": time})
     values.to_dataset(name="temperature").to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
     with pytest.raises(ThermographyError, match=r"cannot be opened \(.*\); write it again") as error:
-        describe_stack(tmp_path / "a.nc")
+        read_stack(tmp_path / "a.nc")
     assert len(str(error.value)) < 1_000
 
 
@@ -159,11 +159,11 @@ def test_a_zarr_store_of_very_many_arrays_is_not_opened(tmp_path):
     xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), name="temperature").to_dataset().to_zarr(
         tmp_path / "a", consolidated=False, zarr_format=3
     )
-    describe_stack(tmp_path / "a" / "zarr.json")
+    read_stack(tmp_path / "a" / "zarr.json")
     for number in range(1_000):
         (tmp_path / "a" / f"v{number}").mkdir()
     with pytest.raises(ThermographyError, match="it holds more than 1000 arrays and groups"):
-        describe_stack(tmp_path / "a" / "zarr.json")
+        read_stack(tmp_path / "a" / "zarr.json")
 
 
 IMAGE = np.round(20.0 + np.arange(10 * 12).reshape(10, 12) / 7.0, 2)
