@@ -319,7 +319,8 @@ def fleet(
     Writes fleet.html, fleet.xlsx, fleet.csv and fleet.json with a row for each. One that fails does not stop the others; exit code 100 and
     the number that failed.
     """
-    from fusion.pipeline.fleet import Row, count_line, find_members, read_rows, run_fleet, summary_table
+    from fusion.pipeline.fleet import find_members, run_fleet
+    from fusion.report.fleet import Row, count_line, read_rows, summary_table
 
     def kept() -> str:
         return f"{out}: {count_line([*read_rows(out).values()])}; start the same command with --resume to go on"

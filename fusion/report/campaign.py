@@ -20,7 +20,7 @@ from fusion.analysis.levels import (
     SEARCH_LEVEL,
     SECOND_LEVEL,
 )
-from fusion.report.findings import first_screen, headline, next_steps, sharpen
+from fusion.report.findings import findings, first_screen, headline, next_steps, sharpen
 from fusion.report.thermograms import describe_thermograms
 from fusion.report.wording import (
     ARROWS,
@@ -618,6 +618,7 @@ def describe_campaign(
         "untouched": untouched(results.inputs, figures),
         "assumptions": {one.at: assumption(results.inputs, one.rests_on) for one in SECTIONS if one.rests_on},
         "first_screen": first_screen(results, stated.get("report", {}), axis, moment(begun[0], zone) if begun else ""),
+        "tiles": [one.tile for one in findings(results) if one.tile],
         "next": next_steps(results)[:MOST_STEPS],
         "thermograms": describe_thermograms(results, datasets["thermograms"]) if "thermograms" in datasets else None,
         "drift_stated": (stated.get("thermography") or {}).get("camera_drift_u_K") is not None,

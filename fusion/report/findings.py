@@ -1,4 +1,4 @@
-"""Conclusions of a run as answers to a reader's questions: why, how much, where, how sure, which place, what remains."""
+"""Findings of a run, which every output shows in this order; what is on the first screen, and what to do next."""
 
 from __future__ import annotations
 
@@ -13,41 +13,26 @@ import rich.table
 from fusion.messages import cell
 from fusion.report.wording import (
     ARROWS,
-    baseline_words,
+    ISO230_TERMS,
     condition,
     conditional,
-    figures_of,
+    drift_extremes,
+    quantity,
+    quoted_values,
     randomised_causes,
     say,
-    untouched,
+    sentences,
 )
-from fusion.results.axis import DriftPart, Iso230Part, RegistrationPart
-from fusion.results.loop import Loop, RecordLoop, StepPart
-from fusion.results.numbers import alike, number, p_words
-from fusion.results.parts import Figures, TimePart, decide
+from fusion.results.axis import DriftPart, Iso230Part
+from fusion.results.loop import RecordLoop, StepPart
+from fusion.results.numbers import alike, print_unit
+from fusion.results.parts import (
+    Figures,
+    Quantity,
+    TimePart,
+    decide,
+)
 from fusion.results.results import Results
-
-#: Question of a reader, and the statement that answers it.
-_QUESTIONS = {
-    "How much": "how_much",
-    "Where": "where",
-    "How sure": "how_sure",
-    "Which place": "which_place",
-    "What remains": "what_remains",
-}
-
-
-class Conclusion(NamedTuple):
-    """One conclusion of a run: the question that it answers, and sentences."""
-
-    question: str
-    text: str
-
-
-def conclude(results: Results) -> list[Conclusion]:
-    """Return the conclusions of a run in the order of a reader's questions; those that the run does not answer are absent."""
-    answers = [Conclusion(question, say(statement, results)) for question, statement in _QUESTIONS.items()]
-    return [answer for answer in answers if answer.text]
 
 
 def headline(results: Results) -> str:
@@ -236,6 +221,127 @@ def next_steps(results: Results) -> list[str]:
     return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]
 
 
+# The findings of a run in the order in which they are told.
+
+
+class Tile(NamedTuple):
+    """A number on the first screen: what it is, the number with its unit, and what it is of."""
+
+    name: str
+    value: str
+    note: str = ""
+
+
+class Finding(NamedTuple):
+    """What a run found, with what each output shows of it.
+
+    `name` and `text` stand on the terminal and in the workbook, `tile` on the first screen of report and application, `value` in its `unit`
+    in the summary of a fleet.
+    """
+
+    code: str
+    name: str
+    text: str
+    tile: Tile | None
+    value: Quantity | None
+    unit: str
+
+
+def findings(results: Results) -> list[Finding]:
+    """Return the findings of a run in the order in which they are told; their words are statements of ``sentences.j2``, by code."""
+    found: list[Finding] = []
+    loop, drift, pictures, regions = results.loop, results.drift, results.thermograms, results.regions or ()
+
+    def add(
+        code: str,
+        name: str = "",
+        of: object = results,
+        *,
+        text: str | None = None,
+        tile: str | Tile = "",
+        rests_on: Figures | None = None,
+        value: Quantity | None = None,
+        unit: str = "",
+    ) -> None:
+        text = say(code, of) if name and text is None else text or ""
+        shown = Tile(tile, *sentences(f"{code}_tile", of)) if isinstance(tile, str) and tile else tile or None
+        if text or shown or value:
+            limits = condition(results.inputs, rests_on) if rests_on else ""
+            found.append(Finding(code, name if text else "", f"{text} {limits}".rstrip(), shown, value, unit))
+
+    if results.inputs is not None and (pictures is None or pictures.series):
+        add("inputs", "inputs", text="\n".join(sentences("inputs", results)))
+    for quoted in _quoted_tiles(results):
+        add("quoted", tile=quoted)
+    if results.iso230 is not None:
+        for symbol in ISO230_TERMS:
+            add(symbol, value=getattr(results.iso230, f"{symbol}_um"), unit=results.iso230.unit)
+    if isinstance(loop, RecordLoop):
+        moved = [one for test in results.iso230_3 or () for one in test.distortions if one.unit == "um"]
+        for most in sorted(moved, key=lambda one: one.whole.value or 0.0, reverse=True)[:1]:
+            add("drift", of=most, tile="Largest drift", value=most.whole, unit="um")
+    elif drift is not None and drift.range_um:
+        largest, _ = drift_extremes(drift)
+        add("drift", of=largest, tile="Largest drift", value=largest.size, unit="um")
+    if results.field is not None:
+        add("mean_rise", tile=Tile("Table, mean rise", quantity(results.field.mean_rise_K, "K")))
+    elif pictures is not None:
+        own = [one for one in regions if one.camera == pictures.series] or regions
+        for code, name in (("highest", "Highest"), ("lowest", "Lowest"), ("mean", "Mean")):
+            add(code, of=(own[0], pictures), tile=name)
+    several = pictures is not None and len(pictures.cameras) > 1
+    for one in regions:
+        if not several or one.name == "whole picture":
+            add("region_line", one.camera if several else one.name, one)
+    if results.registration is not None and pictures is None:
+        add("registration", "registration", results.registration)
+    if drift is not None:
+        add("scatter", "scatter per position", text=_scatter_range(drift), rests_on="positions")
+    if loop is not None:
+        add("verdict", "verdict", text=f"{loop.verdict.replace('_', ' ')}: {headline(results)}")
+    for code in ("how_much", "where", "how_sure", "which_place", "what_remains"):
+        add(code, code.replace("_", " "))
+    if loop is not None:
+        add("declared", "declared", text=", ".join(loop.declared) or "nothing")
+        for step in loop.steps:
+            add("added", "added", step, rests_on="causes")
+        error = Quantity(value=loop.rmse_final_um, u=None)
+        add("held_out", "held-out error", loop, tile="Held-out error", rests_on="positions", value=error, unit="um")
+        add("plain_predictions", "plain predictions", loop, rests_on="positions")
+        add("noise_floor", "noise floor", loop, rests_on="positions")
+    if isinstance(loop, RecordLoop):
+        add("unexplained", of=loop, tile="Unexplained variance")
+        for run in (one for one in loop.runs if one.held_out):
+            add("run_line", f"run {run.file}", run)
+    add("next", "next", text="\n".join(f"{number}. {step}" for number, step in enumerate(next_steps(results), start=1)))
+    for warning in results.warnings:
+        add("warning", "warning", text=warning.message)
+    return found
+
+
+def _quoted_tiles(results: Results) -> list[Tile]:
+    """Return A by ISO 230-2, and where the readings of the laser say nothing else the other values that are quoted."""
+    iso = results.iso230
+    if iso is None:
+        return []
+    alone = results.loop is None and results.drift is None and results.field is None
+    quoted = dict(list(quoted_values(iso).items())[: 3 if alone else 1])
+    if alone and iso.A_um.value is not None:
+        quoted["M"] = quantity(iso.M_um, print_unit(iso.unit))
+    return [Tile(f"{name}, ISO 230-2", value, iso.window.split(" (")[0]) for name, value in quoted.items()]
+
+
+def _scatter_range(drift: DriftPart) -> str:
+    """Return smallest, largest and median scatter over targets and directions, µm."""
+    scatter = drift.scatter_um.values()
+    if not scatter:
+        return "not known: no position has enough readings"
+    least, largest, median = alike([min(scatter), max(scatter), float(np.median(scatter))], distinct=False)
+    # A variance whose estimate is negative is kept as zero: no position is free of scatter.
+    span = f"{least} to" if min(scatter) > 0.0 else "up to"
+    return f"{span} {largest} µm, median {median} µm"
+
+
 # What the command prints.
 
 
@@ -251,88 +357,5 @@ def summary_table(results: Results) -> rich.table.Table:
 
 
 def summary_rows(results: Results) -> list[tuple[str, str]]:
-    """Return names and texts of the findings of a run, in the order of the report."""
-    rows: list[tuple[str, str]] = []
-    if results.inputs is not None and not (results.thermograms and not results.thermograms.series):
-        doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
-        lines = [line for line in (*doubts, untouched(results.inputs, figures_of(results))) if line]
-        open_checks = [f"not verified: {check.evidence} {check.remedy}" for check in results.inputs.unverified]
-        sound = [] if lines else [f"sound in {len(results.inputs.checks)} checks"]
-        rows.append(("inputs", "\n".join([*lines, *sound, *open_checks])))
-    if results.regions is not None:
-        several = results.thermograms is not None and len(results.thermograms.cameras) > 1
-        shown = [one for one in results.regions if not several or one.name == "whole picture"]
-        rows += [(one.camera if several else one.name, say("region_line", one)) for one in shown]
-    if results.registration is not None and results.thermograms is None:
-        rows.append(("registration", _registration(results.registration)))
-    if results.drift is not None:
-        scatter = _scatter_range(results.drift)
-        rows.append(("scatter per position", f"{scatter} {condition(results.inputs, 'positions')}".rstrip()))
-    if results.loop is not None:
-        rows.append(("verdict", f"{results.loop.verdict.replace('_', ' ')}: {headline(results)}"))
-    rows += [(answer.question.lower(), answer.text) for answer in conclude(results)]
-    if results.loop is not None:
-        rows.append(("declared", ", ".join(results.loop.declared) or "nothing"))
-        found = _loop_rows(results.loop)
-        rows += [(name, f"{text} {condition(results.inputs, figures)}".rstrip()) for name, text, figures in found]
-        rows += _run_rows(results.loop)
-    steps = enumerate(next_steps(results), start=1)
-    rows.append(("next", "\n".join(f"{number}. {step}" for number, step in steps)))
-    return rows + [("warning", warning.message) for warning in results.warnings]
-
-
-def _registration(part: RegistrationPart) -> str:
-    """Return the scatter of the fiducials; of four, which determine the plan exactly, the uncertainty."""
-    if part.rms_mm is None or not math.isfinite(part.rms_mm):
-        count = len(part.leave_one_out_mm)
-        return f"standard uncertainty {number(part.position_u_mm, 2)} mm, not checked: {count} fiducials determine the plan exactly"
-    return f"{number(part.rms_mm, 2)} mm rms"
-
-
-def _scatter_range(drift: DriftPart) -> str:
-    """Return smallest, largest and median scatter over targets and directions, µm."""
-    scatter = drift.scatter_um.values()
-    if not scatter:
-        return "not known: no position has enough readings"
-    least, largest, median = alike([min(scatter), max(scatter), float(np.median(scatter))], distinct=False)
-    # A variance whose estimate is negative is kept as zero: no position is free of scatter.
-    span = f"{least} to" if min(scatter) > 0.0 else "up to"
-    return f"{span} {largest} µm, median {median} µm"
-
-
-def _loop_rows(loop: Loop) -> list[tuple[str, str, Figures]]:
-    """Return name and text of what the model is and predicts, with the figures that each rests on."""
-    rows: list[tuple[str, str, Figures]] = []
-    for step in loop.steps:
-        doubt = f", {say('doubt', step)}" if step.doubt else ""
-        one_of = f"one of {', '.join((step.effect, *step.tied))}" if step.tied else step.effect
-        without = f", without a name: {step.withheld}" if step.withheld else ""
-        rows.append(
-            ("added", f"{one_of} ({p_words(step.p_value)}), {say('step_errors', step)}{doubt}{without}", "causes")
-        )
-    stages = (loop.errors.declared, loop.errors.final) if loop.steps else (loop.errors.declared,)
-    numbers = iter(alike([value for one in stages for value in (one.rmse_um, one.low_um, one.high_um)], distinct=False))
-    errors = " -> ".join(
-        f"{error} [{low} to {high}]" for error, low, high in zip(numbers, numbers, numbers, strict=True)
-    )
-    words = baseline_words(loop)
-    names = dict.fromkeys(name for name in ("last_value", "mean", "mean_run", loop.best_baseline) if name in words)
-    plain = alike([getattr(loop.baselines, name).rmse_um for name in names], distinct=False)
-    baselines = ", ".join(f"{words[name]} {error}" for name, error in zip(names, plain, strict=True))
-    return [
-        *rows,
-        ("held-out error", f"{errors} µm", "positions"),
-        ("plain predictions", f"{baselines} µm", "positions"),
-        ("noise floor", f"{number(loop.noise_floor_um, 3)} µm", "positions"),
-    ]
-
-
-def _run_rows(loop: Loop) -> list[tuple[str, str]]:
-    """The runs that are held out of a record of several, each with its error before and after and its verdict."""
-    rows = []
-    for run in loop.runs if isinstance(loop, RecordLoop) else ():
-        if run.held_out:
-            errors = (run.rmse_declared_um, run.rmse_final_um, run.rmse_persistence_um)
-            declared, final, plain = (number(error, 3) for error in errors)
-            rows.append((f"run {run.file}", f"{run.verdict}: {declared} -> {final} µm, its zero repeated {plain} µm"))
-    return rows
+    """Return names and texts of the findings of a run."""
+    return [(one.name, one.text) for one in findings(results) if one.name]

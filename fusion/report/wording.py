@@ -313,6 +313,7 @@ def environment(*, html: bool) -> jinja2.Environment:
         "channel": lambda name: CHANNELS.get(name, name),
         "contributor": lambda name: CONTRIBUTORS.get(name, name),
         "edges": edges,
+        "error_of": lambda name, loop: getattr(loop.baselines, name).rmse_um,
         "effect": effect_words,
         "input_name": lambda name: INPUT_NAMES.get(name, name),
         "is_record": lambda loop: isinstance(loop, RecordLoop),
@@ -325,8 +326,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, beaten_by_repetition, better_plain, drift_extremes, figures_of_anomalies, quoted_term, quoted_values, randomised_causes,
-        worse_channels,
+        alike, baseline_words, beaten_by_repetition, better_plain, drift_extremes, figures_of, figures_of_anomalies, quoted_term,
+        quoted_values, randomised_causes, untouched, worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
     return made

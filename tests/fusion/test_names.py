@@ -25,8 +25,9 @@ from fusion.app.results.data import Linker, Products, Selection
 from fusion.app.results.screen import results_screen
 from fusion.app.setup.screen import SetUpScreen
 from fusion.campaign.config import load_campaign
-from fusion.pipeline.fleet import Row, as_csv, find_members, render_fleet, with_findings, write_book
+from fusion.pipeline.fleet import find_members
 from fusion.report.exports.controls import emit
+from fusion.report.fleet import Row, as_csv, render_fleet, with_findings, write_book
 from fusion.results.recursion import read_recursion
 from tests.fusion.app.texts import texts
 from tests.fusion.campaign_parts import change, simulated

@@ -40,7 +40,7 @@ from fusion.report.charts.plan import (
 from fusion.report.charts.readings import cycle_map
 from fusion.report.charts.record import draw_record
 from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_series, new_figure, of_rank, palette
-from fusion.report.findings import action, conclude, next_steps, step_phrase
+from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import (
     Table,
     anomaly_cause,
@@ -173,9 +173,9 @@ def loop_steps(products: Products, linker: Linker) -> ui.Parts:
     results = products.results
     loop = results.loop
     assert loop is not None
-    answers = [one for one in conclude(results) if one.question in ("How sure", "What remains")]
+    answers = {"How sure": say("how_sure", results), "What remains": say("what_remains", results)}
     parts = [
-        *(ui.paragraph(f"{one.question}: {one.text}") for one in answers),
+        *(ui.paragraph(f"{question}: {text}") for question, text in answers.items() if text),
         table_of(errors_table(loop), "Errors of predicting what was held out"),
         ui.note(DECIDED_BEFORE),
     ]

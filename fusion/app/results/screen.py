@@ -17,10 +17,11 @@ from fusion.common import FusionError, versions
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.report.charts.thermograms import draw_thermograms
-from fusion.report.findings import first_screen
+from fusion.report.findings import findings, first_screen
 from fusion.report.page import ProductsError, print_pdf, report_of
 from fusion.report.sheet import describe_sheet, write_iso230, write_thermal_tests
 from fusion.report.wording import say
+from fusion.results.results import Results
 from fusion.results.store import write_atomically
 
 
@@ -77,18 +78,20 @@ def _parts(state: ui.State, products: Products) -> ui.Parts:
     shown = {name: build for name, (there, build) in builders.items() if there}
     parts = {name: partial(lambda build: ui.column(*_or_fault(build)), build) for name, build in shown.items()}
     chooser, part = ui.switched("Part", parts, next(iter(parts)))
-    lead = [ui.paragraph(products.results.campaign), *_outcome(products)]
+    lead = [ui.paragraph(products.results.campaign), *_outcome(products.results)]
     if (products.folder / "report.html").is_file():
         lead.append(ui.link("Open the report", ui.report_link(state.root, products.folder)))
         lead.append(_printing(state, products))
     return [*lead, *_chosen(selection, targets), chooser, part]
 
 
-def _outcome(products: Products) -> ui.Parts:
-    """What the report says before anything else."""
-    said = first_screen(products.results, {}, "", "")
+def _outcome(results: Results) -> ui.Parts:
+    """What the report says before anything else, in words and in numbers."""
+    said = first_screen(results, {}, "", "")
     kinds = {"open": "warning", "decision": "", "unmet": "warning", "cause": ""}
-    return [ui.paragraph(said[name], kind=kind) for name, kind in kinds.items() if said[name]]
+    tiles = [one.tile for one in findings(results) if one.tile]
+    words = [ui.paragraph(said[name], kind=kind) for name, kind in kinds.items() if said[name]]
+    return [*words, ui.table(("Finding", "Value", "Of"), tiles, caption="In numbers")] if tiles else words
 
 
 def _printing(state: ui.State, products: Products) -> pn.viewable.Viewable:

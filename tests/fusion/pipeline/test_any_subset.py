@@ -10,11 +10,11 @@ import pytest
 
 from fusion.analysis.alignment.align import AlignmentError
 from fusion.pipeline.check import check_campaign
-from fusion.pipeline.fleet import Row, with_findings
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.run import run_campaign
 from fusion.report.exports.export import ExportError, export_results
 from fusion.report.findings import summary_rows
+from fusion.report.fleet import Row, with_findings
 from fusion.report.page import report_of
 from fusion.report.sheet import describe_sheet, render_iso230
 from fusion.results.folder import claim, read_manifest

@@ -20,7 +20,6 @@ from fusion.app.results.charts import anomaly_cards, laser_charts, loop_steps
 from fusion.app.results.data import Linker, Products, Selection
 from fusion.app.results.screen import _outcome
 from fusion.pipeline.compare import compare_campaigns
-from fusion.pipeline.fleet import Row, render_fleet, with_findings, write_book
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.iso230_3 import read_thermal_tests
 from fusion.pipeline.run import run_campaign
@@ -28,6 +27,7 @@ from fusion.report.campaign import thermal_test_tables
 from fusion.report.comparison import render_comparison
 from fusion.report.exports.export import export_results
 from fusion.report.findings import summary_table
+from fusion.report.fleet import Row, render_fleet, with_findings, write_book
 from fusion.report.sheet import describe_sheet, iso230_tables, write_iso230, write_thermal_tests
 from fusion.report.wording import ISO230_TERMS, ONE_WAY_TERMS
 from fusion.results.numbers import measured
@@ -193,7 +193,7 @@ def surfaces(run, tmp_path_factory) -> Mapping[str, str]:
     selection = Selection(cycle=1, target=3)
     linker = Linker(selection, products.targets, products.cycles, None)
     parts = [
-        *_outcome(products), *laser_charts(products, selection, linker), *loop_steps(products, linker),
+        *_outcome(products.results), *laser_charts(products, selection, linker), *loop_steps(products, linker),
         *anomaly_cards(products, selection),
     ]  # fmt: skip
     again = shutil.copytree(run, out / "again")

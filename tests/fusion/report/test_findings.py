@@ -1,0 +1,199 @@
+"""Findings of a run: each on every surface that shows it, with one number; what is doubted stands beside what rests on it."""
+
+from __future__ import annotations
+
+import io
+import re
+from html import unescape
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from fusion.analysis.consistency.checks import Check, inputs_part, judge
+from fusion.app.results.screen import _outcome
+from fusion.report.campaign import describe_campaign
+from fusion.report.exports.tables import findings_table
+from fusion.report.findings import Finding, findings, summary_rows, summary_table
+from fusion.report.fleet import Row, with_findings
+from fusion.report.page import render_page
+from fusion.results.results import Notice, Results, assemble
+from fusion.results.store import write_json
+from tests.fusion.app.texts import texts
+from tests.fusion.report.test_campaign import ORIGIN
+from tests.fusion.report.test_fleet import PICTURES
+from tests.fusion.report.test_record import record
+from tests.fusion.results_sample import PARTS, RECORD_LOOP
+
+MOVED: dict[str, Any] = {
+    "kind": "spindle", "duration_h": 9.0, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
+    "distortions": [
+        {
+            "name": name, "unit": unit, "whole": {"value": value, "u": 0.9}, "settling_min": None,
+            **{key: {"value": None, "u": None} for key in ("first_hour", "last_hour", "change")},
+        }
+        for name, unit, value in (("X", "um", 89.2), ("tilt", "um/m", 120.0))
+    ],
+}  # fmt: skip
+DRIFT = {**PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [3.1, 11.127], "range_u_um": [0.1, 0.17]}
+FIELD = {
+    "fields": 9, "frames": 9, "duration_s": 60.0, "mean_rise_K": {"value": 1.05, "u": 0.2}, "largest_rise_K": {"value": 2.0, "u": 0.2},
+    "largest_cycle": 9, "largest_after_s": 60.0, "largest_x_mm": 1.0, "largest_y_mm": 1.0,
+}  # fmt: skip
+RUN = {
+    "file": "run 2",
+    "held_out": True,
+    "duration_h": 5.0,
+    "blocks": 60,
+    "verdict": "explained",
+    "rmse_persistence_um": 0.9,
+}
+RUNS = [{**RUN, "rmse_declared_um": 0.6, "rmse_final_um": 0.4}]
+LATE = [Notice("clock", "The clocks disagree.", "Set clock_offset.")]
+AXIS = {name: part for name, part in PARTS.items() if name not in ("registration", "hotspots")}
+#: Results of an axis with a camera, of a laser alone, of a record, and of a camera alone; and what their products hold.
+SAMPLES: dict[str, tuple[Results, dict[str, Any]]] = {
+    "axis": (assemble("A", {**AXIS, "drift": DRIFT, "field": FIELD}, LATE), {}),
+    "laser": (assemble("L", {"iso230": PARTS["iso230"]}, []), {}),
+    "record": (assemble("R", {"loop": {**RECORD_LOOP, "runs": RUNS}, "iso230_3": [MOVED]}, []), {"record": record()}),
+    "camera": (assemble("C", PICTURES, []), {}),
+}
+#: What each of them says, in its order; doubled are those of several steps, values and regions.
+CODES = {
+    "axis": (
+        "quoted A R E M B drift mean_rise scatter verdict how_much where how_sure what_remains declared added held_out plain_predictions "
+        "noise_floor next warning"
+    ),
+    "laser": "quoted quoted quoted quoted A R E M B how_much next",
+    "record": (
+        "drift verdict how_sure what_remains declared added held_out plain_predictions noise_floor unexplained run_line next"
+    ),
+    "camera": "highest lowest mean region_line next",
+}
+
+
+def one_line(text: str) -> str:
+    """A text without marks and frames, on one line."""
+    return " ".join(unescape(re.sub("<[^>]*>|[─-╿]", " ", text)).split())
+
+
+@pytest.fixture(scope="module")
+def surfaces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """What each surface shows of every sample."""
+    shown = {}
+    for name, (results, products) in SAMPLES.items():
+        folder, printed = tmp_path_factory.mktemp(name), io.StringIO()
+        write_json(folder / "results.json", results.as_json())
+        Console(width=5000, file=printed).print(summary_table(results))
+        summary = describe_campaign(results, ORIGIN, products, None)
+        given = {"results": results, "provenance": ORIGIN, "summary": summary, "thermal_map": None}
+        shown[name] = {
+            "page": one_line(render_page("report.html.j2", {}, **given)),
+            "terminal": one_line(printed.getvalue()),
+            "application": one_line(texts(_outcome(results))),
+            "workbook": dict(zip(*findings_table(results)[["finding", "value"]].T.values, strict=True)),
+            "fleet": with_findings(Row(name, state="finished"), folder),
+        }
+    return shown
+
+
+EVERY = [
+    pytest.param(name, one, id=f"{name}-{at}-{one.code}")
+    for name, (results, _) in SAMPLES.items()
+    for at, one in enumerate(findings(results))
+]
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_findings_come_in_the_order_of_the_report(name: str) -> None:
+    assert [one.code for one in findings(SAMPLES[name][0])] == CODES[name].split()
+
+
+@pytest.mark.parametrize(("name", "one"), EVERY)
+def test_a_finding_stands_on_every_surface_that_shows_it(
+    surfaces: dict[str, dict[str, Any]], name: str, one: Finding
+) -> None:
+    shown = surfaces[name]
+    if one.name:
+        assert f"{one.name} {one_line(one.text)}" in shown["terminal"]
+        assert one.text in shown["workbook"][one.name]
+    if one.tile:
+        assert " ".join(one.tile).strip() in shown["page"] and " ".join(one.tile).strip() in shown["application"]
+    if one.value is not None and hasattr(shown["fleet"], key := f"{one.code}_{one.unit}"):
+        assert getattr(shown["fleet"], key) == one.value.value
+        assert getattr(shown["fleet"], f"{one.code}_u_{one.unit}", None) == one.value.u
+    assert one.name or one.tile or one.value
+
+
+@pytest.mark.parametrize("name", ["axis", "record"])
+def test_numbers_of_a_fleet_are_findings(surfaces: dict[str, dict[str, Any]], name: str) -> None:
+    stated = {f"{one.code}_{one.unit}" for one in findings(SAMPLES[name][0]) if one.value}
+    columns = {"drift_um", "held_out_um", *(f"{symbol}_um" for symbol in "AREMB")}
+    assert {key for key in columns if getattr(surfaces[name]["fleet"], key) is not None} == stated
+
+
+def test_the_findings_of_a_run_in_a_few_rows():
+    rows = dict(summary_rows(assemble("A", PARTS, [Notice("clock", "The clocks disagree.", "Set clock_offset.")])))
+    assert rows["registration"] == "0.10 mm rms"
+    assert "A = 1.00 \u00b1 0.20 \u00b5m" in rows["how much"]
+    assert rows["where"].startswith("Position 3 repeats worse than the others")
+    assert all(
+        part in rows["added"]
+        for part in ("step_event (p = 0.001)", "from 0.60 to 0.40 \u00b5m", "from 0.70 to 0.50 \u00b5m")
+    )
+    assert rows["held-out error"] == "0.60 [0.50 to 0.70] -> 0.40 [0.35 to 0.46] \u00b5m"
+    assert rows["plain predictions"].endswith("ridge regression with lagged copies 0.50 \u00b5m")
+    assert rows["next"].splitlines()[-1] == "3. Set clock_offset."
+    assert rows["warning"] == "The clocks disagree."
+
+
+def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
+    checks = [Check("datum", 1.0, 0.5, False, "It is off.", "Check it.", "figures")]
+    rows = dict(summary_rows(assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])))
+    condition = "(only if the datum of the laser stayed the same)"
+    touched = {name for name, text in rows.items() if condition[1:-1] in text.lower()}
+    of_laser = "verdict, how much, where, how sure, scatter per position, added, held-out error, plain predictions, noise floor, next"
+    assert touched == set(of_laser.split(", "))
+
+
+def test_what_is_not_verified_is_said_with_what_would_confirm_it():
+    checks = [
+        judge("material_rise", 0.0, 0.07, "Scale not verified.", unverified="State where the material sensor sits.")
+    ]
+    results = assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])
+    rows = dict(summary_rows(results))
+    assert (
+        rows["inputs"] == "sound in 1 checks\nnot verified: Scale not verified. State where the material sensor sits."
+    )
+    assert rows["next"].startswith("1. State where the material sensor sits.")
+    assert results.inputs.state == "sound" and results.inputs.assumptions("field") == ("the emissivity is right",)
+    # A scale that all share makes no cause right or wrong.
+    assert results.inputs.assumptions("positions", "attribution", "causes") == ()
+    accepted = assemble("A", {**PARTS, "inputs": inputs_part(checks, ("material_rise",))}, [])
+    assert accepted.inputs.unverified == ()
+
+
+def test_an_exact_fit_is_not_printed_as_accuracy():
+    part = {**PARTS["registration"], "rms_mm": None, "position_u_mm": 0.87, "leave_one_out_mm": dict.fromkeys("ABCD")}
+    rows = dict(summary_rows(assemble("four discs", {**PARTS, "registration": part}, [])))
+    assert rows["registration"] == ("standard uncertainty 0.87 mm, not checked: 4 fiducials determine the plan exactly")
+
+
+@pytest.mark.parametrize(
+    ("positive", "negative", "stated"),
+    [
+        ((0.4, None), (0.2, 0.3), "0.20 to 0.40 µm, median 0.30 µm"),
+        ((0.4, 0.0), (0.2, 0.3), "up to 0.40 µm, median 0.25 µm"),
+        ((None,), (None,), "not known: no position has enough readings"),
+    ],
+)
+def test_scatter_leaves_out_what_is_not_determined(positive, negative, stated):
+    drift = {**PARTS["drift"], "scatter_um": {"positive": positive, "negative": negative}}
+    assert dict(summary_rows(assemble("A", {**PARTS, "drift": drift}, [])))["scatter per position"] == stated
+
+
+def test_plain_predictions_are_last_value_mean_and_the_best_regression():
+    results = assemble("A", PARTS, [])
+    best = results.loop.model_copy(update={"best_baseline": "mean", "steps": ()})
+    rows = dict(summary_rows(results.model_copy(update={"loop": best})))
+    assert rows["plain predictions"].count(", ") == 1 and "->" not in rows["held-out error"]
