@@ -16,6 +16,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from fusion.analysis.consistency.library import RULES
 from fusion.campaign.remote import read_registry
 from tests.readme import measured_files
 
@@ -143,6 +144,13 @@ def pages() -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_every_check_has_a_row_with_its_limits(pages: ModuleType) -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", pages.checks_table(), re.M))
+    assert list(rows) == list(RULES)
+    assert "`LEAST_TRAVEL_SHARE = 0.03`. | the positions are in mm |" in rows["travel"]
+    assert not [code for code, row in rows.items() if len(row.split(" | ")) != 3 or "| |" in row]
 
 
 def test_every_measured_figure_is_whole_and_its_command_names_tests_that_exist(pages: ModuleType) -> None:

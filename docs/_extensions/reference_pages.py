@@ -1,4 +1,4 @@
-"""Pages that are written from the code (modules, command, campaign file, recipe, results), and the tables of the measured figures."""
+"""Pages that are written from the code (modules, checks, command, campaign file, recipe, results), and tables of measured figures."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pkgutil
 import re
 import typing
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,8 +19,10 @@ from sphinx.application import Sphinx
 
 import thermofuse
 from fusion import cli
+from fusion.analysis.consistency.library import RULES
 from fusion.campaign.config import campaign_schema
 from fusion.campaign.inspect import Kind
+from fusion.report.wording import environment
 from fusion.results.results import results_schema
 from fusion.twin.recipe_file import recipe_schema
 
@@ -230,6 +233,23 @@ def kinds_of_file() -> str:
     return "\n".join(["| kind | key |", "|---|---|", *rows]) + "\n"
 
 
+def checks_table() -> str:
+    """Return a row for every consistency check: what its docstring compares, with the limits in the code, and what hangs on it."""
+    conditions = environment(html=False).get_template("checks.j2").module.conditions
+    lines = ["| code | what is compared, and its limit | what has to be right | else endangered |", "|---|---|---|---|"]
+    first: dict[str, str] = {}
+    for code, rule in RULES.items():
+        about = re.sub(r"`(_?[A-Z][A-Za-z_]+)`", partial(quoted, rule.find), rule.find.__doc__ or "")
+        said = about if first.setdefault(about, code) == code else f"as `{first[about]}`"
+        lines.append(f"| `{code}` | {' | '.join(cell(text) for text in (said, *conditions[code]))} |")
+    return "\n".join(lines) + "\n"
+
+
+def quoted(function: Any, name: re.Match[str]) -> str:
+    """Return a constant of a function's module with its value."""
+    return f"`{name[1].lstrip('_')} = {function.__globals__[name[1]]}`"
+
+
 def measured_table(rows: Sequence[Mapping[str, str]]) -> str:
     """Return the figures of one section that are shown in `measured.md`; the last column is the aim where any row has one."""
     last = "aim" if any(row["aim"] for row in rows) else "n"
@@ -275,6 +295,7 @@ def write_pages(app: Sphinx) -> None:
     measured = Path(app.srcdir) / "measured.md"
     pages[measured] = measured_page(measured.read_text(encoding="utf-8"), measured_rows(measured.with_suffix(".csv")))
     pages |= {
+        generated / "checks.md": checks_table(),
         generated / "command.md": command_page(),
         generated / "campaign.md": campaign_page(
             campaign_schema(), (reference / "campaign-file.md").read_text(encoding="utf-8")

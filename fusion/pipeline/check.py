@@ -13,14 +13,19 @@ import numpy as np
 import xarray as xr
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
-from fusion.analysis.consistency.checks import Check, ContradictionError, Severity, open_doubts, refuse_contradictions
-from fusion.analysis.consistency.clocks import without_consequences
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
 from fusion.campaign.inspect import Kind, Recording, time_bars
 from fusion.campaign.logs import NO_START, read_drivers
 from fusion.messages import BAD_INPUT
-from fusion.pipeline.consistency import check_source
+from fusion.pipeline.consistency import (
+    Check,
+    ContradictionError,
+    check_source,
+    open_doubts,
+    refuse_contradictions,
+    without_consequences,
+)
 from fusion.results.progress import counted
 from fusion.results.results import Notice
 from interferometry.io.readings import read_deviations
@@ -46,7 +51,7 @@ class CampaignCheck:
     @property
     def doubts(self) -> list[Check]:
         """Checks that are not passed, nor accepted, and that a run would name first; contradictions are faults."""
-        return [one for one in open_doubts(self.checks, self.accepted) if one.severity is Severity.DOUBT]
+        return [one for one in open_doubts(self.checks, self.accepted) if not one.contradicts]
 
     def lines(self, *, quiet: bool = False, brief: bool = False) -> list[str]:
         """Return the check as lines of text, what would refuse it last; `quiet` leaves faults and doubts only, `brief` the verdict too."""

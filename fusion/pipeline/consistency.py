@@ -1,10 +1,9 @@
-"""The checks of a run: those before the long work, those of the fields, and those on what was fitted."""
+"""The checks of a run: those before the long work, those of the fields, and those on what was fitted; what follows from them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,65 +12,97 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.alignment.readings import ReadingsError, read_fused
-from fusion.analysis.consistency.camera import (
-    check_coverage,
-    check_frames,
-    check_gaps,
-    check_order,
-    check_phase,
-    check_picture,
-    check_place,
-    check_registration,
-    compare_phase,
-)
-from fusion.analysis.consistency.checks import CODES, Check
-from fusion.analysis.consistency.clocks import Evidence, Recording, check_clocks
-from fusion.analysis.consistency.courses import (
-    check_load_course,
-    check_load_kind,
-    check_load_scale,
-    compare_drift,
-    compare_load,
-    compare_material,
-)
+from fusion.analysis.consistency.camera import Motion, compare_phase, file_warnings
+from fusion.analysis.consistency.checks import Found, Inputs, Phase, Rule
+from fusion.analysis.consistency.clocks import Evidence, Recording, compare_clocks
+from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
 from fusion.analysis.consistency.field_series import field_at, thin_fields
-from fusion.analysis.consistency.logs import (
-    check_contact_sensors,
-    check_log,
-    check_material,
-    compare_sensors,
-)
-from fusion.analysis.consistency.model import check_coefficients
-from fusion.analysis.consistency.readings import check_readings, check_signs
-from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, Source, is_rotary, overridden_parameters
+from fusion.analysis.consistency.library import RULES
+from fusion.analysis.consistency.material import log_with_camera
+from fusion.campaign.config import CampaignError
+from fusion.campaign.inputs import CameraInputs, LaserInputs, Source, is_rotary, overridden_parameters
+from fusion.campaign.inputs import Inputs as Read
+from fusion.common import FusionError
+from fusion.report.wording import check_words
+from fusion.results.parts import CheckPart, Figures
+from fusion.results.results import Notice
 from thermography.io.other_cameras import TemperatureFrame
 
 
-def check_source(source: Inputs) -> list[Check]:
+class ContradictionError(FusionError):
+    """Inputs that cannot all be true; the message names the file, the value and the remedy."""
+
+
+class Check(CheckPart):
+    """One check of a run; `contradicts` where it ends the run unless it is passed."""
+
+    contradicts: bool = False
+
+
+def run_checks(phase: Phase, inputs: Inputs) -> list[Check]:
+    """Make the checks of a phase for which there is what they take."""
+    made = ((rule, rule.make(inputs)) for rule in RULES.values() if rule.phase == phase)
+    return [_worded(rule, found, inputs) for rule, found in made if found is not None]
+
+
+def _worded(rule: Rule, found: Found, inputs: Inputs) -> Check:
+    """What a check found, in words; a doubted environment touches the readings that it has compensated."""
+    numbers = {name: getattr(found, name) for name in ("value", "limit", "passed", "verified")}
+    files = {name: value for name, value in vars(inputs).items() if name.endswith("_file")}
+    words = check_words(rule.code, {**files, **found.facts, **numbers})
+    touched = inputs.recompensated and rule.code.startswith("environment")
+    figures: tuple[Figures, ...] = ("positions", *rule.figures) if touched else rule.figures
+    # What nothing contradicts and nothing confirms: sizes depend on it, no name does.
+    conditional = figures if found.verified else tuple(name for name in figures if name == "field")
+    return Check(code=rule.code, contradicts=found.contradicts, conditional=conditional, **numbers, **words)
+
+
+def check_source(source: Read) -> list[Check]:
     """Check what was read, before anything is calculated."""
-    unknown = [code for code in source.campaign.accept.doubts if code not in CODES]
+    unknown = [code for code in source.campaign.accept.doubts if code not in RULES]
     if unknown:
         raise CampaignError(
-            f"{source.campaign.path}: accept.doubts = {unknown[0]!r}: no such check; there are: {', '.join(CODES)}"
+            f"{source.campaign.path}: accept.doubts = {unknown[0]!r}: no such check; there are: {', '.join(RULES)}"
         )
-    checks: list[Check] = []
+    motion, inputs = _motion(source), dict[str, Any]()
     if isinstance(source, LaserInputs):
-        checks += _check_readings_and_logs(source)
+        inputs = _of_logs(source) | _of_readings(source)
     if isinstance(source, CameraInputs) and source.frames:
-        checks += check_order(source.frames)
-        if isinstance(source, Source) and source.thermography.table == "still":
-            # Frames of a moving table estimate the offset of the clocks themselves.
-            checks += check_phase(_frame_times(source), source.deviations)
-        if isinstance(source, Source):
-            offset_s = source.thermography.clock_offset_s or 0.0
-            checks += check_coverage(_frame_times(source), source.deviations, offset_s=offset_s)
         stated, stack = set(overridden_parameters(source.thermography)), source.thermography.stack
         # Temperatures whose emissivity is not stated are taken as they are: a notice of its own, and no doubt about a stored value.
         if isinstance(source.frames[0], TemperatureFrame) and (stack is None or stack.emissivity is None):
             stated.add("emissivity")
-        checks += check_frames(source.frames, overridden=stated)
-    return [*checks, *check_clocks(_recordings(source), _of_stamps(source))]
+        inputs |= {"frames": source.frames, "file_warnings": file_warnings(source.frames, overridden=stated)}
+        if isinstance(source, Source):
+            offset_s = source.thermography.clock_offset_s or 0.0
+            inputs |= {"frame_time": _frame_times(source), "motion": motion, "offset_s": offset_s}
+    return [*run_checks("source", Inputs(**inputs)), *_check_clocks(source, compare_phase(motion))]
+
+
+def _of_logs(source: Read) -> dict[str, Any]:
+    """Logs with the names of their files, and whether the readings were compensated with one."""
+    laser, drivers = source.campaign.interferometry, source.campaign.drivers
+    return {
+        "environment": source.environment,
+        "environment_file": (None if laser is None else laser.environment) or "the environment log",
+        "drivers": source.drivers,
+        "drivers_file": "the drivers' log" if drivers is None else drivers.file,
+        "recompensated": isinstance(source, LaserInputs) and source.is_recompensated,
+    }
+
+
+def _of_readings(source: LaserInputs) -> dict[str, Any]:
+    """Readings, and logs that stand beside them."""
+    deviations, plan, sensors = source.deviations, source.campaign.plan, source.sensors
+    inputs: dict[str, Any] = {"deviations": deviations, "reading_time": deviations["time"]}
+    if not is_rotary(deviations) and np.isfinite(deviations["deviation"].values).any():
+        inputs["linear"] = deviations
+    if plan is not None and plan.axis is not None and plan.size_mm is not None:
+        extent = (abs(part) * length for part, length in zip(plan.axis.direction, plan.size_mm, strict=True))
+        inputs["plan_extent_mm"] = sum(extent)
+    if sensors is not None and not isinstance(source, CameraInputs):
+        inputs |= {"sensors": sensors.temperature.to_dataset(name="temperature"), "sensors_file": sensors.file}
+    return inputs
 
 
 def _frame_times(source: CameraInputs, fields: xr.Dataset | None = None) -> NDArray[np.datetime64]:
@@ -81,15 +112,21 @@ def _frame_times(source: CameraInputs, fields: xr.Dataset | None = None) -> NDAr
     return camera_on_laser_clock(source.frame_times, source.thermography.clock_offset_s or 0.0)
 
 
-def _of_stamps(source: Inputs, fields: xr.Dataset | None = None) -> list[Evidence]:
-    """What the stamps of the frames of a still table say of the camera's clock."""
+def _motion(source: Read, fields: xr.Dataset | None = None) -> Motion | None:
+    """The frames in the motion of the axis; frames of a moving table estimate the offset of the clocks themselves."""
     if isinstance(source, Source) and source.thermography.table == "still":
-        return compare_phase(_frame_times(source, fields), source.deviations)
-    return []
+        return Motion.of(_frame_times(source, fields), source.deviations)
+    return None
 
 
-def _recordings(source: Inputs, fields: xr.Dataset | None = None) -> list[Recording]:
-    """All recordings of a test; the frames on the clock of the fields, where those are known."""
+def _check_clocks(source: Read, compared: Sequence[Evidence], fields: xr.Dataset | None = None) -> list[Check]:
+    """Check the clocks of all recordings; the frames on the clock of the fields, where those are known."""
+    found = compare_clocks(_recordings(source, fields), compared)
+    return run_checks("clocks", Inputs(**_of_logs(source), clocks=found))
+
+
+def _recordings(source: Read, fields: xr.Dataset | None = None) -> list[Recording]:
+    """All recordings of a test."""
     campaign, found = source.campaign, list[Recording]()
     laser, drivers = campaign.interferometry, campaign.drivers
     if isinstance(source, LaserInputs):
@@ -111,70 +148,102 @@ def _recordings(source: Inputs, fields: xr.Dataset | None = None) -> list[Record
     return found
 
 
-def _log_files(campaign: Campaign) -> tuple[str, str]:
-    """Names of the files of environment and drivers."""
-    laser, drivers = campaign.interferometry, campaign.drivers
-    environment = None if laser is None else laser.environment
-    return environment or "the environment log", "the drivers' log" if drivers is None else drivers.file
-
-
-def _check_readings_and_logs(source: LaserInputs) -> list[Check]:
-    """Checks of the readings in themselves, and of the logs."""
-    times, plan = source.deviations["time"].values.ravel(), source.campaign.plan
-    environment_file, drivers_file = _log_files(source.campaign)
-    extent_mm = None
-    if plan is not None and plan.axis is not None and plan.size_mm is not None:
-        extent_mm = sum(abs(part) * length for part, length in zip(plan.axis.direction, plan.size_mm, strict=True))
-    checks = [
-        *([] if is_rotary(source.deviations) else check_readings(source.deviations, plan_extent_mm=extent_mm)),
-        *check_signs(source.deviations),
-        *check_log(source.environment, times, name="environment", file=environment_file),
-        *check_log(source.drivers, times, name="drivers", file=drivers_file),
-        *check_load_kind(source.drivers, file=drivers_file),
-    ]
-    if source.sensors is not None and not isinstance(source, CameraInputs):
-        # They stand for the camera.
-        logged = source.sensors.temperature.to_dataset(name="temperature")
-        checks += check_log(logged, times, name="sensors", file=source.sensors.file)
-    return [*checks, *check_contact_sensors(source.environment, source.drivers, file=environment_file)]
-
-
 def check_fields(source: CameraInputs, fields: xr.Dataset, fused: xr.Dataset | None = None) -> list[Check]:
     """Check the fields in themselves and against logs and contact sensors; with a laser against material temperature and drift too."""
-    field, (environment_file, drivers_file) = thin_fields(fields), _log_files(source.campaign)
-    compared, material, gaps = list[Evidence](), list[Check](), list[Check]()
+    inputs, field, on_plan = _of_logs(source), thin_fields(fields), source.sensors
+    inputs |= {"fields": fields, "field": field}
+    compared = list[Evidence]()
     if isinstance(source, Source) and fused is not None:
         # It takes three cycles at three targets with readings among the frames.
         with suppress(ReadingsError):
             compared += compare_drift(read_fused(fused))
         place_mm = source.interferometry.material_sensor_mm
         near = field if place_mm is None else field_at(fields, place_mm)
-        compared += [*_of_stamps(source, fields), *compare_material(near, source.environment)]
-        material = check_material(near, source.environment, stated=place_mm is not None, file=environment_file)
-        gaps = check_gaps(fields["time"].values, source.deviations["time"])
-    sensors, on_plan = list[Check](), source.sensors
+        compared += [*compare_phase(_motion(source, fields)), *compare_material(near, source.environment)]
+        inputs |= {"logged": log_with_camera(near, source.environment), "place_stated": place_mm is not None}
+        inputs |= {"frame_time": fields["time"].values, "reading_time": source.deviations["time"]}
     if on_plan is not None:
-        sensors = compare_sensors(fields, on_plan.temperature, on_plan.x_mm, on_plan.y_mm, u_K=on_plan.u_K)
-    if sensors:
-        # Contact sensors on the plan have shown the scale, or contradict it.
-        material = [check if check.verified else replace(check, verified=True, remedy="") for check in material]
-    return [
-        *check_clocks(_recordings(source, fields), [*compared, *compare_load(field, source.drivers)]),
-        *check_load_scale(field, source.drivers, file=drivers_file),
-        *check_load_course(field, source.drivers, file=drivers_file, environment=source.environment),
-        *material,
-        *sensors,
-        *check_place(fields),
-        *check_picture(fields),
-        *gaps,
-    ]
+        inputs |= {"sensor_temperature": on_plan.temperature, "sensor_u_K": on_plan.u_K}
+        inputs |= {"sensor_x_mm": on_plan.x_mm, "sensor_y_mm": on_plan.y_mm}
+    clocks = _check_clocks(source, [*compared, *compare_load(field, source.drivers)], fields)
+    return [*clocks, *_together(run_checks("fields", Inputs(**inputs)))]
+
+
+def _together(checks: Sequence[Check]) -> Iterator[Check]:
+    """The checks of the camera's temperature, with what contact sensors on the plan and exchanged columns say of them."""
+    exchanged = any(check.code == "environment_columns" and not check.passed for check in checks)
+    with_sensors = any(check.code == "sensors_rise" for check in checks)
+    for check in checks:
+        changed: dict[str, Any] = {}
+        if check.code.startswith("material") and exchanged and not check.passed:
+            changed["remedy"] = (
+                f"See environment_columns first: with both columns exchanged, camera and log agree. {check.remedy}"
+            )
+        if check.code.startswith("material") and with_sensors and not check.verified:
+            # They have shown the scale, or contradict it.
+            changed = {"verified": True, "remedy": "", "conditional": RULES[check.code].figures}
+        yield check.model_copy(update=changed)
 
 
 def check_plan(source: CameraInputs, registration: Mapping[str, Any]) -> list[Check]:
     """Check what the registration found."""
-    return check_registration(registration, file=source.fiducials_file)
+    return run_checks("plan", Inputs(registration=registration, fiducials_file=source.fiducials_file))
 
 
 def check_loop(loop: Mapping[str, Any], source: LaserInputs) -> list[Check]:
     """Check what the closed loop fitted against physics."""
-    return check_coefficients(loop, travel_mm=float(np.abs(source.deviations["position"]).max()))
+    return run_checks("loop", Inputs(loop=loop, travel_mm=float(np.abs(source.deviations["position"]).max())))
+
+
+def without_consequences(checks: Sequence[Check], accepted: Collection[str] = ()) -> list[Check]:
+    """Leave out what cannot be judged until a doubted clock is right; a refusal among it is that of the clock."""
+    latest = list({check.code: check for check in checks}.values())
+    doubted = [check for check in latest if is_doubted_clock(check) and check.code not in accepted]
+    waiting = [check for check in latest if doubted and RULES[check.code].waits and not check.passed]
+    if waiting:
+        codes = f" To be judged when the clocks are right: {', '.join(check.code for check in waiting)}."
+        refused = any(check.contradicts for check in waiting)
+        latest = [
+            one.model_copy(update={"contradicts": refused, "evidence": one.evidence + codes}) if one in doubted else one
+            for one in latest
+        ]
+    return [check for check in latest if check not in waiting]
+
+
+def is_doubted_clock(check: Check) -> bool:
+    """Whether a check says that a clock is wrong."""
+    return RULES[check.code].phase == "clocks" and not check.passed
+
+
+def refuse_contradictions(checks: Sequence[Check]) -> None:
+    """Refuse inputs that cannot all be true."""
+    faults = [check for check in checks if not check.passed and check.contradicts]
+    if faults:
+        raise ContradictionError("\n".join(f"{check.evidence} {check.remedy}" for check in faults))
+
+
+def open_doubts(checks: Sequence[Check], accepted: Collection[str]) -> list[Check]:
+    """Checks that are not passed and that the campaign file does not accept."""
+    return [check for check in checks if not check.passed and check.code not in accepted]
+
+
+def inputs_part(checks: Sequence[Check], accepted: Collection[str], *, corrected: bool = False) -> dict[str, object]:
+    """The part ``inputs`` of results.json."""
+    sound = "corrected" if corrected else "sound"
+    return {
+        "state": "doubted" if open_doubts(checks, accepted) else sound,
+        "accepted": sorted(accepted),
+        "checks": [check.model_dump(exclude={"contradicts"}) for check in checks],
+    }
+
+
+def doubt_notices(checks: Sequence[Check], accepted: Collection[str]) -> list[Notice]:
+    """One warning for every check that is not passed."""
+    notices = []
+    for check in checks:
+        if check.passed:
+            continue
+        known = check.code in accepted
+        message = f"{check.evidence} {'Accepted in the campaign file.' if known else f'Endangered: {check.endangers}.'}"
+        notices.append(Notice(f"doubt_{check.code}", message, "" if known else check.remedy))
+    return notices

@@ -14,8 +14,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from fusion.analysis.alignment.align import describe_sensors, join_sensors
-from fusion.analysis.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
-from fusion.analysis.consistency.clocks import FOLLOWING_NOTICES, is_doubted_clock, without_consequences
+from fusion.analysis.consistency.clocks import FOLLOWING_NOTICES
 from fusion.analysis.effects.plugins import plugins
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import (
@@ -33,7 +32,18 @@ from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, thermal
 from fusion.pipeline import positioning as interferometry
 from fusion.pipeline import record as record_stage
-from fusion.pipeline.consistency import check_fields, check_loop, check_plan, check_source
+from fusion.pipeline.consistency import (
+    Check,
+    check_fields,
+    check_loop,
+    check_plan,
+    check_source,
+    doubt_notices,
+    inputs_part,
+    is_doubted_clock,
+    refuse_contradictions,
+    without_consequences,
+)
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.iso230_3 import evaluate_axis_test, evaluate_record_test, with_conditions
 from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
@@ -185,7 +195,6 @@ def _run_loaded(
                     checks,
                     campaign.accept.doubts,
                     corrected="camera" in run.parts and camera_corrected(run.parts["camera"]),
-                    recompensated=isinstance(source, LaserInputs) and source.is_recompensated,
                 )
             return _finish(run, made)
         except BaseException:

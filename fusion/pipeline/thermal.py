@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.consistency.field_series import field_at, thin_fields
-from fusion.analysis.consistency.logs import rise_share_u
+from fusion.analysis.consistency.material import rise_share_u
 from fusion.campaign.config import RegionTable, ThermographyTable, relative_name
 from fusion.campaign.inputs import (
     OVERRIDABLE,

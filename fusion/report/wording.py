@@ -338,9 +338,9 @@ def _without_control(value: object) -> object:
     return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
-def sentences(name: str, *facts: Any) -> list[str]:
-    """Return the lines of a statement of ``sentences.j2`` as plain text."""
-    macro = getattr(environment(html=False).get_template("sentences.j2").module, name)
+def sentences(name: str, *facts: Any, template: str = "sentences.j2") -> list[str]:
+    """Return the lines of a statement as plain text."""
+    macro = getattr(environment(html=False).get_template(template).module, name)
     return [" ".join(line.split()) for line in macro(*facts).splitlines() if line.strip()]
 
 
@@ -369,6 +369,14 @@ def quoted_values(iso: Iso230Window) -> dict[str, str]:
 def quoted_term(symbol: str) -> str:
     """Return the term of the standard for the symbol of a quoted value, which ends with it."""
     return ISO230_TERMS.get(symbol) or f"{ONE_WAY_TERMS[symbol[0]]}{symbol[1:]}"
+
+
+def check_words(code: str, facts: Mapping[str, Any]) -> dict[str, str]:
+    """Return the words of a check; its remedy where it is not passed, or not verified."""
+    assumption, endangers = environment(html=False).get_template("checks.j2").module.conditions[code]  # type: ignore[attr-defined]
+    evidence, *remedy = sentences(code, facts, template="checks.j2")
+    needed = [] if facts["passed"] and facts["verified"] else remedy
+    return {"assumption": assumption, "endangers": endangers, "evidence": evidence, "remedy": " ".join(needed)}
 
 
 class DriftExtreme(NamedTuple):

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from fusion.analysis.consistency.library import RULES
+from fusion.pipeline.consistency import Check
+from fusion.report.wording import environment
+
 MEASURED = {"value": 1.0, "u": 0.1}
 BOTH = {"positive": [0.4, None], "negative": [0.5, 0.6]}
 SCORE = {
@@ -182,3 +186,13 @@ RECORD_LOOP: dict[str, Any] = {
         [{**SCORE, "chained_rmse_before_um": 0.7, "chained_rmse_after_um": 0.5, "chosen": True, "rejected": ""}]
     ],
 }
+
+
+def told(code: str, *, passed: bool, verified: bool = True) -> Check:
+    """A check by its code, as a run tells it."""
+    assumption, _ = environment(html=False).get_template("checks.j2").module.conditions[code]
+    figures = RULES[code].figures if verified else ("field",)
+    return Check(
+        code=code, value=1.0, limit=0.5, passed=passed, verified=verified, evidence="It is off.", remedy="Check it.",
+        endangers="figures", assumption=assumption, conditional=figures,
+    )  # fmt: skip

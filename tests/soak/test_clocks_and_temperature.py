@@ -12,11 +12,11 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry
-from fusion.analysis.consistency.camera import check_phase
-from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.courses import check_load_course, check_load_kind, check_load_scale
+from fusion.analysis.consistency.camera import Motion
+from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.field_series import field_at, thin_fields
-from fusion.analysis.consistency.logs import check_material
+from fusion.analysis.consistency.material import log_with_camera
+from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
@@ -56,10 +56,14 @@ def of_logs(test: Recorded, *, stated: bool) -> list[Check]:
     """The checks of the logs and of the camera's rise."""
     field = thin_fields(test.fields)
     near = field_at(test.fields, PROBE_MM) if stated else field
-    return [
-        *check_load_scale(field, test.drivers, file="drivers.csv"),
-        *check_material(near, test.environment, stated=stated, file="environment.csv"),
-    ]
+    logged = log_with_camera(near, test.environment)
+    inputs = Inputs(field=field, drivers=test.drivers, logged=logged, place_stated=stated)
+    return [check for check in run_checks("fields", inputs) if check.code != "drivers_course"]
+
+
+def of_stamps(stamps: np.ndarray, deviations: xr.Dataset) -> list[Check]:
+    """The checks of the stamps of the frames against the motion of the axis."""
+    return run_checks("source", Inputs(motion=Motion.of(stamps, deviations)))
 
 
 def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +75,7 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
             for check in (
                 *of_logs(test, stated=True),
                 *of_logs(test, stated=False),
-                *check_phase(test.fields["time"].values, test.deviations),
+                *of_stamps(test.fields["time"].values, test.deviations),
                 *clocks(test).values(),
                 *clocks(without_ends(test)).values(),
             )
@@ -112,7 +116,7 @@ def test_clock_rates(gain_s_per_h: float, capsys: pytest.CaptureFixture[str]) ->
         test = record(Recipe().vary(campaign={"seed": seed}))
         true = test.fields["time"].values
         gained = (true - true[0]) * (gain_s_per_h / 3600.0)
-        noticed += not check_phase(true + gained, test.deviations)[0].passed
+        noticed += not of_stamps(true + gained, test.deviations)[0].passed
     with capsys.disabled():
         print(f"\ncamera clock gains {gain_s_per_h:g} s/h over 4.2 h: noticed {rate(noticed, runs)}")
 
@@ -227,8 +231,9 @@ def test_lying_loads(capsys: pytest.CaptureFixture[str]) -> None:
         field, logged = thin_fields(test.fields), test.drivers["duty"].values
         for name, change in LYING_LOADS.items():
             log = _of(test.drivers, duty=np.asarray(change(logged), float))
-            (course,) = check_load_course(field, log, file="drivers.csv")
-            (kind,) = check_load_kind(log, file="drivers.csv") or (course,)
+            inputs = Inputs(field=field, drivers=log)
+            course = next(check for check in run_checks("fields", inputs) if check.code == "drivers_course")
+            kind = next(iter(run_checks("source", inputs)), course)
             little = "explains little" if course.value > course.limit else "explains most"
             little = little if np.ptp(log["duty"].values) > 0.0 else "constant"
             told[name][f"{little}, {'silent' if course.passed and kind.passed else 'noticed'}"] += 1

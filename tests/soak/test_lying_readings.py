@@ -10,8 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from fusion.analysis.consistency.readings import check_readings, check_signs
+from fusion.analysis.consistency.checks import Inputs
 from fusion.common import Array
+from fusion.pipeline.consistency import run_checks
 from fusion.twin import simulate
 from fusion.twin.truth import deviations_of
 from tests.soak.rates import campaigns, first_seed, rate
@@ -104,7 +105,7 @@ def test_errors_of_operator_and_recorder(lie: str, capsys: pytest.CaptureFixture
         deviations["deviation"].values = change(read, np.random.default_rng([seed, 5]))
         failed = {
             check.code
-            for check in (*check_readings(deviations, plan_extent_mm=None), *check_signs(deviations))
+            for check in run_checks("source", Inputs(linear=deviations, deviations=deviations))
             if not check.passed
         }
         doubted, named = doubted + bool(failed), named + (code in failed)

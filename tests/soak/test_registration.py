@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from fusion.analysis.consistency.camera import check_registration
+from fusion.analysis.consistency.checks import Inputs
+from fusion.pipeline.consistency import run_checks
 from tests.soak.table_views import DISCS, GRID, Table, View, draw_view, hinted
 from thermography.common import ThermographyError
 from thermography.registration.plan import Fiducial
@@ -316,9 +317,10 @@ def _doubts(registration: Registration, listed: list[Fiducial]) -> tuple[str, ..
         "unchecked": registration.unchecked,
         "contradicted_hints": registration.contradicted_hints,
         "mirrored": registration.mirrored,
+        "span": 1.0,
         "area_ratio": registration.area_ratio,
     }
-    return tuple(check.code for check in check_registration(part, file="fiducials.csv") if not check.passed)
+    return tuple(check.code for check in run_checks("plan", Inputs(registration=part)) if not check.passed)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

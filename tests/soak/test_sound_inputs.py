@@ -10,12 +10,11 @@ import pytest
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
-from fusion.analysis.consistency.courses import check_load_course, check_load_kind
+from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.field_series import thin_fields
-from fusion.analysis.consistency.logs import check_log
-from fusion.analysis.consistency.model import check_coefficients, compare_lines
-from fusion.analysis.consistency.readings import check_readings, check_signs
+from fusion.analysis.consistency.model import compare_lines
 from fusion.analysis.drift_model.axis import close_loop
+from fusion.pipeline.consistency import run_checks
 from fusion.results.loop import ResidualTestsPart
 from fusion.twin import simulate
 from fusion.twin.recipe import AnomalyRecipe, EffectRecipe, Recipe
@@ -91,15 +90,15 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         result = close_loop(read_fused(fused), ["axis_expansion", "table_offset"])
         line = compare_lines(result.after, len(result.declared), fields, axis)
         loop = result.described(ResidualTestsPart.model_construct(), axis_line=line).model_dump(exclude_unset=True)
-        times = deviations["time"].values.ravel()
+        extent_mm, logs = truth.recipe.plan.width_mm, {"environment": environment, "drivers": drivers}
+        of_source = Inputs(
+            linear=deviations, deviations=deviations, plan_extent_mm=extent_mm, reading_time=deviations["time"], **logs
+        )
+        of_loop = Inputs(loop=loop, travel_mm=result.after.readings.span_mm)
         checks = [
-            *check_readings(deviations, plan_extent_mm=truth.recipe.plan.width_mm),
-            *check_signs(deviations),
-            *check_log(environment, times, name="environment", file="environment.csv"),
-            *check_log(drivers, times, name="drivers", file="drivers.csv"),
-            *check_load_kind(drivers, file="drivers.csv"),
-            *check_load_course(thin_fields(fields), drivers, file="drivers.csv"),
-            *check_coefficients(loop, travel_mm=result.after.readings.span_mm),
+            *run_checks("source", of_source),
+            *run_checks("fields", Inputs(field=thin_fields(fields), drivers=drivers)),
+            *run_checks("loop", of_loop),
         ]
         failed = [check for check in checks if not check.passed]
         doubted += bool(failed)

@@ -1,4 +1,4 @@
-"""Checks of the frames: settings that change within a series, implausible parameters, temperatures outside the calibrated range."""
+"""Checks of the camera: times and settings that its frames store, what they show over the series, their registration."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import itertools
 import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import covered_share, likely_zone_shift
-from fusion.analysis.consistency.checks import Check, Severity, judge
+from fusion.analysis.consistency.checks import CAMERA, CLOCK, Found, check, judge
 from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
 from fusion.common import Array
 from thermography.common import ThermographyError
@@ -47,32 +49,22 @@ _REGULAR_STEPS = (0.8, 3.0)
 _NUMBERED = re.compile(r"(.*?)(\d+)\D*")
 
 
-def check_order(frames: Sequence[FrameReference]) -> list[Check]:
-    """Check that the times of frames do not go backwards from one to the next."""
+@check("source", CAMERA)
+def camera_stamps(frames: Sequence[FrameReference]) -> Found | None:
+    """Times of frames that go backwards from one to the next, within a file and between consecutively numbered files: none; where
+    `_SET_BACK_SHARE` of the steps between files do, or the frames are regular in the order of their times, the files were renamed, and
+    the times are taken.
+    """
     timed = [frame for frame in frames if not np.isnat(frame.time)]
     if not timed:
-        return []
+        return None
     ordered = sorted(timed, key=lambda frame: (_numbered(frame.path), frame.index))
     steps = [(before, after) for before, after in itertools.pairwise(ordered) if _follows(before, after)]
     back = [(before, after) for before, after in steps if after.time < before.time]
-    if back and _renamed(back, len(steps), np.sort(np.array([frame.time for frame in timed]))):
-        evidence = f"The names of the frames do not follow their times ({len(back)} of {len(steps)} steps go back); the times were taken."
-        return [judge("camera_stamps", 0.0, 0.0, evidence)]
-    named = "; ".join(
-        f"{after.path.name}{f' frame {after.index}' if after.index else ''} is {(before.time - after.time) / np.timedelta64(1, 's'):.0f} s "
-        f"before {before.path.name}"
-        for before, after in back[:3]
-    )
-    return [
-        judge(
-            "camera_stamps",
-            len(back),
-            0.0,
-            f"The camera's clock goes backwards {len(back)} times: {named}.",
-            "Check whether the camera's clock was set during the test; leave out the frames before or after.",
-            sound="The camera's clock never goes backwards.",
-        )
-    ]
+    renamed = bool(back) and _renamed(back, len(steps), np.sort(np.array([frame.time for frame in timed])))
+    first = [(before, after, (before.time - after.time) / np.timedelta64(1, "s")) for before, after in back[:3]]
+    value = 0.0 if renamed else len(back)
+    return judge(value, 0.0, renamed=renamed, back=len(back), steps=len(steps), first=first)
 
 
 def _renamed(back: Sequence[tuple[FrameReference, FrameReference]], steps: int, times: NDArray[np.datetime64]) -> bool:
@@ -99,93 +91,94 @@ def _follows(before: FrameReference, after: FrameReference) -> bool:
     return (folder, stem, number + 1) == (next_folder, next_stem, next_number)
 
 
-def check_phase(frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> list[Check]:
-    """Check the rate of the camera's clock, and whether frames of a still table are stamped while the axis stands at position 0."""
-    seconds, cycle_end, reading_s, position_mm = _motion(frame_time, deviations)
-    period = float(np.median(np.diff(cycle_end))) if cycle_end.size > 1 else np.nan
-    locked = _lock(seconds, cycle_end, period) if cycle_end.size >= _LEAST_BURSTS else None
-    limit_s_per_h = 3600.0 * _LARGEST_SLIP * period / float(np.ptp(seconds)) if np.isfinite(period) else 0.0
-    if locked is None:
-        evidence = "The frames have no fixed phase in the cycle: cannot be tested."
-        return [judge("camera_rate", 0.0, limit_s_per_h, evidence), judge("camera_phase", 0.0, _AWAY_SHARE, evidence)]
-    slip_cycles, rate = locked
-    away = _away_share(seconds, reading_s, position_mm)
-    return [
-        judge(
-            "camera_rate",
-            rate,
-            limit_s_per_h,
-            f"The camera's clock gains {rate:+.3g} s/h on the cycles of the laser ({slip_cycles:+.2f} cycles over the test).",
-            "Check the camera's clock against that of the laser at start and end; where a timer of the camera takes the frames of a table "
-            "that does not move in its view, accept camera_rate.",
-            passed=abs(slip_cycles) <= _LARGEST_SLIP,
-        ),
-        judge(
-            "camera_phase",
-            away,
-            _AWAY_SHARE,
-            f"{100.0 * away:.0f} % of the frames are stamped while the axis was away from position 0.",
-            'Check clock_offset: with table = "still" every frame shows the table at axis position 0. Where the axis does not move the '
-            "table in the camera's view, accept camera_phase.",
-        ),
-    ]
+@dataclass(frozen=True)
+class Motion:
+    """Stamps of the frames of a still table, and the motion of the axis.
+
+    Attributes
+    ----------
+    seconds, cycle_end, reading_s : times of frames, ends of cycles and readings since the first frame, s
+    position_mm : of the readings
+    """
+
+    seconds: Array
+    cycle_end: Array
+    reading_s: Array
+    position_mm: Array
+
+    @classmethod
+    def of(cls, frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> Motion:
+        """Bring both to one clock."""
+        time = deviations["time"].values.astype("datetime64[ns]")
+        position = np.broadcast_to(deviations["position"].values, time.shape)
+        since = (time - frame_time[0].astype("datetime64[ns]")) / np.timedelta64(1, "s")
+        timed = ~np.isnat(time)
+        order = np.argsort(since[timed])
+        ends = np.array([row[known].max() for row, known in zip(since, timed, strict=True) if known.any()])
+        frames = (frame_time - frame_time[0]) / np.timedelta64(1, "s")
+        return cls(np.asarray(frames, float), ends, since[timed][order], position[timed][order])
+
+    @property
+    def period_s(self) -> float:
+        """Of the cycles; nan of less than two."""
+        return float(np.median(np.diff(self.cycle_end))) if self.cycle_end.size > 1 else np.nan
+
+    @cached_property
+    def locked(self) -> tuple[float, float] | None:
+        """Steady slip of the bursts of frames on the cycles, in cycles over the test and in s/h; None where they keep no place."""
+        return _lock(self.seconds, self.cycle_end, self.period_s) if self.cycle_end.size >= _LEAST_BURSTS else None
+
+    def away_share(self, late_s: float = 0.0) -> float:
+        """Share of the frames, were they late, that are stamped while the axis was away from position 0."""
+        return _away_share(self.seconds - late_s, self.reading_s, self.position_mm)
 
 
-def check_coverage(frame_time: NDArray[np.datetime64], deviations: xr.Dataset, *, offset_s: float) -> list[Check]:
-    """Check that frames and readings were taken at the same time; `offset_s` is what the campaign file states of the camera's clock."""
+@check("source", CLOCK, waits=True)
+def camera_rate(motion: Motion) -> Found:
+    """Gain of the camera's clock on the cycles, where frames are taken once per cycle at one place in it (scatter up to `_LOCKED_CYCLES`
+    cycles): slip over the test of at most `_LARGEST_SLIP` cycles.
+    """
+    limit = (
+        3600.0 * _LARGEST_SLIP * motion.period_s / float(np.ptp(motion.seconds)) if motion.cycle_end.size > 1 else 0.0
+    )
+    slip_cycles, rate = motion.locked or (None, 0.0)
+    return judge(rate, limit, passed=slip_cycles is None or abs(slip_cycles) <= _LARGEST_SLIP, slip_cycles=slip_cycles)
+
+
+@check("source", CAMERA, waits=True)
+def camera_phase(motion: Motion) -> Found:
+    """Share of such frames of a still table that are stamped while the axis was away from position 0: at most `_AWAY_SHARE`."""
+    away = 0.0 if motion.locked is None else motion.away_share()
+    return judge(away, _AWAY_SHARE, testable=motion.locked is not None)
+
+
+@check("source", CLOCK, waits=True)
+def frames_coverage(frame_time: NDArray[np.datetime64], deviations: xr.Dataset, offset_s: float) -> Found:
+    """Share of the readings between the first and the last frame: more than 0, and not below `_COVERED_NOW` where a shift by whole
+    quarter hours covers all; else a contradiction.
+    """
     readings = deviations["time"].values
     readings = readings[~np.isnat(readings)]
-    covered, shift = covered_share(readings, frame_time), likely_zone_shift(readings, frame_time)
-    first, last, start, end = (
+    covered, shift_s = covered_share(readings, frame_time), likely_zone_shift(readings, frame_time)
+    ends = [
         f"{np.datetime_as_string(time, unit='s')}Z" for time in (*frame_time[[0, -1]], readings.min(), readings.max())
-    )
-    laser = f"readings of {deviations.attrs.get('source', 'the laser')}"
-    span = f"frames {first} to {last}, {laser} {start} to {end}"
-    zones = covered < _COVERED_NOW and shift is not None
-    evidence = f"{100.0 * covered:.0f} % of the readings lie between the first and the last frame ({span})"
-    remedy = "Set thermography.clock_offset (camera clock minus laser clock), or check that both folders belong to the same test."
-    if zones and shift is not None:
-        evidence += f": the clocks look {abs(shift) / 3600:g} h apart, as in two time zones"
-        remedy = (
-            f'Write thermography.clock_offset = "{offset_s + shift:g} s" (camera clock minus laser clock) if the camera\'s is wrong, or '
-            "give the times of both with their zone."
-        )
-    return [
-        judge(
-            "frames_coverage",
-            covered,
-            _COVERED_NOW,
-            f"{evidence}.",
-            remedy,
-            passed=covered > 0.0 and not zones,
-            severity=Severity.CONTRADICTION,
-        )
     ]
+    zones = covered < _COVERED_NOW and shift_s is not None
+    facts = {"ends": ends, "laser": deviations.attrs.get("source", "the laser"), "offset_s": offset_s}
+    passed = covered > 0.0 and not zones
+    return judge(covered, _COVERED_NOW, passed=passed, contradicts=True, shift_s=shift_s if zones else None, **facts)
 
 
-def compare_phase(frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> list[Evidence]:
-    """Compare the stamps of the frames of a still table with the motion of the axis: what they say of the camera's clock."""
-    seconds, cycle_end, reading_s, position_mm = _motion(frame_time, deviations)
-    if cycle_end.size < _LEAST_BURSTS or _lock(seconds, cycle_end, float(np.median(np.diff(cycle_end)))) is None:
+def compare_phase(motion: Motion | None) -> list[Evidence]:
+    """Compare the stamps of the frames with the motion of the axis: what they say of the camera's clock."""
+    if motion is None or motion.locked is None:
         return []
-    away = np.array([_away_share(seconds - QUARTER_S * k, reading_s, position_mm) for k in QUARTERS]) / _AWAY_SHARE
+    away = np.array([motion.away_share(QUARTER_S * k) for k in QUARTERS]) / _AWAY_SHARE
     return [Evidence("laser", "camera", away, away, TIMES, "place in the cycle")]
 
 
-def _motion(frame_time: NDArray[np.datetime64], deviations: xr.Dataset) -> tuple[Array, Array, Array, Array]:
-    """Frames, ends of the cycles and readings in s since the first frame, and the axis positions of the readings, mm."""
-    time = deviations["time"].values.astype("datetime64[ns]")
-    position = np.broadcast_to(deviations["position"].values, time.shape)
-    since = (time - frame_time[0].astype("datetime64[ns]")) / np.timedelta64(1, "s")
-    timed = ~np.isnat(time)
-    order = np.argsort(since[timed])
-    ends = np.array([row[known].max() for row, known in zip(since, timed, strict=True) if known.any()])
-    frames = (frame_time - frame_time[0]) / np.timedelta64(1, "s")
-    return np.asarray(frames, float), ends, since[timed][order], position[timed][order]
-
-
 def _lock(seconds: Array, cycle_end: Array, period: float) -> tuple[float, float] | None:
-    """Steady slip of the bursts of frames on the cycles, in cycles over the test and in s/h; None where they keep no place."""
+    """As `Motion.locked`."""
     starts = seconds[np.concatenate([[True], np.diff(seconds) > _BURST_SHARE * period])]
     number = np.interp(starts, cycle_end, np.arange(cycle_end.size))
     before, after = starts < cycle_end[0], starts > cycle_end[-1]
@@ -220,28 +213,34 @@ def _away_share(seconds: Array, reading_s: Array, position_mm: Array) -> float:
 _OUTSIDE_SHARE = 0.01
 #: The parameters of Planck's law that belong to a range of the camera.
 _PLANCK = ("planck_r1", "planck_b", "planck_f", "planck_o", "planck_r2")
-_CHANGING = ("parameters_vary", "several_cameras", "several_lenses")
+_CHANGING = ("parameters_vary", "several_cameras", "several_lenses", "range")
 
 
-def check_frames(frames: Sequence[FrameReference], *, overridden: Collection[str]) -> list[Check]:
-    """Check what the frames store of their measurement."""
-    if not frames:
-        return []
+def file_warnings(frames: Sequence[FrameReference], *, overridden: Collection[str]) -> list[FileWarning]:
+    """What is conspicuous in what the frames store of their measurement."""
     ranges = [(frame.limits.minimum_K, frame.limits.maximum_K) for frame in frames]
     switched = [place for place in range(1, len(frames)) if ranges[place] != ranges[place - 1]]
     continued = len(switched) == 1 and _continued(frames, switched[0])
     warnings = check_series(frames, overridden={*overridden, *(_PLANCK if continued else ())})
-    changing = [warning for warning in warnings if warning.code in _CHANGING]
     if switched and not continued:
-        changing.append(
+        warnings.append(
             FileWarning("range", f"the camera's range changes ({len({*ranges})} ranges).", "Use one range.")
         )
-    implausible = [warning for warning in warnings if warning.code not in _CHANGING]
-    return [
-        _collected("camera_settings", changing, "The settings of the camera stay the same over the series."),
-        _collected("camera_parameters", implausible, "The stored parameters of the measurement are plausible."),
-        _range(_spread(frames)),
-    ]
+    return warnings
+
+
+@check("source", CAMERA)
+def camera_settings(file_warnings: Sequence[FileWarning]) -> Found:
+    """Parameters, range, serial number and lens over the series, those stated in the campaign file left out: no change; one switch of the
+    range is none where either range has its own parameters of Planck's law and the temperatures go on across it (`scene_change`).
+    """
+    return _collected([warning for warning in file_warnings if warning.code in _CHANGING])
+
+
+@check("source", CAMERA)
+def camera_parameters(file_warnings: Sequence[FileWarning]) -> Found:
+    """Implausible stored parameters, those stated in the campaign file left out: none."""
+    return _collected([warning for warning in file_warnings if warning.code not in _CHANGING])
 
 
 def _continued(frames: Sequence[FrameReference], place: int) -> bool:
@@ -260,23 +259,15 @@ def _continued(frames: Sequence[FrameReference], place: int) -> bool:
     return float(np.mean(change > np.maximum(before, after) + _JUMP_K)) <= _JUMP_SHARE
 
 
-def _collected(code: str, warnings: Sequence[FileWarning], sound: str) -> Check:
+def _collected(warnings: Sequence[FileWarning]) -> Found:
     """One check of several warnings of one kind."""
-    evidence = " ".join(f"{warning.message[0].upper()}{warning.message[1:]}" for warning in warnings)
-    remedy = " ".join(dict.fromkeys(warning.remedy for warning in warnings))
-    return judge(code, len(warnings), 0.0, evidence, remedy, sound=sound)
+    return judge(len(warnings), 0.0, warnings=warnings, remedies=dict.fromkeys(one.remedy for one in warnings))
 
 
-def _range(frames: Sequence[Frame]) -> Check:
-    """Share of pixels outside the calibrated range in the first, the middle and the last frame."""
-    outside = max([0.0, *(share_outside_range(frame) for frame in frames)])
-    return judge(
-        "camera_range",
-        outside,
-        _OUTSIDE_SHARE,
-        f"Up to {100.0 * outside:.3g} % of the pixels of a frame are outside the range in which the camera is calibrated.",
-        "Select the range of the camera that holds these temperatures.",
-    )
+@check("source", CAMERA)
+def camera_range(frames: Sequence[FrameReference]) -> Found:
+    """Pixels outside the calibrated range in the first, middle and last frame: at most `_OUTSIDE_SHARE`."""
+    return judge(max([0.0, *(share_outside_range(frame) for frame in _spread(frames))]), _OUTSIDE_SHARE)
 
 
 def _spread(frames: Sequence[FrameReference]) -> list[Frame]:
@@ -316,24 +307,51 @@ _GAP_S = 600.0
 _GAP_STEPS = 3.0
 #: Largest share of the readings that may lie in gaps.
 _GAP_SHARE = 0.1
-_LEFT_OUT = {
-    "frames_damaged": "damaged, or unlike those before and after them",
-    "frames_obstructed": "with an object in front of the table",
-    "frames_shaken": "displaced singly",
-    "frames_unplaced": "in which the moving table is not located",
-}
+_LEFT_OUT = ("frames_damaged", "frames_obstructed", "frames_shaken", "frames_unplaced")
 
 
-def check_place(fields: xr.Dataset) -> list[Check]:
-    """Check whether the frames show the table, where it is registered, over the whole series."""
+@check("fields", CAMERA)
+def camera_place(fields: xr.Dataset) -> Found | None:
+    """Share of the frames in stretches after which nothing shows that the registration held ([registration.md](registration.md)): at most
+    `_UNCHECKED_SHARE`; of a moving table, its lasting displacement across the axis: at most `_ACROSS_MM` mm.
+    """
     if "frames_repeated" not in fields.attrs:
-        return []
-    left_out = {name: json.loads(fields.attrs.get(name, "[]")) for name in _LEFT_OUT}
-    total = int(fields["frame_count"].sum()) + sum(len(names) for names in left_out.values())
-    common = [_left_out(left_out, total), _repeated(fields, total)]
+        return None
     if "table_across" in fields:
-        return [_across(fields), *common]
-    return [_unchecked(fields, total), *common, _jump(fields)]
+        return _across(fields)
+    stretches, knocks = json.loads(fields.attrs["unchecked_stretches"]), json.loads(fields.attrs["knocks"])
+    share = sum(stretch["frames"] for stretch in stretches) / _total(fields)
+    return judge(share, _UNCHECKED_SHARE, stretches=stretches, knocks=len(knocks), across_mm=None)
+
+
+@check("fields", CAMERA)
+def frames_left_out(fields: xr.Dataset) -> Found | None:
+    """Share of the frames that are damaged, displaced alone, do not show where a moving table is, or have something before it
+    ([fields.md](fields.md)): at most a third.
+    """
+    if "frames_repeated" not in fields.attrs:
+        return None
+    counts, total = _counts(fields), _total(fields)
+    return judge(sum(counts.values()) / total, _LEFT_OUT_SHARE, counts=counts, total=total)
+
+
+@check("fields", CAMERA)
+def frames_repeated(fields: xr.Dataset) -> Found | None:
+    """Share of the frames that hold the image of the frame before: at most `_REPEATED_SHARE`."""
+    if "frames_repeated" not in fields.attrs:
+        return None
+    repeated, total = json.loads(fields.attrs["frames_repeated"]), _total(fields)
+    return judge(len(repeated) / total, _REPEATED_SHARE, repeated=repeated, total=total)
+
+
+def _counts(fields: xr.Dataset) -> dict[str, int]:
+    """How many frames were left out, by why."""
+    return {name: len(json.loads(fields.attrs.get(name, "[]"))) for name in _LEFT_OUT}
+
+
+def _total(fields: xr.Dataset) -> int:
+    """All frames of a series, also those left out."""
+    return int(fields["frame_count"].sum()) + sum(_counts(fields).values())
 
 
 def find_gaps(frame_time: NDArray[np.datetime64]) -> list[tuple[np.datetime64, np.datetime64]]:
@@ -353,24 +371,6 @@ def in_gaps(readings: xr.DataArray, gaps: Sequence[tuple[np.datetime64, np.datet
     return inside
 
 
-def check_gaps(frame_time: NDArray[np.datetime64], readings: xr.DataArray) -> list[Check]:
-    """Check that the readings lie between frames that show their field."""
-    gaps = find_gaps(frame_time)
-    count, total = int(in_gaps(readings, gaps).sum()), max(int(readings.notnull().sum()), 1)
-    longest = max(gaps, key=lambda gap: gap[1] - gap[0], default=None)
-    where = "" if longest is None else f", the longest of {gap_words(longest)}"
-    return [
-        judge(
-            "frames_gaps",
-            count / total,
-            _GAP_SHARE,
-            f"{100.0 * count / total:.0f} % of the readings fall into {len(gaps)} gaps between frames{where}.",
-            "Give all frames of the test, or leave out the cycles that have none.",
-            passed=count <= _GAP_SHARE * total,
-        )
-    ]
-
-
 def gap_words(gap: tuple[np.datetime64, np.datetime64]) -> str:
     """Return length, start and end of a gap as words."""
     minutes = (gap[1] - gap[0]) / np.timedelta64(60, "s")
@@ -378,76 +378,29 @@ def gap_words(gap: tuple[np.datetime64, np.datetime64]) -> str:
     return f"{minutes:.0f} min from {start}Z to {end}Z"
 
 
-def _unchecked(fields: xr.Dataset, total: int) -> Check:
-    """Share of frames in stretches after which no frame shows that the registration held."""
-    stretches = json.loads(fields.attrs["unchecked_stretches"])
-    knocks = json.loads(fields.attrs["knocks"])
-    named = "; ".join(f"{one['first']} to {one['last']} ({one['frames']} frames)" for one in stretches)
-    return judge(
-        "camera_place",
-        sum(stretch["frames"] for stretch in stretches) / total,
-        _UNCHECKED_SHARE,
-        f"Neither fiducials nor the table's outline show whether camera or table moved: {named}."
-        if stretches
-        else f"The registration was followed through {len(knocks)} displacements of camera or table.",
-        "Fasten camera and table, and use fiducials that stay visible: low emissivity, warm or cold surroundings.",
-    )
-
-
-def _across(fields: xr.Dataset) -> Check:
+def _across(fields: xr.Dataset) -> Found:
     """Largest lasting change of the place of a moving table across its axis: the axis cannot move it so, but a knock can."""
     across = fields["table_across"].dropna("frame_time")
     place, times = across.values, across["frame_time"].values
     parts = np.arange(_ACROSS_FRAMES, len(place) - _ACROSS_FRAMES + 1)
-    change, since = 0.0, ""
+    change, since = 0.0, None
     if parts.size:
         # The division into two means that leaves the smallest squares.
         before = np.cumsum(place)[parts - 1] / parts
         after = (place.sum() - parts * before) / (len(place) - parts)
         at = int(parts[np.argmax((after - before) ** 2 * parts * (len(place) - parts))])
         change = float(np.median(place[at:]) - np.median(place[:at]))
-        since = f", from {np.datetime_as_string(times[at], unit='s')}Z on"
-    displaced = f"The table in the frames is displaced across its axis by {change:+.2f} mm"
-    return judge(
-        "camera_place",
-        abs(change),
-        _ACROSS_MM,
-        f"{displaced}{since}: camera or table moved.",
-        "Fasten camera and table; give the frames before and after as two campaigns.",
-        sound=f"{displaced}.",
-    )
+        since = np.datetime_as_string(times[at], unit="s")
+    return judge(abs(change), _ACROSS_MM, across_mm=change, since=since)
 
 
-def _left_out(left_out: dict[str, list[str]], total: int) -> Check:
-    """Share of the frames that were left out because they do not show the table."""
-    share = sum(len(names) for names in left_out.values()) / total
-    named = ", ".join(f"{len(names)} {_LEFT_OUT[name]}" for name, names in left_out.items() if names)
-    return judge(
-        "frames_left_out",
-        share,
-        _LEFT_OUT_SHARE,
-        f"{100 * share:.0f} % of {total} frames were left out{f': {named}' if named else ''}.",
-        "Keep the view of the table free and the camera fixed and running; record these cycles again.",
-    )
-
-
-def _repeated(fields: xr.Dataset, total: int) -> Check:
-    """Share of the frames that hold the image of the frame before."""
-    repeated = json.loads(fields.attrs["frames_repeated"])
-    held = f"{len(repeated)} of {total} frames hold the image of the frame before"
-    held += f", {repeated[0]} to {repeated[-1]}" if repeated else ""
-    return judge(
-        "frames_repeated",
-        len(repeated) / total,
-        _REPEATED_SHARE,
-        f"{held}: the camera was frozen.",
-        "Leave these frames out, and check that the camera ran and that no file was copied.",
-        sound=f"{held}.",
-    )
-
-
-def _jump(fields: xr.Dataset) -> Check:
-    """Largest jump that a part of the table makes between two frames while the rest does not."""
+@check("fields", CAMERA)
+def scene_change(fields: xr.Dataset) -> Found | None:
+    """Share of the cells whose change from one frame to the next, apart from a change that all share, exceeds those before and after by
+    `_JUMP_K` K and `_JUMP_SIGMAS` standard deviations: at most `_JUMP_SHARE`.
+    """
+    if "frames_repeated" not in fields.attrs or "table_across" in fields:
+        return None
     frames, times = fields["frame_temperature"], fields["time"].values
     seconds = np.diff(times) / np.timedelta64(1, "s")
     least_K = _least_jump(frames)
@@ -460,7 +413,7 @@ def _jump(fields: xr.Dataset) -> Check:
     share = np.concatenate(shares)
     at = int(np.argmax(share)) if share.size else 0
     value = float(share[at]) if share.size else 0.0
-    evidence = "No part of the table changes from one frame to the next by more than its changes before and after."
+    facts = dict[str, Any]()
     if value > _JUMP_SHARE:
         cells = _excess(frames, seconds, slice(at, at + 1), least_K)[0] > 0
         y, x = (float(fields[axis].values[np.nonzero(cells)[k]].mean()) for k, axis in enumerate(("y", "x")))
@@ -468,18 +421,8 @@ def _jump(fields: xr.Dataset) -> Check:
         size = float(np.median((after - before)[cells]) - np.nanmedian(after - before))
         instants = np.datetime_as_string(times[np.flatnonzero(share > _JUMP_SHARE) + 2], unit="s")
         strongest = instants[np.argmax(share[share > _JUMP_SHARE])]
-        evidence = (
-            f"{100 * value:.0f} % of the table around x = {x:.0f} mm, y = {y:.0f} mm jumps by {size:+.1f} K against the rest from one "
-            f"frame to the next, at {strongest}Z: a reflection, an object on the table or a blurred view, but no warming"
-            + (f" ({len(instants)} jumps in all)." if len(instants) > 1 else ".")
-        )
-    return judge(
-        "scene_change",
-        value,
-        _JUMP_SHARE,
-        evidence,
-        "Shield the table from sun and lamps, keep it free of objects and liquids, or leave these frames out.",
-    )
+        facts = {"x_mm": x, "y_mm": y, "size_K": size, "strongest": strongest, "jumps": len(instants)}
+    return judge(value, _JUMP_SHARE, **facts)
 
 
 def _changes(frames: xr.DataArray, first: int, stop: int) -> Array:
@@ -518,42 +461,46 @@ _ZERO_SHARE = 0.33
 _RIM_SHARE = 0.03
 
 
-def check_picture(fields: xr.Dataset) -> list[Check]:
-    """Check that discs of low emissivity and the table around them warm as surfaces of one temperature."""
+@check("fields", CAMERA)
+def camera_picture(fields: xr.Dataset) -> Found | None:
+    """Largest change of a disc that the table around it shares, and other discs do not ([radiometry.md](radiometry.md)): at most
+    `_PICTURE_K` K and `_RIM_SHARE` of the largest change of the table at a disc; not verified where the table moves in view, camera or
+    table was displaced, or fewer than five discs of low emissivity are in view.
+    """
     shown = json.loads(fields.attrs.get("discs", "{}"))
     if not shown:
-        return []
+        return None
     if "untested" in shown:
-        words = f"Picture not verified: whether a pattern of the camera or a reflection grew in it cannot be tested ({shown['untested']})."
-        remedy = "Take frames of the table at rest, with five or more discs of low emissivity over the whole plan."
-        return [judge("camera_picture", 0.0, _PICTURE_K, words, unverified=remedy)]
-    pattern_K, zero_K = shown["pattern_K"], shown["zero_K"]
+        return judge(0.0, _PICTURE_K, verified=False, untested=shown["untested"])
+    limit_K = _PICTURE_K + _RIM_SHARE * shown["warming_K"]
+    return judge(shown["pattern_K"], limit_K, untested=None, disc=shown["disc"])
+
+
+@check("fields", CAMERA)
+def camera_zero(fields: xr.Dataset) -> Found | None:
+    """Change that all discs share with the table around them, after the correction of the camera and apart from the room: more than
+    `_PICTURE_K` K is not verified, and doubted where the uncertainty of the zero may be more than `_ZERO_SHARE` of the mean rise.
+    """
+    shown = json.loads(fields.attrs.get("discs", "{}"))
+    if not shown or "untested" in shown:
+        return None
+    zero_K = shown["zero_K"]
     moved, share = zero_K > _PICTURE_K, zero_share(fields)
-    known = not moved or share <= _ZERO_SHARE
-    of_rise = "The uncertainty of the rise contains it." if known else f"It may be {100.0 * share:.0f} % of the rise."
-    keep_in_view = "Keep a surface of constant temperature in view (reference_patch under [thermography])."
-    return [
-        judge(
-            "camera_picture",
-            pattern_K,
-            _PICTURE_K + _RIM_SHARE * shown["warming_K"],
-            f"Discs and the table around them change alike by up to {pattern_K:.2g} K against other places (most at {shown['disc']}); no "
-            "temperature of the table does that: a pattern grows in the picture (narcissus, a warm lens, a dirty window), or a reflection.",
-            "Let the camera warm up, clean or remove the window, tilt the camera by some degrees, and shield the table from sun and lamps.",
-            sound=f"Discs and the table around them show no pattern that grows in the picture (largest {pattern_K:.2g} K).",
-        ),
-        judge(
-            "camera_zero",
-            zero_K,
-            _PICTURE_K,
-            f"Zero not verified: discs of low emissivity change by {zero_K:.2g} K with the table around them and not with the logged room: "
-            f"the camera's zero, a window, or what the discs reflect. {of_rise}",
-            keep_in_view,
-            passed=known,
-            unverified=keep_in_view if moved else "",
-            sound="" if moved else f"The discs show no change of the camera's zero (largest {zero_K:.2g} K).",
-        ),
-    ]
+    return judge(
+        zero_K, _PICTURE_K, passed=not moved or share <= _ZERO_SHARE, verified=not moved, moved=moved, share=share
+    )
+
+
+@check("fields", CLOCK, waits=True)
+def frames_gaps(frame_time: NDArray[np.datetime64], reading_time: xr.DataArray) -> Found:
+    """Share of the readings in gaps between frames, longer than `_GAP_S` s and `_GAP_STEPS` usual steps: at most `_GAP_SHARE`; a gap with
+    readings is always named, with the cycles that have no frame.
+    """
+    gaps = find_gaps(frame_time)
+    count, total = int(in_gaps(reading_time, gaps).sum()), max(int(reading_time.notnull().sum()), 1)
+    longest = max(gaps, key=lambda gap: gap[1] - gap[0], default=None)
+    named = "" if longest is None else gap_words(longest)
+    return judge(count / total, _GAP_SHARE, passed=count <= _GAP_SHARE * total, gaps=len(gaps), longest=named)
 
 
 def mean_rise(fields: xr.Dataset) -> Array:
@@ -586,60 +533,49 @@ _LARGEST_AREA_RATIO = 1.05
 _LEAST_SPAN = 0.25
 
 
-def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Check]:
-    """Check what the registration found."""
-    used, listed = list(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
-    unchecked, hints = ", ".join(registration["unchecked"]), len(registration["contradicted_hints"])
-    found, span, mirrored = len(used) / listed, registration["span"], bool(registration["mirrored"])
+@check("plan", CAMERA)
+def fiducials_found(registration: Mapping[str, Any]) -> Found:
+    """Share of the listed fiducials that are in view and agree: at least `_LEAST_FOUND`."""
+    used, listed = len(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
+    found = used / listed
+    return judge(found, _LEAST_FOUND, passed=found >= _LEAST_FOUND, used=used, listed=listed)
+
+
+@check("plan", CAMERA)
+def fiducials_unchecked(registration: Mapping[str, Any]) -> Found:
+    """Fiducials that the others predict to no better than a quarter of a diameter, all of four: none."""
+    return judge(len(registration["unchecked"]), 0.0, unchecked=registration["unchecked"])
+
+
+@check("plan", CAMERA)
+def fiducial_hints(registration: Mapping[str, Any]) -> Found:
+    """Share of the fiducials in use that lie more than 25 px from their approximate pixel position: at most
+    `_LARGEST_CONTRADICTED`; hints that all lie by the same shift from their discs, and most not on another one, were read in another view
+    and agree (named, not counted).
+    """
+    hints, used = len(registration["contradicted_hints"]), len(registration["leave_one_out_mm"])
+    return judge(hints / used, _LARGEST_CONTRADICTED, hints=hints, used=used)
+
+
+@check("plan", CAMERA)
+def fiducial_diameters(registration: Mapping[str, Any]) -> Found:
+    """Median ratio of the imaged to the listed area of the discs, at the scale of their places: at most `_LARGEST_AREA_RATIO`, and its
+    inverse.
+    """
     # Points without a disc have no area.
     area = registration["area_ratio"]
     ratio = 1.0 if area is None or not np.isfinite(area) else float(area)
-    return [
-        judge(
-            "fiducials_found",
-            found,
-            _LEAST_FOUND,
-            f"{len(used)} of the {listed} fiducials of {file} are in view and agree.",
-            f"Check that {file} belongs to this table, and clean or repaint the discs.",
-            passed=found >= _LEAST_FOUND,
-        ),
-        judge(
-            "fiducials_unchecked",
-            len(registration["unchecked"]),
-            0.0,
-            f"If {unchecked} were elsewhere than {file} says, the other fiducials would not reveal it.",
-            f"Measure the places of {unchecked} again, and paint and list more discs: six or more, over the whole plan.",
-            sound="Every fiducial is checked by the others.",
-        ),
-        judge(
-            "fiducial_hints",
-            hints / len(used),
-            _LARGEST_CONTRADICTED,
-            f"{hints} of {len(used)} fiducials lie more than 25 px from their column_px, row_px in {file}.",
-            f"Read column_px, row_px of {file} off a frame of this series, or remove them; check that the names belong to the places.",
-        ),
-        judge(
-            "fiducial_diameters",
-            ratio,
-            _LARGEST_AREA_RATIO,
-            f"By the scale of x_mm, y_mm the discs in view have {ratio:.3f} times the area that diameter_mm of {file} says.",
-            f"Measure a disc and a distance between two of them, and correct {file}; focus the camera.",
-            passed=bool(abs(np.log(ratio)) <= np.log(_LARGEST_AREA_RATIO)),
-        ),
-        judge(
-            "fiducials_span",
-            span,
-            _LEAST_SPAN,
-            f"The fiducials in use span {100 * span:.0f} % of the plan.",
-            f"Check size under [plan], and that {file} belongs to this table; else paint discs over the whole plan.",
-            passed=span >= _LEAST_SPAN,
-        ),
-        judge(
-            "plan_mirrored",
-            mirrored,
-            0.0,
-            f"The plan of {file} appears mirrored in the frames.",
-            "Check the signs of x_mm and y_mm, and [plan.axis]; if the plan is drawn with y upwards, accept this doubt.",
-            sound="The plan is not mirrored in the frames.",
-        ),
-    ]
+    passed = bool(abs(np.log(ratio)) <= np.log(_LARGEST_AREA_RATIO))
+    return judge(ratio, _LARGEST_AREA_RATIO, passed=passed)
+
+
+@check("plan", CAMERA)
+def fiducials_span(registration: Mapping[str, Any]) -> Found:
+    """Share of the plan's area that the fiducials in use span: at least `_LEAST_SPAN`."""
+    return judge(registration["span"], _LEAST_SPAN, passed=registration["span"] >= _LEAST_SPAN)
+
+
+@check("plan", CAMERA)
+def plan_mirrored(registration: Mapping[str, Any]) -> Found:
+    """Sense in which the plan turns in the frame: the same; a plan drawn with y upwards appears mirrored and is accepted once."""
+    return judge(bool(registration["mirrored"]), 0.0)

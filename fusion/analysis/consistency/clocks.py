@@ -6,16 +6,17 @@ one recording against another it contradicts. The clock of a recording is named 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import covered_share
-from fusion.analysis.consistency.checks import Check, Severity, judge
+from fusion.analysis.consistency.checks import CLOCK, LOG, Found, Rule, judge
 from fusion.common import Array
+from fusion.results.parts import Figures
 
 #: Lateness that is tried, in quarters of an hour: as far as time zones lie apart; a log of another day is no clock's doing.
 QUARTERS = np.arange(-56, 57)
@@ -28,12 +29,6 @@ _LEAST_COVERED, _COVERED_SHIFTED = 0.9, 0.95
 _ENOUGH, TIMES, COURSES = 2.0, 1.0, 2.0
 #: Lateness by which it is said whether a wrong clock would have been noticed: an hour.
 _HOUR = 4
-#: What a wrong clock makes doubtful by itself: checks that wait until it is right.
-_WAITING = (
-    *("environment_coverage", "drivers_coverage", "sensors_coverage", "frames_coverage", "frames_gaps", "camera_phase"),
-    *("camera_rate", "material_course", "material_still", "material_rise", "environment_columns", "sensors_rise"),
-    *("expansion_coefficient", "sensitivity", "axis_line"),
-)
 #: Notices whose remedy follows from a wrong clock alone.
 FOLLOWING_NOTICES = ("readings_outside_frames", "frames_outside_cycles")
 
@@ -57,10 +52,6 @@ class Recording:
     table: str
     key: str = "clock_offset"
     offset_s: float = 0.0
-
-    def moved(self, quarters: int) -> str:
-        """What the campaign file has to say where the clock is late by quarters of an hour more."""
-        return f'{self.key} = "{self.offset_s + QUARTER_S * quarters:g} s" under [{self.table}]'
 
     @property
     def sorted(self) -> NDArray[np.datetime64]:
@@ -97,11 +88,11 @@ class Evidence:
 _ZERO = int(np.flatnonzero(QUARTERS == 0)[0])
 
 
-def check_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] = ()) -> list[Check]:
-    """Check the clocks of all recordings of a test against each other, by their times and by `compared` courses."""
+def compare_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] = ()) -> dict[str, Found]:
+    """Compare the clocks of all recordings of a test, by their times and by `compared` courses; what is found of each, by its check."""
     known = [one for one in recordings if one.sorted.size]
     if len(known) < 2:
-        return []
+        return {}
     gathered = [*_of_times(known), *compared]
     evidence = [one for one in gathered if not _outvoted(one, gathered)]
     against = [one for one in evidence if one.cost[_ZERO] > 1.0]
@@ -109,11 +100,13 @@ def check_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] =
     if sum(one.weight for one in against) >= _ENOUGH:
         late = {one.name: quarters for one in known if (quarters := _lateness(one.name, evidence))}
     odd = next(iter(late)) if len(late) == 1 else None
-    checks = [
-        _named(one, late[odd], known, against) if one.name == odd else _sound(one, evidence, noticed=bool(against))
+    found = {
+        f"{one.name}_clock": _named(one, late[odd], known, against)
+        if one.name == odd
+        else _sound(one, evidence, noticed=bool(against))
         for one in known
-    ]
-    return [*checks, _undecided(known, late, against, odd)]
+    }
+    return {**found, "clocks": _undecided(known, late, against, odd)}
 
 
 def _outvoted(one: Evidence, evidence: Sequence[Evidence]) -> bool:
@@ -154,104 +147,64 @@ def _of_times(recordings: Sequence[Recording]) -> Iterator[Evidence]:
                 yield Evidence(one.name, other.name, cost, 1.0 - covered, TIMES, "readings covered")
 
 
-def _words(quarters: int) -> str:
-    """A lateness as it is read."""
-    minutes = 15 * abs(quarters)
-    return f"{f'{minutes / 60:g} h' if minutes % 60 == 0 else f'{minutes} min'} {'late' if quarters > 0 else 'early'}"
-
-
-def _named(odd: Recording, possible: Sequence[int], known: Sequence[Recording], against: Sequence[Evidence]) -> Check:
+def _named(odd: Recording, possible: Sequence[int], known: Sequence[Recording], against: Sequence[Evidence]) -> Found:
     """The doubt of the one clock that contradicts the others."""
-    quarters, *others_possible = possible
-    fit = f" ({', '.join(_words(k) for k in others_possible[:2])} would do as well)" if others_possible else ""
-    why = _by_file(known, against, odd=odd.name)
-    *first, last = (one.file for one in known if one.name != odd.name)
-    return judge(
-        f"{odd.name}_clock",
-        15.0 * quarters,
-        0.0,
-        f"The clock of {odd.file} is {_words(quarters)}{fit}: so taken, it agrees with {', '.join(first)} and {last}, which agree among "
-        "themselves; "
-        f"as it stands, it contradicts {why}.",
-        f"Check clock and time zone of {odd.file}; to take its clock as {_words(quarters)}, write {odd.moved(quarters)}. Leave the other "
-        "files as they are.",
-        passed=False,
-    )
+    others = [one for one in known if one is not odd]
+    shown = {one.file: _whats(against, odd.name, one.name) for one in others}
+    agreeing = [one.file for one in others]
+    return judge(15.0 * possible[0], 0.0, passed=False, odd=odd, possible=possible, shown=shown, agreeing=agreeing)
 
 
-def _by_file(known: Sequence[Recording], against: Sequence[Evidence], *, odd: str) -> str:
-    """The other recordings that one contradicts, each with what shows it."""
-    shown = {
-        one.file: dict.fromkeys(each.what for each in against if {each.first, each.second} == {odd, one.name})
-        for one in known
-        if one.name != odd
-    }
-    return "; ".join(f"{file} ({', '.join(whats)})" for file, whats in shown.items() if whats)
+def _whats(against: Sequence[Evidence], *names: str) -> list[str]:
+    """What two recordings contradict each other in."""
+    return list(dict.fromkeys(one.what for one in against if {one.first, one.second} == {*names}))
 
 
-def _sound(one: Recording, evidence: Sequence[Evidence], *, noticed: bool) -> Check:
+def _sound(one: Recording, evidence: Sequence[Evidence], *, noticed: bool) -> Found:
     """The passed check of a clock, with what it could have shown."""
     told = all(
         sum(each.weight for each in evidence if each.cost[each.at(one.name, hour)] > 1.0) >= _ENOUGH
         for hour in (-_HOUR, _HOUR)
     )
-    if noticed:
-        return judge(
-            f"{one.name}_clock", 0.0, 0.0, f"The clock of {one.file} is not the one that contradicts the others."
-        )
-    limits = (
-        "one of an hour would have been" if told else "whether it is an hour off cannot be told from these recordings"
-    )
-    return judge(f"{one.name}_clock", 0.0, 0.0, f"No clock offset of {one.file} detected; {limits}.")
+    return judge(0.0, 0.0, odd=one, noticed=noticed, told=told)
 
 
 def _undecided(
     known: Sequence[Recording], late: dict[str, list[int]], against: Sequence[Evidence], odd: str | None
-) -> Check:
+) -> Found:
     """Whether clocks disagree of which none can be named."""
     files = {one.name: one.file for one in known}
-    if odd is not None:
-        return judge("clocks", 0.0, 0.0, f"That of {files[odd]} is the only clock that contradicts the others.")
-    if sum(one.weight for one in against) < _ENOUGH:
-        return judge("clocks", 0.0, 0.0, f"The clocks of {', '.join(files.values())} do not contradict one another.")
-    between = {
-        (one.first, one.second): [each.what for each in against if (each.first, each.second) == (one.first, one.second)]
-        for one in against
-    }
-    pairs = [f"{files[first]} and {files[second]} ({', '.join(whats)})" for (first, second), whats in between.items()]
-    possible = [one for one in known if one.name in late]
-    either = " or ".join(f"{one.file} is taken as {_words(late[one.name][0])}" for one in possible)
-    keys = " or ".join(one.moved(late[one.name][0]) for one in possible)
-    which = (
-        f"they agree where {either}, and no other recording decides which" if either else "no single clock explains it"
-    )
-    named = [one.file for one in known if any(one.name in pair for pair in between)]
+    passed = odd is not None or sum(one.weight for one in against) < _ENOUGH
+    pairs = dict.fromkeys((one.first, one.second) for one in against)
+    named = {name for pair in pairs for name in pair}
     return judge(
-        "clocks",
-        15.0 * max((abs(likeliest) for likeliest, *_ in late.values()), default=0),
+        0.0 if passed else 15.0 * max((abs(likeliest) for likeliest, *_ in late.values()), default=0),
         0.0,
-        f"The clocks disagree: {'; '.join(pairs)}: {which}.",
-        f"Check clocks and time zones of {' and '.join(named)}{f'; then write {keys}' if keys else ''}.",
-        passed=False,
+        passed=passed,
+        alone=None if odd is None else files[odd],
+        files=list(files.values()),
+        pairs=[(files[first], files[second], _whats(against, first, second)) for first, second in pairs],
+        possible=[(one, late[one.name][0]) for one in known if one.name in late],
+        named=[one.file for one in known if one.name in named],
     )
 
 
-def without_consequences(checks: Sequence[Check], accepted: Collection[str] = ()) -> list[Check]:
-    """Leave out what cannot be judged until a doubted clock is right; a refusal among it is that of the clock."""
-    latest = list({check.code: check for check in checks}.values())
-    doubted = [check for check in latest if is_doubted_clock(check) and check.code not in accepted]
-    if not doubted:
-        return latest
-    waiting = [check for check in latest if check.code in _WAITING and not check.passed]
-    if waiting:
-        severity = max((check.severity for check in waiting), key=list(Severity).index)
-        codes = f" To be judged when the clocks are right: {', '.join(check.code for check in waiting)}."
-        latest = [
-            replace(one, severity=severity, evidence=one.evidence + codes) if one in doubted else one for one in latest
-        ]
-    return [check for check in latest if check not in waiting]
+def _clock(code: str, figures: tuple[Figures, ...]) -> Rule:
+    """The check of one clock, of what all recordings together show."""
+
+    def find(clocks: Mapping[str, Found]) -> Found | None:
+        """Every two recordings, at every quarter of an hour up to 14 h ([below](#the-odd-clock)): doubted where evidence of weight
+        `_ENOUGH` contradicts the stated clocks, and this one moved alone ends every contradiction; `clocks` where several could be that
+        one, or none; a contradiction where it leaves so few common times that a coverage would refuse.
+        """
+        return clocks.get(code)
+
+    return Rule(code, "clocks", figures, find)
 
 
-def is_doubted_clock(check: Check) -> bool:
-    """Whether a check says that a clock is wrong."""
-    return not check.passed and (check.code == "clocks" or check.code.endswith("_clock"))
+LASER_CLOCK = _clock("laser_clock", CLOCK)
+CAMERA_CLOCK = _clock("camera_clock", CLOCK)
+ENVIRONMENT_CLOCK = _clock("environment_clock", LOG)
+DRIVERS_CLOCK = _clock("drivers_clock", LOG)
+SENSORS_CLOCK = _clock("sensors_clock", CLOCK)
+CLOCKS = _clock("clocks", CLOCK)

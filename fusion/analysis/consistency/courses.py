@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.readings import Readings, Series
-from fusion.analysis.consistency.checks import Check, judge
+from fusion.analysis.consistency.checks import LOG, Found, check, judge
 from fusion.analysis.consistency.clocks import COURSES, QUARTER_S, QUARTERS, Evidence
 from fusion.analysis.consistency.field_series import FieldSeries
-from fusion.analysis.consistency.logs import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_LAGS_S, compare_course
+from fusion.analysis.consistency.logs import SOURCE_S, even_times, loads_of
+from fusion.analysis.consistency.material import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_LAGS_S, compare_course
 from fusion.analysis.drift_model.fit import SHIFT_AND_STRETCH, Term, fit_model, scaled_systems
 from fusion.analysis.drift_model.gains import by_width, profile_gains
 from fusion.analysis.effects.effect import Candidate
@@ -27,8 +29,6 @@ from interferometry.drift.kalman import DriftModelError
 
 #: Shifts of a log that are tried, s: three hours, as far as time zones of one country lie apart, in steps of two minutes.
 _LOG_SHIFTS_S = np.arange(-10_800.0, 10_801.0, 120.0)
-#: Minutes of a month: a log that is longer has an even grid of no more times than this, or than its rows.
-_MONTH_MIN = 43_200
 #: Delays of a log against the field that are no clock's, s: a sensor follows late; heat takes minutes from a source to the surface, and a
 #: source of another time constant than those tried looks early or late.
 _SENSOR_EARLY_S, _LOG_DELAY_S = 300.0, 900.0
@@ -38,8 +38,8 @@ _MISFIT_RATIO = 3.0
 #: Share of the frames that a shifted log must still cover.
 _LEAST_COMMON = 0.5
 
-#: Time constants of source and table through which a load is seen, s: 5 and 20 min; half an hour, two and ten hours.
-_SOURCE_S, _TABLE_S = (300.0, 1200.0), (1800.0, 7200.0, 36_000.0)
+#: Time constants of the table through which a load is seen, s: half an hour, two and ten hours.
+_TABLE_S = (1800.0, 7200.0, 36_000.0)
 #: Leading modes of the field's rate: source and table make two, the rest is noise.
 _MODES = 2
 #: Share of the variance of the field's rate that the load must explain, and the factor by which a shift must lessen what is left: half
@@ -63,10 +63,6 @@ _OTHER_TIMES, _MOST_OTHER_TIMES, _LEAST_VARIATION, _STRUCTURED, _LEAST_WARMED_K 
 _CLIPPED_SHARE, _HELD_S = 0.2, 900.0
 #: Values from which on it is unlikely that a load which is switched among levels meets each of them but the largest once.
 _LEVELS = 4
-#: Rises in a row without a fall that chance makes less than once in a million: a counter.
-_COUNTED = 20
-#: Share of the variance of a load's response that may depend on whether it is held or interpolated between two rows.
-_BETWEEN_ROWS = 0.25
 #: Resampled courses, none of which may gain as much, from blocks of this length, s.
 _DRAWS, _BLOCK_S = 400, 1800.0
 
@@ -124,7 +120,7 @@ def _as_evidence(misfit: Array, early_s: float, ratio: float, *, second: str, wh
 
 def compare_load(field: FieldSeries | None, log: xr.Dataset | None) -> list[Evidence]:
     """Compare the loads with the rate of the field: what the load that explains most of it says of the clock of the drivers' log."""
-    loads = _loads(log)
+    loads = loads_of(log)
     if field is None or log is None or not loads:
         return []
     at, rate = field.since_start(log["time"].values), _Rate.of(field)
@@ -144,102 +140,42 @@ def compare_load(field: FieldSeries | None, log: xr.Dataset | None) -> list[Evid
     return _as_evidence(misfit, _LOG_DELAY_S, _LEFT_RATIO, second="drivers", what="load and field")
 
 
-def check_load_scale(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
-    """Check that a load keeps its unit: a share does not become per cent, and where a size jumps, the field's rate must follow."""
-    loads = _loads(log)
-    if field is None or log is None or not loads:
-        return []
-    at, rate = field.since_start(log["time"].values), _Rate.of(field)
-    value, evidence = 1.0, f"No change of scale of the loads in {file} detected."
+@check("fields", LOG)
+def drivers_scale(field: FieldSeries, drivers: xr.Dataset) -> Found | None:
+    """Largest value of a load before and after a sample at which it grows or falls by `_SCALE_JUMP` times: no column of unit 1 that is 0
+    to 1 on one side, with fractions, and up to `_PER_CENT` on the other, or has all its levels there a hundred times as large; else, no
+    factor of 60, 100, 1000 or 3600 without which the load leaves `_LEFT_RATIO` times less of the field's rate, and explains
+    `_LEAST_EXPLAINED` of it.
+    """
+    loads = loads_of(drivers)
+    if not loads:
+        return None
+    at, rate = field.since_start(drivers["time"].values), _Rate.of(field)
+    value, facts = 1.0, dict[str, Any]()
     for name, load in loads.items():
         for start, factor in _scale_jumps(load):
-            share = str(log[name].attrs.get("units", "")) == "1" and _share_and_per_cent(load, start)
-            reason = "a share and per cent" if share else _rate_against_jump(rate, at, load, start, factor)
-            if reason:
+            share = str(drivers[name].attrs.get("units", "")) == "1" and _share_and_per_cent(load, start)
+            left = None if share else _left_without(rate, at, load, start, factor)
+            if share or left is not None:
                 value = 100.0 if share else max(factor, 1.0 / factor)
-                since = np.datetime_as_string(log["time"].values[start], unit="s")
-                size = "larger" if factor > 1.0 else "smaller"
-                evidence = f"{name} in {file} is some {value:.0f} times {size} from {since}Z on: {reason}."
-    remedy = f"Write all rows of {file} in one unit; a share is 0 to 1 or, throughout, per cent."
-    return [judge("drivers_scale", value, _SCALE_JUMP, evidence, remedy, passed=value == 1.0)]
+                since = np.datetime_as_string(drivers["time"].values[start], unit="s")
+                facts = {"name": name, "grows": factor > 1.0, "since": since, "left": left}
+    return judge(value, _SCALE_JUMP, passed=value == 1.0, **facts)
 
 
-def check_load_kind(log: xr.Dataset | None, *, file: str) -> list[Check]:
-    """Check that the loads are loads by their own shape: no counters, and rows that are dense enough."""
-    loads = _loads(log)
-    if log is None or not loads:
-        return []
-    at = np.asarray((log["time"].values - log["time"].values[0]) / np.timedelta64(1, "s"), float)
-    found = []
-    for name, load in loads.items():
-        if other := _other_kind(load):
-            found.append(f"{name} {other}")
-        elif (share := _between_rows(at, load)) > _BETWEEN_ROWS:
-            found.append(
-                f"{name} is known too seldom: {100.0 * share:.0f} % of the variance of what it heats depends on whether it stays or "
-                "changes steadily from row to row, as in a log of events"
-            )
-    remedy = f"Write the load itself into {file}, a row every minute: of a counter its differences, of events the state after each."
-    sound = f"The loads in {file} look like loads."
-    return [judge("drivers_kind", len(found), 0.0, f"{file}: {'; '.join(found)}.", remedy, sound=sound)]
-
-
-def _other_kind(load: Array) -> str:
-    """What a column counts or how it changes in place of a load, by its own shape; empty where that does not tell."""
-    load = load[np.isfinite(load)]
-    steps = np.diff(load)
-    rises, falls = steps[steps > 0.0], steps[steps < 0.0]
-    changes, rows = rises.size + falls.size, load.size
-    if changes >= _COUNTED and not (rises.size and falls.size):
-        return f"only {'grows' if rises.size else 'falls'}, in {changes} of {rows} rows: a counter"
-    # It begins again near zero each time, and grows for long in between.
-    reset = load[1:][steps < 0.0]
-    if falls.size >= 2 and rises.size >= _COUNTED * falls.size and reset.max() <= rises.max():
-        return f"grows in {rises.size} of {rows} rows and begins again near zero {falls.size} times: a counter that is reset"
-    moves = np.flatnonzero(load)
-    single = moves.size >= 4 and moves.size < 0.5 * rows and (np.diff(moves) > 1).all()
-    if single and load.min() < 0.0 < load.max():
-        return f"is zero but in {moves.size} single rows of both signs: the changes of a load"
-    return ""
-
-
-def _loads(log: xr.Dataset | None, *, constant: bool = False) -> dict[str, Array]:
-    """The loads of a log by name; `constant`: also those that never change."""
-    columns = {} if log is None else log.data_vars
-    return {
-        str(name): column.values.astype(float)
-        for name, column in columns.items()
-        if _is_load(column, constant=constant)
-    }
-
-
-def _even(at: Array) -> Array:
-    """Even times from the first row of a log to its last, s: a minute apart, or as many as the log has rows or a month has minutes."""
-    return np.arange(at[0], at[-1] + 1.0, max(60.0, float(at[-1] - at[0]) / max(at.size, _MONTH_MIN)))
-
-
-def _between_rows(at: Array, load: Array) -> float:
-    """Share of the variance of a quick source's response that differs between a load held from row to row and one interpolated."""
-    known = np.isfinite(load)
-    grid = _even(at)
-    held = load[known][np.searchsorted(at[known], grid, side="right").clip(1) - 1]
-    responses = respond(
-        np.column_stack([np.interp(grid, at[known], load[known]), held]), grid, time_constant_s=_SOURCE_S[0]
-    )
-    return float(np.var(responses[:, 1] - responses[:, 0]) / max(float(np.var(responses[:, 1])), 1e-30))
-
-
-def check_load_course(
-    field: FieldSeries | None, log: xr.Dataset | None, *, file: str, environment: xr.Dataset | None = None
-) -> list[Check]:
-    """Check that the field's rate follows a load: more than the same log at other times, and than backwards; what other loads and the
-    logged air explain need not be explained by it.
+@check("fields", LOG)
+def drivers_course(field: FieldSeries, drivers: xr.Dataset, environment: xr.Dataset | None = None) -> Found | None:
+    """Share of the variance of the field's rate that the best load leaves, against the same log at `_OTHER_TIMES` other times, and
+    backwards; tested where the load's standard deviation is at least `_LEAST_VARIATION` of its largest value and the rate has a structure
+    of its own: doubted where all loads and the logged air together leave more than 0.4, and it leaves no less than at half of the other
+    times or the log's own shape says that it shows less than the load ([below](#clocks)); or where backwards it leaves `_BACKWARDS_RATIO`
+    times less and explains `_LEAST_EXPLAINED`.
     """
-    loads = _loads(log, constant=True)
-    if field is None or log is None or not loads:
-        return []
-    at, rate = field.since_start(log["time"].values), _Rate.of(field)
-    grid = _even(at)
+    loads = loads_of(drivers, constant=True)
+    if not loads:
+        return None
+    at, rate = field.since_start(drivers["time"].values), _Rate.of(field)
+    grid = even_times(at)
     courses = {name: np.interp(grid, at[np.isfinite(load)], load[np.isfinite(load)]) for name, load in loads.items()}
     lefts = {name: _load_left(rate, grid, course) for name, course in courses.items()}
     name = min(lefts, key=lambda one: lefts[one])
@@ -258,57 +194,45 @@ def check_load_course(
         rolls = np.linspace(0, course.size, _OTHER_TIMES, endpoint=False, dtype=int)[1:]
         at_other_times = float(np.mean([_load_left(rate, grid, np.roll(course, k)) <= left for k in rolls]))
     constant = float(np.ptp(course)) == 0.0
-    coarse = _coarse_kind(at, loads[name]) if explains_little and (_bends(field) if constant else structured) else ""
-    evidence = f"{name} in {file} explains {100.0 * (1.0 - left):.0f} % of the rate at which the field changes"
-    if beside:
-        evidence += f", with all that was logged {100.0 * (1.0 - together):.0f} %"
-    if is_backwards:
-        evidence += f", read backwards in time {100.0 * (1.0 - left_backwards):.0f} %"
-    elif coarse:
-        evidence += f", and {coarse}"
-    if at_other_times > 0.0:
-        evidence += f"; {100.0 * at_other_times:.0f} % of the same log put at other times explain as much or more"
-    return [
-        judge(
-            "drivers_course",
-            left,
-            1.0 - _LEAST_EXPLAINED,
-            f"{evidence}.",
-            f"Check whether {file} is of this test and of the axis that heats the table, in the order of its times, the load itself, "
-            "neither clipped nor a state nor a mean over a longer time, and whether it holds what else heats the table.",
-            passed=not (is_backwards or coarse or at_other_times > _MOST_OTHER_TIMES),
-        )
-    ]
+    coarse = _coarse_kind(at, loads[name]) if explains_little and (_bends(field) if constant else structured) else {}
+    return judge(
+        left,
+        1.0 - _LEAST_EXPLAINED,
+        passed=not (is_backwards or coarse or at_other_times > _MOST_OTHER_TIMES),
+        name=name,
+        together=together if beside else None,
+        backwards=left_backwards if is_backwards else None,
+        coarse=coarse,
+        at_other_times=at_other_times,
+    )
 
 
-def _coarse_kind(at: Array, load: Array) -> str:
+def _coarse_kind(at: Array, load: Array) -> dict[str, Any]:
     """What a log that shows less than the load holds instead, by its own shape; empty where that does not tell."""
     at, load = at[np.isfinite(load)], load[np.isfinite(load)]
     starts = np.concatenate([[0], np.flatnonzero(np.diff(load)) + 1])
     if starts.size == 1:
-        return "stays at one value"
+        return {"kind": "constant"}
     values, rows = np.unique(load, return_counts=True)
     lengths = np.diff([*starts, load.size])
     if values.size == 2:
         marks = bool((lengths[load[starts] == values[np.argmin(rows)]] == 1).all())
-        return "holds marks, as of starts" if marks else "knows two states, as of a switch"
+        return {"kind": "marks" if marks else "switch"}
     # Where other values than the largest and that at rest come back as well, the load is switched from level to level.
     _, times = np.unique(load[starts], return_counts=True)
     is_cut_off = times[-1] > 1 and times.size > _LEVELS and (times[1:-1] == 1).all()
     if is_cut_off and rows[-1] >= _CLIPPED_SHARE * load.size:
-        return (
-            f"is {values[-1]:g}, its largest value, in {100.0 * rows[-1] / load.size:.0f} % of the rows, as if clipped"
-        )
+        return {"kind": "clipped", "largest": values[-1], "share": rows[-1] / load.size}
     # The first and the last stretch may have been cut off.
     held_s = np.diff(at[starts[1:]])
     if held_s.size > 1 and held_s.min() >= _HELD_S and np.allclose(held_s / held_s.min() % 1.0, 0.0, atol=0.01):
-        return f"changes every {held_s.min() / 60.0:.0f} min only, as a mean over that time"
-    return ""
+        return {"kind": "mean", "minutes": held_s.min() / 60.0}
+    return {}
 
 
 def _bends(field: FieldSeries) -> bool:
     """Whether half of the table changes in a course that no warm-up makes: a source that nobody logged bends a part of it."""
-    fading = [np.exp(-field.seconds / time_constant_s) for time_constant_s in (*_SOURCE_S, *_TABLE_S[:2])]
+    fading = [np.exp(-field.seconds / time_constant_s) for time_constant_s in (*SOURCE_S, *_TABLE_S[:2])]
     smooth = np.column_stack([np.ones(field.seconds.size), field.seconds, *fading])
     bent = field.temperature - smooth @ np.linalg.lstsq(smooth, field.temperature, rcond=None)[0]
     return _follows(_Rate.of(field)) and bool(np.median(np.ptp(bent, axis=0)) > _LEAST_WARMED_K)
@@ -352,14 +276,13 @@ def _share_and_per_cent(load: Array, start: int) -> bool:
     return bool(shares and other.min() >= 0.0 and 0.01 * _PER_CENT < other.max() <= _PER_CENT)
 
 
-def _rate_against_jump(rate: _Rate, at: Array, load: Array, start: int, factor: float) -> str:
-    """Why the field contradicts a jump of a load; empty where it does not."""
+def _left_without(rate: _Rate, at: Array, load: Array, start: int, factor: float) -> tuple[float, float] | None:
+    """Shares of the field's rate that a load leaves as it is logged and without its jump, where these contradict the jump; None else."""
     corrected = np.where(np.arange(load.size) < start, load, load / factor)
     left, left_corrected = _load_left(rate, at, load), _load_left(rate, at, corrected)
     if left_corrected > 1.0 - _LEAST_EXPLAINED or left < _LEFT_RATIO * left_corrected:
-        return ""
-    as_logged, without = (100.0 * np.sqrt(share) for share in (left, left_corrected))
-    return f"the load leaves {as_logged:.0f} % of the field's rate unexplained as it is logged, {without:.0f} % without that factor"
+        return None
+    return float(np.sqrt(left)), float(np.sqrt(left_corrected))
 
 
 def _load_left(rate: _Rate, at: Array, *loads: Array) -> float:
@@ -374,14 +297,6 @@ def _load_left(rate: _Rate, at: Array, *loads: Array) -> float:
         share *= float(left[best])
         rate = replace(rate, modes=rate.modes - np.outer(taken, taken @ rate.modes))
     return share
-
-
-def _is_load(column: xr.DataArray, *, constant: bool = False) -> bool:
-    """Whether a column may drive the field: numbers that change and are no temperature."""
-    if column.dtype.kind not in "fiu" or str(column.attrs.get("units", "")) in ("degC", "K"):
-        return False
-    finite = np.isfinite(column.values)
-    return int(finite.sum()) >= 2 and (constant or float(np.ptp(column.values[finite])) > 0.0)
 
 
 @dataclass(frozen=True)
@@ -414,12 +329,12 @@ class _Rate:
 
     def columns(self, at: Array, load: Array, shifts_s: NDArray[np.floating] = _LOG_SHIFTS_S) -> Array:
         """Unit responses to a load, (shifts, shapes, n), whitened and freed of the trend; zero where a load does not change."""
-        grid = _even(at)
+        grid = even_times(at)
         finite = np.isfinite(load)
         steps = np.interp(grid, at[finite], load[finite])[:, None]
         shapes = [
             respond(respond(steps, grid, time_constant_s=source), grid, time_constant_s=table)[:, 0]
-            for source in _SOURCE_S
+            for source in SOURCE_S
             for table in _TABLE_S
         ]
         columns = np.empty((len(shifts_s), len(shapes), self.weight.size))

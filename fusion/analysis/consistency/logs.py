@@ -1,18 +1,17 @@
-"""Checks of the logs: whether they cover the time of the readings, and whether their temperature sensors are sound."""
+"""Checks of the logs: whether they cover the time of the readings, hold loads, and whether their temperature sensors are sound."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import covered_share, likely_zone_shift
+from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.sensor_health import Kind, examine_sensors
-from fusion.analysis.consistency.checks import Check, Severity, judge
-from fusion.analysis.consistency.field_series import FieldSeries, field_at
+from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
 from fusion.common import Array
 
 #: Temperatures of the environment log.
@@ -28,15 +27,62 @@ _APART_S = 3600.0
 _COVERED_NOW = 0.6
 #: ... both ends within this time, s: loggers are switched on and off by hand.
 _SAME_END_S = 900.0
+#: Minutes of a month: a log that is longer has an even grid of no more times than this, or than its rows.
+_MONTH_MIN = 43_200
+#: Rises in a row without a fall that chance makes less than once in a million: a counter.
+_COUNTED = 20
+#: Share of the variance of a load's response that may depend on whether it is held or interpolated between two rows.
+_BETWEEN_ROWS = 0.25
+#: Time constants of a source of heat through which a load is seen, s: 5 and 20 min.
+SOURCE_S = (300.0, 1200.0)
 
 
-def check_log(log: xr.Dataset | None, times: NDArray[np.datetime64], *, name: str, file: str) -> list[Check]:
+@check("source", LOG, waits=True)
+def environment_coverage(environment: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
+    """Share of the readings between two samples of the log that are no gap apart: at least `_LEAST_COVERED`; a contradiction where it
+    ends, or begins, more than `_APART_S` s before or after all readings, or covers less than `_COVERED_NOW` where a shift by whole
+    quarter hours brings both ends of the log within `_SAME_END_S` s of those of the readings.
+    """
+    return _coverage(environment, reading_time)
+
+
+@check("source", LOG, waits=True)
+def drivers_coverage(drivers: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
+    """The same of the drivers' log."""
+    return _coverage(drivers, reading_time)
+
+
+@check("source", LOG)
+def drivers_kind(drivers: xr.Dataset) -> Found | None:
+    """Changes of a load, all of one sign, or growing for long and beginning again near zero: fewer than `_COUNTED`, else a counter;
+    single rows of both signs among zeros: changes of a load; share of the variance of the response of a source of 5 min that depends on
+    whether the load is held or interpolated from row to row: at most `_BETWEEN_ROWS`, else events, or rows that are too rare.
+    """
+    loads = loads_of(drivers)
+    if not loads:
+        return None
+    at = np.asarray((drivers["time"].values - drivers["time"].values[0]) / np.timedelta64(1, "s"), float)
+    found = []
+    for name, load in loads.items():
+        if kind := _other_kind(load):
+            found.append({"name": name, **kind})
+        elif (share := _between_rows(at, load)) > _BETWEEN_ROWS:
+            found.append({"name": name, "kind": "rare", "share": share})
+    return judge(len(found), 0.0, found=found)
+
+
+@check("source", CLOCK, waits=True)
+def sensors_coverage(sensors: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
+    """The same as of the environment log, of the contact sensors' log where it stands for the camera."""
+    return _coverage(sensors, reading_time)
+
+
+def _coverage(log: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
     """Check that a log covers the time of the readings."""
-    if log is None or log.sizes["time"] == 0:
-        return []
+    times = reading_time.values.ravel()
     readings = times[~np.isnat(times)]
-    if readings.size == 0:
-        return []
+    if log.sizes["time"] == 0 or readings.size == 0:
+        return None
     logged = log["time"].values
     covered = _covered(logged, readings)
     passed = covered >= _LEAST_COVERED
@@ -44,36 +90,19 @@ def check_log(log: xr.Dataset | None, times: NDArray[np.datetime64], *, name: st
     gaps = not passed and covered_share(readings, logged) >= _LEAST_COVERED
     late_s = None if passed or gaps else likely_zone_shift(readings, logged)
     clear = late_s is not None and covered < _COVERED_NOW and _same_ends(logged, readings, late_s)
-    first, last, start, end = (
-        f"{np.datetime_as_string(time, unit='s')}Z" for time in (*logged[[0, -1]], readings.min(), readings.max())
-    )
     apart_s = max(readings.min() - logged[-1], logged[0] - readings.max()) / np.timedelta64(1, "s")
-    evidence = f"{file} ({first} to {last}) covers {100.0 * covered:.0f} % of the readings ({start} to {end})"
-    if gaps:
-        evidence += "; the others fall into gaps of the log"
-    if late_s is not None:
-        hours = f"{abs(late_s) / 3600.0:g} h {'late' if late_s > 0.0 else 'early'}"
-        evidence += f", and nearly all of them if its clock is {hours}"
-    return [
-        judge(
-            f"{name}_coverage",
-            covered,
-            _LEAST_COVERED,
-            f"{evidence}.",
-            f"Log without a break in the next test; what happened in the gaps of {file} is not known."
-            if gaps
-            else f"Check the date, the clock and the time zone of {file} (write its times with their zone, or time_zone), or leave it out "
-            "of the campaign file.",
-            passed=passed,
-            severity=Severity.CONTRADICTION if apart_s > _APART_S or clear else Severity.DOUBT,
-        )
-    ]
+    ends = [f"{np.datetime_as_string(at, unit='s')}Z" for at in (*logged[[0, -1]], readings.min(), readings.max())]
+    contradicts = bool(apart_s > _APART_S or clear)
+    return judge(covered, _LEAST_COVERED, passed=passed, contradicts=contradicts, ends=ends, gaps=gaps, late_s=late_s)
 
 
-def check_contact_sensors(environment: xr.Dataset | None, drivers: xr.Dataset | None, *, file: str) -> list[Check]:
-    """Check that the temperature sensors of the environment log are sound."""
-    if environment is None or environment.sizes["time"] == 0:
-        return []
+@check("source", LOG)
+def contact_sensors(environment: xr.Dataset, drivers: xr.Dataset | None = None) -> Found | None:
+    """Temperatures of the environment log, and those in degC of the drivers' log, each predicted from the others, the loads and its past
+    ([sensor-health.md](sensor-health.md)); only a clear fault counts, and no sensor that shows one reading throughout.
+    """
+    if environment.sizes["time"] == 0:
+        return None
     start = environment["time"].values[0]
     seconds = np.asarray((environment["time"].values - start) / np.timedelta64(1, "s"), float)
     columns = {name: environment[name].values for name in _CONTACT_SENSORS if name in environment}
@@ -93,17 +122,9 @@ def check_contact_sensors(environment: xr.Dataset | None, drivers: xr.Dataset | 
         sensor for sensor, column in enumerate(columns.values()) if np.unique(column[np.isfinite(column)]).size > 1
     }
     clear = [fault for fault in faults if fault.is_clear and (fault.kind is not Kind.STUCK or fault.sensor in changing)]
-    names = [f"{list(columns)[fault.sensor].replace('_', ' ')} {fault.words}" for fault in clear]
-    return [
-        judge(
-            "contact_sensors",
-            len(names),
-            0.0,
-            f"{file}: {'; '.join(names)}.",
-            f"Check contact and cable, and leave the log out from then on ({file}).",
-            sound=f"No contact sensor of {file} shows a step, ramp, stuck-at or drop-out fault.",
-        )
-    ]
+    return judge(
+        len(clear), 0.0, faults=[(list(columns)[fault.sensor].replace("_", " "), fault.words) for fault in clear]
+    )
 
 
 def _same_ends(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64], late_s: float) -> bool:
@@ -125,329 +146,54 @@ def _covered(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64]) -
     return float(np.mean(inside & (step <= max(_GAP_S, 10.0 * float(np.median(steps))))))
 
 
-# Contact sensors on the table against each other, and against the camera that sees their places.
-
-#: Largest difference between camera and sensors in standard uncertainties.
-_LIMIT = 3.0
-#: Standard uncertainty of the rise under a surface probe relative to that of the surface (contact, stem conduction), as a share of it.
-_CONTACT = 0.02
-
-
-def compare_sensors(
-    fields: xr.Dataset, temperature: xr.DataArray, x_mm: Array, y_mm: Array, *, u_K: float
-) -> list[Check]:
-    """Check the camera's rise at the places of contact sensors against theirs."""
-    compared = []
-    for k, name in enumerate(temperature["sensor"].values):
-        seen = field_at(fields, (float(x_mm[k]), float(y_mm[k])))
-        if seen is None:
-            continue
-        at = seen.since_start(temperature["time"].values)
-        inside = (seen.seconds >= at[0]) & (seen.seconds <= at[-1])
-        if inside.sum() < 2:
-            continue
-        logged = np.interp(seen.seconds[inside], at, temperature.values[:, k])
-        camera = seen.temperature[inside, 0]
-        # Means over the first and the last tenth: what is compared is the rise, not its noise.
-        ends = max(1, int(inside.sum()) // 10)
-        rises = [float(values[-ends:].mean() - values[:ends].mean()) for values in (camera, logged)]
-        cell = fields["temperature_rise_u"].isel(cycle=-1).sel(x=x_mm[k], y=y_mm[k], method="nearest")
-        u = float(np.sqrt(np.nan_to_num(float(cell)) ** 2 + 2.0 * u_K**2 + (_CONTACT * rises[1]) ** 2))
-        compared.append((abs(rises[0] - rises[1]) / u, str(name), rises[0], rises[1], u))
-    if not compared:
-        return []
-    worst, sensor, camera_K, sensor_K, u = max(compared)
-    return [
-        judge(
-            "sensors_rise",
-            worst,
-            _LIMIT,
-            f"At {sensor} the camera shows a rise of {camera_K:.2f} K, the sensor of {sensor_K:.2f} K; standard uncertainty of the "
-            f"difference {u:.2f} K ({len(compared)} sensors compared, this one differs most).",
-            "Check emissivity and reflected_temperature, the places of the sensors and their contact.",
-        )
-    ]
+def _other_kind(load: Array) -> dict[str, Any]:
+    """What a column counts or how it changes in place of a load, by its own shape; empty where that does not tell."""
+    load = load[np.isfinite(load)]
+    steps = np.diff(load)
+    rises, falls = steps[steps > 0.0], steps[steps < 0.0]
+    changes, rows = rises.size + falls.size, load.size
+    if changes >= _COUNTED and not (rises.size and falls.size):
+        return {"kind": "counter", "changes": changes, "rows": rows, "grows": rises.size > 0}
+    # It begins again near zero each time, and grows for long in between.
+    reset = load[1:][steps < 0.0]
+    if falls.size >= 2 and rises.size >= _COUNTED * falls.size and reset.max() <= rises.max():
+        return {"kind": "reset", "changes": rises.size, "rows": rows, "resets": falls.size}
+    moves = np.flatnonzero(load)
+    single = moves.size >= 4 and moves.size < 0.5 * rows and (np.diff(moves) > 1).all()
+    if single and load.min() < 0.0 < load.max():
+        return {"kind": "changes", "rows": moves.size}
+    return {}
 
 
-# Camera and environment log against each other: an emissivity error appears as a gain, a reflected-temperature error
-# as an offset.
-
-#: Time constants of a material sensor that are tried, s: from a thermocouple in a hole to a magnetic probe.
-SENSOR_LAGS_S = (0.0, 180.0, 360.0, 600.0, 900.0)
-#: The sensor follows the table only where the course of a cell leaves less than this share of its standard deviation.
-LEAST_FOLLOWED = 0.3
-#: Resolution of a logged temperature, K: smaller differences mean nothing.
-RESOLUTION_K = 0.01
-#: Share by which the rise under a surface probe may differ from that of the surface: contact and stem conduction, 2 standard
-#: uncertainties of 2 %.
-_CONTACT_SHARE = 0.04
-#: The same where the sensor's place is not stated: several cells follow alike, and their rises differ by some per cent.
-_UNKNOWN_PLACE = 0.07
-#: Drift of the camera's zero within a test that its correction leaves, K.
-_CAMERA_DRIFT_K = 0.05
-#: Smallest change of the logged temperature that can tell a slope, K.
-_LEAST_CHANGE_K = 1.0
-#: Share of the log's standard deviation that the cell most like it leaves at most: beyond, they share less than half of its variance.
-_LARGEST_LEFT = 0.7
-#: Share of the change of the least changing cell that the log has at least: a sensor on the table, also one in poor contact, shows more.
-_LEAST_SHARE = 0.5
-#: Fewest frames from which a course can be distinguished from another one.
-_LEAST_FRAMES = 12
-#: Differences over this time show the slope without a slow drift of the camera, s.
-_SHORT_TERM_S = 1200.0
-#: A cell is as good as the best one where the misfit is no larger by this many units of log-likelihood.
-_AS_GOOD = 6.0
-#: Accuracy, K, to which a surface probe follows its place: where that is not stated, cells within this cannot be distinguished.
-_PROBE_K = 0.03
-#: Largest difference of the levels, K: twice the accuracy of a thermal camera of 2 K.
-_LARGEST_LEVEL_K = 4.0
+def loads_of(log: xr.Dataset | None, *, constant: bool = False) -> dict[str, Array]:
+    """The loads of a log by name; `constant`: also those that never change."""
+    columns = {} if log is None else log.data_vars
+    return {
+        str(name): column.values.astype(float)
+        for name, column in columns.items()
+        if _is_load(column, constant=constant)
+    }
 
 
-#: Parts of a test that are left out in turn, and coverage factor of 95 % for the standard deviation that they give (Student's t, 5
-#: degrees of freedom; JCGM 100:2008, G.3).
-_PARTS, _PARTS_95 = 6, 2.57
-#: What confirms the scale of the camera's rise.
-_KEEP_IN_VIEW = (
-    "Keep a surface of constant temperature in view (reference_patch under [thermography]), which shows the camera's zero, and check the "
-    "contact of the material sensor."
-)
-_STATE_PLACE = (
-    "State where the material sensor sits on the table: material_sensor under [interferometry], its place on the plan."
-)
-
-
-def compare_course(cells: Array, logged: Array) -> tuple[Array, float]:
-    """Return what a constant and a positive multiple of every cell leave of a logged temperature, and its standard deviation, K."""
-    centred, target = cells - cells.mean(axis=0), logged - logged.mean()
-    product = np.maximum(centred.T @ target, 0.0)
-    explained = product**2 / np.maximum((centred**2).sum(axis=0), 1e-12)
-    left = np.maximum(target @ target - explained, 0.0)
-    return np.sqrt(left / logged.size), float(target.std())
-
-
-def _material(near: FieldSeries | None, log: xr.Dataset | None) -> tuple[Array, Array] | None:
-    """Whether the log covers each frame, and the logged material temperature at those that it covers."""
-    if near is None or log is None or "material_temperature" not in log:
-        return None
-    at = near.since_start(log["time"].values)
-    inside = (near.seconds >= at[0]) & (near.seconds <= at[-1])
-    if inside.sum() < 2:
-        return None
-    return inside, np.interp(near.seconds[inside], at, log["material_temperature"].values)
-
-
-def rise_share_u(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool) -> float | None:
-    """Standard uncertainty of the camera's rise, as a share of it, that a material sensor leaves; None where it tells nothing."""
-    compared = _material(near, log)
-    if near is None or compared is None:
-        return None
-    slopes = _slopes(near, *compared, stated=stated)
-    # Every scale at which some place of the sensor fits is as likely (rectangular, JCGM 100:2008, 4.3.7).
-    return (
-        None if slopes is None else float(np.hypot(_CONTACT, max(abs(slope - 1.0) for slope in slopes) / np.sqrt(3.0)))
-    )
-
-
-def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool, file: str) -> list[Check]:
-    """Check course, rise and level of the camera's temperature and the logged material temperature against each other."""
-    compared = _material(near, log)
-    if near is None or log is None or compared is None:
-        words = "Scale not verified: no material temperature is logged with the frames, which would confirm the camera's rise."
-        remedy = "Log a contact sensor on the table (material_temperature in the environment log), and state its place (material_sensor)."
-        return [judge("material_rise", 0.0, _UNKNOWN_PLACE, words, unverified=remedy)]
-    inside, logged = compared
-    checks = [
-        _same_course(near, inside, logged, file=file),
-        _still(near, inside, logged, file=file),
-        _rise(near, inside, logged, stated=stated),
-        *([_gain(near, inside, logged)] if stated else []),
-        _level(near.temperature[inside], logged),
-    ]
-    if "air_temperature" not in log:
-        return checks
-    air = np.interp(near.seconds[inside], near.since_start(log["time"].values), log["air_temperature"].values)
-    columns = judge(
-        "environment_columns",
-        not _agrees(near, inside, logged, stated=stated) and _agrees(near, inside, air, stated=stated),
-        0.0,
-        f"In {file} the air temperature follows the table in time course, rise and level, and the material temperature does not: the "
-        "columns look exchanged.",
-        f"Check the headings air_temperature and material_temperature of {file}.",
-        sound=f"The columns of air and material temperature in {file} do not look exchanged.",
-    )
-    if columns.passed:
-        return [*checks, columns]
-    first = "See environment_columns first: with both columns exchanged, camera and log agree. "
-    return [*(one if one.passed else replace(one, remedy=first + one.remedy) for one in checks), columns]
-
-
-def _same_course(near: FieldSeries, inside: Array, logged: Array, *, file: str) -> Check:
-    """Correlation of material and surface temperature: low where frames are out of order, a clock is off, or the sensor sits elsewhere."""
-    change = float(np.ptp(logged))
-    left = 0.0
-    if change >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES:
-        # Share of the log's standard deviation that a constant and a positive multiple of the most similar cell leave.
-        courses = [compare_course(near.lagged(lag_s)[inside], logged) for lag_s in SENSOR_LAGS_S]
-        left = min(float(unexplained_K.min()) for unexplained_K, _ in courses) / max(courses[0][1], RESOLUTION_K)
-    logs = f"The material temperature in {file} changes by {change:.2g} K"
-    return judge(
-        "material_course",
-        left,
-        _LARGEST_LEFT,
-        f"{logs}; no surface temperature on the table correlates with it: the best one leaves {100.0 * left:.0f} % unexplained.",
-        f"Check the order, the times and the day of the frames and of the rows of {file}, its columns, and whether the sensor sits on "
-        "the table.",
-        sound=f"{logs}; consistent with the table.",
-    )
-
-
-def _still(near: FieldSeries, inside: Array, logged: Array, *, file: str) -> Check:
-    """A sensor that shows less than every part of the table does is stuck, or sits elsewhere."""
-    change = float(np.ptp(logged))
-    least = float(np.ptp(near.lagged(SENSOR_LAGS_S[-1])[inside], axis=0).min())
-    testable = least >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES
-    share = change / least if testable else 1.0
-    shown = f"changes by {change:.2g} K" if change > 0.0 else f"stays at {logged[0]:g} degC to the last digit"
-    return judge(
-        "material_still",
-        share,
-        _LEAST_SHARE,
-        f"The material temperature in {file} {shown}, the table by at least {least:.2g} K{'' if testable else ': cannot be tested'}.",
-        f"Check the material sensor: its cable, its column in {file}, and whether it sits on the table.",
-        passed=share >= _LEAST_SHARE,
-    )
-
-
-def _agrees(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> bool:
-    """Whether a logged temperature shows course, rise and level of the table."""
-    slopes = _slopes(near, inside, logged, stated=stated)
-    if slopes is None or abs(_off(slopes)) > _rise_limit(logged, stated=stated):
+def _is_load(column: xr.DataArray, *, constant: bool = False) -> bool:
+    """Whether a column may drive the field: numbers that change and are no temperature."""
+    if column.dtype.kind not in "fiu" or str(column.attrs.get("units", "")) in ("degC", "K"):
         return False
-    return _level(near.temperature[inside], logged).passed
+    finite = np.isfinite(column.values)
+    return int(finite.sum()) >= 2 and (constant or float(np.ptp(column.values[finite])) > 0.0)
 
 
-def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> Check:
-    """The camera's rise per K of the logged one."""
-    change, limit = float(np.ptp(logged)), _rise_limit(logged, stated=stated)
-    slopes = _slopes(near, inside, logged, stated=stated)
-    if slopes is None:
-        untestable = (
-            f"Scale not verified: the logged material temperature changes by {change:.2g} K and does not show it."
-        )
-        remedy = "State the emissivity with its uncertainty." if stated else _STATE_PLACE
-        return judge("material_rise", 0.0, limit, untestable, unverified=remedy)
-    off = _off(slopes)
-    where = "at the sensor's place" if stated else "where it resembles the sensor most"
-    open_scale = _STATE_PLACE if not stated else _KEEP_IN_VIEW if slopes[1] - slopes[0] > 2.0 * limit else ""
-    why = "the two do not change in proportion" if stated else "the place of the material sensor is not known"
-    unknown = f"Scale not verified, {why}. " if open_scale and abs(off) <= limit else ""
-    return judge(
-        "material_rise",
-        off,
-        limit,
-        f"{unknown}The camera's rise {where} is {slopes[0]:.3g} to {slopes[1]:.3g} times that of the logged material temperature, which "
-        f"changes by {change:.2g} K.",
-        "Check emissivity, object_distance and reflected_temperature (a rise that is too large comes from an emissivity that is too "
-        "small), the drift of the camera, and whether the sensor sits on the table (material_sensor under [interferometry]).",
-        passed=abs(off) <= limit,
-        unverified=open_scale,
+def even_times(at: Array) -> Array:
+    """Even times from the first row of a log to its last, s: a minute apart, or as many as the log has rows or a month has minutes."""
+    return np.arange(at[0], at[-1] + 1.0, max(60.0, float(at[-1] - at[0]) / max(at.size, _MONTH_MIN)))
+
+
+def _between_rows(at: Array, load: Array) -> float:
+    """Share of the variance of a quick source's response that differs between a load held from row to row and one interpolated."""
+    known = np.isfinite(load)
+    grid = even_times(at)
+    held = load[known][np.searchsorted(at[known], grid, side="right").clip(1) - 1]
+    responses = respond(
+        np.column_stack([np.interp(grid, at[known], load[known]), held]), grid, time_constant_s=SOURCE_S[0]
     )
-
-
-def _gain(near: FieldSeries, inside: Array, logged: Array) -> Check:
-    """Change through the test of the camera's rise per K of the logged one, apart from a steady drift of its zero."""
-    limit, seconds = _rise_limit(logged, stated=True), near.seconds[inside]
-    passed = np.asarray((seconds - seconds.mean()) / np.ptp(seconds))
-    lagged = [near.lagged(lag_s)[inside, 0] for lag_s in SENSOR_LAGS_S]
-    # What a sensor makes of the course between two frames is not noise: its weight is judged by leaving out parts of the test.
-    part = np.minimum((_PARTS * np.arange(len(logged))) // len(logged), _PARTS - 1)
-    fits = []
-    # A sensor shows the place through a time constant between two of those that are tried, from a state that is not known: what was
-    # before the first frame fades with that time constant, and in a table that warms ever more slowly it looks like a change of gain.
-    for (faster, slower), lag_s in zip(pairwise(lagged), SENSOR_LAGS_S[1:], strict=True):
-        centred, fades = faster - faster.mean(), np.exp(-seconds / lag_s)
-        design = np.column_stack(
-            [np.ones(len(centred)), centred, slower - slower.mean(), passed, passed * centred, fades]
-        )
-        found = np.array(
-            [np.linalg.lstsq(design[part != k], logged[part != k], rcond=None)[0] for k in range(-1, _PARTS)]
-        )
-        gains = found[:, 1] + found[:, 2]
-        if (gains > 0.0).all():
-            changes = -found[:, 4] / gains
-            rest = logged - design @ found[0]
-            fits.append((float(rest @ rest), float(changes[0]), float(np.sqrt((_PARTS - 1) * np.var(changes[1:])))))
-    # Of the time constants that fit as well as the best one, the one that asks for the least change.
-    as_good = min((left for left, _, _ in fits), default=0.0) * np.exp(2.0 * _AS_GOOD / len(logged))
-    change, u = min(
-        ((change, u) for left, change, u in fits if left <= as_good),
-        key=lambda fit: abs(fit[0]) - _PARTS_95 * fit[1],
-        default=(0.0, np.inf),
-    )
-    testable = float(np.ptp(logged)) >= _LEAST_CHANGE_K and inside.sum() >= _LEAST_FRAMES and u <= limit
-    evidence = (
-        "The camera's rise at the sensor's place per K of the logged material temperature changes by "
-        f"{change:+.2g} ± {_PARTS_95 * u:.2g} from the first to the last frame."
-    )
-    untestable = "The logged material temperature does not show whether the camera's gain stayed the same."
-    return judge(
-        "material_gain",
-        max(abs(change) - _PARTS_95 * u, 0.0) if testable else 0.0,
-        limit,
-        evidence if testable else untestable,
-        "Check the window before the camera (dirt, condensation) and its transmission, what the table reflects, and the sensor's contact.",
-    )
-
-
-def _rise_limit(logged: Array, *, stated: bool) -> float:
-    """Share by which the camera's rise may differ from that of the log."""
-    return (_CONTACT_SHARE if stated else _UNKNOWN_PLACE) + _CAMERA_DRIFT_K / max(
-        float(np.ptp(logged)), _LEAST_CHANGE_K
-    )
-
-
-def _off(slopes: tuple[float, float]) -> float:
-    """Distance of a range of slopes from 1, with its sign; 0 where it contains 1."""
-    low, high = slopes
-    return max(low - 1.0, 0.0) - max(1.0 - high, 0.0)
-
-
-def _slopes(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> tuple[float, float] | None:
-    """Smallest and largest slope of the camera over the log that the data allow; None where it changes little or no cell follows it."""
-    if float(np.ptp(logged)) < _LEAST_CHANGE_K or inside.sum() < _LEAST_FRAMES:
-        return None
-    step = max(1, round(_SHORT_TERM_S / float(np.median(np.diff(near.seconds[inside])))))
-    courses = []
-    for lag_s in SENSOR_LAGS_S:
-        cells = near.lagged(lag_s)[inside]
-        courses.append((*compare_course(cells, logged), cells))
-    best = max(min(float(unexplained_K.min()) for unexplained_K, _, _ in courses), 0.5 * RESOLUTION_K)
-    if best > LEAST_FOLLOWED * courses[0][1]:
-        return None
-    as_good = best * float(np.exp(_AS_GOOD / logged.size))
-    if not stated:
-        as_good = max(as_good, _PROBE_K)
-    slopes = []
-    for unexplained_K, _, cells in courses:
-        chosen = cells[:, unexplained_K <= as_good]
-        for camera, log in ((chosen, logged), (chosen[step:] - chosen[:-step], logged[step:] - logged[:-step])):
-            camera, log = camera - camera.mean(axis=0), log - log.mean()
-            product = log @ camera
-            follows = product > 0.0
-            slopes += [product[follows] / (log @ log), (camera**2).sum(axis=0)[follows] / product[follows]]
-    all_slopes = np.concatenate(slopes)
-    return float(all_slopes.min()), float(all_slopes.max())
-
-
-def _level(cells: Array, logged: Array) -> Check:
-    """Distance of the logged level from the levels of the table."""
-    level, table = float(np.median(logged)), np.median(cells, axis=0)
-    off = max(float(table.min()) - level, 0.0) - max(level - float(table.max()), 0.0)
-    return judge(
-        "material_level",
-        off,
-        _LARGEST_LEVEL_K,
-        f"The table reads {table.min():.1f} to {table.max():.1f} degC, the logged material temperature {level:.1f} degC.",
-        "Check reflected_temperature, emissivity, the stored transmission, and where the material sensor sits.",
-        passed=abs(off) <= _LARGEST_LEVEL_K,
-    )
+    return float(np.var(responses[:, 1] - responses[:, 0]) / max(float(np.var(responses[:, 1])), 1e-30))

@@ -14,7 +14,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine
 from fusion.analysis.alignment.readings import Series
-from fusion.analysis.consistency.checks import Check, judge
+from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
 from fusion.analysis.drift_model.fit import ModelFit, Term, place_of, refit_fixed
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.analysis.levels import LINE_LEVEL
@@ -226,29 +226,17 @@ _LINES_SPAN = 0.1
 _BEYOND_SIGMAS = 3.0
 
 
-def check_coefficients(loop: Mapping[str, Any], *, travel_mm: float) -> list[Check]:
-    """Check the coefficients of the final model against physics."""
+def _expansions(loop: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The declared expansion, where a coefficient is stated."""
     declared = loop.get("declared_coefficients", [])
-    stated = [entry for entry in declared if entry["effect"] == "axis_expansion" and entry.get("prior") is not None]
-    added = [{"effect": step["effect"], **entry} for step in loop.get("steps", []) for entry in step["coefficients"]]
-    line = loop.get("axis_line")
-    return [
-        *(_expansion(entry, absorbed=_absorbed(loop.get("steps", []))) for entry in stated[:1]),
-        *_sensitivities([*declared, *added], travel_mm),
-        *([] if line is None else [_axis_line(line, loop.get("unconfirmed_effects", {}))]),
-    ]
-
-
-def _absorbed(steps: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether an added effect may be what a wrong coefficient leaves: the compensation of the material acts in proportion to it."""
-    return any("material_compensation" in (step["effect"], *step.get("tied", ())) for step in steps)
+    return [entry for entry in declared if entry["effect"] == "axis_expansion" and entry.get("prior") is not None]
 
 
 def withhold_names(loop: Mapping[str, Any], effects: Mapping[str, Effect]) -> dict[str, Any]:
     """The part ``loop`` of results.json, where the expansion contradicts the stated one without the names of effects that are told by
     their course in time alone: one of them has taken, or left, a part of the expansion.
     """
-    stated = [one for one in loop["declared_coefficients"] if one["effect"] == "axis_expansion" and one.get("prior")]
+    stated = _expansions(loop)
     if not stated or abs(_asked_for(stated[0])[2]) <= _LIMIT:
         return dict(loop)
     alone, alone_u, _ = _asked_for(stated[0])
@@ -277,26 +265,21 @@ def _asked_for(entry: Mapping[str, Any]) -> tuple[float, float, float]:
     return alone, alone_u, (alone - stated) / math.hypot(alone_u, stated_u)
 
 
-def _expansion(entry: Mapping[str, Any], *, absorbed: bool) -> Check:
-    stated, stated_u = entry["prior"], entry["prior_u"]
-    alone, alone_u, off = _asked_for(entry)
-    evidence = (
-        f"The readings ask for an expansion of {alone:.3g} ± {alone_u:.2g} ppm/K, stated are {stated:.3g} ± {stated_u:.2g} ppm/K "
-        f"({off:+.1f} standard deviations, limit {_LIMIT:g})."
-        if math.isfinite(alone_u)
-        else "The readings alone do not determine the expansion of the axis; nothing contradicts the stated coefficient."
-    )
-    if absorbed:
-        evidence += " An error of the material compensation was added too, which a wrong coefficient imitates."
-    return judge(
-        "expansion_coefficient",
-        off,
-        _LIMIT,
-        evidence,
-        "Check expansion_coefficient, the emissivity, origin and direction under [plan.axis], the sign and the unit of the deviations, "
-        "the unit of the positions, and the clocks of camera and laser; or the model lacks an effect that is correlated with it.",
-        passed=abs(off) <= _LIMIT and not absorbed,
-    )
+@check("loop", LOG, waits=True)
+def expansion_coefficient(loop: Mapping[str, Any]) -> Found | None:
+    """The coefficient that the readings ask for, the share of its lagged copies included, against the stated one: within `_LIMIT`
+    standard deviations, and without `material_compensation` added, by itself or in a tie: it acts in proportion to the coefficient, and
+    imitates a wrong one.
+    """
+    stated = _expansions(loop)
+    if not stated:
+        return None
+    alone, alone_u, off = _asked_for(stated[0])
+    # The compensation of the material may be what a wrong coefficient leaves.
+    absorbed = any("material_compensation" in (step["effect"], *step.get("tied", ())) for step in loop.get("steps", []))
+    facts = {"stated": stated[0]["prior"], "stated_u": stated[0]["prior_u"], "absorbed": absorbed}
+    passed = abs(off) <= _LIMIT and not absorbed
+    return judge(off, _LIMIT, passed=passed, alone=alone, alone_u=alone_u if math.isfinite(alone_u) else None, **facts)
 
 
 def _jackknife_u(entry: Mapping[str, Any]) -> float:
@@ -304,11 +287,16 @@ def _jackknife_u(entry: Mapping[str, Any]) -> float:
     return math.inf if moved is None else float(moved)
 
 
-def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> list[Check]:
-    """The coefficient per kelvin that lies furthest beyond what expansion can do, or nearest to it."""
+@check("loop", LOG, waits=True)
+def sensitivity(loop: Mapping[str, Any], travel_mm: float) -> Found | None:
+    """Every coefficient per kelvin, declared or added, less `_BEYOND_SIGMAS` standard deviations, against the largest one possible:
+    `_LARGEST_PPM_PER_K` ppm/K along the axis, or 1.1 times the stated coefficient where that is larger (polymers), and that times the
+    largest frame (`_FRAME_TRAVELS` travels, at least `_LEAST_FRAME_MM` mm) across it: at most 1.
+    """
+    added = [{"effect": step["effect"], **entry} for step in loop.get("steps", []) for entry in step["coefficients"]]
+    coefficients = [*loop.get("declared_coefficients", []), *added]
     frame_mm = max(_FRAME_TRAVELS * travel_mm, _LEAST_FRAME_MM)
     stated = [entry["prior"] for entry in coefficients if entry["unit"] == "ppm/K" and entry.get("prior") is not None]
-    # Stages and printers of polymer state a larger one.
     ppm_per_K = max([_LARGEST_PPM_PER_K, *(1.1 * value for value in stated)])
     largest = {"ppm/K": ppm_per_K, "um/K": ppm_per_K * frame_mm * 1e-3}
 
@@ -318,52 +306,26 @@ def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> l
 
     compared = [entry for entry in coefficients if entry["unit"] in largest]
     if not compared:
-        return []
+        return None
     entry = max(compared, key=share_of)
-    unit, frame = entry["unit"].replace("um", "µm"), f"the expansion of a frame of {frame_mm * 1e-3:.2g} m"
-    return [
-        judge(
-            "sensitivity",
-            max(share_of(entry), 0.0),
-            1.0,
-            f"{entry['effect'].replace('_', ' ')} has {entry['value']:.3g} {unit}, {frame} reaches {largest[entry['unit']]:.3g} {unit} "
-            "at most.",
-            "Check the scale of the temperatures (emissivity, range, unit), and the units of positions (mm) and deviations (µm).",
-            sound=f"No coefficient per kelvin is beyond what {frame} can do.",
-        )
-    ]
+    facts = {"entry": entry, "largest": largest[entry["unit"]], "frame_m": frame_mm * 1e-3}
+    return judge(max(share_of(entry), 0.0), 1.0, **facts)
 
 
-def _axis_line(line: Mapping[str, Any], unconfirmed: Mapping[str, float]) -> Check:
+@check("loop", CLOCK, waits=True)
+def axis_line(loop: Mapping[str, Any]) -> Found | None:
+    """Log-likelihood that the best other line on the plan, order of the targets or sign of the deviations gains: at most what is gained
+    by chance in `LINE_LEVEL` of `_DRAWS` simulated tests with the declared line, at least ln 500 = 6.2; `_LINE_GAIN_OVER_CAUSE` where it
+    makes a named cause superfluous, which was chosen among as many.
+    """
+    line = loop.get("axis_line")
+    if line is None:
+        return None
     limit = _LINE_GAIN_OVER_CAUSE if line["superfluous"] else line["gain_limit"]
     # An effect that is significant but has no name yet is worth about -ln p; a line that explains less is no better explanation.
-    limit = max(limit, *(-math.log(max(p, sys.float_info.min)) for p in unconfirmed.values()), 0.0)
-    named = [name.replace("_", " ") for name in line["superfluous"]]
-    without = f", and without {', '.join(named)}" if named else ""
-    low, high = line["alternative_ppm_per_K"]
-    spread = lines_differ(line)
-    if line["gain"] <= 0.0:
-        none = "No other line on the plan, order of the targets or sign of the deviations explains the readings better"
-    else:
-        none = (
-            f"Of other lines on the plan, orders of the targets and signs of the deviations none explains the readings better than chance "
-            f"or an effect without a name would (log-likelihood {line['gain']:+.1f} {line['alternative']}, limit {limit:.1f})"
-        )
-    return judge(
-        "axis_line",
-        line["gain"],
-        limit,
-        f"The field explains the readings better {line['alternative']} than as declared (log-likelihood {line['gain']:+.1f}, limit "
-        f"{limit:g}), with an expansion of {line['expansion_ppm_per_K']:.3g} ± {line['expansion_u_ppm_per_K']:.2g} ppm/K{without}.",
-        "Check origin and direction under [plan.axis], the plan coordinates of the fiducials, the order of the targets and the sign "
-        "of the deviations.",
-        sound=f"{'Line not verified. ' if spread else ''}{none}; lines that fit as well as the declared one indicate {low:.3g} to "
-        f"{high:.3g} ppm/K.",
-        unverified="Measure the plan point under the spindle at axis position 0 again (origin under [plan.axis]); a test in which one part "
-        "of the table warms more than the rest would show the line."
-        if spread
-        else "",
-    )
+    unconfirmed = loop.get("unconfirmed_effects", {}).values()
+    limit = max(limit, *(-math.log(max(p, sys.float_info.min)) for p in unconfirmed), 0.0)
+    return judge(line["gain"], limit, verified=not lines_differ(line), line=line)
 
 
 def lines_differ(line: Mapping[str, Any]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse, special
 
 from fusion.analysis.alignment.readings import known_mean
-from fusion.analysis.consistency.checks import Check, judge
+from fusion.analysis.consistency.checks import LASER, Found, check, judge
 from fusion.common import Array
 from thermography.common import scatter_by_median
 
@@ -55,26 +55,6 @@ _LEAST_SIDE = 3
 _EXCHANGE_SIGMAS, _OPPOSITE_P, _SAME_SIZE = 8.0, 1e-3, 0.25
 
 
-def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> list[Check]:
-    """Check what readings can say of themselves."""
-    values = deviations["deviation"].values
-    if not np.isfinite(values).any():
-        return []
-    noise_um = random_part_um(values)
-    return [
-        _largest_deviation(deviations),
-        _unit(deviations, max(noise_um, _rounding_um(values))),
-        *([] if plan_extent_mm is None else [_travel(deviations, plan_extent_mm)]),
-        _copied_cycles(deviations),
-        _copied_targets(deviations),
-        _repeated_value(deviations),
-        _missed_trigger(deviations),
-        _exchanged_approaches(deviations, noise_um),
-        _datum(deviations, noise_um),
-        _zeroed_cycles(deviations),
-    ]
-
-
 def random_part_um(values: Array) -> float:
     """Random part of a reading from the second differences of each site over the cycles, in which a slow drift cancels."""
     if values.shape[0] < 3:
@@ -100,43 +80,33 @@ def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
     return size > _GROSS_SIGMAS * scatter
 
 
-def _largest_deviation(deviations: xr.Dataset) -> Check:
-    """Unit check: deviations that spread over a large share of the travel and over the distance of two targets suggest another unit."""
-    position = np.sort(deviations["position"].values)
-    low, high = np.nanquantile(deviations["deviation"].values, [0.025, 0.975])
-    spread_um, travel_mm = float(high - low), float(np.ptp(position))
+@check("source", LASER)
+def deviation_magnitude(linear: xr.Dataset) -> Found:
+    """Range of the central 95 % of the deviations: at most the larger of `_LARGEST_SHARE` of the travel, and the smaller of `_LARGEST_MM`
+    mm and the least distance of two targets; measured stages of 8 mm spread over up to 6 % of it.
+    """
+    position = np.sort(linear["position"].values)
+    low, high = np.nanquantile(linear["deviation"].values, [0.025, 0.975])
+    travel_mm = float(np.ptp(position))
     least_mm = min([_LARGEST_MM, *np.diff(position)])
     limit_um = 1e3 * max(_LARGEST_SHARE * travel_mm, least_mm)
-    return judge(
-        "deviation_magnitude",
-        spread_um,
-        limit_um,
-        f"The deviations spread over {spread_um:.3g} µm, on a travel of {travel_mm:.4g} mm with {position.size} targets (limit "
-        f"{limit_um:.3g} µm).",
-        "Check the units: deviations are read as µm and positions as mm.",
-    )
+    return judge(high - low, limit_um, travel_mm=travel_mm, targets=position.size)
 
 
-def _unit(deviations: xr.Dataset, noise_um: float) -> Check:
-    """Unit check: repeatability below that of air, not from rounding, or scatter and profile that change by one factor."""
-    travel_mm = float(np.ptp(deviations["position"].values))
+@check("source", LASER)
+def deviation_unit(linear: xr.Dataset) -> Found:
+    """Random part of a reading, from second differences of each site over the cycles, or the rounding where it is coarser: at least
+    `_LEAST_NOISE_UM` µm, over a shorter travel than `_NOISE_TRAVEL_MM` mm in proportion less; and random part and profile that both
+    change by one factor of at least `_UNIT_FACTOR` from one cycle on.
+    """
+    values, travel_mm = linear["deviation"].values, float(np.ptp(linear["position"].values))
+    noise_um = max(random_part_um(values), _rounding_um(values))
     limit_um = _LEAST_NOISE_UM * min(travel_mm / _NOISE_TRAVEL_MM, 1.0)
-    complete = np.isfinite(deviations["deviation"].values).all(axis=(1, 2))
-    first, factor = _unit_change(deviations["deviation"].values[complete])
-    evidence = f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (air makes {limit_um:.2g} µm over {travel_mm:.4g} mm)."
-    if first:
-        cycle = deviations["cycle"].values[complete][first]
-        evidence = (
-            f"From cycle {cycle} on scatter and profile are both some {factor:.2g} times those of the cycles before."
-        )
-    return judge(
-        "deviation_unit",
-        noise_um,
-        limit_um,
-        evidence,
-        f"Check the unit of the deviations{' from there on' if first else ': they look like mm and are read as µm'}.",
-        passed=not (noise_um < limit_um or first),
-    )
+    complete = np.isfinite(values).all(axis=(1, 2))
+    first, factor = _unit_change(values[complete])
+    cycle = linear["cycle"].values[complete][first] if first else None
+    passed = not (noise_um < limit_um or first)
+    return judge(noise_um, limit_um, passed=passed, travel_mm=travel_mm, cycle=cycle, factor=factor)
 
 
 def _unit_change(values: Array) -> tuple[int, float]:
@@ -157,49 +127,36 @@ def _unit_change(values: Array) -> tuple[int, float]:
     return (place + _UNIT_SIDE, float(np.exp(of_shape[place]))) if size[place] > np.log(_UNIT_FACTOR) else (0, 1.0)
 
 
-def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
-    """Unit check: a travel that hardly shows on the plan suggests metres or inches."""
-    travel_mm = float(np.ptp(deviations["position"].values))
+@check("source", LASER)
+def travel(linear: xr.Dataset, plan_extent_mm: float) -> Found:
+    """Span of the targets over the extent of the plan along the axis: at least `_LEAST_TRAVEL_SHARE`."""
+    travel_mm = float(np.ptp(linear["position"].values))
     share = travel_mm / plan_extent_mm
-    return judge(
-        "travel",
-        share,
-        _LEAST_TRAVEL_SHARE,
-        f"The targets span {travel_mm:.4g} mm, {100.0 * share:.2g} % of the plan along the axis ({plan_extent_mm:.4g} mm).",
-        "Check the unit of the positions: they are read as mm and look like m or inch; if the travel is that short, accept travel.",
-        passed=share >= _LEAST_TRAVEL_SHARE,
-    )
+    passed = share >= _LEAST_TRAVEL_SHARE
+    return judge(share, _LEAST_TRAVEL_SHARE, passed=passed, travel_mm=travel_mm, extent_mm=plan_extent_mm)
 
 
-def _copied_cycles(deviations: xr.Dataset) -> Check:
-    """Two cycles that agree digit for digit are one cycle, entered twice."""
-    number, values = deviations["cycle"].values, deviations["deviation"].values
+@check("source", LASER)
+def copied_cycles(linear: xr.Dataset) -> Found:
+    """Cycles that agree digit for digit in `_COPIED_SHARE` of their readings: the probability that as many different values agree, from
+    the most frequent difference of neighbours, times the number of pairs, is below `_COINCIDENCE` ([below](#operator-and-recorder)).
+    """
+    number, values = linear["cycle"].values, linear["deviation"].values
     rows = values.reshape(len(values), -1)
     pairs = [f"{number[a]} and {number[b]}" for a, b in _copies(rows, rows[:0])]
-    return judge(
-        "copied_cycles",
-        len(pairs),
-        0.0,
-        f"Cycles {_first_few(pairs)} agree digit for digit.",
-        "Leave one of the two cycles out of the file.",
-        sound="No two cycles agree digit for digit.",
-    )
+    return judge(len(pairs), 0.0, pairs=_first_few(pairs))
 
 
-def _copied_targets(deviations: xr.Dataset) -> Check:
-    """Two targets, or both approaches of one, that agree digit for digit over the cycles are one column, entered twice."""
-    number, values = deviations["target"].values, deviations["deviation"].values
+@check("source", LASER)
+def copied_targets(linear: xr.Dataset) -> Found:
+    """The same of targets, or both approaches of one, over the cycles; also from the most frequent difference between the approaches,
+    whose median counts.
+    """
+    number, values = linear["target"].values, linear["deviation"].values
     between = np.diff(values, axis=1)
     copies = _copies(values.reshape(len(values), -1).T, between.reshape(len(values), -1).T)
     pairs = dict.fromkeys(f"{number[a % number.size]} and {number[b % number.size]}" for a, b in copies)
-    return judge(
-        "copied_targets",
-        len(pairs),
-        0.0,
-        f"Targets {_first_few([*pairs])} agree digit for digit over the cycles (one target with itself: in both approaches).",
-        "Enter the readings of every target and approach from its own column, or leave the copy out of the file.",
-        sound="No two targets or approaches agree digit for digit.",
-    )
+    return judge(len(pairs), 0.0, pairs=_first_few([*pairs]))
 
 
 def _first_few(names: Sequence[str]) -> str:
@@ -225,10 +182,14 @@ def _copies(rows: Array, between: Array) -> list[tuple[int, int]]:
     ]
 
 
-def _repeated_value(deviations: xr.Dataset) -> Check:
-    """One value that far more readings hold than scatter and resolution let them is a limit of the recorder or a filler."""
-    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
-    sound = judge("repeated_value", 0.0, 0.0, "No value is repeated beyond what the resolution makes.")
+@check("source", LASER)
+def repeated_value(linear: xr.Dataset) -> Found:
+    """Readings that hold one value at targets that scatter by more than their resolution, or at several targets in every cycle the
+    largest or smallest of all, or that hold what the target before or after them read, against the number that scatter and resolution
+    make: p of the excess, times the number of values, is below `_COINCIDENCE`.
+    """
+    values = linear["deviation"].values.reshape(linear.sizes["cycle"], -1)
+    sound = judge(0.0, 0.0)
     with np.errstate(invalid="ignore"):
         steps = np.abs(np.diff(np.round(values, 6), axis=0))
     least = np.where(steps > 0.0, steps, np.inf).min(axis=0, initial=np.inf)
@@ -240,7 +201,7 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     # Where rounding makes the scatter, readings repeat; so does the reading at which the laser is zeroed, but not those of several targets.
     scatters = np.nan_to_num(random_um) > step_um
     if scatters.any():
-        limited = _at_a_limit(values, *_held_values(values), deviations.sizes["target"])
+        limited = _at_a_limit(values, *_held_values(values), linear.sizes["target"])
         random_um[limited] = np.median(random_um[scatters])
         scatters |= limited
     some = np.round(values[:, scatters], 6)
@@ -255,19 +216,12 @@ def _repeated_value(deviations: xr.Dataset) -> Check:
     # Any of the values might have been the most frequent one, and its first reading is no repetition.
     p = found.size * float(special.gammainc(counts.max() - 1, expected)) if counts.max() > 1 else 1.0
     if p >= _COINCIDENCE:
-        return _held_readings(deviations) or sound
-    end = {np.nanmax(some): ", the largest of these", np.nanmin(some): ", the smallest of these"}.get(value, "")
-    return judge(
-        "repeated_value",
-        float(counts.max()),
-        expected,
-        f"{counts.max()} readings at targets that scatter hold one value, {value:g} µm{end}; scatter and resolution make {expected:.2g}.",
-        "Check the range of the recorder (clipped readings) and what it writes where it has no reading; leave these out of the file.",
-        passed=False,
-    )
+        return _held_readings(linear) or sound
+    end = {np.nanmax(some): "largest", np.nanmin(some): "smallest"}.get(value, "")
+    return judge(counts.max(), expected, passed=False, um=value, end=end)
 
 
-def _held_readings(deviations: xr.Dataset) -> Check | None:
+def _held_readings(deviations: xr.Dataset) -> Found | None:
     """Readings that hold what the target before in the order of travel read, digit for digit, far more often than the resolution lets
     them; None where none do.
     """
@@ -286,27 +240,23 @@ def _held_readings(deviations: xr.Dataset) -> Check | None:
     count = int(equal.sum())
     if count < 2 or float(special.gammainc(count, expected)) >= _COINCIDENCE:
         return None
-    return judge(
-        "repeated_value",
-        float(count),
-        expected,
-        f"{count} readings hold what the target before or after them read, digit for digit; scatter and resolution make {expected:.2g}.",
-        "Check what the recorder writes where it has no reading, and the time that a reading needs; leave these readings out of the file.",
-        passed=False,
-    )
+    return judge(count, expected, passed=False, um=None)
 
 
-def _missed_trigger(deviations: xr.Dataset) -> Check:
-    """In some successive cycles the profile is that of the others, by one target late or early in the order of travel."""
-    sound = judge("missed_trigger", 0.0, 0.0, "The profile does not shift by a target in any cycles.")
-    complete = np.isfinite(deviations["deviation"].values).all(axis=(1, 2))
-    values, cycles = deviations["deviation"].values[complete], deviations["cycle"].values[complete]
+@check("source", LASER)
+def missed_trigger(linear: xr.Dataset) -> Found:
+    """Profile of the stretch of successive cycles that differs most from the others, in one approach, in both or over the whole way there
+    and back, against theirs: as read and shifted by one target in the order of travel, apart from a line; the probability that a change
+    as large lies as near to a shift is below `_SHIFT_BY_CHANCE`.
+    """
+    complete = np.isfinite(linear["deviation"].values).all(axis=(1, 2))
+    values, cycles = linear["deviation"].values[complete], linear["cycle"].values[complete]
     noise_um = max(random_part_um(values), _rounding_um(values))
     if len(values) < 2 * _LEAST_SIDE or values.shape[2] < _LEAST_TARGETS or not noise_um > 0.0:
-        return sound
+        return judge(0.0, 0.0)
     # In the order of travel, so that a missed trigger shifts both approaches alike.
-    order = np.argsort(deviations["position"].values)
-    names = deviations["direction"].values
+    order = np.argsort(linear["position"].values)
+    names = linear["direction"].values
     passes = values[:, :, order]
     passes[:, names == "negative"] = passes[:, names == "negative", ::-1]
     totals = np.concatenate([np.zeros((1, *passes.shape[1:])), np.cumsum(passes, axis=0)])
@@ -319,9 +269,7 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
     profiles = (others[..., 1:-1], others[..., :-2], others[..., 2:])
     squares = np.stack([(_bent(inside[..., 1:-1] - one, along[1:-1]) ** 2).sum(axis=-1) for one in profiles])
     within = passes.shape[2] - 4
-    tried = [
-        (squares[..., k], within, f" in {name} approach" if names.size > 1 else "") for k, name in enumerate(names)
-    ]
+    tried = [(squares[..., k], within, name if names.size > 1 else "") for k, name in enumerate(names)]
     if names.size > 1:
         tried.append((squares.sum(axis=-1), names.size * within, ""))
         way, there_and_back = np.concatenate([along, along[::-1]]), others.reshape(len(others), -1)
@@ -337,19 +285,11 @@ def _missed_trigger(deviations: xr.Dataset) -> Check:
         # Share of the volume of all changes as large that lies as near to a shift by one target; a line is fitted.
         p = 2.0 * len(tried) * min(left_um / as_read[place], 1.0) ** freedom
         found.append((p, as_read[place], left_um, place, late[place] < early[place], where))
-    p, as_read_um, left_um, place, is_late, one_way = min(found, key=lambda one: one[0])
-    since = f"From cycle {cycles[first[place]]} on"
-    if end[place] < len(passes):
-        since = f"In cycles {cycles[first[place]]} to {cycles[end[place] - 1]}, against all others,"
+    p, as_read_um, left_um, place, is_late, approach = min(found, key=lambda one: one[0])
+    last = cycles[end[place] - 1] if end[place] < len(passes) else None
+    passed = p >= _SHIFT_BY_CHANCE
     return judge(
-        "missed_trigger",
-        as_read_um,
-        left_um,
-        f"{since} every target reads what the one {'before' if is_late else 'after'} it in the order of travel read "
-        f"otherwise{one_way}: the profiles differ by {as_read_um:.2g} µm as read, by {left_um:.2g} µm shifted by one target.",
-        "A trigger was missed or counted twice: give these readings to the targets at which they were taken, or leave these cycles out.",
-        passed=p >= _SHIFT_BY_CHANCE,
-        sound=sound.evidence,
+        as_read_um, left_um, passed=passed, first=cycles[first[place]], last=last, is_late=is_late, approach=approach
     )
 
 
@@ -393,15 +333,18 @@ def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:
         yield start, (holds[rows] @ holds.T).toarray() / np.maximum(both, 1.0)
 
 
-def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
-    """A reversal error that changes its sign and keeps its size at one cycle shows exchanged labels of approach."""
-    sound = judge("approach_labels", 0.0, _EXCHANGE_SIGMAS, "The reversal error keeps its sign over the test.")
-    if deviations.sizes["direction"] < 2 or not noise_um > 0.0:
+@check("source", LASER)
+def approach_labels(linear: xr.Dataset) -> Found:
+    """Change of the reversal error at one cycle, equal in size and opposite in sign at every target: at most `_EXCHANGE_SIGMAS` standard
+    errors, or p of the equality below `_OPPOSITE_P` and unequal by more than `_SAME_SIZE` of it.
+    """
+    values, sound = linear["deviation"].values, judge(0.0, _EXCHANGE_SIGMAS)
+    noise_um = random_part_um(values)
+    if linear.sizes["direction"] < 2 or not noise_um > 0.0:
         return sound
-    values = deviations["deviation"].values
     reversal = values[:, 0] - values[:, 1]
     known = np.isfinite(reversal).any(axis=1)
-    reversal, cycles = reversal[known], deviations["cycle"].values[known]
+    reversal, cycles = reversal[known], linear["cycle"].values[known]
 
     def sigmas(k: int) -> float:
         """Change of the reversal error at a cycle in standard errors."""
@@ -429,21 +372,18 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     near = np.nanmean(reversal[max(0, place - _LEAST_SIDE) : place]), np.nanmean(reversal[place : place + _LEAST_SIDE])
     if not opposite or near[0] * near[1] >= 0.0 or abs(near[1] - near[0]) <= 0.7 * size:
         return sound
-    return judge(
-        "approach_labels",
-        abs(best),
-        _EXCHANGE_SIGMAS,
-        f"From cycle {cycles[place]} on the reversal error has the opposite sign and the same size at every target "
-        f"({near[0]:+.2f} to {near[1]:+.2f} µm).",
-        f"Check the labels of the direction of approach from cycle {cycles[place]} on.",
-    )
+    return judge(abs(best), _EXCHANGE_SIGMAS, cycle=cycles[place], before=near[0], after=near[1])
 
 
-def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
-    """A sudden shift of all targets and approaches alike, far larger than the drift about it, is a new datum or a slip."""
-    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
-    level, cycles = _levels(values), deviations["cycle"].values
-    sound = judge("datum", 0.0, _DATUM_RANGES, "The readings do not jump together at any cycle.")
+@check("source", LASER)
+def datum(linear: xr.Dataset) -> Found:
+    """Jump of all targets and both approaches at one cycle, over the range of the drift on either side: at most `_DATUM_RANGES`, or
+    `_LEAST_DATUM_UM` µm.
+    """
+    values, noise_um = linear["deviation"].values, random_part_um(linear["deviation"].values)
+    values = values.reshape(linear.sizes["cycle"], -1)
+    level, cycles = _levels(values), linear["cycle"].values
+    sound = judge(0.0, _DATUM_RANGES)
     if level.size < 2 * _LEAST_SIDE or not noise_um > 0.0:
         return sound
     # Over two cycles, so that a jump within a cycle counts whole; the cycle between belongs to neither side.
@@ -461,18 +401,10 @@ def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
         return sound
     multiple = abs(size) / drift
     if multiple <= _DATUM_RANGES or abs(size) <= _LEAST_DATUM_UM:
-        return replace(sound, value=multiple)
+        return judge(multiple, _DATUM_RANGES, passed=True)
     # The cycle between belongs to the level that it is nearer to.
     first = cycles[place] if 2.0 * abs(level[place] - level[place - 1]) > abs(size) else cycles[place + 1]
-    return judge(
-        "datum",
-        multiple,
-        _DATUM_RANGES,
-        f"From cycle {first} on all targets read {size:+.3g} µm in both approaches, {multiple:.2g} times the drift on either side: the "
-        "datum of the laser changed (beam broken, zeroed or set up again), or a mount slipped.",
-        f"If the laser was zeroed or set up again before cycle {first}, evaluate the two parts as two campaigns; if not, check the "
-        "clamping of optics and laser head.",
-    )
+    return judge(multiple, _DATUM_RANGES, size_um=size, cycle=first)
 
 
 def _levels(values: Array) -> Array:
@@ -504,23 +436,17 @@ def _at_a_limit(values: Array, held: Array, shares: Array, targets: int) -> NDAr
     return marked
 
 
-def _zeroed_cycles(deviations: xr.Dataset) -> Check:
-    """A reading that is the same in every cycle, where all others scatter, was set to that value."""
-    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+@check("source", LASER)
+def zeroed_cycles(linear: xr.Dataset) -> Found:
+    """Largest share of the cycles in which a reading is one and the same, where those of most sites are not: less than `_ZEROED_SHARE`."""
+    values = linear["deviation"].values.reshape(linear.sizes["cycle"], -1)
     held, shares = _held_values(values)
-    shares[_at_a_limit(values, held, shares, deviations.sizes["target"])] = 0.0
+    shares[_at_a_limit(values, held, shares, linear.sizes["target"])] = 0.0
     site = int(np.argmax(shares))
-    direction, target = np.unravel_index(site, deviations["deviation"].shape[1:])
-    return judge(
-        "zeroed_cycles",
-        shares[site],
-        _ZEROED_SHARE,
-        f"Target {deviations['target'].values[target]} in {deviations['direction'].values[direction]} approach reads the same in "
-        f"{100.0 * shares[site]:.0f} % of the cycles: the laser was set to zero there each time, so that a shift of all targets is lost.",
-        "Zero the laser once, at the start of the test; from this one only changes along the axis can be evaluated.",
-        passed=shares[site] < _ZEROED_SHARE or float(np.median(shares)) > _ORDINARY_SHARE,
-        sound="No reading is the same in every cycle.",
-    )
+    direction, target = np.unravel_index(site, linear["deviation"].shape[1:])
+    passed = shares[site] < _ZEROED_SHARE or float(np.median(shares)) > _ORDINARY_SHARE
+    names = {"target": linear["target"].values[target], "direction": linear["direction"].values[direction]}
+    return judge(shares[site], _ZEROED_SHARE, passed=passed, **names)
 
 
 # Checks of order and sign: passes against their label, targets numbered from the other end, readings mirrored against
@@ -540,15 +466,13 @@ _PASS_AT_LEAST, _TARGET_AT_LEAST = 8.0, 5.0
 _OPPOSITE = -0.5
 
 
-def check_signs(deviations: xr.Dataset) -> list[Check]:
-    """Check the labels of the approaches against the travel, and the signs of the readings against one another."""
-    timed = not np.isnat(deviations["time"].values).all()
-    travel = [_travel_order(deviations)] if timed else []
-    return [*travel, _target_order(deviations), _mirrored_readings(deviations)]
-
-
-def _travel_order(deviations: xr.Dataset) -> Check:
-    """A cycle whose positive pass goes down and whose negative pass goes up has its labels exchanged."""
+@check("source", LASER)
+def travel_order(deviations: xr.Dataset) -> Found | None:
+    """Cycles in which the pass labelled positive runs down and the one labelled negative runs up, by the times of the readings: none (a
+    step cycle runs up in both).
+    """
+    if np.isnat(deviations["time"].values).all():
+        return None
     # Steps from reading to reading against the label less those along it, (cycle, direction).
     order = np.argsort(deviations["position"].values)
     time = deviations["time"].values[..., order].astype("datetime64[ns]")
@@ -558,30 +482,17 @@ def _travel_order(deviations: xr.Dataset) -> Check:
     steps = np.asarray(-label * np.nansum(np.sign(np.diff(seconds, axis=-1)), axis=-1))
     contrary = (steps > 0).all(axis=1) if steps.shape[1] == 2 else np.zeros(len(steps), bool)
     first = deviations["cycle"].values[np.argmax(contrary)]
-    return judge(
-        "travel_order",
-        contrary.mean(),
-        0.0,
-        f"In {contrary.sum()} of {contrary.size} cycles, first in cycle {first}, the readings labelled positive were taken at falling "
-        "positions and those labelled negative at growing positions.",
-        "Exchange the labels of the direction of approach, or correct the times of the readings.",
-        sound="The passes run in the direction of their labels.",
-    )
+    return judge(contrary.mean(), 0.0, contrary=contrary.sum(), cycles=contrary.size, first=first)
 
 
-def _target_order(deviations: xr.Dataset) -> Check:
-    """Approaches that show one profile only when the targets of one of them are read from the other end are numbered differently."""
+@check("source", LASER)
+def target_order(deviations: xr.Dataset) -> Found:
+    """Distance of the profiles of both approaches, apart from their level, over its scatter from cycle to cycle: as read less than
+    `_TARGET_AT_LEAST`, or with the targets of one approach from the other end more than `_INVERTED_AT_MOST`.
+    """
     as_read, turned = _distances_of_approaches(deviations)
-    return judge(
-        "target_order",
-        as_read,
-        _TARGET_AT_LEAST,
-        f"The profiles of the two approaches differ by {as_read:.1f} times their scatter from cycle to cycle, and by {turned:.1f} "
-        "times with the targets of one approach read from the other end.",
-        "Number the targets by their position in both approaches: in one of them the readings are in the order of travel.",
-        passed=not (as_read >= _TARGET_AT_LEAST and turned <= _INVERTED_AT_MOST),
-        sound="Both approaches number the targets alike, as far as their profiles show.",
-    )
+    passed = not (as_read >= _TARGET_AT_LEAST and turned <= _INVERTED_AT_MOST)
+    return judge(as_read, _TARGET_AT_LEAST, passed=passed, turned=turned)
 
 
 def _distances_of_approaches(deviations: xr.Dataset) -> tuple[float, float]:
@@ -599,20 +510,18 @@ def _distances_of_approaches(deviations: xr.Dataset) -> tuple[float, float]:
     return float(np.sqrt(np.mean(apart**2))) / usual, float(np.sqrt(np.mean(turned**2))) / usual
 
 
-def _mirrored_readings(deviations: xr.Dataset) -> Check:
-    """Readings that are those of the others with the opposite sign."""
+@check("source", LASER)
+def mirrored_readings(deviations: xr.Dataset) -> Found:
+    """Shape over the targets, in the passes after a cycle or in one approach, or deviation of one target, that agrees with the others
+    only with the opposite sign: inverted, at most `_INVERTED_AT_MOST` times what is usual from cycle to cycle or from target to target,
+    at least what rounding makes; as read, more than `_PASS_AT_LEAST` (passes) or `_TARGET_AT_LEAST` times (targets); of an approach the
+    drift as well, correlation at most `_OPPOSITE`.
+    """
     mirrored = [*_mirrored_passes(deviations), *_mirrored_targets(deviations)]
-    return judge(
-        "mirrored_readings",
-        len(mirrored),
-        0.0,
-        f"Deviations have the sign opposite to that of the others: {'; '.join(mirrored)}.",
-        "Check the sign of the deviations there.",
-        sound="The signs agree.",
-    )
+    return judge(len(mirrored), 0.0, mirrored=mirrored)
 
 
-def _mirrored_passes(deviations: xr.Dataset) -> list[str]:
+def _mirrored_passes(deviations: xr.Dataset) -> list[tuple[str, Any]]:
     """Passes that show the shape of the others mirrored: from one cycle on, or in one direction of approach."""
     values = deviations["deviation"].values
     values = values[np.isfinite(values).all(axis=(1, 2))]
@@ -624,13 +533,12 @@ def _mirrored_passes(deviations: xr.Dataset) -> list[str]:
     usual = max(float(np.median(np.abs(steps))), _rounding_um(values))
     sums, jumps = np.abs(size[1:] + size[:-1]).mean(axis=1), np.abs(steps).min(axis=1)
     changes = (sums <= _INVERTED_AT_MOST * usual) & (jumps > _PASS_AT_LEAST * usual)
-    found = [f"from cycle {cycle} on" for cycle in cycles[1:][changes]]
+    found: list[tuple[str, Any]] = [("cycle", cycle) for cycle in cycles[1:][changes]]
     if size.shape[1] == 2:
         mirrored = np.median(np.abs(size.sum(axis=1))) <= _INVERTED_AT_MOST * usual
         apart = np.median(np.abs(np.diff(size, axis=1))) > _PASS_AT_LEAST * usual
         if mirrored and apart and np.corrcoef(levels.T)[0, 1] <= _OPPOSITE:
-            names = deviations["direction"].values
-            found.append(f"approach in {names[1]} direction against approach in {names[0]} direction")
+            found.append(("approach", deviations["direction"].values))
     return found
 
 
@@ -642,7 +550,7 @@ def _shape_size(values: Array) -> Array:
     return np.asarray((passes @ axes[0]).reshape(shapes.shape[:2]))
 
 
-def _mirrored_targets(deviations: xr.Dataset) -> list[str]:
+def _mirrored_targets(deviations: xr.Dataset) -> list[tuple[str, Any]]:
     """Targets that lie near the straight line through the others only when their sign is inverted."""
     values, position = deviations["deviation"].values, deviations["position"].values
     passes = values.reshape(-1, values.shape[2])
@@ -655,7 +563,7 @@ def _mirrored_targets(deviations: xr.Dataset) -> list[str]:
     inverted = np.sqrt(np.mean((passes + expected) ** 2, axis=0))
     usual = max(float(np.median(as_read)), _rounding_um(values))
     found = (as_read > _TARGET_AT_LEAST * usual) & (inverted <= _INVERTED_AT_MOST * usual)
-    return [f"target {number}" for number in deviations["target"].values[found]]
+    return [("target", number) for number in deviations["target"].values[found]]
 
 
 def _line_through_others(passes: Array, position: Array, target: int) -> Array:

@@ -10,12 +10,13 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry
 from fusion.analysis.alignment.readings import Readings, Series
-from fusion.analysis.consistency.model import check_coefficients
+from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.drift_model.axis import FieldFault, rmse
 from fusion.analysis.drift_model.fit import fit_model
 from fusion.analysis.effects.effect import Prior
 from fusion.analysis.effects.library import library
 from fusion.pipeline import drift_model
+from fusion.pipeline.consistency import run_checks
 from fusion.pipeline.drift_model import (
     CorrectedCamera,
     axis_scale_u,
@@ -295,7 +296,7 @@ def test_what_was_expected_does_not_depend_on_the_rise():
     entry = {"value": mean(alone), "u": u, "prior": expected, "prior_u": expected_u}
     assert scaled(entry, 0.01)["u_scale"] == pytest.approx(abs(mean(alone * 1.01) - mean(alone)))
     declared = [{**scaled(entry, 0.1), "effect": "axis_expansion", "unit": "ppm/K"}]
-    check = check_coefficients({"declared_coefficients": declared}, travel_mm=500.0)[0]
+    (check,) = run_checks("loop", Inputs(loop={"declared_coefficients": declared}))
     # 10 against 12: with 1 of the readings, 10 % of 10 of the scale, and 2 of the expectation.
     assert check.value == pytest.approx(-2.0 / np.sqrt(1.0 + 1.0 + 4.0))
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from fusion.analysis.consistency.checks import Check, inputs_part, judge
 from fusion.app.results.screen import _outcome
+from fusion.pipeline.consistency import inputs_part
 from fusion.report.campaign import describe_campaign
 from fusion.report.exports.tables import findings_table
 from fusion.report.findings import Finding, findings, summary_rows, summary_table
@@ -23,7 +23,7 @@ from tests.fusion.app.texts import texts
 from tests.fusion.report.test_campaign import ORIGIN
 from tests.fusion.report.test_fleet import PICTURES
 from tests.fusion.report.test_record import record
-from tests.fusion.results_sample import PARTS, RECORD_LOOP
+from tests.fusion.results_sample import PARTS, RECORD_LOOP, told
 
 MOVED: dict[str, Any] = {
     "kind": "spindle", "duration_h": 9.0, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
@@ -148,7 +148,7 @@ def test_the_findings_of_a_run_in_a_few_rows():
 
 
 def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
-    checks = [Check("datum", 1.0, 0.5, False, "It is off.", "Check it.", "figures")]
+    checks = [told("datum", passed=False)]
     rows = dict(summary_rows(assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])))
     condition = "(only if the datum of the laser stayed the same)"
     touched = {name for name, text in rows.items() if condition[1:-1] in text.lower()}
@@ -157,15 +157,11 @@ def test_a_doubt_stands_beside_every_finding_that_rests_on_it():
 
 
 def test_what_is_not_verified_is_said_with_what_would_confirm_it():
-    checks = [
-        judge("material_rise", 0.0, 0.07, "Scale not verified.", unverified="State where the material sensor sits.")
-    ]
+    checks = [told("material_rise", passed=True, verified=False)]
     results = assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])
     rows = dict(summary_rows(results))
-    assert (
-        rows["inputs"] == "sound in 1 checks\nnot verified: Scale not verified. State where the material sensor sits."
-    )
-    assert rows["next"].startswith("1. State where the material sensor sits.")
+    assert rows["inputs"] == "sound in 1 checks\nnot verified: It is off. Check it."
+    assert rows["next"].startswith("1. Check it.")
     assert results.inputs.state == "sound" and results.inputs.assumptions("field") == ("the emissivity is right",)
     # A scale that all share makes no cause right or wrong.
     assert results.inputs.assumptions("positions", "attribution", "causes") == ()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fusion.analysis.consistency.checks import Check, inputs_part
+from fusion.pipeline.consistency import inputs_part
 from fusion.report import findings as answers
 from fusion.report import wording
 from fusion.report.findings import action, next_steps, step_phrase
@@ -26,7 +26,7 @@ from fusion.results.loop import (
 )
 from fusion.results.parts import AreaPart, InputsPart, Iso230Tolerance, Quantity, TimePart
 from fusion.results.results import AnomalyPart, CorrelationPart, Iso230Part, Notice, RecordLoop, Results, assemble
-from tests.fusion.results_sample import PARTS
+from tests.fusion.results_sample import PARTS, told
 
 
 @pytest.mark.parametrize(
@@ -105,8 +105,7 @@ def test_numbers_probabilities_and_times_are_printed_as_a_reader_expects_them():
 
 def doubted(*codes: str) -> InputsPart:
     """The part on the inputs with some checks that are not passed."""
-    checks = [Check(code, 1.0, 0.5, False, "It is off.", "Check it.", "figures") for code in codes]
-    return InputsPart.model_validate(inputs_part(checks, ()))
+    return InputsPart.model_validate(inputs_part([told(code, passed=False) for code in codes], ()))
 
 
 def test_what_a_doubt_touches_is_conditional_and_several_are_named_or_counted():
@@ -545,7 +544,7 @@ def test_the_model_comes_first_and_what_asks_for_nothing_is_left_out():
 
 
 def test_what_to_do_about_a_cause_is_conditional_where_a_doubted_input_endangers_it():
-    steps = next_steps(results(loop("explained", step("dead_path")), inputs=doubted("signs")))
+    steps = next_steps(results(loop("explained", step("dead_path")), inputs=doubted("mirrored_readings")))
     (about,) = [one for one in steps if one.endswith(effect_words("dead_path").remedy[1:])]
     assert about.startswith("Only if ")
 

@@ -13,19 +13,16 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.consistency.camera import (
-    check_frames,
-    check_gaps,
-    check_order,
-    check_phase,
-    check_picture,
-    check_place,
-    check_registration,
+    Motion,
+    file_warnings,
     find_gaps,
     gap_words,
     mean_rise,
     zero_share,
 )
-from fusion.analysis.consistency.checks import CODES, Check
+from fusion.analysis.consistency.checks import Inputs
+from fusion.analysis.consistency.library import RULES
+from fusion.pipeline.consistency import Check, _worded, run_checks
 from tests.fusion.analysis.consistency.twin_fields import recorded
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CalibratedRange
@@ -46,12 +43,12 @@ def frames(campaign_folder: Path) -> list[FrameReference]:
 
 
 def failed(frames: list[FrameReference], overridden: set[str]) -> dict[str, str]:
-    return {check.code: check.evidence for check in check_frames(frames, overridden=overridden) if not check.passed}
+    inputs = Inputs(frames=frames, file_warnings=file_warnings(frames, overridden=overridden))
+    return {check.code: check.evidence for check in run_checks("source", inputs) if not check.passed}
 
 
 def test_a_sound_series_passes(frames: list[FrameReference]) -> None:
     assert failed(frames, STATED) == {} and failed(frames, set()) == {}
-    assert check_frames([], overridden=set()) == []
 
 
 def with_parameters(frame: FrameReference, **changed: float) -> FrameReference:
@@ -148,6 +145,21 @@ def phase(seconds_late: float = 0.0, *, gain_s_per_h: float = 0.0, keep: slice =
     return {check.code: check for check in check_phase(stamps[keep], test.deviations)}
 
 
+def check_phase(stamps: np.ndarray, deviations: xr.Dataset) -> list[Check]:
+    return run_checks("source", Inputs(motion=Motion.of(stamps, deviations)))
+
+
+def check_order(frames: list[FrameReference]) -> Check:
+    inputs, rule = Inputs(frames=frames), RULES["camera_stamps"]
+    found = rule.make(inputs)
+    assert found is not None
+    return _worded(rule, found, inputs)
+
+
+def of_fields(fields: xr.Dataset) -> list[Check]:
+    return run_checks("fields", Inputs(fields=fields))
+
+
 def test_frames_at_the_end_of_each_cycle_pass() -> None:
     found = phase()
     assert found["camera_rate"].passed and found["camera_rate"].value == pytest.approx(0.0, abs=0.01)
@@ -196,27 +208,26 @@ def test_few_cycles_tell_nothing() -> None:
 
 
 def test_a_clock_that_was_set_back_is_doubted(frames: list[FrameReference]) -> None:
-    (sound,) = check_order(frames)
+    sound = check_order(frames)
     assert sound.passed
     back = [*frames[:3], *(replace(frame, time=frame.time - np.timedelta64(1, "h")) for frame in frames[3:])]
-    (found,) = check_order(sorted(back, key=lambda frame: frame.time))
+    found = check_order(sorted(back, key=lambda frame: frame.time))
     assert not found.passed and found.value == 1.0
     assert "IR_0004.jpg is 3420 s before IR_0003.jpg" in found.evidence
-    assert check_order([]) == []
 
 
 def test_a_counter_that_starts_anew_is_no_clock_set_back(frames: list[FrameReference]) -> None:
     folder = frames[0].path.parent
     names = ("IR_9998.jpg", "IR_9999.jpg", "IR_0001.jpg", "IR_0002.jpg")
     renamed = [replace(frame, path=folder / name) for frame, name in zip(frames, names, strict=False)]
-    assert check_order(renamed)[0].passed
+    assert check_order(renamed).passed
 
 
 def test_frames_of_one_file_go_by_their_index(frames: list[FrameReference]) -> None:
     sequence = [replace(frame, path=Path("a.seq"), index=k) for k, frame in enumerate(frames)]
-    assert check_order(sequence)[0].passed
+    assert check_order(sequence).passed
     swapped = [replace(sequence[0], index=1), replace(sequence[1], index=0), *sequence[2:]]
-    assert not check_order(swapped)[0].passed
+    assert not check_order(swapped).passed
 
 
 def numbered(seconds: np.ndarray, like: FrameReference) -> list[FrameReference]:
@@ -240,12 +251,12 @@ def test_renamed_files_are_no_fault_of_the_clock(campaign_folder: Path) -> None:
     two_exchanged = seconds.copy()
     two_exchanged[[7, 32]] = seconds[[32, 7]]
     for renamed in (shuffled, two_exchanged):
-        (check,) = check_order(numbered(renamed, like))
+        check = check_order(numbered(renamed, like))
         assert check.passed and "the times were taken" in check.evidence
     set_back = seconds - np.where(np.arange(40) >= 20, 600.0, 0.0)
     other_year = seconds - np.where(np.arange(40) >= 20, 25 * 365 * 86400.0, 0.0)
     for wrong in (set_back, other_year, seconds - np.where(np.arange(40) >= 20, 504.0, 0.0)):
-        (check,) = check_order(numbered(wrong, like))
+        check = check_order(numbered(wrong, like))
         assert not check.passed and "goes backwards 1 times" in check.evidence
 
 
@@ -281,13 +292,13 @@ def fields(change_K: np.ndarray | None = None, **remarks: list) -> xr.Dataset:
 
 
 def doubted_places(dataset: xr.Dataset) -> dict[str, Check]:
-    return {check.code: check for check in check_place(dataset) if not check.passed}
+    return {check.code: check for check in of_fields(dataset) if not check.passed}
 
 
 def test_a_sound_place_passes() -> None:
     assert doubted_places(fields()) == {}
-    assert len(check_place(fields())) == 4
-    assert check_place(fields().drop_attrs()) == []
+    assert len(of_fields(fields())) == 4
+    assert of_fields(fields().drop_attrs()) == []
 
 
 def test_a_common_step_of_the_camera_is_no_jump_of_a_part() -> None:
@@ -351,24 +362,25 @@ def test_a_moving_table_is_not_displaced_across_its_axis_nor_lost() -> None:
 def test_readings_in_a_gap_between_frames_are_counted() -> None:
     dataset = fields()
     readings = xr.DataArray(dataset["time"].values[:, None] + np.array([30, 60], "m8[s]"), dims=("cycle", "target"))
-    (sound,) = check_gaps(dataset["time"].values, readings)
+    (sound,) = run_checks("fields", Inputs(frame_time=dataset["time"].values, reading_time=readings))
     assert sound.passed and sound.value == 0.0
     kept = np.delete(dataset["time"].values, np.arange(14, 23))
-    (check,) = check_gaps(kept, readings)
+    (check,) = run_checks("fields", Inputs(frame_time=kept, reading_time=readings))
     # Nine frames are missing, so that ten intervals of 4.2 min lie between the frames about them.
     assert not check.passed and check.value == 0.25
     assert "42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z" in check.evidence
     assert [gap_words(gap) for gap in find_gaps(kept)] == ["42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z"]
-    assert check_gaps(np.delete(kept, np.arange(1, len(kept))), readings)[0].passed
+    (alone,) = run_checks("fields", Inputs(frame_time=kept[:1], reading_time=readings))
+    assert alone.passed
 
 
 def test_a_long_series_is_checked_piece_by_piece_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     lit = np.zeros((FRAMES, ROWS, COLUMNS))
     lit[18:28, 2:6, 10:16] = 1.0
     lit[:, 0, :3] = np.nan
-    at_once = [check_place(fields(change_K)) for change_K in (None, lit)]
+    at_once = [of_fields(fields(change_K)) for change_K in (None, lit)]
     monkeypatch.setattr("thermography.large_arrays.PIECE_BYTES", 7 * 8 * ROWS * COLUMNS)
-    assert [check_place(fields(change_K)) for change_K in (None, lit)] == at_once
+    assert [of_fields(fields(change_K)) for change_K in (None, lit)] == at_once
 
 
 # What a registration leaves to doubt.
@@ -386,8 +398,7 @@ SOUND = {
 
 
 def doubts(**changed):
-    checks = check_registration({**SOUND, **changed}, file="fiducials.csv")
-    assert all(check.code in CODES for check in checks)
+    checks = run_checks("plan", Inputs(registration={**SOUND, **changed}, fiducials_file="fiducials.csv"))
     assert all(bool(check.remedy) != check.passed for check in checks)
     return [(check.code, check.evidence) for check in checks if not check.passed]
 
@@ -424,11 +435,11 @@ def test_a_pattern_in_the_picture_is_doubted_and_a_zero_that_may_be_a_reflection
     pattern_K: float, zero_K: float
 ) -> None:
     shown = {"pattern_K": pattern_K, "disc": "F3", "zero_K": zero_K, "warming_K": 2.0}
-    picture, zero = check_picture(xr.Dataset(attrs={"discs": json.dumps(shown)}))
+    picture, zero = of_fields(xr.Dataset(attrs={"discs": json.dumps(shown)}))
     assert picture.passed is (pattern_K < 0.1) and ("F3" in picture.evidence) is (pattern_K > 0.1)
     assert zero.passed and zero.verified is (zero_K < 0.1) and bool(zero.remedy) is (zero_K > 0.1)
     # Fields of earlier versions do not say.
-    assert check_picture(xr.Dataset()) == []
+    assert of_fields(xr.Dataset()) == []
 
 
 @pytest.mark.parametrize(("zero_u_K", "passed"), [(0.2, True), (0.8, False)])
@@ -444,13 +455,13 @@ def test_a_zero_that_may_be_more_than_a_third_of_the_rise_is_doubted(zero_u_K: f
     )
     share = zero_u_K / np.sqrt(np.mean(rise**2))
     assert zero_share(fields) == pytest.approx(share)
-    _, zero = check_picture(fields)
+    _, zero = of_fields(fields)
     assert zero.passed is passed and "reference_patch" in zero.remedy and zero.verified is not zero.passed
     assert (f"{100.0 * share:.0f} % of the rise" in zero.evidence) is not passed
 
 
 def test_a_picture_that_no_disc_confirms_is_not_verified() -> None:
-    (picture,) = check_picture(xr.Dataset(attrs={"discs": json.dumps({"untested": "the table moves"})}))
+    (picture,) = of_fields(xr.Dataset(attrs={"discs": json.dumps({"untested": "the table moves"})}))
     assert picture.passed and not picture.verified and "(the table moves)" in picture.evidence and picture.remedy
 
 

@@ -1,32 +1,30 @@
-"""What follows from a check that is not passed: refused, doubted, or accepted by the user."""
+"""What a check takes, and what follows where it is not passed: refused, doubted, or accepted by the user."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+import xarray as xr
 
-from fusion.analysis.consistency.checks import (
-    CODES,
-    Check,
+from fusion.analysis.consistency.checks import LASER, Found, Inputs, check, judge
+from fusion.analysis.consistency.library import RULES
+from fusion.pipeline.consistency import (
     ContradictionError,
-    Severity,
-    condition_of,
     doubt_notices,
     inputs_part,
-    judge,
     open_doubts,
     refuse_contradictions,
+    run_checks,
 )
+from tests.fusion.analysis.consistency.test_readings import sound as sound_readings
+from tests.fusion.results_sample import told
 
-SOUND = Check("travel", 0.4, 0.03, True, "The targets span 300 mm.", "", "lengths")
-DOUBT = Check("copied_cycles", 1.0, 0.8, False, "Cycles 1 and 2 agree.", "Leave one out.", "scatter")
+SOUND, DOUBT = told("travel", passed=True), told("copied_cycles", passed=False)
 
 
 def test_a_contradiction_is_refused_with_its_remedy_and_a_doubt_is_not() -> None:
     refuse_contradictions([SOUND, DOUBT])
-    with pytest.raises(ContradictionError, match=r"^Cycles 1 and 2 agree\. Leave one out\.$"):
-        refuse_contradictions([SOUND, replace(DOUBT, severity=Severity.CONTRADICTION)])
+    with pytest.raises(ContradictionError, match=r"^It is off\. Check it\.$"):
+        refuse_contradictions([SOUND, DOUBT.model_copy(update={"contradicts": True})])
 
 
 def test_a_doubt_is_open_until_the_campaign_file_accepts_it() -> None:
@@ -40,43 +38,54 @@ def test_a_doubt_is_open_until_the_campaign_file_accepts_it() -> None:
 
 def test_a_doubt_is_a_warning_that_names_what_it_endangers() -> None:
     (notice,) = doubt_notices([SOUND, DOUBT], ())
-    assert (notice.code, notice.remedy) == ("doubt_copied_cycles", "Leave one out.")
-    assert notice.message == "Cycles 1 and 2 agree. Endangered: scatter."
+    assert (notice.code, notice.remedy) == ("doubt_copied_cycles", "Check it.")
+    assert notice.message == "It is off. Endangered: figures."
     (known,) = doubt_notices([DOUBT], ("copied_cycles",))
     assert known.remedy == "" and known.message.endswith("Accepted in the campaign file.")
 
 
 @pytest.mark.parametrize(("value", "passed"), [(0.5, True), (0.6, False), (float("nan"), False)])
-def test_remedy_and_evidence_of_a_fault_fall_away_where_a_check_passes(value: float, passed: bool) -> None:
-    check = judge("camera_place", value, 0.5, "It moved.", "Fasten it.", sound="It stayed.")
-    assert check.passed is passed
-    assert (check.evidence, check.remedy) == (("It stayed.", "") if passed else ("It moved.", "Fasten it."))
-    assert check.endangers.startswith("temperature fields")
-    assert judge("travel", value, 0.5, "It is short.", passed=not passed).passed is not passed
+def test_a_check_is_passed_up_to_its_limit_and_only_a_passed_one_is_unverified(value: float, passed: bool) -> None:
+    assert judge(value, 0.5).passed is passed
+    assert judge(value, 0.5, passed=not passed).passed is not passed
+    assert judge(value, 0.5, verified=False).verified is not passed
 
 
-@pytest.mark.parametrize("code", CODES)
+def test_a_check_takes_what_there_is_by_name_and_an_unknown_name_is_an_error() -> None:
+    @check("source", LASER)
+    def kept(travel_mm: float, linear: xr.Dataset | None = None) -> Found:
+        return judge(travel_mm, 1.0, alone=linear is None)
+
+    assert kept.make(Inputs()) is None
+    found = kept.make(Inputs(travel_mm=2.0))
+    assert found is not None and not found.passed and found.facts == {"alone": True}
+    with pytest.raises(TypeError, match="the check misspelt takes deviation: no such input"):
+
+        @check("source", LASER)
+        def misspelt(deviation: xr.Dataset) -> Found:
+            return judge(0.0, 0.0)
+
+
+@pytest.mark.parametrize("code", RULES)
 def test_every_check_says_what_has_to_be_right_and_a_cause_needs_all_of_it(code: str) -> None:
-    condition = condition_of(code)
-    assert condition.assumption != condition_of("no such check").assumption
-    assert "causes" in condition.figures
+    assert told(code, passed=False).assumption
+    assert "causes" in RULES[code].figures
 
 
 @pytest.mark.parametrize(
-    ("code", "assumption", "held"),
-    [
-        ("material_rise", "the emissivity is right", {"positions"}),
-        ("datum", "the datum of the laser stayed the same", {"field"}),
-        ("drivers_clock", "the clock of the drivers' log is right", {"positions", "field", "attribution"}),
-    ],
+    ("code", "held"),
+    [("material_rise", {"positions"}), ("datum", {"field"}), ("drivers_clock", {"positions", "field", "attribution"})],
 )
-def test_what_the_other_instrument_shows_alone_is_not_conditional(code: str, assumption: str, held: set[str]) -> None:
-    condition = condition_of(code)
-    assert condition.assumption == assumption
-    assert {"positions", "field", "attribution", "causes"} - set(condition.figures) == held
+def test_what_the_other_instrument_shows_alone_is_not_conditional(code: str, held: set[str]) -> None:
+    assert {"positions", "field", "attribution", "causes"} - set(RULES[code].figures) == held
 
 
 def test_a_doubted_environment_touches_the_readings_that_it_has_compensated() -> None:
-    assert "positions" not in condition_of("environment_coverage").figures
-    assert "positions" in condition_of("environment_coverage", recompensated=True).figures
-    assert "positions" not in condition_of("drivers_coverage", recompensated=True).figures
+    times = sound_readings()["time"].values[:2, 0, 0]
+    log = xr.Dataset({"air_temperature": ("time", [20.0, 20.1])}, coords={"time": times})
+    for recompensated in (False, True):
+        inputs = Inputs(
+            environment=log, drivers=log, reading_time=sound_readings()["time"], recompensated=recompensated
+        )
+        touched = {check.code: "positions" in check.conditional for check in run_checks("source", inputs)}
+        assert touched["environment_coverage"] is recompensated and not touched["drivers_coverage"]

@@ -6,23 +6,22 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.consistency import courses
-from fusion.analysis.consistency.checks import Severity, judge
-from fusion.analysis.consistency.clocks import QUARTERS, Recording, check_clocks, without_consequences
+from fusion.analysis.consistency import logs
+from fusion.analysis.consistency.checks import Inputs
+from fusion.analysis.consistency.clocks import QUARTERS, Recording
 from fusion.analysis.consistency.courses import (
     _coarse_kind,
-    _other_kind,
-    check_load_course,
-    check_load_kind,
-    check_load_scale,
     compare_drift,
     compare_load,
     compare_material,
 )
-from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.analysis.consistency.field_series import FieldSeries, field_at, thin_fields
+from fusion.pipeline.consistency import Check, run_checks, without_consequences
+from fusion.report.wording import sentences
 from tests.fusion.analysis.consistency.twin_fields import (
     FILES,
     SENSOR_MM,
+    check_clocks,
     clocks,
     late,
     recorded,
@@ -68,14 +67,16 @@ def test_two_recordings_have_no_majority() -> None:
     late_log = Recording(
         "environment", "environment.csv", late(test.environment, 60.0)["time"].values, "interferometry"
     )
-    checks = {check.code: check for check in check_clocks([laser, late_log])}
+    checks = check_clocks([laser, late_log])
     assert [code for code, check in checks.items() if not check.passed] == ["clocks"]
     assert checks["clocks"].value == 60.0
     assert "laser.csv is taken as 1 h early or environment.csv is taken as 1 h late" in checks["clocks"].evidence
-    assert all(check.passed for check in check_clocks([laser, environment]))
-    assert check_clocks([laser]) == []
+    assert all(check.passed for check in check_clocks([laser, environment]).values())
+    assert check_clocks([laser]) == {}
     moment = Recording("drivers", "drivers.csv", laser.sorted[:1], "drivers")
-    assert all(check.passed for check in check_clocks([laser, moment])), "one row has no ends to begin and end with"
+    assert all(check.passed for check in check_clocks([laser, moment]).values()), (
+        "one row has no ends to begin and end with"
+    )
 
 
 def test_two_against_two_are_not_accused() -> None:
@@ -112,13 +113,27 @@ def test_a_material_temperature_contradicts_every_delay_but_its_own() -> None:
 
 
 def test_what_a_wrong_clock_makes_doubtful_waits_until_it_is_right() -> None:
-    clock = judge("laser_clock", 60.0, 0.0, "Late.", passed=False)
-    covered = judge("drivers_coverage", 0.5, 0.9, "Half.", passed=False, severity=Severity.CONTRADICTION)
-    other = judge("datum", 9.0, 5.0, "Jumps.", passed=False)
+    said = {
+        "value": 9.0,
+        "limit": 0.0,
+        "passed": False,
+        "remedy": "",
+        "endangers": "",
+        "assumption": "",
+        "conditional": (),
+    }
+    clock, other = (Check(code=code, evidence="It is off.", **said) for code in ("laser_clock", "datum"))
+    covered = Check(code="drivers_coverage", evidence="Half.", contradicts=True, **said)
     kept = without_consequences([clock, covered, other])
     assert [check.code for check in kept] == ["laser_clock", "datum"]
-    assert kept[0].severity is Severity.CONTRADICTION and "drivers_coverage" in kept[0].evidence
+    assert kept[0].contradicts and "drivers_coverage" in kept[0].evidence
     assert without_consequences([clock, covered, other], ["laser_clock"]) == [clock, covered, other]
+
+
+def of_load(field: FieldSeries | None, drivers: xr.Dataset | None) -> dict[str, Check]:
+    """The checks of a load by itself, and against the field."""
+    inputs = Inputs(field=field, drivers=drivers, drivers_file="drivers.csv")
+    return {check.code: check for phase in ("source", "fields") for check in run_checks(phase, inputs)}
 
 
 def loads(values: np.ndarray, units: str = "1") -> xr.Dataset:
@@ -136,7 +151,7 @@ def test_a_share_that_becomes_per_cent_is_doubted(from_middle: float, switched: 
     duty = (duty > np.median(duty)).astype(float) if switched else duty
     half = np.arange(duty.size) >= duty.size // 2
     log = loads(np.where(half, from_middle, 1.0) * duty * (1.0 if from_middle > 1.0 else 100.0))
-    (check,) = check_load_scale(thin_fields(test.fields), log, file="drivers.csv")
+    check = of_load(thin_fields(test.fields), log)["drivers_scale"]
     assert not check.passed and check.value == 100.0
     assert check.evidence.startswith(
         f"duty in drivers.csv is some 100 times {'larger' if from_middle > 1.0 else 'smaller'}"
@@ -149,9 +164,9 @@ def test_a_jump_of_another_unit_is_held_against_the_rate_of_the_field() -> None:
     duty = test.drivers["duty"].values.astype(float)
     half = np.arange(duty.size) >= duty.size // 2
     field = thin_fields(test.fields)
-    (check,) = check_load_scale(field, loads(1500.0 * np.where(half, 60.0, 1.0) * duty, "1/min"), file="drivers.csv")
+    check = of_load(field, loads(1500.0 * np.where(half, 60.0, 1.0) * duty, "1/min"))["drivers_scale"]
     assert not check.passed and "% of the field's rate unexplained" in check.evidence
-    (sound,) = check_load_scale(field, loads(1500.0 * duty, "1/min"), file="drivers.csv")
+    sound = of_load(field, loads(1500.0 * duty, "1/min"))["drivers_scale"]
     assert sound.passed and sound.value == 1.0
 
 
@@ -169,8 +184,7 @@ def test_logs_that_are_no_load_of_the_table_are_doubted_and_named(change, words:
     field, duty = thin_fields(test.fields), test.drivers["duty"]
     changed = np.flatnonzero(np.diff(duty.values, prepend=-1.0)) if "events" in words else slice(None)
     log = xr.Dataset({"duty": duty[changed].copy(data=change(duty.values.astype(float)))})
-    checks = [*check_load_kind(log, file="drivers.csv"), *check_load_course(field, log, file="drivers.csv")]
-    assert words in " ".join(check.evidence for check in checks if not check.passed)
+    assert words in " ".join(check.evidence for check in of_load(field, log).values() if not check.passed)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +202,11 @@ def test_logs_that_are_no_load_of_the_table_are_doubted_and_named(change, words:
 )
 def test_a_log_that_shows_less_than_the_load_is_named_after_its_shape(load, words: str) -> None:
     found = _coarse_kind(60.0 * np.arange(len(load)), np.array(load, float))
-    assert found.startswith(words) and bool(found) == bool(words)
+    assert in_words(found).startswith(words) and bool(found) == bool(words)
+
+
+def in_words(kind: dict[str, object]) -> str:
+    return " ".join(sentences("kind_of_load", kind, template="checks.j2")) if kind else ""
 
 
 @pytest.mark.parametrize(
@@ -207,8 +225,8 @@ def test_a_log_that_shows_less_than_the_load_is_named_after_its_shape(load, word
     ],
 )
 def test_a_counter_and_changes_of_a_load_are_told_by_their_shape(load, words: str) -> None:
-    found = _other_kind(np.asarray(load))
-    assert found.startswith(words) and bool(found) == bool(words)
+    found = logs._other_kind(np.asarray(load))
+    assert in_words(found).startswith(words) and bool(found) == bool(words)
 
 
 def test_what_two_loads_heat_together_need_not_be_explained_by_either() -> None:
@@ -217,14 +235,14 @@ def test_what_two_loads_heat_together_need_not_be_explained_by_either() -> None:
     # Half of the levels in either log: neither shows the heat by itself.
     first = np.arange(duty.size) // 45 % 2 == 0
     log = test.drivers.assign(duty=("time", np.where(first, duty, 0.0)), other=("time", np.where(first, 0.0, duty)))
-    (check,) = check_load_course(field, log, file="drivers.csv")
+    check = of_load(field, log)["drivers_course"]
     assert check.passed and "with all that was logged" in check.evidence
 
 
 def test_a_log_of_starts_of_a_varying_load_is_doubted() -> None:
     test = recorded(duty="random")
     log = test.drivers.assign(duty=test.drivers["duty"].copy(data=starts(test.drivers["duty"].values)))
-    (check,) = check_load_course(thin_fields(test.fields), log, file="drivers.csv")
+    check = of_load(thin_fields(test.fields), log)["drivers_course"]
     assert not check.passed and check.value > check.limit and "holds marks, as of starts" in check.evidence
 
 
@@ -234,18 +252,15 @@ def test_a_load_that_drives_the_table_a_staircase_and_a_constant_one_are_loads()
         field = thin_fields(test.fields)
         size = test.drivers.sizes["time"]
         staircase = test.drivers.assign(duty=("time", np.linspace(0.0, 5.0, size).round()))
-        checks = [
-            *check_load_course(field, test.drivers, file="drivers.csv"),
-            *(check for log in (test.drivers, staircase) for check in check_load_kind(log, file="drivers.csv")),
-        ]
-        assert len(checks) == 3 and all(check.passed for check in checks)
+        checks = [*of_load(field, test.drivers).values(), *of_load(None, staircase).values()]
+        assert len(checks) == 4 and all(check.passed for check in checks)
     constant = xr.Dataset({"duty": test.drivers["duty"].copy(data=np.ones(size))})
-    assert check_load_kind(constant, file="drivers.csv") == check_load_course(field, None, file="drivers.csv") == []
+    assert of_load(None, constant) == of_load(field, None) == {}
 
 
 def test_an_even_grid_has_a_time_for_each_minute_of_a_log_but_no_more_than_a_month_has() -> None:
-    np.testing.assert_array_equal(courses._even(np.array([-30.0, 600.0])), np.arange(-30.0, 601.0, 60.0))
-    decades = courses._even(np.array([0.0, 7.8e8]))
+    np.testing.assert_array_equal(logs.even_times(np.array([-30.0, 600.0])), np.arange(-30.0, 601.0, 60.0))
+    decades = logs.even_times(np.array([0.0, 7.8e8]))
     assert decades.size == 30 * 24 * 60 + 1
     assert decades[-1] == pytest.approx(7.8e8)
 
@@ -254,9 +269,9 @@ def test_an_even_grid_has_a_time_for_each_minute_of_a_log_but_no_more_than_a_mon
 def test_a_small_share_before_a_large_one_and_numbers_of_programs_are_no_per_cent(before: float, after: float) -> None:
     test = recorded()
     log = loads(np.where(np.arange(test.drivers.sizes["time"]) < 60, before, after))
-    (check,) = check_load_scale(thin_fields(test.fields), log, file="drivers.csv")
+    check = of_load(thin_fields(test.fields), log)["drivers_scale"]
     assert check.passed
-    assert check_load_scale(None, log, file="drivers.csv") == []
+    assert "drivers_scale" not in of_load(None, log)
 
 
 # Coarse cells and thinned frames: what the checks of clocks and temperatures look at.

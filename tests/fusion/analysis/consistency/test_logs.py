@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.consistency.checks import Check, Severity
-from fusion.analysis.consistency.field_series import field_at, thin_fields
-from fusion.analysis.consistency.logs import (
-    check_contact_sensors,
-    check_log,
-    check_material,
-    compare_sensors,
-    rise_share_u,
-)
+from fusion.analysis.consistency.checks import Inputs
+from fusion.analysis.consistency.field_series import FieldSeries, field_at, thin_fields
+from fusion.analysis.consistency.material import log_with_camera, rise_share_u
+from fusion.pipeline.consistency import Check, _together, run_checks
 from tests.fusion.analysis.consistency.twin_fields import SENSOR_MM, recorded, scaled
 
 START = np.datetime64("2026-03-09T06:30", "ns")
@@ -27,13 +22,19 @@ def log(first_s: float, last_s: float, step_s: float = 60.0) -> xr.Dataset:
 
 
 def check(dataset: xr.Dataset) -> Check:
-    (only,) = check_log(dataset, READINGS, name="drivers", file="drivers.csv")
+    (only,) = covered(dataset, READINGS)
     return only
+
+
+def covered(drivers: xr.Dataset | None, readings: np.ndarray) -> list[Check]:
+    return run_checks(
+        "source", Inputs(drivers=drivers, drivers_file="drivers.csv", reading_time=xr.DataArray(readings, dims="time"))
+    )
 
 
 def test_a_log_of_another_day_is_a_contradiction() -> None:
     found = check(log(86400.0, 86400.0 + 4 * 3600.0))
-    assert found.severity is Severity.CONTRADICTION and found.value == 0.0
+    assert found.contradicts and found.value == 0.0
     assert found.evidence.startswith(
         "drivers.csv (2026-03-10T06:30:00Z to 2026-03-10T10:30:00Z) covers 0 % of the readings"
     )
@@ -44,13 +45,13 @@ def test_a_log_of_another_day_is_a_contradiction() -> None:
 def test_conditions_noted_before_or_after_the_test_are_no_contradiction(noted_s: list[float]) -> None:
     noted = log(0.0, 0.0).isel(time=[0] * len(noted_s)).assign_coords(time=START + np.array(noted_s).astype("m8[s]"))
     found = check(noted)
-    assert found.severity is Severity.DOUBT and found.value == 0.0
+    assert not found.contradicts and found.value == 0.0
 
 
 @pytest.mark.parametrize(("last_s", "share"), [(4 * 3600.0, 1.0), (2 * 3600.0, 0.5), (3600.0, 0.25)])
 def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
     found = check(log(-60.0, last_s))
-    assert found.passed is (share == 1.0) and found.severity is Severity.DOUBT
+    assert found.passed is (share == 1.0) and not found.contradicts
     # One reading more or less at the end.
     assert found.value == pytest.approx(share, abs=0.002)
 
@@ -58,14 +59,14 @@ def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
 @pytest.mark.parametrize(("late_s", "words"), [(10_800.0, "3 h late"), (-9000.0, "2.5 h early")])
 def test_a_log_of_another_time_zone_is_a_contradiction_that_names_the_shift(late_s: float, words: str) -> None:
     found = check(log(late_s, late_s + 4 * 3600.0))
-    assert found.severity is Severity.CONTRADICTION and found.value < 0.6
+    assert found.contradicts and found.value < 0.6
     assert f"nearly all of them if its clock is {words}." in found.evidence and "time_zone" in found.remedy
 
 
 def test_a_log_that_may_have_been_started_late_is_only_doubted() -> None:
     # Half of the test is covered, and after a shift all of it; but this log goes on for hours after the test.
     found = check(log(7200.0, 10 * 3600.0))
-    assert found.severity is Severity.DOUBT and "2 h late" in found.evidence
+    assert not found.contradicts and "2 h late" in found.evidence
     # An hour late: three quarters are covered, the shift is named.
     assert "if its clock is 1 h late" in check(log(3600.0, 5 * 3600.0)).evidence
 
@@ -83,9 +84,9 @@ def test_a_log_with_a_long_gap_is_doubted() -> None:
 
 
 def test_what_was_not_logged_is_not_checked() -> None:
-    assert check_log(None, READINGS, name="drivers", file="") == []
-    nothing = np.full(3, np.datetime64("NaT"))
-    assert check_log(log(0.0, 60.0), nothing, name="drivers", file="") == []
+    assert covered(None, READINGS) == []
+    nothing = np.full(3, np.datetime64("NaT", "ns"))
+    assert covered(log(0.0, 60.0), nothing) == []
 
 
 def environment(jump_K: float = 0.0) -> xr.Dataset:
@@ -109,13 +110,17 @@ def drivers(jump_K: float) -> xr.Dataset:
     )
 
 
+def contact_sensors(environment: xr.Dataset | None, drivers: xr.Dataset | None = None) -> Check:
+    inputs = Inputs(environment=environment, drivers=drivers, environment_file="environment.csv")
+    return next(check for check in run_checks("source", inputs) if check.code == "contact_sensors")
+
+
 def test_a_contact_sensor_that_jumps_alone_is_doubted_by_name() -> None:
-    (sound,) = check_contact_sensors(environment(), drivers(0.0), file="environment.csv")
+    sound = contact_sensors(environment(), drivers(0.0))
     assert (sound.code, sound.passed, sound.value) == ("contact_sensors", True, 0.0)
-    (doubted,) = check_contact_sensors(environment(2.0), None, file="environment.csv")
+    doubted = contact_sensors(environment(2.0))
     assert not doubted.passed
     assert doubted.evidence.startswith("environment.csv: material temperature jumps by 2 K from 2.9")
-    assert check_contact_sensors(None, None, file="environment.csv") == []
 
 
 def test_a_stable_room_that_shows_one_digit_is_sound() -> None:
@@ -125,12 +130,11 @@ def test_a_stable_room_that_shows_one_digit_is_sound() -> None:
     time = START + np.arange(300) * np.timedelta64(60, "s")
     room = xr.Dataset({name: ("time", np.round(one, 1)) for name, one in columns.items()}, coords={"time": time})
     assert np.ptp(room["material_temperature"].values) == 0.0
-    (check,) = check_contact_sensors(room, None, file="environment.csv")
-    assert check.passed
+    assert contact_sensors(room).passed
 
 
 def test_a_temperature_among_the_drivers_is_examined_and_its_load_is_not() -> None:
-    (doubted,) = check_contact_sensors(environment(), drivers(3.0), file="environment.csv")
+    doubted = contact_sensors(environment(), drivers(3.0))
     assert doubted.evidence.startswith("environment.csv: nut jumps by 3 K from 2.9")
 
 
@@ -158,17 +162,22 @@ def fields() -> xr.Dataset:
     return xr.Dataset({"frame_temperature": (("time", "y", "x"), frames), "temperature_rise_u": rise_u}, plan)
 
 
-def test_a_camera_that_reads_the_rise_too_small_is_doubted() -> None:
+def sensors_rise(temperature: xr.DataArray) -> list[Check]:
     x, y = np.array([30.0, 130.0]), np.array([30.0, 70.0])
-    (agreeing,) = compare_sensors(fields(), logged(1.0, 1.0), x, y, u_K=0.1)
+    inputs = Inputs(fields=fields(), sensor_temperature=temperature, sensor_x_mm=x, sensor_y_mm=y, sensor_u_K=0.1)
+    return run_checks("fields", inputs)
+
+
+def test_a_camera_that_reads_the_rise_too_small_is_doubted() -> None:
+    (agreeing,) = sensors_rise(logged(1.0, 1.0))
     assert agreeing.passed and "2 sensors compared" in agreeing.evidence
-    (doubted,) = compare_sensors(fields(), logged(1.0, 1.4), x, y, u_K=0.1)
+    (doubted,) = sensors_rise(logged(1.0, 1.4))
     assert not doubted.passed and doubted.evidence.startswith("At t2 the camera shows a rise of ")
 
 
 def test_sensors_of_another_time_are_not_compared() -> None:
     late = logged(1.0).assign_coords(time=MINUTES + np.timedelta64(1, "D"))
-    assert compare_sensors(fields(), late, np.array([30.0]), np.array([30.0]), u_K=0.1) == []
+    assert sensors_rise(late) == []
 
 
 # Consistency checks of camera and environment log: an emissivity is a slope, a reflection an offset; logs of another course.
@@ -183,8 +192,13 @@ def checks(factor: float = 1.0, *, seed: int = 5, offset_K: float = 0.0, stated:
 
 def of_log(environment: xr.Dataset, fields: xr.Dataset, *, stated: bool) -> dict[str, Check]:
     near = field_at(fields, SENSOR_MM) if stated else thin_fields(fields)
-    found = check_material(near, environment, stated=stated, file="environment.csv")
-    return {check.code: check for check in found}
+    return {check.code: check for check in check_material(near, environment, stated=stated)}
+
+
+def check_material(near: FieldSeries | None, environment: xr.Dataset | None, *, stated: bool) -> list[Check]:
+    logged = log_with_camera(near, environment)
+    inputs = Inputs(logged=logged, place_stated=stated, environment_file="environment.csv")
+    return list(_together(run_checks("fields", inputs)))
 
 
 @pytest.mark.parametrize("stated", [True, False])
@@ -307,9 +321,9 @@ def test_without_a_log_or_a_field_nothing_confirms_the_scale() -> None:
     test = recorded()
     without = test.environment.drop_vars("material_temperature")
     for near, log in ((None, test.environment), (thin_fields(test.fields), None), (thin_fields(test.fields), without)):
-        (check,) = check_material(near, log, stated=False, file="")
+        (check,) = check_material(near, log, stated=False)
         assert (
             check.code == "material_rise" and check.passed and not check.verified and "material_sensor" in check.remedy
         )
-        assert check.as_json()["conditional"] == ("field",)
+        assert check.conditional == ("field",)
     assert "environment_columns" not in of_log(test.environment.drop_vars("air_temperature"), test.fields, stated=False)

@@ -11,11 +11,12 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
-from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.model import _interpolate, check_coefficients, compare_lines, with_line, withhold_names
+from fusion.analysis.consistency.checks import Inputs
+from fusion.analysis.consistency.model import _interpolate, compare_lines, with_line, withhold_names
 from fusion.analysis.drift_model.axis import declare
 from fusion.analysis.drift_model.fit import Term, fit_model
 from fusion.analysis.effects.library import library
+from fusion.pipeline.consistency import Check, run_checks
 from fusion.results.loop import AxisLine
 from tests.fusion.small_campaign import term
 
@@ -62,7 +63,7 @@ def compared(fused: xr.Dataset, fields: xr.Dataset, declared: AxisGeometry, *add
 def doubted(comparison: AxisLine) -> bool:
     (check,) = (
         check
-        for check in check_coefficients({"axis_line": comparison.model_dump()}, travel_mm=180.0)
+        for check in run_checks("loop", Inputs(loop={"axis_line": comparison.model_dump()}))
         if check.code == "axis_line"
     )
     assert check.value == comparison.gain
@@ -156,7 +157,7 @@ def declared(alone: float, alone_u: float, *, moved: float | None = 0.0, stated_
 
 
 def by_code(loop: dict[str, object], travel_mm: float = 300.0) -> dict[str, Check]:
-    return {check.code: check for check in check_coefficients(loop, travel_mm=travel_mm)}
+    return {check.code: check for check in run_checks("loop", Inputs(loop=loop, travel_mm=travel_mm))}
 
 
 @pytest.mark.parametrize(
@@ -193,11 +194,10 @@ def test_a_coefficient_that_rests_on_one_target_alone_contradicts_nothing(moved:
 )
 def test_an_added_error_of_the_compensation_may_be_a_wrong_coefficient(effect: str, tied: tuple[str, ...]) -> None:
     step = {"effect": effect, "tied": tied, "coefficients": []}
-    check = check_coefficients({**declared(11.5, 0.2), "steps": [step]}, travel_mm=300.0)[0]
+    check = by_code({**declared(11.5, 0.2), "steps": [step]})["expansion_coefficient"]
     assert not check.passed and check.evidence.endswith("which a wrong coefficient imitates.")
-    assert check_coefficients(
-        {**declared(11.5, 0.2), "steps": [{**step, "tied": (), "effect": "dead_path"}]}, travel_mm=300.0
-    )[0].passed
+    other = {**step, "tied": (), "effect": "dead_path"}
+    assert by_code({**declared(11.5, 0.2), "steps": [other]})["expansion_coefficient"].passed
 
 
 def test_readings_that_say_nothing_contradict_nothing() -> None:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.analysis.consistency.checks import Check
+from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.readings import (
     _equal_shares,
-    check_readings,
-    check_signs,
     find_gross_readings,
     random_part_um,
 )
+from fusion.pipeline.consistency import Check, _of_readings, run_checks
 from interferometry.deviations import build_deviations
 
 CYCLES, TARGETS = 40, 12
@@ -41,7 +41,11 @@ def sound(seed: int = 5, *, noise_um: float = 0.4, reversal_um: float = 1.2) -> 
 
 
 def failed(deviations: xr.Dataset) -> dict[str, Check]:
-    return {check.code: check for check in check_readings(deviations, plan_extent_mm=PLAN_MM) if not check.passed}
+    return {
+        check.code: check
+        for check in run_checks("source", Inputs(linear=deviations, plan_extent_mm=PLAN_MM))
+        if not check.passed
+    }
 
 
 def with_deviation(test: xr.Dataset, values: np.ndarray) -> xr.Dataset:
@@ -111,8 +115,8 @@ def test_sound_tests_of_other_machines_pass(
         values = np.round(values / rounding_um) * rounding_um
         time = np.full(values.shape, np.datetime64("NaT", "ns"))
         test = build_deviations(range(1, cycles + 1), range(1, targets + 1), travel_mm * share, values, time)
-        assert [*check_readings(test, plan_extent_mm=None), *check_signs(test)] and not failed_signs(test)
-        assert [check for check in check_readings(test, plan_extent_mm=None) if not check.passed] == []
+        assert run_checks("source", Inputs(deviations=test)) and not failed_signs(test)
+        assert [check for check in run_checks("source", Inputs(linear=test)) if not check.passed] == []
 
 
 def test_a_cycle_that_was_copied_is_named() -> None:
@@ -310,18 +314,16 @@ def test_without_any_reading_there_is_nothing_to_check() -> None:
     ((start, shares),) = _equal_shares(values.reshape(4, -1))
     assert start == 0 and not shares.any() and shares.shape == (4, 4)
     assert np.isnan(random_part_um(values))
-    test = sound()
-    assert (
-        check_readings(with_deviation(test, np.full_like(test["deviation"].values, np.nan)), plan_extent_mm=PLAN_MM)
-        == []
-    )
+    nothing = with_deviation(sound(), np.full((CYCLES, 2, TARGETS), np.nan))
+    source = SimpleNamespace(deviations=nothing, campaign=SimpleNamespace(plan=None), sensors=None)
+    assert "linear" not in _of_readings(source)
 
 
 # Order and sign of the readings: exchanged labels and inverted signs are named, sound readings and step cycles pass.
 
 
 def failed_signs(deviations: xr.Dataset) -> dict[str, Check]:
-    return {check.code: check for check in check_signs(deviations) if not check.passed}
+    return {check.code: check for check in run_checks("source", Inputs(deviations=deviations)) if not check.passed}
 
 
 def sloped(seed: int = 5) -> xr.Dataset:

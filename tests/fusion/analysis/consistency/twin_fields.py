@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -10,11 +11,12 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.consistency.camera import compare_phase
-from fusion.analysis.consistency.checks import Check
-from fusion.analysis.consistency.clocks import Recording, check_clocks
+from fusion.analysis.consistency.camera import Motion, compare_phase
+from fusion.analysis.consistency.checks import Inputs
+from fusion.analysis.consistency.clocks import Evidence, Recording, compare_clocks
 from fusion.analysis.consistency.courses import compare_drift, compare_load, compare_material
 from fusion.analysis.consistency.field_series import field_at, thin_fields
+from fusion.pipeline.consistency import Check, run_checks
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
@@ -72,14 +74,20 @@ def clocks(test: Recorded, *, drift: bool = True) -> dict[str, Check]:
     field = thin_fields(test.fields)
     compared = [
         *(compare_drift(test.readings()) if drift else []),
-        *compare_phase(test.fields["time"].values, test.deviations),
+        *compare_phase(Motion.of(test.fields["time"].values, test.deviations)),
         *compare_material(field_at(test.fields, SENSOR_MM), test.environment),
         *compare_load(field, test.drivers),
     ]
     recordings = [
         Recording(name, file, getattr(test, part)["time"].values.ravel(), name) for name, (part, file) in FILES.items()
     ]
-    return {check.code: check for check in check_clocks(recordings, compared)}
+    return check_clocks(recordings, compared)
+
+
+def check_clocks(recordings: Sequence[Recording], compared: Sequence[Evidence] = ()) -> dict[str, Check]:
+    """The checks of some clocks."""
+    found = compare_clocks(recordings, compared)
+    return {check.code: check for check in run_checks("clocks", Inputs(clocks=found))}
 
 
 def with_late(test: Recorded, name: str, minutes: float) -> Recorded:
