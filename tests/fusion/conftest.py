@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from tests.fusion.campaign_parts import simulated
 
@@ -34,20 +37,49 @@ amplitude_um = 1.5
 """
 
 
-@pytest.fixture(scope="session")
-def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared."""
-    return simulated(tmp_path_factory.mktemp("twin"), RECIPE).parent
+#: What decides the products of a run: the program, what it knows, and how tests make their campaigns.
+_SOURCES = ("thermofuse", "thermography", "interferometry", "fusion", "data", "tests/fusion")
 
 
 @pytest.fixture(scope="session")
-def results_folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The products of that campaign, complete."""
+def kept(pytestconfig: pytest.Config) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Return a function that fills a folder once for all workers, and for later calls while no source changes."""
+    digest = sha256()
+    for path in sorted(each for source in _SOURCES for each in (pytestconfig.rootpath / source).rglob("*.*")):
+        if path.is_file() and path.suffix != ".pyc":
+            digest.update(path.read_bytes())
+    base = pytestconfig.rootpath / "build" / "kept"
+    root = base / digest.hexdigest()
+
+    def fill_once(name: str, fill: Callable[[Path], object]) -> Path:
+        root.mkdir(parents=True, exist_ok=True)
+        folder, whole = root / name, root / f"{name}.whole"
+        with FileLock(root / f"{name}.lock"):
+            if not whole.exists():
+                for earlier in base.iterdir():
+                    if earlier != root:
+                        shutil.rmtree(earlier, ignore_errors=True)
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                whole.touch()
+        return folder
+
+    return fill_once
+
+
+@pytest.fixture(scope="session")
+def campaign_folder(kept: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+    """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared; tests do not change it."""
+    return kept("simulated", lambda folder: simulated(folder, RECIPE)) / "campaign"
+
+
+@pytest.fixture(scope="session")
+def results_folder(kept: Callable[[str, Callable[[Path], object]], Path], campaign_folder: Path) -> Path:
+    """The products of that campaign, complete; tests do not change them."""
     from fusion.pipeline.run import run_campaign
 
-    out = tmp_path_factory.mktemp("run") / "results"
-    run_campaign(campaign_folder / "campaign.toml", out)
-    return out
+    return kept("run", lambda folder: run_campaign(campaign_folder / "campaign.toml", folder / "results")) / "results"
 
 
 @pytest.fixture
