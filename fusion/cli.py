@@ -155,7 +155,9 @@ def run(
     ],
     out: Annotated[
         Path | None,
-        Option(help="Results folder; left out: 'results' next to the campaign file, or here for an address."),
+        Option(
+            help="Results folder; left out: 'results' next to the campaign file, or here for an address or two campaigns."
+        ),
     ] = None,
     resume: Annotated[bool, Option("--resume", help="Continue a run that is in the results folder.")] = False,
     scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="dask scheduler for the per-frame work.")] = None,
@@ -607,7 +609,7 @@ def verify(
     """
     from dataclasses import asdict
 
-    from fusion.pipeline.verify import verify_compensation
+    from fusion.pipeline.plan import verify_compensation
     from fusion.report.campaign import verification_table
 
     with _answering():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -12,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.campaign.config import CampaignError
+from fusion.results.parts import TimePart
 from fusion.results.results import Notice
 from interferometry.io.tables import DATED, NO_ZONE
 
@@ -59,13 +59,13 @@ def is_dated(times: NDArray[np.datetime64]) -> bool:
     return bool(known.size and known.max() > DATED)
 
 
-def time_part(table: xr.Dataset, stated: str | None) -> dict[str, Any]:
-    """Return the part ``time`` of results.json; nothing where no time holds a date."""
+def time_part(table: xr.Dataset, stated: str | None) -> TimePart | None:
+    """Return when readings were taken; None where no time holds a date."""
     times = table["time"].values
     if not is_dated(times):
-        return {}
+        return None
     times = times[~np.isnat(times)]
-    return {"time": {"first": utc(times.min()), "last": utc(times.max()), "zone": shown_zone(table, stated)}}
+    return TimePart(first=utc(times.min()), last=utc(times.max()), zone=shown_zone(table, stated))
 
 
 def zone_notices(table: xr.Dataset, *, code: str, of: str) -> Iterator[Notice]:

@@ -23,16 +23,14 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.campaign.inputs import Source
 from fusion.pipeline.drift_model import place_scale_u, scaled
 from fusion.pipeline.positioning import average_cycles
-from fusion.results.axis import SourcePart
-from fusion.results.parts import AreaPart
+from fusion.results import axis as schema
+from fusion.results.parts import AreaPart, Quantity, Sensitivity
 from fusion.results.progress import Report
-from fusion.results.results import Outcome
+from fusion.results.results import Outcome, Parts
 from thermography.fields.hotspots import Hotspot, detect_hotspots
 
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
 _SEEN_SHARE = 0.8
-#: What is said of a hotspot where no drift was measured, or too little of it.
-_UNTESTED: dict[str, Any] = {"targets": [], "p_value": None, "lag_s": None}
 
 
 def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, report: Report) -> Outcome[xr.DataTree]:
@@ -60,29 +58,26 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     plan, shape = field.to_dataset(name="field"), (field.sizes["y"], field.sizes["x"])
     areas = {region.name: area_of(region.cells(field).reshape(shape), plan) for region in regions}
     named = {f"hotspot {k}": spot for k, spot in enumerate(spots, start=1)}
-    parts = {
-        "hotspots": [_hotspot_part(name, spot, maps, readings, fields) for name, spot in named.items()],
-        "correlation": _correlation_part(maps, find_source(maps), fields, areas),
-    }
+    parts = Parts(
+        hotspots=[_hotspot(name, spot, fields, **_tested(name, maps, readings)) for name, spot in named.items()],
+        correlation=_describe_correlation(maps, find_source(maps), fields, areas),
+    )
     return Outcome(maps, parts, tuple(averaged))
 
 
-def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested."""
+def describe_hotspots(fields: xr.Dataset) -> tuple[schema.HotspotPart, ...]:
+    """Return the hotspots where no drift was measured, or too little of it to be tested."""
     spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
-    return [{**_peak_part(f"hotspot {k}", spot, fields), **_UNTESTED} for k, spot in enumerate(spots, start=1)]
+    return tuple(_hotspot(f"hotspot {k}", spot, fields) for k, spot in enumerate(spots, start=1))
 
 
-def _peak_part(name: str, spot: Hotspot, fields: xr.Dataset) -> dict[str, Any]:
-    """Place, area and rise of a hotspot."""
+def _hotspot(name: str, spot: Hotspot, fields: xr.Dataset, **tested: Any) -> schema.HotspotPart:
+    """Place, area and rise of a hotspot; without results where it was not tested."""
     u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
-    return {
-        "name": name,
-        "peak_rise_K": spot.peak_rise_K,
-        "peak_rise_u_K": float(u),
-        **{key: getattr(spot, key) for key in ("x_mm", "y_mm", "centroid_x_mm", "centroid_y_mm")},
-        "area": dict(zip(("x_low_mm", "x_high_mm", "y_low_mm", "y_high_mm"), spot.extent_mm, strict=True)),
-    }
+    area = dict(zip(AreaPart.model_fields, spot.extent_mm, strict=True))
+    own = {key: value for key, value in vars(spot).items() if key in schema.HotspotPart.model_fields}
+    untested = {"targets": (), "p_value": None, "lag_s": None}
+    return schema.HotspotPart(name=name, peak_rise_u_K=u, area=area, **own, **{**untested, **tested})
 
 
 def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Region]:
@@ -119,46 +114,49 @@ def _describe_sensors(choice: SensorChoice) -> xr.Dataset:
     return dataset.assign_coords(sensor=np.arange(1, len(losses) + 1))
 
 
-def _correlation_part(
-    maps: xr.DataTree, source: SourcePart, fields: xr.Dataset, regions: Mapping[str, AreaPart | None]
-) -> dict[str, Any]:
-    """The part ``correlation`` of results.json."""
+def _describe_correlation(
+    maps: xr.DataTree, source: schema.SourcePart, fields: xr.Dataset, regions: Mapping[str, AreaPart | None]
+) -> schema.CorrelationPart:
+    """What the correlation found."""
     session = maps.to_dataset()
-    drift = session["unexplained_drift"]
-    return {
-        "p_resolution": 1.0 / (int(maps.attrs["draws"]) + 1),
-        "verdict": str(maps.attrs["verdict"]),
-        "excitation": str(maps.attrs["excitation"]),
-        "false_alarm_rate": float(session["false_alarm_rate"]),
-        "source": {
-            **source.model_dump(exclude_unset=True),
-            "area": regions[source.name] if source.kind == "region" else source.area,
-            "sensitivity_um_per_K": scaled(
-                source.sensitivity_um_per_K.model_dump(exclude_unset=True),
-                place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float)),
-            ),
+    drift, strength = session["unexplained_drift"], source.sensitivity_um_per_K.model_dump(exclude_unset=True)
+    scale_u = place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float))
+    area = regions[source.name] if source.kind == "region" else source.area
+    completed = {"area": area, "sensitivity_um_per_K": Sensitivity(**scaled(strength, scale_u))}
+    return schema.CorrelationPart(
+        p_resolution=1.0 / (int(maps.attrs["draws"]) + 1),
+        verdict=maps.attrs["verdict"],
+        excitation=maps.attrs["excitation"],
+        false_alarm_rate=session["false_alarm_rate"],
+        source=source.model_copy(update=completed),
+        recommended_test=recommend_measurement(maps, source),
+        unexplained_drift_um_per_h={
+            str(name): drift.sel(channel=name) for name in drift["channel"].values if name != "joint"
         },
-        "recommended_test": recommend_measurement(maps, source),
-        "unexplained_drift_um_per_h": {
-            str(name): float(drift.sel(channel=name)) for name in drift["channel"].values if name != "joint"
-        },
-        "modes": _candidate_parts(maps, "modes", "mode", fields, _mode_areas(maps)),
-        "regions": _candidate_parts(maps, "regions", "region", fields, regions),
-        "sensors": _sensor_part(maps.children["sensors"].to_dataset()),
-        "randomised_duty": _duty_part(maps.children["duty"].to_dataset()) if "duty" in maps.children else None,
-    }
+        modes=_describe_places(maps, "modes", "mode", fields, _mode_areas(maps)),
+        regions=_describe_places(maps, "regions", "region", fields, regions),
+        sensors=_describe_choice(maps.children["sensors"].to_dataset()),
+        randomised_duty=_describe_duty(maps.children["duty"].to_dataset()) if "duty" in maps.children else None,
+    )
 
 
-def _duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
+def _sensitivity(found: xr.Dataset, scale_u: float) -> Sensitivity:
+    return Sensitivity(**scaled({"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}, scale_u))
+
+
+def _describe_duty(duty: xr.Dataset) -> list[schema.DutyPart]:
     """What the randomisation test found for every switched source."""
-    found = []
-    for name in duty["source"].values:
-        load = duty.sel(source=name)
-        drift = {"value": float(load["sensitivity"]), "u": float(load["sensitivity_u"])}
-        constants = [float(load["time_constant"]), float(load["second_time_constant"])]
-        tested = {"cause": bool(load["p_value"] <= ATTRIBUTION_LEVEL), "p_value": float(load["p_value"])}
-        found.append({"name": str(name), **tested, "drift_at_full_duty_um": drift, "time_constants_s": constants})
-    return found
+    return [
+        schema.DutyPart(
+            name=str(name),
+            cause=float(load["p_value"]) <= ATTRIBUTION_LEVEL,
+            p_value=load["p_value"],
+            drift_at_full_duty_um=Quantity(value=load["sensitivity"], u=load["sensitivity_u"]),
+            time_constants_s=(load["time_constant"], load["second_time_constant"]),
+        )
+        for name in duty["source"].values
+        for load in [duty.sel(source=name)]
+    ]
 
 
 def _mode_areas(maps: xr.DataTree) -> dict[str, AreaPart | None]:
@@ -173,61 +171,57 @@ def _mode_areas(maps: xr.DataTree) -> dict[str, AreaPart | None]:
     }
 
 
-def _candidate_parts(
+def _describe_places(
     maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset, areas: Mapping[str, AreaPart | None]
-) -> list[dict[str, Any]]:
+) -> list[schema.PlacePart]:
     """Modes or regions with their areas and their results for every part of the drift."""
     if name not in maps.children:
         return []
     group = maps.children[name].to_dataset()
-    listed = []
+    places = []
     for k in range(group.sizes[kind]):
         candidate = group.isel({kind: k})
-        parts: dict[str, dict[str, Any]] = {}
-        scale_u = place_scale_u(fields, float(candidate["at_x"]), float(candidate["at_y"]))
+        x_mm, y_mm = float(candidate["at_x"]), float(candidate["at_y"])
+        scale_u = place_scale_u(fields, x_mm, y_mm)
+        parts = {}
         for channel in map(str, group["channel"].values):
             found = candidate.sel(channel=channel)
-            sensitivity = {"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}
-            parts[channel] = {
-                "p_value": float(found["p_value"]),
-                "sensitivity_um_per_K": scaled(sensitivity, scale_u),
-                "lag_s": float(found["lag"]),
-                "detectable_um_per_K": float(found["detectable_sensitivity"]),
-            }
-            if kind == "mode":
-                parts[channel]["p_given_leading_mode"] = float(found["p_beside"])
+            parts[channel] = schema.TestedPart(
+                p_value=found["p_value"],
+                sensitivity_um_per_K=_sensitivity(found, scale_u),
+                lag_s=found["lag"],
+                detectable_um_per_K=found["detectable_sensitivity"],
+                **({"p_given_leading_mode": found["p_beside"]} if kind == "mode" else {}),
+            )
         label = f"mode {candidate[kind].item()}" if kind == "mode" else str(candidate[kind].item())
-        place = {"x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "area": areas[label]}
-        listed.append({"name": label, **place, "parts": parts})
-    return listed
+        places.append(schema.PlacePart(name=label, x_mm=x_mm, y_mm=y_mm, area=areas[label], parts=parts))
+    return places
 
 
-def _sensor_part(sensors: xr.Dataset) -> dict[str, Any]:
+def _describe_choice(sensors: xr.Dataset) -> schema.SensorsPart:
     """The contact sensors in place of the camera."""
     keys = {"x_mm": "at_x", "y_mm": "at_y", "loss_um": "loss", "loss_upper_limit_um": "loss_at_most"}
-    chosen = (sensors.isel(sensor=k) for k in range(sensors.sizes["sensor"]))
-    return {
-        "block_length_s": float(sensors["run_length"]),
-        "camera_reduction_um": float(sensors["camera_gain"]),
-        "camera_reduction_significant": bool(sensors["camera_decided"]),
-        "sets": [
-            {**{key: float(sensor[name]) for key, name in keys.items()}, "significant": bool(sensor["decided"])}
-            for sensor in chosen
+    return schema.SensorsPart(
+        block_length_s=sensors["run_length"],
+        camera_reduction_um=sensors["camera_gain"],
+        camera_reduction_significant=bool(sensors["camera_decided"]),
+        sets=[
+            schema.SensorSetPart(significant=bool(one["decided"]), **{key: one[name] for key, name in keys.items()})
+            for one in (sensors.isel(sensor=k) for k in range(sensors.sizes["sensor"]))
         ],
-    }
+    )
 
 
-def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset, fields: xr.Dataset) -> dict[str, Any]:
-    """One entry of ``hotspots`` in results.json: the part of the drift that it goes with most, and the targets that it drives."""
-    tested: dict[str, Any] = _UNTESTED
+def _tested(hotspot: str, maps: xr.DataTree, fused: xr.Dataset) -> dict[str, Any]:
+    """The part of the drift that a hotspot goes with most, and the targets that it drives; nothing where it was not tested."""
     regions = maps.children["regions"].to_dataset() if "regions" in maps.children else None
-    if regions is not None and name in regions["region"].values:
-        region = regions.sel(region=name)
-        ratio = (region["statistic"] / region["threshold"]).fillna(0.0).values
-        best = region.isel(channel=int(np.lexsort((-ratio, region["p_value"].fillna(1.0).values))[0]))
-        driven = _driven_targets(maps, fused, name, best)
-        tested = {"targets": driven, "p_value": float(best["p_value"]), "lag_s": float(best["lag"])}
-    return {**_peak_part(name, spot, fields), **tested}
+    if regions is None or hotspot not in regions["region"].values:
+        return {}
+    region = regions.sel(region=hotspot)
+    ratio = (region["statistic"] / region["threshold"]).fillna(0.0).values
+    best = region.isel(channel=int(np.lexsort((-ratio, region["p_value"].fillna(1.0).values))[0]))
+    driven = _driven_targets(maps, fused, hotspot, best)
+    return {"targets": driven, "p_value": best["p_value"], "lag_s": best["lag"]}
 
 
 def _driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:

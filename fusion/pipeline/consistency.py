@@ -24,7 +24,7 @@ from fusion.campaign.inputs import CameraInputs, LaserInputs, Source, is_rotary,
 from fusion.campaign.inputs import Inputs as Read
 from fusion.common import FusionError
 from fusion.report.wording import check_words
-from fusion.results.parts import CheckPart, Figures
+from fusion.results.parts import CheckPart, Figures, InputsPart
 from fusion.results.results import Notice
 from thermography.io.other_cameras import TemperatureFrame
 
@@ -227,14 +227,14 @@ def open_doubts(checks: Sequence[Check], accepted: Collection[str]) -> list[Chec
     return [check for check in checks if not check.passed and check.code not in accepted]
 
 
-def inputs_part(checks: Sequence[Check], accepted: Collection[str], *, corrected: bool = False) -> dict[str, object]:
-    """The part ``inputs`` of results.json."""
+def inputs_part(checks: Sequence[Check], accepted: Collection[str], *, corrected: bool = False) -> InputsPart:
+    """Whether the inputs agree."""
     sound = "corrected" if corrected else "sound"
-    return {
-        "state": "doubted" if open_doubts(checks, accepted) else sound,
-        "accepted": sorted(accepted),
-        "checks": [check.model_dump(exclude={"contradicts"}) for check in checks],
-    }
+    return InputsPart(
+        state="doubted" if open_doubts(checks, accepted) else sound,
+        accepted=sorted(accepted),
+        checks=[check.model_dump(exclude={"contradicts"}) for check in checks],
+    )
 
 
 def doubt_notices(checks: Sequence[Check], accepted: Collection[str]) -> list[Notice]:

@@ -35,7 +35,7 @@ from fusion.pipeline.positioning import diagnose_positions, sites_of
 from fusion.results import store
 from fusion.results.loop import ResidualTestsPart
 from fusion.results.progress import Report, counted
-from fusion.results.results import Notice, Outcome
+from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import joined
 from thermography.fields.cycle_fields import cycles_with_field
 
@@ -192,7 +192,7 @@ def model_drift(
     positions = diagnose_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
     result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
-    anomalies, line = [position.as_json() for position in positions], None
+    anomalies, line = [store.plain(position) for position in positions], None
     if isinstance(source, Source) and fields is not None:
         line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
     described = result.described(ResidualTestsPart(**tests), field_corrections=errors, axis_line=line)
@@ -209,12 +209,7 @@ def model_drift(
         loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)
     loop = withhold_names(loop, effects)
     loop = {**loop, "declared_coefficients": [with_spread(entry) for entry in loop["declared_coefficients"]]}
-    parts = {
-        "anomalies": [
-            {**one, "position_mm": float(deviations["position"].sel(target=one["target"]))} for one in anomalies
-        ],
-        "loop": {**loop, "steps": with_event_times(loop["steps"], result, fused)},
-    }
+    parts = Parts(anomalies=anomalies, loop={**loop, "steps": with_event_times(loop["steps"], result, fused)})
     return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,9 @@ from fusion.campaign.config import (
 from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.campaign.time_zones import is_dated, shown_zone
-from fusion.results.axis import Iso230Part
+from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window
 from fusion.results.numbers import exact, moment
-from fusion.results.parts import decide, is_determined
+from fusion.results.parts import Iso230Tolerance, Quantity, decide, is_determined
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
 from fusion.results.store import file_sha256, group, has, is_file_list, joined, plain, read_json_object, read_product
@@ -85,22 +85,24 @@ def evaluate_standard(
     deviations: xr.Dataset,
     budget: StatedBudget,
     *,
-    drift: xr.DataArray | None,
-    material_degC: xr.DataArray | None,
+    drift: xr.Dataset | None,
+    environment: xr.Dataset | None = None,
     cycles: list[int] | None = None,
-) -> tuple[xr.Dataset, xr.Dataset, dict[str, Any]]:
+) -> tuple[xr.Dataset, xr.Dataset, Iso230Part]:
     """Evaluate windows of a test by ISO 230-2, and say which of them shows the warmed-up axis."""
-    windows = evaluate_windows(deviations, budget=budget.budget, drift=drift, material_degC=material_degC)
+    beside: dict[str, Any] = {
+        "budget": budget.budget,
+        "drift": None if drift is None else drift["drift"],
+        "material_degC": material_by_cycle(deviations, environment),
+    }
+    windows = evaluate_windows(deviations, **beside)
     numbers = deviations["cycle"].values
     blocks = [
         numbers[(numbers >= first) & (numbers <= last)].tolist()
         for first, last in zip(windows["first_cycle"].values, windows["last_cycle"].values, strict=True)
     ]
     quoted = blocks[settled_window(windows)] if cycles is None else cycles
-    first, settled = (
-        evaluate_iso230(deviations, cycles=window, budget=budget.budget, drift=drift, material_degC=material_degC)
-        for window in (blocks[0], quoted)
-    )
+    first, settled = (evaluate_iso230(deviations, cycles=window, **beside) for window in (blocks[0], quoted))
     of_standard = windows.isel(window=slice(0, -1)) if windows.sizes["window"] > 1 else windows
     if cycles is not None:
         rule = ""
@@ -109,28 +111,28 @@ def evaluate_standard(
     else:
         rule = _RULE_WITHOUT_DRIFT if drift is None else _RULE
     # What was measured beside the readings tells where two inputs of the budget come from.
-    part_of = partial(_window_part, budget=budget, drift=drift is not None, material=material_degC is not None)
-    part = {
-        **part_of(settled, quoted),
-        "settled_rule": rule,
-        "first": part_of(first, blocks[0]),
-        "range_um": {
-            name: {"lowest": float(of_standard[name].min()), "highest": float(of_standard[name].max())}
-            for name in QUANTITIES
+    material = beside["material_degC"] is not None
+    described = partial(_describe_window, budget=budget, drift=drift is not None, material=material)
+    part = Iso230Part(
+        **vars(described(settled, quoted)),
+        settled_rule=rule,
+        first=described(first, blocks[0]),
+        range_um={
+            name: Iso230Range(lowest=of_standard[name].min(), highest=of_standard[name].max()) for name in QUANTITIES
         },
-    }
+    )
     return windows, settled, part
 
 
-def _quantity(result: xr.Dataset, name: str, **where: str) -> dict[str, float]:
+def _quantity(result: xr.Dataset, name: str, **where: str) -> Quantity:
     """Return value and standard uncertainty of a quantity."""
-    return {"value": float(result[name].sel(where)), "u": float(result[f"{name}_u"].sel(where))}
+    return Quantity(value=result[name].sel(where), u=result[f"{name}_u"].sel(where))
 
 
-def _window_part(
+def _describe_window(
     result: xr.Dataset, cycles: list[int], *, budget: StatedBudget, drift: bool, material: bool
-) -> dict[str, Any]:
-    """Return the values of one window with its budget, as in results.json."""
+) -> Iso230Window:
+    """Return the values of one window with its budget."""
     by_direction = {
         direction: {f"{name}_um": _quantity(result, f"{name}_unidirectional", direction=direction) for name in "ARE"}
         for direction in ("positive", "negative")
@@ -140,20 +142,20 @@ def _window_part(
     one_way = {
         name: float((found.sel(contributor=other) ** 2).sum() ** 0.5) for name, found in _one_way_shares(result).items()
     }
-    return {
-        "unit": result["A"].attrs["units"],
-        "window": result.attrs["window"],
-        "cycles": cycles,
+    return Iso230Window(
+        unit=result["A"].attrs["units"],
+        window=result.attrs["window"],
+        cycles=cycles,
         **{f"{name}_um": _quantity(result, name) for name in _AXIS},
-        "B_of_scatter_um": float(result["B_of_scatter"]),
+        B_of_scatter_um=result["B_of_scatter"],
         **by_direction,
-        "u_without_sampling_um": {name: float(without.sel(quantity=name)) for name in _AXIS} | one_way,
-        "contributions": [
+        u_without_sampling_um={name: without.sel(quantity=name) for name in _AXIS} | one_way,
+        contributions=[
             _contribution(result, name, budget, drift, material)
             for name in CONTRIBUTIONS
             if budget.origins.get(name) != "not of a rotary axis"
         ],
-    }
+    )
 
 
 def _one_way_shares(result: xr.Dataset) -> dict[str, xr.DataArray]:
@@ -166,9 +168,11 @@ def _one_way_shares(result: xr.Dataset) -> dict[str, xr.DataArray]:
     return {name: found for name, found in shares.items() if found.notnull().all()}
 
 
-def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, drift: bool, material: bool) -> dict[str, Any]:
+def _contribution(
+    result: xr.Dataset, name: str, budget: StatedBudget, drift: bool, material: bool
+) -> Iso230Contribution:
     """Return one row of the budget."""
-    parts = {f"{symbol}_um": float(result["contribution"].sel(quantity=symbol, contributor=name)) for symbol in _AXIS}
+    parts = {f"{symbol}_um": result["contribution"].sel(quantity=symbol, contributor=name) for symbol in _AXIS}
     u: float | None = None
     unit, origin = "um", "from the readings"
     if name in _INPUTS:
@@ -183,8 +187,8 @@ def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, drift: bo
         origin = budget.origins.get(name, found)
     elif name == "extremes":
         origin = "mean excess in simulated tests like this one"
-    one_way = {key: float(found.sel(contributor=name)) for key, found in _one_way_shares(result).items()}
-    return {"contributor": name, "u": u, "unit": unit, "origin": origin, **parts, "unidirectional_um": one_way}
+    one_way = {key: found.sel(contributor=name) for key, found in _one_way_shares(result).items()}
+    return Iso230Contribution(contributor=name, u=u, unit=unit, origin=origin, **parts, unidirectional_um=one_way)
 
 
 # What the test sheet of ISO 230-2 holds in addition to the values: tolerances, conditions stated and checked, other
@@ -196,42 +200,38 @@ _OF_LENGTHS = ("Travel of the axis", "Lead of the screw", "Feed", "Expansion coe
 
 
 def complete_sheet(
-    part: Mapping[str, Any], dataset: xr.Dataset, *, campaign: Campaign | None, environment: xr.Dataset | None
-) -> dict[str, Any]:
-    """Return the part ``iso230`` of the results with tolerances, conditions and other standards of the quoted window."""
-    cycles = part["cycles"]
+    part: Iso230Part, dataset: xr.Dataset, *, campaign: Campaign | None, environment: xr.Dataset | None
+) -> Iso230Part:
+    """Return the evaluation with tolerances, conditions and other standards of the quoted window."""
+    cycles = part.cycles
     report = ReportTable() if campaign is None else campaign.report
     limits = (AcceptanceTable() if campaign is None else campaign.acceptance).limits()
     settling = estimate_settling(dataset, group(dataset, "drift")) if has(dataset, "drift") else None
     checks = check_conditions(dataset, cycles=cycles, lead_mm=report.screw_lead_mm, settling=settling)
-    return {
-        **part,
+    others = [] if is_rotary(dataset) else evaluate_other_standards(dataset, cycles=cycles)
+    sheet = {
         "tolerances": [row for symbol, limit in limits.items() for row in _judge(part, symbol, limit)],
-        "checks": [asdict(check) for check in checks],
+        "checks": [vars(check) for check in checks],
         "conditions": [
             {"name": name, "text": text} for name, text in _conditions(dataset, report, campaign, environment).items()
         ],
-        "other_standards": []
-        if is_rotary(dataset)
-        else [asdict(value) for value in evaluate_other_standards(dataset, cycles=cycles)],
+        "other_standards": [vars(value) for value in others],
     }
+    return Iso230Part.model_validate({**vars(part), **sheet})
 
 
-def _judge(part: Mapping[str, Any], symbol: str, limit: float) -> list[dict[str, Any]]:
+def _judge(part: Iso230Part, symbol: str, limit: float) -> Iterator[Iso230Tolerance]:
     """Judge a quantity, each direction by itself where it is unidirectional."""
+    found = {symbol: part}
     if symbol.endswith("_unidirectional"):
-        short = symbol.removesuffix("_unidirectional")
-        found = {f"{short}{arrow}": part[direction][f"{short}_um"] for direction, arrow in _ARROWS.items()}
-    else:
-        found = {symbol: part[f"{symbol}_um"]}
-    rows = []
-    for name, quantity in found.items():
-        value, u = quantity["value"], quantity["u"]
-        expanded = 2 * u if is_determined(u) else None
-        decision = decide(value, expanded, limit)
-        judged = {"limit_um": limit, "value_um": value, "expanded_u_um": expanded, "decision": decision}
-        rows.append({"quantity": name, **judged})
-    return rows
+        symbol = symbol.removesuffix("_unidirectional")
+        found = {f"{symbol}{arrow}": getattr(part, direction) for direction, arrow in _ARROWS.items()}
+    for name, holder in found.items():
+        quantity: Quantity = getattr(holder, f"{symbol}_um")
+        expanded = 2 * quantity.u if is_determined(quantity.u) else None
+        decision = decide(quantity.value, expanded, limit)
+        judged = {"limit_um": limit, "value_um": quantity.value, "expanded_u_um": expanded, "decision": decision}
+        yield Iso230Tolerance(quantity=name, **judged)
 
 
 def _conditions(
@@ -444,13 +444,7 @@ def _evaluate(
     drift, digits = estimate_joint(deviations)
     without = lacks_course(deviations)
     remarks = (*_remarks(deviations), *(notice.message for notice in digits), *([without] if without else []))
-    windows, settled, found = evaluate_standard(
-        deviations,
-        budget,
-        drift=None if drift is None else drift["drift"],
-        material_degC=material_by_cycle(deviations, environment),
-        cycles=window,
-    )
+    windows, settled, found = evaluate_standard(deviations, budget, drift=drift, environment=environment, cycles=window)
     dataset = joined(deviations, iso=windows, settled=settled, **({} if drift is None else {"drift": drift}))
     found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
     return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, hashed(files))

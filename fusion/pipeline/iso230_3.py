@@ -239,8 +239,10 @@ def _distortion(course: _Course, seconds: Array) -> ThermalDistortion:
     )
 
 
-def with_conditions(tests: Sequence[ThermalTest], campaign: Campaign, table: xr.Dataset) -> tuple[ThermalTest, ...]:
-    """Return the tests of a campaign, evaluated from a table, with whose they were, and under which conditions, as its file states."""
+def thermal_tests(campaign: Campaign, table: xr.Dataset) -> tuple[ThermalTest, ...]:
+    """Evaluate the tests of a campaign from its record or its readings, with whose they were and the conditions that its file states."""
+    evaluate = evaluate_axis_test if campaign.record is None else evaluate_record_test
+    tests = evaluate(table, campaign.thermal_test)
     zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
     report, date = campaign.report, date_of(table["time"].values, zone)
     conditions = {
@@ -274,20 +276,12 @@ def read_thermal_tests(path: Path) -> StatedTests:
             f"{path}: name a campaign file or a results folder; thermofuse init writes a campaign file for a table"
         )
     campaign = load_campaign(path)
-    found = thermal_tests(campaign)
+    found: tuple[ThermalTest, ...] = ()
+    of = "interferometry" if campaign.record is None else "record"
+    if campaign.record is not None:
+        found = thermal_tests(campaign, read_record(campaign))
+    elif campaign.interferometry is not None:
+        found = thermal_tests(campaign, read_laser(campaign)["deviations"])
     if not found:
         raise CampaignError(f"{path}: a test by ISO 230-3 needs {_NEEDS}")
-    of = "interferometry" if campaign.record is None else "record"
     return StatedTests(campaign.campaign.title, found, hashed({path.name: path, **campaign.files_of(of)}))
-
-
-def thermal_tests(campaign: Campaign) -> tuple[ThermalTest, ...]:
-    """Read and evaluate the tests of a campaign."""
-    if campaign.record is not None:
-        table = read_record(campaign)
-        return with_conditions(evaluate_record_test(table, campaign.thermal_test), campaign, table)
-    if campaign.interferometry is None:
-        return ()
-    deviations = read_laser(campaign)["deviations"]
-    tests = evaluate_axis_test(deviations, campaign.thermal_test)
-    return with_conditions(tests, campaign, deviations)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,12 +13,13 @@ from fusion.analysis.consistency.readings import find_gross_readings
 from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose
 from fusion.analysis.levels import POSITION_LEVEL
 from fusion.campaign.inputs import LaserInputs, Source, lacks_course
-from fusion.campaign.recompensation import material_by_cycle
 from fusion.campaign.time_zones import shown_zone, utc
 from fusion.pipeline.iso230 import estimate_joint, evaluate_standard
+from fusion.results.axis import AnomalyPart, DriftPart, Evidence, NeighboursPart
 from fusion.results.numbers import moment
+from fusion.results.parts import ByDirection, TimePart
 from fusion.results.progress import Report, counted, listed, silent
-from fusion.results.results import Notice, Outcome
+from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import group, joined
 from interferometry import neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
@@ -40,12 +39,9 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
     drift, digits = estimate_joint(deviations)
     deviations = deviations if drift is None else flag_outliers(deviations, drift)
     windows, settled, standard = evaluate_standard(
-        deviations,
-        source.iso_budget,
-        drift=None if drift is None else drift["drift"],
-        material_degC=material_by_cycle(deviations, source.environment),
+        deviations, source.iso_budget, drift=drift, environment=source.environment
     )
-    groups, parts = {"iso": windows, "settled": settled}, dict[str, Any](iso230=standard)
+    groups, parts = {"iso": windows, "settled": settled}, Parts(iso230=standard)
     if not lacks_course(deviations):
         comparison = neighbours.compare(deviations, drift)
         groups |= {
@@ -54,26 +50,31 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
             "comparison": comparison,
             "chart": neighbours.build_chart(deviations),
         }
-        compared = {"conventional_s_um": "conventional", "pair_s_um": "differenced", "ratio": "ratio"}
-        parts["neighbours"] = {key: by_direction(comparison[name]) for key, name in compared.items()}
+        parts.neighbours = NeighboursPart(
+            conventional_s_um=by_direction(comparison["conventional"]),
+            pair_s_um=by_direction(comparison["differenced"]),
+            ratio=by_direction(comparison["ratio"]),
+        )
     groups |= {} if drift is None else {"drift": drift}
     dataset = joined(deviations, **groups)
     zone = shown_zone(deviations, source.campaign.zone_of("interferometry"))
     if not np.isnat(times).all():
-        parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
+        parts.time = TimePart(first=utc(times.min()), last=utc(times.max()), zone=zone)
     if drift is not None:
         course = drift["drift"].mean("direction")
         # No estimate knows the change from one half of the test to the other better than the means of the readings in both: a drift
         # whose variance is estimated as zero has no uncertainty of its own.
         least_u = 2.0 * drift["sigma"] / np.sqrt(deviations["deviation"].notnull().sum(("cycle", "direction")))
         range_u = np.maximum(drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0), least_u)
-        parts["drift"] = {
-            **{f"{name}_um": by_direction(drift[name]) for name in ("profile", "profile_u", "scatter")},
-            "position_mm": deviations["position"].values.tolist(),
+        parts.drift = DriftPart(
+            profile_um=by_direction(drift["profile"]),
+            profile_u_um=by_direction(drift["profile_u"]),
+            scatter_um=by_direction(drift["scatter"]),
+            position_mm=deviations["position"].values.tolist(),
             # Of the mean of both approaches.
-            "range_um": (course.max("cycle") - course.min("cycle")).values.tolist(),
-            "range_u_um": range_u.values.tolist(),
-        }
+            range_um=(course.max("cycle") - course.min("cycle")).values.tolist(),
+            range_u_um=range_u.values.tolist(),
+        )
     report("deviations", 1, 1)
     return Outcome(dataset, parts, (*digits, *_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
 
@@ -143,9 +144,9 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset | None, zone: str
         )
 
 
-def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
-    """Return an array over direction and target as lists per direction."""
-    return {str(name): np.asarray(values.sel(direction=name), float).tolist() for name in values["direction"].values}
+def by_direction(values: xr.DataArray) -> ByDirection:
+    """Return an array over direction and target as one value per target for each direction."""
+    return ByDirection(**{str(one): values.sel(direction=one).values.tolist() for one in values["direction"].values})
 
 
 def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
@@ -247,36 +248,7 @@ def _outside_notices(fused: xr.Dataset) -> Iterator[Notice]:
 _PERMUTATIONS = 999
 
 
-@dataclass(frozen=True)
-class DiagnosedPosition:
-    """A position that stands out, and its diagnosis."""
-
-    anomaly: Anomaly
-    diagnosis: Diagnosis
-
-    def as_json(self) -> dict[str, Any]:
-        """One entry of ``anomalies`` in results.json: what was flagged, its cause, and the evidence for and against it."""
-        anomaly, diagnosis = self.anomaly, self.diagnosis
-        return {
-            "target": anomaly.target,
-            "direction": anomaly.direction,
-            "p_value": anomaly.p_value,
-            "p_resolution": anomaly.least_p_value,
-            "scatter_um": anomaly.scatter_um,
-            "cause": diagnosis.cause,
-            "evidence": {
-                "kind": anomaly.kind,
-                "extra_um": anomaly.extra_um,
-                "probability": diagnosis.probability,
-                "for": list(diagnosis.for_it),
-                "against": list(diagnosis.against_it),
-                "check": diagnosis.check,
-                **diagnosis.evidence,
-            },
-        }
-
-
-def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.DataArray) -> list[DiagnosedPosition]:
+def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.DataArray) -> list[AnomalyPart]:
     """Detect positions that stand out given the named effects, and diagnose them."""
     left = (fused["deviation"] - explained).values
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=left))
@@ -284,12 +256,32 @@ def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.
     found = detect_anomalies(cleaned, estimate_drift(cleaned), level=POSITION_LEVEL, permutations=_PERMUTATIONS)
     anomalies = [anomaly for anomaly in found if anomaly.stands_out]
     diagnoses = diagnose(fused.assign(deviation=fused["deviation"].copy(data=left)), anomalies)
-    return [DiagnosedPosition(*both) for both in zip(anomalies, diagnoses, strict=True)]
+    position_mm = deviations["position"]
+    return [
+        diagnosed(anomaly, diagnosis, position_mm=float(position_mm.sel(target=anomaly.target)))
+        for anomaly, diagnosis in zip(anomalies, diagnoses, strict=True)
+    ]
 
 
-def sites_of(positions: Sequence[DiagnosedPosition], targets: int) -> list[tuple[int, str]]:
+def diagnosed(anomaly: Anomaly, diagnosis: Diagnosis, *, position_mm: float) -> AnomalyPart:
+    """Return what was flagged, its cause, and the evidence for and against it."""
+    stated = {"for": diagnosis.for_it, "against": diagnosis.against_it, "check": diagnosis.check}
+    found = {"kind": anomaly.kind, "extra_um": anomaly.extra_um, "probability": diagnosis.probability}
+    return AnomalyPart(
+        target=anomaly.target,
+        position_mm=position_mm,
+        direction=anomaly.direction,
+        p_value=anomaly.p_value,
+        p_resolution=anomaly.least_p_value,
+        scatter_um=anomaly.scatter_um,
+        cause=diagnosis.cause,
+        evidence=Evidence(**found, **stated, **diagnosis.evidence),
+    )
+
+
+def sites_of(anomalies: Sequence[AnomalyPart], targets: int) -> list[tuple[int, str]]:
     """Sites that are reported as anomalies, so that the loop does not report them again as a remainder."""
-    anomalies, sides = [position.anomaly for position in positions], {"both": ("positive", "negative")}
+    sides = {"both": ("positive", "negative")}
     if 4 * len({anomaly.target for anomaly in anomalies}) > targets:
         return []
     return [

@@ -27,7 +27,7 @@ from fusion.campaign.inputs import pipe_notices, read_record
 from fusion.campaign.time_zones import zone_notices
 from fusion.results.numbers import duration, number
 from fusion.results.progress import Report, clock_notices, counted, left_out_notices, listed
-from fusion.results.results import Notice, Outcome
+from fusion.results.results import Notice, Outcome, Parts
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,8 @@ def model_record(source: RecordSource, *, report: Report) -> Outcome:
         effects=None if source.health.names_causes else {},
         progress=lambda done, total, what: report("closed loop", done, total),
     )
-    loop = result.described(source.health.findings)
-    notices = (*source.notices, *digit_notices(result))
-    return Outcome(record_variables(source.record, result), {"loop": loop}, notices)
+    parts = Parts(loop=result.described(source.health.findings))
+    return Outcome(record_variables(source.record, result), parts, (*source.notices, *digit_notices(result)))
 
 
 def digit_notices(result: RecordResult) -> Iterator[Notice]:

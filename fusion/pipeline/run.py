@@ -29,8 +29,7 @@ from fusion.campaign.inputs import (
 from fusion.campaign.remote import fetched_campaign, is_address, require_outside_cache
 from fusion.campaign.time_zones import time_part
 from fusion.messages import naming
-from fusion.pipeline import attribution, drift_model, thermal
-from fusion.pipeline import positioning as interferometry
+from fusion.pipeline import attribution, drift_model, positioning, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import (
     Check,
@@ -45,8 +44,7 @@ from fusion.pipeline.consistency import (
     without_consequences,
 )
 from fusion.pipeline.iso230 import complete_sheet
-from fusion.pipeline.iso230_3 import evaluate_axis_test, evaluate_record_test, with_conditions
-from fusion.pipeline.positioning import choose_targets, insufficient_for_correlation, insufficient_for_model
+from fusion.pipeline.iso230_3 import thermal_tests
 from fusion.pipeline.stages import (
     STAGES,
     Run,
@@ -59,13 +57,13 @@ from fusion.pipeline.stages import (
     refuse_other_campaign,
     stamp_run,
 )
-from fusion.pipeline.thermal import camera_corrected, describe_field
+from fusion.pipeline.thermal import camera_corrected
 from fusion.pipeline.thermograms import csv_of, evaluate_thermograms, has_regions
 from fusion.pipeline.workers import Worker
 from fusion.results.folder import claim, discard, open_folder, read_manifest
 from fusion.results.progress import Report, silent
 from fusion.results.results import Notice, Outcome, Results, assemble
-from fusion.results.store import StageStamps, is_large, open_dataset, write_dataset, write_json, write_text
+from fusion.results.store import StageStamps, is_large, open_dataset, plain, write_dataset, write_json, write_text
 from thermography.io.sequence import FrameList
 
 if TYPE_CHECKING:
@@ -191,11 +189,8 @@ def _run_loaded(
                 checks = without_consequences([*checks, *made["checks"]], campaign.accept.doubts)
                 doubts = doubt_notices(checks, campaign.accept.doubts)
                 run.notices = [*doubts, *_without_following(run.notices, checks)]
-                run.parts["inputs"] = inputs_part(
-                    checks,
-                    campaign.accept.doubts,
-                    corrected="camera" in run.parts and camera_corrected(run.parts["camera"]),
-                )
+                corrected = run.parts.camera is not None and camera_corrected(run.parts.camera)
+                run.parts.inputs = inputs_part(checks, campaign.accept.doubts, corrected=corrected)
             return _finish(run, made)
         except BaseException:
             # Nobody is left behind who writes into the folder.
@@ -237,9 +232,11 @@ def _evaluate_thermograms(run: Run, camera: CameraInputs, alone: CameraInputs | 
     thermograms: xr.Dataset = run.stage("thermograms", partial(evaluate_thermograms, camera))
     claim(run.folder, _TABLE)
     run.products.append(write_text(run.folder / _TABLE, csv_of(thermograms)))
-    if alone:
-        run.parts |= time_part(thermograms, run.campaign.campaign.time_zone)
-    series = run.parts["thermograms"]["series"] if alone else run.parts["regions"][0]["camera"]
+    found = run.parts
+    if alone and (taken := time_part(thermograms, run.campaign.campaign.time_zone)):
+        found.time = taken
+    assert found.regions is not None
+    series = found.thermograms.series if found.thermograms else found.regions[0].camera
     run.draw(partial(_draw, "pictures", thermograms, series))
     return thermograms
 
@@ -258,7 +255,7 @@ def _begin_evaluation(run: Run, laser: LaserInputs, camera: CameraInputs) -> Cal
     """Begin to evaluate the readings while the frames are reduced, unless the camera is needed to compensate them."""
     if isinstance(laser, Source) and laser.needs_camera:
         return None
-    return run.begin("deviations", partial(interferometry.evaluate_interferometry, _without_frames(laser)))
+    return run.begin("deviations", partial(positioning.evaluate_interferometry, _without_frames(laser)))
 
 
 def _reduce(run: Run, camera: CameraInputs, scheduler: str | None = None) -> xr.Dataset:
@@ -270,7 +267,6 @@ def _reduce(run: Run, camera: CameraInputs, scheduler: str | None = None) -> xr.
         fields = open_dataset(run.folder / STAGES["fields"].file)
     if fields.nbytes > _MOST_SENT:
         run.worker = Worker(run.worker.faults)
-    run.parts["field"] = describe_field(fields, run.parts["radiometry"])
     return fields
 
 
@@ -284,34 +280,34 @@ def _compensate(run: Run, laser: LaserInputs, fields: xr.Dataset) -> LaserInputs
 
 def _evaluate(run: Run, laser: LaserInputs, evaluation: Callable[[], xr.Dataset] | None = None) -> xr.Dataset:
     """The deviations, and what is stated of the test."""
-    evaluate = partial(interferometry.evaluate_interferometry, _without_frames(laser))
+    evaluate = partial(positioning.evaluate_interferometry, _without_frames(laser))
     deviations: xr.Dataset = run.stage("deviations", evaluate) if evaluation is None else evaluation()
     # What is stated of the test is no input of the stage: a corrected serial number computes nothing again.
-    run.parts["iso230"] = complete_sheet(
-        run.parts["iso230"], deviations, campaign=run.campaign, environment=laser.environment
-    )
-    tests = evaluate_axis_test(deviations, run.campaign.thermal_test)
-    run.parts["iso230_3"] = with_conditions(tests, run.campaign, deviations)
+    standard = run.parts.iso230
+    assert standard is not None
+    run.parts.iso230 = complete_sheet(standard, deviations, campaign=run.campaign, environment=laser.environment)
+    run.parts.iso230_3 = thermal_tests(run.campaign, deviations)
     return deviations
 
 
 def _align(run: Run, laser: LaserInputs, deviations: xr.Dataset, fields: Maybe = None) -> Maybe:
     """Readings, fields and logs on one clock; None where the readings have no times."""
-    if "drift" not in run.parts:
+    if run.parts.drift is None:
         return None
     if fields is None:
-        fused, notices = interferometry.align_with_logs(laser, deviations)
+        fused, notices = positioning.align_with_logs(laser, deviations)
     else:
         assert isinstance(laser, Source)
-        fused, notices = interferometry.align_recordings(laser, fields, deviations)
+        fused, notices = positioning.align_recordings(laser, fields, deviations)
     run.notices.extend(notices)
     return fused
 
 
 def _choose(run: Run, deviations: xr.Dataset, fused: xr.Dataset, fields: Maybe = None) -> Maybe:
     """The readings that are modelled; None where they are too few."""
-    too_small = [*insufficient_for_model(deviations), *([] if fields is None else insufficient_for_correlation(fields))]
-    modelled, notices = choose_targets(fused)
+    too_small = [*positioning.insufficient_for_model(deviations)]
+    too_small += [] if fields is None else positioning.insufficient_for_correlation(fields)
+    modelled, notices = positioning.choose_targets(fused)
     run.notices.extend(too_small or notices)
     return None if too_small else modelled
 
@@ -360,7 +356,7 @@ def _begin_charts_of_model(
 ) -> None:
     """Begin to draw what the model found, while the rest is written."""
     found = drift_model.join_fusion(fused, modelled, None, model).to_dataset()
-    standing_out = {anomaly["target"] for anomaly in run.parts.get("anomalies") or ()}
+    standing_out = {anomaly.target for anomaly in run.parts.anomalies or ()}
     run.draw(partial(_draw, "modelled", deviations, found, standing_out))
 
 
@@ -370,7 +366,7 @@ def _find_hotspots(
     """Wait for the correlation, which tests the hotspots; describe them where there is none."""
     if correlation is not None:
         return correlation()
-    run.parts["hotspots"] = attribution.describe_hotspots(fields)
+    run.parts.hotspots = attribution.describe_hotspots(fields)
     return None
 
 
@@ -399,10 +395,10 @@ def _check(
     if field_checks is not None and maps_written is not None:
         maps_written()
         assert isinstance(source, CameraInputs)
-        checks += [*check_plan(source, run.parts["registration"]), *field_checks()]
+        checks += [*check_plan(source, plain(run.parts.registration)), *field_checks()]
     if model is not None:
         assert isinstance(source, LaserInputs)
-        checks += check_loop(run.parts["loop"], source)
+        checks += check_loop(plain(run.parts.loop), source)
     return checks
 
 
@@ -412,7 +408,7 @@ def _join_sensors(run: Run, source: Inputs, fields: Maybe = None) -> Maybe:
     if sensors is None:
         return None
     joined = join_sensors(sensors.logged, sensors.logged_x_mm, sensors.logged_y_mm, sensors.faults, fields)
-    run.parts["sensors"] = describe_sensors(joined, file=sensors.file)
+    run.parts.sensors = describe_sensors(joined, file=sensors.file)
     joined = run.described(joined)
     claim(run.folder, _SENSORS)
     run.products.append(write_dataset(run.folder / _SENSORS, joined))
@@ -423,9 +419,9 @@ def _model_record(run: Run, record_source: record_stage.RecordSource) -> xr.Data
     """The loop of a record."""
     record: xr.Dataset = run.stage("record", partial(record_stage.model_record, record_source))
     table = record_source.health.table
-    tests = evaluate_record_test(table, run.campaign.thermal_test)
-    run.parts["iso230_3"] = with_conditions(tests, run.campaign, table)
-    run.parts |= time_part(table, run.campaign.zone_of("record"))
+    run.parts.iso230_3 = thermal_tests(run.campaign, table)
+    if (taken := time_part(table, run.campaign.zone_of("record"))) is not None:
+        run.parts.time = taken
     return record
 
 
@@ -481,9 +477,10 @@ def _draw_attributed(fused: xr.Dataset, modelled: xr.Dataset, outcome: Outcome[x
     """The charts of where drift and field agree."""
     from fusion.report.charts.campaign import draw_attributed
 
-    correlation = outcome.parts["correlation"]
+    correlation = outcome.parts.correlation
+    assert correlation is not None
     joined = drift_model.join_fusion(fused, modelled, outcome.dataset, None)
-    return draw_attributed(joined, correlation["source"]["part"], correlation["p_resolution"])
+    return draw_attributed(joined, correlation.source.part, correlation.p_resolution)
 
 
 def _draw(part: str, *found: Any) -> Drawn:
@@ -498,7 +495,7 @@ def _finish(run: Run, made: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
     datasets = {name: made[name] for name in _DATASETS if made.get(name) is not None}
     _discard_stale(run, datasets)
-    run.parts["plugins"] = [plugin.model_dump() for plugin in plugins()]
+    run.parts.plugins = tuple(plugins())
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     run.report("report", 0, 1)

@@ -22,7 +22,7 @@ from fusion.campaign.config import Campaign
 from fusion.common import place_within, versions
 from fusion.pipeline.workers import Worker
 from fusion.results.progress import Report, silent
-from fusion.results.results import Notice, Outcome, Results, read_results
+from fusion.results.results import Notice, Outcome, Parts, Results, read_results
 from fusion.results.store import (
     OutputError,
     Product,
@@ -32,7 +32,6 @@ from fusion.results.store import (
     file_sha256,
     is_file_list,
     open_dataset,
-    plain,
     read_dataset,
     read_json_object,
     read_tree,
@@ -49,7 +48,7 @@ if TYPE_CHECKING:
 # there already.
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 6
+PRODUCT_LAYOUT = 7
 #: The stamp of a whole run, which its last stage gets.
 _REPORT = "report"
 
@@ -304,7 +303,7 @@ class Run:
         Each waits for a part of the charts and returns it.
     taken : dict
         By stage, what its result depends on of tables that it does not list whole.
-    parts, notices : dict, list
+    parts, notices : Parts, list
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
         Wall time (s) and input digest by stage.
@@ -324,7 +323,7 @@ class Run:
     depends: tuple[Any, ...] = field(default_factory=dependencies)
     drawn: list[Callable[[], Drawn]] = field(default_factory=list)
     taken: dict[str, Any] = field(default_factory=dict)
-    parts: dict[str, Any] = field(default_factory=dict)
+    parts: Parts = field(default_factory=Parts)
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)
@@ -364,7 +363,7 @@ class Run:
         notices = tuple(Notice(**item) for item in note["notices"])
         if retitle(path, self._described):
             self.stamps.renew(path)
-        return Outcome(STAGES[name].read(path), note["parts"], notices)
+        return Outcome(STAGES[name].read(path), Parts.model_validate(note["parts"]), notices)
 
     def _finish(self, name: str, key: str, compute: Callable[[], tuple[Outcome[Any], float]] | None) -> Any:
         """Write and stamp what a stage computes in so many seconds, or read what is kept of it."""
@@ -385,7 +384,7 @@ class Run:
         _return_freed_memory()
         self.keys[name] = key
         self.products.append(path)
-        self.parts.update(plain(outcome.parts))
+        self.parts.take(outcome.parts)
         self.notices.extend(outcome.notices)
         self.seconds[name] = spent_s + time.monotonic() - begun
         return outcome.dataset

@@ -31,8 +31,10 @@ from fusion.campaign.inputs import (
 )
 from fusion.campaign.time_zones import utc
 from fusion.common import Array
+from fusion.results.axis import AlignmentPart, CameraPart, CameraStepPart, RegistrationPart
+from fusion.results.parts import BudgetEntry, FieldPart, Quantity, RadiometryPart, SurfacePart, TwoParts
 from fusion.results.progress import Report, counted, listed
-from fusion.results.results import Notice, Outcome
+from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
 from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
@@ -103,7 +105,7 @@ class CameraState:
     source: CameraInputs
     correction_K: Array | None
     u_K: Array
-    part: dict[str, Any]
+    part: CameraPart
     notices: list[Notice]
 
     def per_cycle(self, bounds: Array) -> xr.Dataset:
@@ -193,9 +195,9 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         *repeat_notices(survey.repeated, [frame.time for frame in survey.frames]),
     ]
     levels = _levels(survey, blocks, kept)
-    part: dict[str, Any] = {"frames_checked": len(source.frames), "frames_damaged": rejected, "steps": ()}
+    checked = {"frames_checked": len(source.frames), "frames_damaged": rejected}
     if levels is None:
-        part |= {"drift_K": 0.0, "largest_correction_K": 0.0, "largest_u_K": None}
+        part = CameraPart(**checked, steps=(), drift_K=0.0, largest_correction_K=0.0, largest_u_K=None)
         return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, _NO_SURROUNDINGS])
     background, table, spread = levels
     if survey.patch is not None:
@@ -209,14 +211,17 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     share = signal_slope(background + ZERO_CELSIUS_K, parameters) / at_table
     uneven = np.abs(signal_slope(table + spread + ZERO_CELSIUS_K, parameters) / at_table - 1.0)
     u_K = share * np.hypot(correction.u_K, uneven * correction.correction_K)
-    steps = [(utc(frames[step.index].time), {"value": step.value_K, "u": step.u_K}) for step in correction.steps]
     correction_K, largest_u_K = share * correction.correction_K, float(u_K.max())
-    part |= {
-        "steps": [{"time": time, "step_K": size} for time, size in steps],
-        "drift_K": float(np.ptp(correction.drift_K)),
-        "largest_correction_K": float(np.abs(correction_K).max()),
-        "largest_u_K": largest_u_K,
-    }
+    part = CameraPart(
+        **checked,
+        steps=[
+            CameraStepPart(time=utc(frames[step.index].time), step_K=Quantity(value=step.value_K, u=step.u_K))
+            for step in correction.steps
+        ],
+        drift_K=np.ptp(correction.drift_K),
+        largest_correction_K=np.abs(correction_K).max(),
+        largest_u_K=largest_u_K,
+    )
     notices += _correction_notices(correction, frames, largest_u_K)
     return CameraState(usable, correction_K if correction.corrects else None, u_K, part, notices)
 
@@ -248,13 +253,13 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
     # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
     zero_u_K = np.interp(np.arange(len(source.frames)), shown.index, np.abs(left)) / np.sqrt(3.0)
     u_K = np.maximum(camera.u_K, zero_u_K)
-    part = {**camera.part, "largest_u_K": float(u_K.max())}
+    part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
     return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
 
 
-def camera_corrected(part: Mapping[str, Any]) -> bool:
+def camera_corrected(part: CameraPart) -> bool:
     """Whether thermograms were left out or corrected."""
-    return bool(part["frames_damaged"] or part["steps"] or part["drift_K"])
+    return bool(part.frames_damaged or part.steps or part.drift_K)
 
 
 def _refuse_patch_on_plan(source: CameraInputs, blocks: Blocks) -> None:
@@ -397,34 +402,36 @@ def complete_fields(
     if regions:
         fields = calibrate_surfaces(fields, surfaces, edge, cameras)
     fields = evaluate_uncertainty(fields, cameras["cycle"], inputs, surfaces=surfaces if regions else ())
-    part = {
-        **_two_parts(fields),
-        "rise_scale_u": float(fields["rise_scale_u"].mean()),
-        "budget": _budget(table, fields, camera, inputs, measured=measured_u is not None),
-        "surfaces": [_surface_part(table, one, fields, camera, inputs) for one in surfaces],
-        "edge_cells": int(edge.sum()),
-    }
-    return Outcome(fields, {"radiometry": part}, (*_edge_notices(edge, regions), *_drift_notices(table, fields)))
+    part = RadiometryPart(
+        temperature_u=_two_parts(fields, "temperature"),
+        rise_u=_two_parts(fields, "temperature_rise"),
+        rise_scale_u=fields["rise_scale_u"].mean(),
+        budget=_budget(table, fields, camera, inputs, measured=measured_u is not None),
+        surfaces=[_describe_surface(table, one, fields, camera, inputs) for one in surfaces],
+        edge_cells=edge.sum(),
+    )
+    return Outcome(fields, Parts(radiometry=part), (*_edge_notices(edge, regions), *_drift_notices(table, fields)))
 
 
-def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part ``field`` of results.json."""
+def _describe_field(fields: xr.Dataset) -> FieldPart:
+    """Return the fields in short."""
     rise, times = fields["temperature_rise"], fields["time"].values
     seen = cycles_with_field(rise)
     mean = float(rise.isel(cycle=int(np.flatnonzero(seen)[-1])).mean())
     at = _largest_at(rise)
     cell = rise[at]
     since = (fields["cycle_time"].values[at[0]] - fields["cycle_time"].values[seen][0]) / np.timedelta64(1, "s")
-    return {
-        "fields": int(seen.sum()),
-        "frames": int(fields["frame_count"].sum()) if "frame_count" in fields else int(times.size),
-        "duration_s": float((times[-1] - times[0]) / np.timedelta64(1, "s")),
-        "mean_rise_K": {"value": mean, "u": radiometry["rise_u"]["common_K"]},
-        "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"][at])},
-        "largest_cycle": int(cell["cycle"]),
-        "largest_after_s": float(since),
-        **{f"largest_{axis}_mm": float(cell[axis]) for axis in "xy"},
-    }
+    return FieldPart(
+        fields=seen.sum(),
+        frames=fields["frame_count"].sum() if "frame_count" in fields else times.size,
+        duration_s=(times[-1] - times[0]) / np.timedelta64(1, "s"),
+        mean_rise_K=Quantity(value=mean, u=_two_parts(fields, "temperature_rise").common_K),
+        largest_rise_K=Quantity(value=cell, u=fields["temperature_rise_u"][at]),
+        largest_cycle=cell["cycle"],
+        largest_after_s=since,
+        largest_x_mm=cell["x"],
+        largest_y_mm=cell["y"],
+    )
 
 
 def _largest_at(rise: xr.DataArray) -> tuple[int, int, int]:
@@ -460,14 +467,11 @@ def _emissivity_region(
     return EmissivityRegion(outline, min(estimate.emissivity, 1.0), estimate.emissivity_u)
 
 
-def _two_parts(fields: xr.Dataset) -> dict[str, dict[str, float]]:
-    """Noise, common part and total of temperature and rise, root mean squares over the cells of the last cycle."""
-    parts = {}
+def _two_parts(fields: xr.Dataset, name: str) -> TwoParts:
+    """Noise, common part and total of temperature or rise, root mean squares over the cells of the last cycle."""
     last = _last_field(fields)
-    for key, name in (("temperature_u", "temperature"), ("rise_u", "temperature_rise")):
-        noise, total = (float(np.sqrt((last[f"{name}{end}"] ** 2).mean())) for end in ("_noise_u", "_u"))
-        parts[key] = {"noise_K": noise, "common_K": float(np.sqrt(max(total**2 - noise**2, 0.0))), "total_K": total}
-    return parts
+    noise, total = (float(np.sqrt((last[f"{name}{end}"] ** 2).mean())) for end in ("_noise_u", "_u"))
+    return TwoParts(noise_K=noise, common_K=np.sqrt(max(total**2 - noise**2, 0.0)), total_K=total)
 
 
 def _last_field(fields: xr.Dataset) -> xr.Dataset:
@@ -477,7 +481,7 @@ def _last_field(fields: xr.Dataset) -> xr.Dataset:
 
 def _budget(
     table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty, *, measured: bool
-) -> list[dict[str, Any]]:
+) -> list[BudgetEntry]:
     """Every input that all frames share, with its contributions on the main surface at the mean of the last field."""
     last = _last_field(fields)
     mean = float(last["temperature"].mean())
@@ -493,19 +497,19 @@ def _budget(
             continue
         unstated = "measured" if measured and name == "emissivity" else "assumed"
         source = unstated if getattr(table, key) is None else "stated"
-        of_temperature = abs(float(to_temperature.get(name, 0.0)))
-        of_rise = {"temperature_u_K": of_temperature, "rise_u_percent": 100.0 * abs(float(to_rise.get(name, 0.0)))}
-        value = {"value": getattr(camera, name, None), "u": getattr(inputs, name)}
-        entries.append({"input": name, **value, "source": source, **of_rise})
+        of_temperature, of_rise = (abs(float(shares.get(name, 0.0))) for shares in (to_temperature, to_rise))
+        contributed = {"temperature_u_K": of_temperature, "rise_u_percent": 100.0 * of_rise}
+        value, u = getattr(camera, name, None), getattr(inputs, name)
+        entries.append(BudgetEntry(input=name, value=value, u=u, source=source, **contributed))
     return entries
 
 
-def _zero_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> dict[str, Any]:
+def _zero_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> BudgetEntry:
     """The entry of the budget for the camera's zero: what its correction leaves, or the drift that is stated or assumed."""
     left_K, given_K = _zero_left_K(fields), inputs.camera_drift_K
     source = "measured" if left_K > given_K else "assumed" if table.camera_drift_u_K is None else "stated"
     zero = {"input": "camera_drift_K", "value": None, "u": max(left_K, given_K), "source": source}
-    return {**zero, "temperature_u_K": 0.0, "rise_u_percent": None}
+    return BudgetEntry(**zero, temperature_u_K=0.0, rise_u_percent=None)
 
 
 def _zero_left_K(fields: xr.Dataset) -> float:
@@ -529,10 +533,10 @@ def _drift_notices(table: ThermographyTable, fields: xr.Dataset) -> Iterator[Not
         )
 
 
-def _surface_part(
+def _describe_surface(
     table: ThermographyTable, surface: Surface, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
-) -> dict[str, Any]:
-    """One entry of ``radiometry.surfaces`` in results.json."""
+) -> SurfacePart:
+    """A surface with its emissivity and what it leaves of the rises."""
     shown = find_range(fields, surface.cells)
     sources = {f"region {one.name}": "stated" if one.states is None else "two states" for one in table.surfaces}
     ratio = scale = None
@@ -540,14 +544,14 @@ def _surface_part(
         own = replace(inputs, emissivity=surface.emissivity_u)
         compared = compare_with_monte_carlo(shown, override(camera, emissivity=surface.emissivity), own)
         ratio, scale = compared.rise_ratio, float(np.nanmean(fields["rise_scale_u"].values[surface.cells]))
-    return {
-        "name": surface.name.removeprefix("region "),
-        "emissivity": {"value": surface.emissivity, "u": surface.emissivity_u},
-        "source": sources.get(surface.name, "frames" if table.emissivity is None else "stated"),
-        "cells": int(surface.cells.sum()),
-        "rise_scale_u": scale,
-        "monte_carlo_ratio": ratio,
-    }
+    return SurfacePart(
+        name=surface.name.removeprefix("region "),
+        emissivity=Quantity(value=surface.emissivity, u=surface.emissivity_u),
+        source=sources.get(surface.name, "frames" if table.emissivity is None else "stated"),
+        cells=surface.cells.sum(),
+        rise_scale_u=scale,
+        monte_carlo_ratio=ratio,
+    )
 
 
 def _edge_notices(edge: NDArray[np.bool_], regions: list[EmissivityRegion]) -> Iterator[Notice]:
@@ -595,10 +599,9 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     source, notices = camera.source, camera.notices
     if source.thermography.table == "still":
         notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
-    fields, clock, clock_notices = _reduce_on_clock(
+    fields, offset_s, offset_u_s, clock_notices = _reduce_on_clock(
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
-    offset_s = clock["value"]
     shown: dict[str, Any] = {"untested": "camera or table was displaced, and the discs in the picture with it"}
     if source.thermography.table == "moving":
         shown = {"untested": "the discs move through the picture with the table"}
@@ -606,7 +609,7 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         camera, shown = _held_against_discs(camera, registration)
     fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
-    damaged = [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
+    damaged = [f"{Path(one.file).name}#{one.index}" for one in camera.part.frames_damaged]
     repeated = [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
     fields = fields.assign_attrs(frames_damaged=json.dumps(damaged), frames_repeated=json.dumps(repeated))
     fields = fields.assign_coords(cycle=source.cycles.number)
@@ -618,12 +621,14 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
             moved = camera_on_laser_clock(fields[name].values, offset_s)
             fields[name] = (fields[name].dims, moved, fields[name].attrs)
     fields = fields.assign(_registration_variables(registration, reference))
-    parts = {"registration": _registration_part(registration, source), "camera": camera.part, **completed.parts}
+    parts = completed.parts
+    parts.registration, parts.camera = _describe_registration(registration, source), camera.part
+    parts.field = _describe_field(fields)
     if isinstance(source, Source):
         x, y = source.axis.points(source.deviations["position"].values)
         places = {"target_x": ("target", x, {"units": "mm"}), "target_y": ("target", y, {"units": "mm"})}
         fields = fields.assign(xr.Dataset(places, coords={"target": source.deviations["target"].values}))
-        parts["alignment"] = {"clock_offset_s": clock}
+        parts.alignment = AlignmentPart(clock_offset_s=Quantity(value=offset_s, u=offset_u_s))
     return Outcome(fields, parts, tuple(notices))
 
 
@@ -649,7 +654,7 @@ def _reduce_on_clock(
     checkpoint: Path,
     scheduler: str | None,
     report: Report,
-) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
+) -> tuple[xr.Dataset, float, float | None, list[Notice]]:
     """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
     source = camera.source
     moving = source.thermography.table == "moving"
@@ -673,7 +678,7 @@ def _reduce_on_clock(
         # Without a laser the logs are the other clock; an offset that is not stated is none.
         assumed = isinstance(source, Source) and given is None
         u = 0.0 if isinstance(source, Source) and given is not None else None
-        return reduce(given or 0.0), {"value": given or 0.0, "u": u}, [_ASSUMED_CLOCK] if assumed else []
+        return reduce(given or 0.0), given or 0.0, u, [_ASSUMED_CLOCK] if assumed else []
     fields = reduce(0.0, checkpoint / "before_alignment")
     report("clock offset", 0, 1)
     clock = estimate_clock_offset(
@@ -687,7 +692,7 @@ def _reduce_on_clock(
     report("clock offset", 1, 1)
     # Frames belong to cycles by the laser's clock, so they are sorted into them again.
     fields = reduce(clock.offset_s)
-    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, [*clock_notices(clock)]
+    return fields, clock.offset_s, clock.offset_u_s, [*clock_notices(clock)]
 
 
 def clock_notices(clock: ClockOffset) -> Iterator[Notice]:
@@ -750,22 +755,19 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     return xr.Dataset(variables)
 
 
-def _registration_part(registration: Registration, source: CameraInputs) -> dict[str, Any]:
-    """Return the part ``registration`` of results.json."""
+def _describe_registration(registration: Registration, source: CameraInputs) -> RegistrationPart:
+    """Return the registration in short."""
     # The share of the plan that the fiducials in use span.
     places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
     hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
-    return {
-        "model": registration.model,
-        "frames_rejected": source.frames_rejected,
-        "rms_mm": registration.rms_mm,
-        "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
-        "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
-        "unchecked": list(registration.unchecked),
-        **{name: getattr(registration, name) for name in ("contradicted_hints", "mirrored", "area_ratio")},
-        "span": float(cv2.contourArea(hull)) / (source.grid.width_mm * source.grid.height_mm),
-        "leave_one_out_mm": registration.leave_one_out_mm,
-    }
+    same = ("model", "rms_mm", "unchecked", "contradicted_hints", "mirrored", "area_ratio", "leave_one_out_mm")
+    return RegistrationPart(
+        **{name: getattr(registration, name) for name in same},
+        frames_rejected=source.frames_rejected,
+        position_u_mm=np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2)),
+        fiducials_listed=sum(fiducial.marker is None for fiducial in source.fiducials),
+        span=cv2.contourArea(hull) / (source.grid.width_mm * source.grid.height_mm),
+    )
 
 
 def _registration_notices(registration: Registration) -> Iterator[Notice]:

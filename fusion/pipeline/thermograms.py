@@ -24,8 +24,16 @@ from fusion.pipeline.thermal import (
     repeat_notices,
     stated_uncertainty,
 )
+from fusion.results.parts import (
+    CameraPicturesPart,
+    DifferencePart,
+    PicturePlace,
+    Quantity,
+    TemperatureRegionPart,
+    ThermogramsPart,
+)
 from fusion.results.progress import Report, counted, listed
-from fusion.results.results import Notice, Outcome
+from fusion.results.results import Notice, Outcome, Parts
 from thermography.common import Array, ThermographyError, write_csv
 from thermography.evaluation import (
     WHOLE_PICTURE,
@@ -113,22 +121,25 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
         outlines=json.dumps([{"name": one.name, "kind": one.kind, "points": one.points} for one in outlines.values()]),
     )
     cut = _cut_notices(outlines.values(), hottest.shape)
-    region_parts = {"regions": [part for each in tables for part in _region_parts(each)]}
+    parts = Parts(regions=[region for each in tables for region in _describe_regions(each)])
     if isinstance(source, LaserInputs):
-        return Outcome(dataset, region_parts, tuple(cut))
+        return Outcome(dataset, parts, tuple(cut))
     scene, shifts = _scene(source, override)
-    part: dict[str, Any] = {
-        "pictures": table.sizes["time"],
-        "cameras": [_camera_part(each) for each in tables],
-        "series": of_series,
-        "scene": scene,
-        "largest_shift_px": float(np.linalg.norm(shifts, axis=1).max()) if scene in ("still", "moved") else None,
-        "emissivity": float(override(hottest).emissivity),
-        "indicated_degC": float(shown["temperature"].max()),
-    }
+    compared: dict[str, DifferencePart] = {}
     if (change := _difference(source, override, scene, shifts)) is not None:
         dataset["difference"] = change
-        part["difference"] = _difference_part(source, override, change, shifts[-1] if scene == "still" else None)
+        shift_px = shifts[-1] if scene == "still" else None
+        compared["difference"] = _describe_difference(source, override, change, shift_px)
+    part = parts.thermograms = ThermogramsPart(
+        pictures=table.sizes["time"],
+        cameras=[_describe_camera(each) for each in tables],
+        series=of_series,
+        scene=scene,
+        largest_shift_px=np.linalg.norm(shifts, axis=1).max() if scene in ("still", "moved") else None,
+        emissivity=override(hottest).emissivity,
+        indicated_degC=shown["temperature"].max(),
+        **compared,
+    )
     notices += [*cut, *_series_notices(source, table, of_series, scene), *_scene_notices(source, part)]
     try:
         visible = read_visible_picture(hottest) if isinstance(hottest, FlirFrameReference) else None
@@ -138,7 +149,7 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     if visible is not None:
         dataset["visible"] = (("visible_row", "visible_column", "channel"), _reduced(visible.pixels))
     dataset.attrs["rejected"] = json.dumps(rejected).replace(f"{folder}/", "")
-    return Outcome(dataset, {"thermograms": part, **region_parts}, tuple(notices))
+    return Outcome(dataset, parts, tuple(notices))
 
 
 def _stated_regions(source: CameraInputs, override: Overrides) -> list[Region]:
@@ -218,9 +229,9 @@ def _difference(source: CameraInputs, override: Overrides, scene: Scene, shifts:
     return subtract_frames(last, first).drop_vars(["row", "column"])
 
 
-def _difference_part(
+def _describe_difference(
     source: CameraInputs, override: Overrides, change: xr.DataArray, shift_px: Array | None
-) -> dict[str, Any]:
+) -> DifferencePart:
     """The largest change and the mean one; what both pictures share cancels but for its effect on the scale of the difference.
 
     A shift adds its length times the gradient; where it is not known, or was taken out, the uncertainty of a single pixel is not known.
@@ -242,13 +253,13 @@ def _difference_part(
         parts = [*(float(share) * value for share in scale.values()), inputs.camera_drift_K, *more_K]
         return float(np.linalg.norm(parts))
 
-    return {
-        "seconds": float((source.frame_times[-1] - source.frame_times[0]) / np.timedelta64(1, "s")),
-        "mean_K": {"value": mean, "u": u(mean)},
-        "largest_K": {"value": largest, "u": None if edge is None else u(largest, noise, edge)},
-        "largest_column_px": int(column),
-        "largest_row_px": int(row),
-    }
+    return DifferencePart(
+        seconds=(source.frame_times[-1] - source.frame_times[0]) / np.timedelta64(1, "s"),
+        mean_K=Quantity(value=mean, u=u(mean)),
+        largest_K=Quantity(value=largest, u=None if edge is None else u(largest, noise, edge)),
+        largest_column_px=column,
+        largest_row_px=row,
+    )
 
 
 def _reduced(pixels: np.ndarray) -> np.ndarray:
@@ -257,54 +268,48 @@ def _reduced(pixels: np.ndarray) -> np.ndarray:
     return cv2.resize(np.ascontiguousarray(pixels), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
-def _camera_part(table: xr.Dataset) -> dict[str, Any]:
-    """One camera of ``thermograms.cameras``."""
+def _describe_camera(table: xr.Dataset) -> CameraPicturesPart:
+    """The pictures of one camera."""
     times = table["time"].values
     known = np.sort(times[~np.isnat(times)])
-    return {
-        "name": str(table["camera"].values[0]),
-        "pictures": int(times.size),
-        "first": utc(known[0]) if known.size else None,
-        "last": utc(known[-1]) if known.size else None,
-    }
+    first, last = (utc(known[0]), utc(known[-1])) if known.size else (None, None)
+    return CameraPicturesPart(name=str(table["camera"].values[0]), pictures=times.size, first=first, last=last)
 
 
-def _region_parts(table: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """The entries of ``regions`` in results.json for one camera: extremes of every region over its pictures."""
+def _describe_regions(table: xr.Dataset) -> Iterator[TemperatureRegionPart]:
+    """Extremes of every region over the pictures of one camera."""
     for region in table["region"].values:
         one = table.sel(region=region)
         one = one.isel(time=np.flatnonzero(one["pixels"].values > 0))
         if one.sizes["time"]:
-            yield {
-                "name": str(region),
-                "kind": str(one["kind"].values),
-                "camera": str(one["camera"].values[0]),
-                "pictures": one.sizes["time"],
-                "emissivity": float(one["emissivity"].values[0]),
+            yield TemperatureRegionPart(
+                name=region,
+                kind=one["kind"].item(),
+                camera=one["camera"].values[0],
+                pictures=one.sizes["time"],
+                emissivity=one["emissivity"][0],
                 **_extreme(one, "maximum", np.lexsort((one["overrange"].values, one["maximum"].values))[-1]),
                 **_extreme(one, "minimum", np.lexsort((-one["underrange"].values, one["minimum"].values))[0]),
-                "mean_degC": {"value": float(one["mean"].mean()), "u": float(one["mean_u"].mean())},
-                "overrange_pictures": int((one["overrange"] > 0).sum()),
-                "overrange_pixels": int(one["overrange"].max()),
-                "underrange_pictures": int((one["underrange"] > 0).sum()),
-                "underrange_pixels": int(one["underrange"].max()),
-            }
+                mean_degC=Quantity(value=one["mean"].mean(), u=one["mean_u"].mean()),
+                overrange_pictures=(one["overrange"] > 0).sum(),
+                overrange_pixels=one["overrange"].max(),
+                underrange_pictures=(one["underrange"] > 0).sum(),
+                underrange_pixels=one["underrange"].max(),
+            )
 
 
-def _extreme(one: xr.Dataset, name: str, at: Any) -> dict[str, Any]:
+def _extreme(one: xr.Dataset, name: str, at: Any) -> dict[str, Quantity | PicturePlace]:
     """The highest or lowest temperature of a region over its pictures, with picture and place."""
     there = one.isel(time=int(at))
     time = np.datetime64(there["time"].item(), "ns")
-    return {
-        f"{name}_degC": {"value": float(there[name]), "u": float(there[f"{name}_u"])},
-        f"{name}_at": {
-            "file": str(there["source"].values),
-            "frame": int(there["frame"]),
-            "time": None if np.isnat(time) else utc(time),
-            "column_px": int(there[f"{name}_column"]),
-            "row_px": int(there[f"{name}_row"]),
-        },
-    }
+    place = PicturePlace(
+        file=there["source"].item(),
+        frame=there["frame"],
+        time=None if np.isnat(time) else utc(time),
+        column_px=there[f"{name}_column"],
+        row_px=there[f"{name}_row"],
+    )
+    return {f"{name}_degC": Quantity(value=there[name], u=there[f"{name}_u"]), f"{name}_at": place}
 
 
 def _cut_notices(regions: Iterable[Region], shape: tuple[int, int]) -> Iterator[Notice]:
@@ -345,34 +350,32 @@ def _series_notices(source: CameraInputs, table: xr.Dataset, camera: str, scene:
         yield from pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
 
 
-def _scene_notices(source: CameraInputs, part: dict[str, Any]) -> Iterator[Notice]:
+def _scene_notices(source: CameraInputs, part: ThermogramsPart) -> Iterator[Notice]:
     """Return what the pictures cannot show as a series, and why."""
-    others = part["pictures"] - len(source.frames)
-    if part["scene"] == "no series":
-        cameras = counted(len(part["cameras"]), "camera")
+    others = part.pictures - len(source.frames)
+    if part.scene == "no series":
+        cameras = counted(len(part.cameras), "camera")
         yield Notice(
             "no_series",
-            f"{counted(part['pictures'], 'picture')} of {cameras} are no series: each is evaluated, none is compared with another.",
+            f"{counted(part.pictures, 'picture')} of {cameras} are no series: each is evaluated, none is compared with another.",
             "Put the pictures of one camera and one scene into a folder of their own to see what changes.",
         )
     elif others:
         yield Notice(
             "other_pictures",
             f"{counted(others, 'picture')} of another camera or size, or without a time: evaluated one by one, no part of "
-            f"the series of {part['series']}.",
+            f"the series of {part.series}.",
             "",
         )
-    if part["scene"] == "moved":
+    if part.scene == "moved":
         yield Notice(
             "picture_moved",
-            f"The picture shifts by up to {part['largest_shift_px']:.1f} px: the difference is taken after bringing the last picture onto "
+            f"The picture shifts by up to {part.largest_shift_px:.1f} px: the difference is taken after bringing the last picture onto "
             "the first; regions stay where they are in the picture, and may show another part of the scene.",
             "Fasten the camera.",
         )
-    elif part["scene"] == "unlike":
-        taken = (
-            "the difference of the two is taken pixel by pixel" if "difference" in part else "no difference is taken"
-        )
+    elif part.scene == "unlike":
+        taken = "the difference of the two is taken pixel by pixel" if part.difference else "no difference is taken"
         yield Notice(
             "pictures_unlike",
             f"Some pictures have too little in common to show whether the camera stayed where it was: {taken}.",

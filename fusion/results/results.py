@@ -123,10 +123,8 @@ def _loop_tag(loop: Any) -> str:
     return "record" if "channels" in keys else "axis"
 
 
-class Results(ResultPart):
-    """results.json of a run; a part that a campaign does not have is absent."""
-
-    model_config = ConfigDict(title="thermofuse results")
+class _Heading(ResultPart):
+    """What every results.json begins with."""
 
     schema_version: Literal[4] = Field(alias="schema")
     """Version of this layout."""
@@ -134,6 +132,13 @@ class Results(ResultPart):
     """Title of the campaign."""
     warnings: tuple[Notice, ...]
     """Everything that was left out, is doubtful, or was not possible."""
+
+
+class Parts(ResultPart):
+    """What the stages of a run find, set one after the other; a part that a campaign does not have is never set."""
+
+    model_config = ConfigDict(frozen=False)
+
     plugins: tuple[PluginPart, ...] = ()
     """Effects of other distributions that took part in the run."""
     inputs: InputsPart | None = None
@@ -175,6 +180,18 @@ class Results(ResultPart):
         | None
     ) = None
     """Closed loop."""
+
+    def take(self, more: Parts) -> None:
+        """Set all that other parts hold, as results.json would hold it: a number that is not determined is None."""
+        for name, part in Parts.model_validate(plain(more)):
+            if name in more.model_fields_set:
+                setattr(self, name, part)
+
+
+class Results(Parts, _Heading):
+    """results.json of a run; a part that a campaign does not have is absent."""
+
+    model_config = ConfigDict(title="thermofuse results", frozen=True)
 
     def __str__(self) -> str:
         return "\n".join(f"{name}: {text}" for name, text in self._summary())
@@ -229,10 +246,10 @@ class Results(ResultPart):
         return self.model_dump(mode="json", exclude_unset=True)
 
 
-def assemble(title: str, parts: Mapping[str, Any], warnings: Sequence[Notice]) -> Results:
+def assemble(title: str, parts: Parts | Mapping[str, Any], warnings: Sequence[Notice]) -> Results:
     """Return the results of a run from what the stages found, checked against the models."""
     notices = [asdict(notice) for notice in warnings]
-    return Results.model_validate(plain({"schema": SCHEMA_VERSION, "campaign": title, "warnings": notices, **parts}))
+    return Results.model_validate({"schema": SCHEMA_VERSION, "campaign": title, "warnings": notices, **plain(parts)})
 
 
 def read_results(folder: str | Path) -> Results:
@@ -365,12 +382,12 @@ class Outcome(Generic[Product]):
     ----------
     dataset : Dataset or DataTree
         Its product.
-    parts : dict
-        Its parts of results.json by key, as in `Results`.
+    parts : Parts
+        Its parts of results.json.
     notices : tuple of Notice
         What it left out.
     """
 
     dataset: Product
-    parts: dict[str, Any]
+    parts: Parts
     notices: tuple[Notice, ...] = ()

@@ -38,7 +38,7 @@ def test_rise_with_steps_and_drift(tmp_path: Path, ffc_step_K: float, drift_K_pe
         campaign = write_campaign(truth, tmp_path / f"{seed}")
         source = read_source(load_campaign(campaign))
         outcome = reduce_thermography(source, checkpoint=tmp_path / f"cycles{seed}", scheduler=None, report=silent)
-        fields, part = outcome.dataset, outcome.parts["camera"]
+        fields, part = outcome.dataset, outcome.parts.camera
         true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=5.0)
         error = (fields["temperature_rise"].values - (true - true[0]))[1:]
         u = np.hypot(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.reflections import find_switching_patch, seen_throughout
 from fusion.analysis.alignment.sensor_health import SensorFault
 from fusion.common import Array, FusionError
+from fusion.results.parts import ContactSensorPart
 from interferometry.deviations import resolution_um
 from thermography.large_arrays import in_pieces, piece_slices
 
@@ -414,29 +414,27 @@ def _first_since(temperature: xr.DataArray, dim: str, start: np.datetime64) -> x
     return xr.DataArray(first, dims="sensor")
 
 
-def describe_sensors(joined: xr.Dataset, *, file: str) -> list[dict[str, Any]]:
-    """Return the part ``sensors`` of results.json."""
-    parts = []
-    for name in joined["sensor"].values:
-        one = joined.sel(sensor=name)
-        faulty = bool(one["is_faulty"])
-        used = joined["time"].values < one["fault_time"].values if faulty else np.ones(joined.sizes["time"], bool)
-        last = np.flatnonzero(used & np.isfinite(one["rise"].values))
-        camera = one["camera_rise"].dropna("camera_time").values if "camera_rise" in one else np.empty(0)
-        parts.append(
-            {
-                "name": str(name),
-                "file": file,
-                "x_mm": float(one["x"]),
-                "y_mm": float(one["y"]),
-                "rise_K": float(one["rise"].values[last[-1]]) if last.size else None,
-                "camera_rise_K": float(camera[-1]) if camera.size else None,
-                "used": not faulty,
-                "fault": str(one["fault"].values),
-                "fault_time": f"{np.datetime_as_string(one['fault_time'].values, unit='s')}Z" if faulty else None,
-            }
-        )
-    return parts
+def describe_sensors(joined: xr.Dataset, *, file: str) -> tuple[ContactSensorPart, ...]:
+    """Return how far every contact sensor rose, and the camera at its place."""
+    return tuple(_describe_sensor(joined.sel(sensor=name), file) for name in joined["sensor"].values)
+
+
+def _describe_sensor(one: xr.Dataset, file: str) -> ContactSensorPart:
+    faulty = bool(one["is_faulty"])
+    used = one["time"].values < one["fault_time"].values if faulty else np.ones(one.sizes["time"], bool)
+    last = np.flatnonzero(used & np.isfinite(one["rise"].values))
+    camera = one["camera_rise"].dropna("camera_time").values if "camera_rise" in one else np.empty(0)
+    return ContactSensorPart(
+        name=one["sensor"].item(),
+        file=file,
+        x_mm=one["x"],
+        y_mm=one["y"],
+        rise_K=one["rise"][last[-1]] if last.size else None,
+        camera_rise_K=camera[-1] if camera.size else None,
+        used=not faulty,
+        fault=one["fault"].item(),
+        fault_time=f"{np.datetime_as_string(one['fault_time'].values, unit='s')}Z" if faulty else None,
+    )
 
 
 # The rise of the table along the measured line from contact sensors, where no camera saw it.

@@ -144,12 +144,12 @@ def test_a_campaign_with_the_camera_as_thermometer(copied: Path, results_folder:
     plain = evaluate_interferometry(recorded)
     # The camera's temperature enters E and A along the axis, but cancels where both directions meet at one place.
     seen, logged = (
-        {entry["contributor"]: entry for entry in outcome.parts["iso230"]["contributions"]}["material_temperature"]
+        {entry.contributor: entry for entry in outcome.parts.iso230.contributions}["material_temperature"]
         for outcome in (found, plain)
     )
-    assert seen["origin"] == "from the camera" and logged["origin"] == "assumed"
-    assert seen["E_um"] / logged["E_um"] == pytest.approx(seen["u"] / logged["u"], rel=0.05)
-    assert seen["B_um"] == logged["B_um"] == 0.0
+    assert seen.origin == "from the camera" and logged.origin == "assumed"
+    assert seen.E_um / logged.E_um == pytest.approx(seen.u / logged.u, rel=0.05)
+    assert seen.B_um == logged.B_um == 0.0
 
 
 # The budget of a campaign: stated, measured, assumed.

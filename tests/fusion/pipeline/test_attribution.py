@@ -44,7 +44,7 @@ def outcome(campaign, results_folder):
     fields = read_dataset(results_folder / "fields.nc")
     fused, _ = align_recordings(source, fields, read_dataset(results_folder / "deviations.nc"))
     found = correlate_field(source, fields, fused, report=silent)
-    return found.dataset, dict(found.parts), fused
+    return found.dataset, found.parts, fused
 
 
 def test_the_part_of_the_results_keeps_the_schema(outcome):
@@ -55,20 +55,20 @@ def test_the_part_of_the_results_keeps_the_schema(outcome):
 
 def test_regions_and_hotspots_are_tested_by_name(outcome):
     maps, parts, _ = outcome
-    names = [one["name"] for one in parts["correlation"]["regions"]]
+    names = [one.name for one in parts.correlation.regions]
     assert names[0] == "motor"
     assert names[1:] == [f"hotspot {k}" for k in range(1, len(names))]
-    assert set(parts["correlation"]["regions"][0]["parts"]) == {"common", "proportional", "reversal", "joint"}
+    assert set(parts.correlation.regions[0].parts) == {"common", "proportional", "reversal", "joint"}
     assert maps["target_regions/p_value"].sizes == {"series": 12, "region": len(names)}
-    assert len(parts["hotspots"]) >= len(names) - 1
+    assert len(parts.hotspots) >= len(names) - 1
 
 
 def test_the_switched_load_gets_its_own_verdict(outcome):
     _, parts, _ = outcome
-    (spindle,) = parts["correlation"]["randomised_duty"]
-    assert spindle["name"] == "spindle"
+    (spindle,) = parts.correlation.randomised_duty
+    assert spindle.name == "spindle"
     # The log was replaced by a schedule that has nothing to do with the drift.
-    assert spindle["p_value"] > 0.05 and spindle["cause"] is False
+    assert spindle.p_value > 0.05 and spindle.cause is False
 
 
 def test_the_report_says_it_in_words(outcome):
@@ -100,5 +100,5 @@ def test_a_very_long_test_is_correlated_by_means_of_its_cycles(campaign, results
     found = correlate_field(source, fields, outcome[2], report=silent)
     (notice,) = found.notices
     assert notice.code == "cycles_averaged" and "(12 of 24)" in notice.message
-    parts = [one["name"] for one in found.parts["correlation"]["regions"]]
-    assert parts == [one["name"] for one in outcome[1]["correlation"]["regions"]]
+    parts = [one.name for one in found.parts.correlation.regions]
+    assert parts == [one.name for one in outcome[1].correlation.regions]

@@ -31,9 +31,8 @@ ASSUMED = StatedBudget(
 
 def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
     deviations, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
-    drift = estimate_drift(deviations)["drift"]
-    windows, settled, found = evaluate_standard(deviations, ASSUMED, drift=drift, material_degC=None)
-    part = Iso230Part.model_validate(found)
+    drift = estimate_drift(deviations)
+    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=drift)
     assert part.first.window == "cycles 1 to 5" and part.first.cycles == (1, 2, 3, 4, 5)
     assert min(part.cycles) > 20 and len(part.cycles) == 5
     assert part.R_um.value < part.first.R_um.value
@@ -52,11 +51,10 @@ def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
 
 def test_without_times_no_environmental_variation_is_claimed():
     deviations, _ = simulate(np.random.default_rng(2), cycles=4)
-    _, _, found = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
-    part = Iso230Part.model_validate({**found, "first": None})
+    _, _, part = evaluate_standard(deviations, ASSUMED, drift=None)
     assert part.settled_rule == "the only window of the test"
-    entry = next(row for row in found["contributions"] if row["contributor"] == "environmental_variation")
-    assert np.isnan(entry["u"]) and entry["origin"] == "not known, not contained"
+    entry = next(row for row in part.contributions if row.contributor == "environmental_variation")
+    assert np.isnan(entry.u) and entry.origin == "not known, not contained"
 
 
 STATED = {
@@ -70,7 +68,7 @@ STATED = {
 def sheet(campaign: Campaign | None, environment: xr.Dataset | None = None, *, moved_mm: float = 0.0) -> Iso230Part:
     deviations, _ = simulate(np.random.default_rng(3), cycles=12)
     deviations = deviations.assign_coords(position=deviations["position"] + moved_mm)
-    _, settled, part = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
+    _, settled, part = evaluate_standard(deviations, ASSUMED, drift=None)
     dataset = joined(deviations, settled=settled)
     return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=campaign, environment=environment)))
 

@@ -15,19 +15,19 @@ from fusion.pipeline import positioning as module
 from fusion.pipeline.iso230 import read_test
 from fusion.pipeline.positioning import (
     MOST_TARGETS,
-    DiagnosedPosition,
     align_recordings,
     average_cycles,
     by_direction,
     choose_targets,
     diagnose_positions,
+    diagnosed,
     evaluate_interferometry,
     insufficient_for_correlation,
     insufficient_for_model,
     sites_of,
 )
 from fusion.report.wording import drift_extremes, drift_size
-from fusion.results.axis import DriftPart
+from fusion.results.axis import Evidence
 from fusion.results.results import Notice
 from fusion.results.store import read_dataset
 from fusion.twin import simulate
@@ -68,30 +68,30 @@ def test_digits_that_hide_the_scatter_leave_the_values_of_the_standard(copied):
     table["deviation_um"] = 10.0 * table["target"].round()
     table.to_csv(copied / "laser.csv", index=False)
     outcome = evaluate_interferometry(read_source(load_campaign(copied / "campaign.toml")))
-    assert "no_scatter" in {notice.code for notice in outcome.notices} and "drift" not in outcome.parts
-    assert outcome.parts["iso230"]["A_um"]["value"] == pytest.approx(50.0)
+    assert "no_scatter" in {notice.code for notice in outcome.notices} and outcome.parts.drift is None
+    assert outcome.parts.iso230.A_um.value == pytest.approx(50.0)
     test = read_test(copied / "laser.csv", None)
     assert test.part.R_um.value == 0.0 and any("repeat exactly" in remark for remark in test.remarks)
 
 
 def test_parts_agree_with_the_product(campaign_folder):
     outcome = evaluate_interferometry(read_source(load_campaign(campaign_folder / "campaign.toml")))
-    standard = outcome.parts["iso230"]
-    assert standard["first"]["cycles"] == [1, 2, 3, 4, 5] and standard["cycles"][0] > 12
-    for found, name in ((standard["first"], "iso_A"), (standard, "settled_A")):
-        assert found["A_um"]["value"] == pytest.approx(float(np.atleast_1d(outcome.dataset[name])[0]))
+    standard = outcome.parts.iso230
+    assert standard.first.cycles == (1, 2, 3, 4, 5) and standard.cycles[0] > 12
+    for found, name in ((standard.first, "iso_A"), (standard, "settled_A")):
+        assert found.A_um.value == pytest.approx(float(np.atleast_1d(outcome.dataset[name])[0]))
     profile = outcome.dataset["drift_profile"]
-    assert by_direction(profile)["negative"] == profile.sel(direction="negative").values.tolist()
+    assert by_direction(profile).negative == tuple(profile.sel(direction="negative").values)
     time = outcome.dataset["time"].values
-    told = outcome.parts["time"]
-    for name, one in (("first", time.min()), ("last", time.max())):
-        assert np.datetime64(told[name][:-1]) == one.astype("datetime64[s]")
-    assert told["zone"] is None
+    told = outcome.parts.time
+    for text, one in ((told.first, time.min()), (told.last, time.max())):
+        assert np.datetime64(text[:-1]) == one.astype("datetime64[s]")
+    assert told.zone is None
     course = outcome.dataset["drift_drift"].mean("direction")
-    drift = outcome.parts["drift"]
-    np.testing.assert_allclose(drift["range_um"], course.max("cycle") - course.min("cycle"))
-    assert all(0.0 < u < one for u, one in zip(drift["range_u_um"], drift["range_um"], strict=True))
-    assert drift["position_mm"] == outcome.dataset["position"].values.tolist()
+    drift = outcome.parts.drift
+    np.testing.assert_allclose(drift.range_um, course.max("cycle") - course.min("cycle"))
+    assert all(0.0 < u < one for u, one in zip(drift.range_u_um, drift.range_um, strict=True))
+    assert drift.position_mm == tuple(outcome.dataset["position"].values)
 
 
 def test_a_drift_of_nothing_is_known_no_better_than_the_readings_are(tmp_path):
@@ -104,8 +104,8 @@ def test_a_drift_of_nothing_is_known_no_better_than_the_readings_are(tmp_path):
     scatter = float(outcome.dataset["drift_sigma"])
     # 120 readings less their means know a standard deviation to 7 %.
     assert scatter == pytest.approx(0.25, rel=0.2)
-    assert min(outcome.parts["drift"]["range_u_um"]) >= 2.0 * scatter / np.sqrt(24) * (1.0 - 1e-12)
-    largest, _ = drift_extremes(DriftPart.model_validate(outcome.parts["drift"]))
+    assert min(outcome.parts.drift.range_u_um) >= 2.0 * scatter / np.sqrt(24) * (1.0 - 1e-12)
+    largest, _ = drift_extremes(outcome.parts.drift)
     assert largest.negligible and drift_size(largest).startswith("below 0.")
 
 
@@ -179,13 +179,16 @@ def anomaly(target: int = 3, direction: str = "positive", *, p_value: float = 0.
 
 
 def diagnosis(cause: str = "structural") -> Diagnosis:
-    evidence = {"probability_structural": 0.9, "gain_nats": 4.0}
+    shown = {name: 0.0 for name, field in Evidence.model_fields.items() if field.is_required()}
+    evidence = {**shown, "probability_structural": 0.9, "step_cycle": 4}
+    for stated in ("kind", "extra_um", "probability", "support", "against", "check"):
+        evidence.pop(stated, None)
     return Diagnosis(3, "positive", cause, 0.9, evidence, ("it scatters",), ("it is alone",), "Look at the guide.")
 
 
 def test_sites_are_set_aside_for_at_most_a_quarter_of_the_targets():
     def found(*places):
-        return [DiagnosedPosition(anomaly(*place), diagnosis()) for place in places]
+        return [diagnosed(anomaly(*place), diagnosis(), position_mm=0.0) for place in places]
 
     assert sites_of(found((2,), (5,)), 8) == [(2, "positive"), (5, "positive")]
     assert sites_of(found((2,), (5,)), 7) == sites_of([], 4) == []
@@ -195,24 +198,13 @@ def test_sites_are_set_aside_for_at_most_a_quarter_of_the_targets():
 
 
 def test_a_position_is_written_with_its_evidence():
-    assert DiagnosedPosition(anomaly(), diagnosis()).as_json() == {
-        "target": 3,
-        "direction": "positive",
-        "p_value": 0.01,
-        "p_resolution": 0.0,
-        "scatter_um": 0.8,
-        "cause": "structural",
-        "evidence": {
-            "kind": "scatter",
-            "extra_um": 0.6,
-            "probability": 0.9,
-            "for": ["it scatters"],
-            "against": ["it is alone"],
-            "check": "Look at the guide.",
-            "probability_structural": 0.9,
-            "gain_nats": 4.0,
-        },
-    }
+    one = diagnosed(anomaly(), diagnosis(), position_mm=50.0)
+    assert (one.target, one.position_mm, one.direction, one.cause) == (3, 50.0, "positive", "structural")
+    assert (one.p_value, one.p_resolution, one.scatter_um) == (0.01, 0.0, 0.8)
+    evidence = one.evidence
+    assert (evidence.kind, evidence.extra_um, evidence.probability, evidence.step_cycle) == ("scatter", 0.6, 0.9, 4)
+    assert (evidence.support, evidence.against) == (("it scatters",), ("it is alone",))
+    assert evidence.check == "Look at the guide." and evidence.probability_structural == 0.9
 
 
 def test_what_the_model_explains_is_taken_out_before_positions_are_judged(monkeypatch):
@@ -240,12 +232,16 @@ def test_what_the_model_explains_is_taken_out_before_positions_are_judged(monkey
     monkeypatch.setattr(module, "estimate_drift", lambda cleaned: "drift of what is left")
     monkeypatch.setattr(module, "detect_anomalies", detect)
     monkeypatch.setattr(module, "diagnose", diagnose)
-    told = diagnose_positions(fused, deviations, explained)
+    positions = deviations.assign_coords(target=[1, 3], position=("target", [0.0, 50.0]))
+    told = diagnose_positions(fused, positions, explained)
     for values in judged:
         np.testing.assert_array_equal(values, expected)
         assert values.attrs == {"units": "um"}
     # Scatter that is naturally unequal is no anomaly.
-    assert [(one.anomaly.target, one.diagnosis.cause) for one in told] == [(1, "structural"), (3, "structural")]
+    assert [(one.target, one.position_mm, one.cause) for one in told] == [
+        (1, 0.0, "structural"),
+        (3, 50.0, "structural"),
+    ]
     np.testing.assert_array_equal(fused["deviation"], np.arange(12.0).reshape(3, 2, 2))
 
 

@@ -30,11 +30,15 @@ from fusion.pipeline.stages import (
 )
 from fusion.pipeline.workers import Worker
 from fusion.report.charts.embedded import Drawn
+from fusion.results.axis import AlignmentPart
+from fusion.results.parts import Quantity
 from fusion.results.progress import Report, silent
-from fusion.results.results import Notice, Outcome, assemble
+from fusion.results.results import Notice, Outcome, Parts, assemble
 from fusion.results.store import OutputError, StageStamps, file_sha256, write_json
 from tests.fusion.campaign_parts import change as change_text
 from tests.fusion.campaign_parts import write_laser
+
+PARTS = Parts(alignment=AlignmentPart(clock_offset_s=Quantity(value=1.0, u=None)))
 
 
 class Counting:
@@ -46,9 +50,7 @@ class Counting:
     def __call__(self, *, report: Report) -> Outcome[xr.Dataset]:
         self.times += 1
         time.sleep(self.seconds)
-        return Outcome(
-            xr.Dataset({"drift": ("cycle", [0.5, 1.0])}), {"drift": 1.0}, (Notice("code", "said", "remedy"),)
-        )
+        return Outcome(xr.Dataset({"drift": ("cycle", [0.5, 1.0])}), PARTS, (Notice("code", "said", "remedy"),))
 
 
 class Elsewhere(Worker):
@@ -80,7 +82,7 @@ def test_a_stage_is_kept_until_its_table_or_a_file_of_it_or_the_one_before_chang
         assert run.stage("deviations", work)["drift"].values.tolist() == [0.5, 1.0]
         assert run.begin("model", later)()["drift"].values.tolist() == [0.5, 1.0]
         assert (work.times, later.times) == (times, times)
-        assert run.parts == {"drift": 1.0} and run.notices == [Notice("code", "said", "remedy")] * 2
+        assert run.parts == PARTS and run.notices == [Notice("code", "said", "remedy")] * 2
         assert [path.name for path in run.products] == ["deviations.nc", "model.nc"]
     text = (copied / "campaign.toml").read_text()
     for changed, times in (
@@ -107,7 +109,7 @@ def test_what_a_stage_found_is_drawn_where_it_was_computed_or_from_what_is_kept(
         assert drawn() == Drawn({})
         assert begun()["drift"].values.tolist() == [0.5, 1.0] and drawn() == Drawn({})
     assert work.times == 1, "computed once, then kept"
-    assert seen == [({"drift": 1.0}, [0.5, 1.0])] * 2, "drawn once by each run"
+    assert seen == [(PARTS, [0.5, 1.0])] * 2, "drawn once by each run"
 
 
 def test_a_chart_that_cannot_be_drawn_costs_no_result(new_run):

@@ -25,7 +25,7 @@ from fusion.pipeline.thermal import (
 )
 from fusion.results.progress import silent
 from fusion.results.results import Outcome, assemble
-from fusion.results.store import read_dataset
+from fusion.results.store import plain, read_dataset
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
 from fusion.twin.recipe import Recipe
@@ -86,7 +86,7 @@ def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path):
         "frame_interval_s = 13.0\nclock_offset_s = 37.0\nstate_clock_offset = false\n"
     )
     outcome = _reduce(simulated(tmp_path, recipe))
-    assert outcome.parts["alignment"]["clock_offset_s"]["value"] == pytest.approx(37.0, abs=0.2)
+    assert outcome.parts.alignment.clock_offset_s.value == pytest.approx(37.0, abs=0.2)
     place = outcome.dataset["table_position"]
     assert float(place.max() - place.min()) == pytest.approx(240.0, abs=0.5)
     assert {"time", "frame_time"} <= set(outcome.dataset.coords)
@@ -107,17 +107,17 @@ def test_points_picked_by_hand_and_a_calibrated_lens_serve_a_campaign(tmp_path):
 
     def registered(table):
         table.to_csv(campaign.parent / "fiducials.csv", index=False)
-        part = _reduce(campaign).parts["registration"]
+        part = _reduce(campaign).parts.registration
         source = read_source(load_campaign(campaign))
-        assert [check.code for check in check_plan(source, part) if not check.passed] == []
+        assert [check.code for check in check_plan(source, plain(part)) if not check.passed] == []
         return part
 
     by_discs = registered(fiducials)
-    assert by_discs["model"] == "calibrated lens + homography"
-    assert max(by_discs["rms_mm"], by_discs["position_u_mm"]) < 0.1
+    assert by_discs.model == "calibrated lens + homography"
+    assert max(by_discs.rms_mm, by_discs.position_u_mm) < 0.1
     # Places as read off a screen: whole pixels with the twin's error of a hint, 5 mm each.
     by_points = registered(fiducials.assign(diameter_mm=np.nan))
-    assert by_discs["position_u_mm"] < 0.1 * by_points["position_u_mm"]
+    assert by_discs.position_u_mm < 0.1 * by_points.position_u_mm
     with pytest.raises(RegistrationError, match=r"^fiducials\.csv: the table cannot be located: places and diameters"):
         registered(fiducials.assign(diameter_mm=2 * fiducials["diameter_mm"]).iloc[[0, 4, 5, 9, 10]])
 
@@ -168,9 +168,9 @@ def _damaged(campaign: Path, frames: Iterable[int], data: bytes, *, checksums: b
 def test_steps_and_drift_are_taken_out_before_the_fields_are_made(tmp_path):
     truth, campaign = _campaign(tmp_path / "campaign", ffc_step_K=0.3, drift_K_per_K=0.1)
     outcome = _reduce(campaign)
-    part, fields = outcome.parts["camera"], outcome.dataset
+    part, fields = outcome.parts.camera, outcome.dataset
     planted = truth.frames["camera_offset_K"].values
-    assert part["steps"] and part["drift_K"] > 0.3 and camera_corrected(part)
+    assert part.steps and part.drift_K > 0.3 and camera_corrected(part)
     codes = {notice.code for notice in outcome.notices}
     assert {"camera_steps_corrected", "camera_drift_corrected"} <= codes
     error = np.nanmean(_error_of_rise(truth, outcome), axis=(1, 2))
@@ -206,11 +206,11 @@ def sound_outcome(sound):
 
 
 def test_a_sound_camera_is_left_alone(sound_outcome):
-    part = sound_outcome.parts["camera"]
-    assert part["steps"] == [] and part["drift_K"] == 0.0 and part["frames_damaged"] == []
+    part = sound_outcome.parts.camera
+    assert part.steps == () and part.drift_K == 0.0 and part.frames_damaged == ()
     assert not camera_corrected(part)
     assert (sound_outcome.dataset["camera_correction"] == 0).all()
-    assert 0 < part["largest_u_K"] < 0.05
+    assert 0 < part.largest_u_K < 0.05
     assert not [notice for notice in sound_outcome.notices if notice.code.startswith(("camera", "frames"))]
 
 
@@ -222,9 +222,9 @@ def test_a_sound_camera_is_left_alone(sound_outcome):
 def test_a_damaged_frame_costs_only_itself(sound, sound_outcome, data, checksums):
     with _damaged(sound[1], [10], data, checksums=checksums):
         outcome = _reduce(sound[1])
-    (frame,) = outcome.parts["camera"]["frames_damaged"]
-    assert frame["file"] == "thermal/IR_0001.seq" and frame["index"] == 10 and "damaged" in frame["reason"]
-    assert frame in outcome.parts["registration"]["frames_rejected"]
+    (frame,) = outcome.parts.camera.frames_damaged
+    assert frame.file == "thermal/IR_0001.seq" and frame.index == 10 and "damaged" in frame.reason
+    assert frame in outcome.parts.registration.frames_rejected
     (notice,) = [notice for notice in outcome.notices if notice.code == "frames_damaged"]
     assert notice.message.startswith("1 frame left out: thermal/IR_0001.seq (")
     before, after = (one.dataset["temperature"].values for one in (sound_outcome, outcome))
@@ -298,8 +298,9 @@ def test_a_stated_emissivity_is_its_share_of_every_rise(campaign, results_folder
     camera = 'camera_offset_u = "0 K"\ncamera_scale_u = 0.0'
     stated = ("emissivity = 0.97", f'emissivity = "0.97 +- 0.0097"{exact}{camera}')
     outcome = completed(campaign, results_folder, stated)
-    assert outcome.parts["radiometry"]["rise_scale_u"] == pytest.approx(0.01, rel=0.05)
-    assert outcome.parts["radiometry"]["budget"][0].items() >= {"input": "emissivity", "source": "stated"}.items()
+    assert outcome.parts.radiometry.rise_scale_u == pytest.approx(0.01, rel=0.05)
+    first = outcome.parts.radiometry.budget[0]
+    assert (first.input, first.source) == ("emissivity", "stated")
     rise, u = (outcome.dataset[name].isel(cycle=-1) for name in ("temperature_rise", "temperature_rise_u"))
     common = np.sqrt(u**2 - outcome.dataset["temperature_rise_noise_u"].isel(cycle=-1) ** 2)
     zero = float(outcome.dataset["camera_correction_u"][-1])
@@ -311,9 +312,9 @@ def test_a_stated_emissivity_is_its_share_of_every_rise(campaign, results_folder
 def test_the_larger_of_stated_and_measured_drift_is_taken_and_said(campaign, results_folder, stated_K, taken):
     stated = ("emissivity = 0.97", f'emissivity = 0.97\ncamera_drift_u = "{stated_K} K"')
     outcome = completed(campaign, results_folder, stated)
-    entry = next(item for item in outcome.parts["radiometry"]["budget"] if item["input"] == "camera_drift_K")
+    entry = next(item for item in outcome.parts.radiometry.budget if item.input == "camera_drift_K")
     left_K = float(outcome.dataset["camera_correction_u"].max())
-    assert entry["source"] == taken and entry["u"] == pytest.approx(max(stated_K, left_K))
+    assert entry.source == taken and entry.u == pytest.approx(max(stated_K, left_K))
     u = float(outcome.dataset["temperature_rise_u"].isel(cycle=-1).mean())
     assert (u > stated_K) if taken == "stated" else (u < 1.0)
     notice = next(item for item in outcome.notices if item.code == "camera_drift_stated")
@@ -334,9 +335,9 @@ def test_a_region_is_calibrated_with_its_own_emissivity(campaign, results_folder
     assert steel > 1.5 * rest
     (notice,) = outcome.notices
     assert notice.message.endswith("cells at the edges of region steel see two surfaces and were left empty.")
-    part = outcome.parts["radiometry"]
-    assert [surface["name"] for surface in part["surfaces"]] == ["", "steel"]
-    assert part["edge_cells"] == int(notice.message.split()[0]) > 0
+    part = outcome.parts.radiometry
+    assert [surface.name for surface in part.surfaces] == ["", "steel"]
+    assert part.edge_cells == int(notice.message.split()[0]) > 0
     assert assemble("x", outcome.parts, outcome.notices).radiometry is not None
 
 
@@ -347,10 +348,10 @@ def test_the_emissivity_of_a_region_comes_from_two_states(campaign, results_fold
     known = (f'{{cycle = {n}, temperature = "{celsius:.4f} +- 0.01 degC"}}' for n, celsius in ((1, first), (24, last)))
     states = f"states = [{', '.join(known)}]\n"
     outcome = completed(campaign, results_folder, region=REGION + states)
-    steel = outcome.parts["radiometry"]["surfaces"][1]
-    assert steel["source"] == "two states"
-    assert steel["emissivity"]["value"] == pytest.approx(0.97, abs=3 * steel["emissivity"]["u"])
-    assert steel["emissivity"]["u"] < 0.1
+    steel = outcome.parts.radiometry.surfaces[1]
+    assert steel.source == "two states"
+    assert steel.emissivity.value == pytest.approx(0.97, abs=3 * steel.emissivity.u)
+    assert steel.emissivity.u < 0.1
 
 
 def test_an_emissivity_that_may_be_nothing_is_refused(campaign, results_folder):

@@ -55,21 +55,21 @@ def evaluated(path: Path):
     found = evaluate_thermograms(read_source(load_campaign(path)), report=silent)
     return (
         found.dataset,
-        found.parts["thermograms"],
-        {one["name"]: one for one in found.parts["regions"]},
+        found.parts.thermograms,
+        {one.name: one for one in found.parts.regions},
         found.notices,
     )
 
 
 def test_two_pictures_give_their_difference(tmp_path, scene):
     dataset, part, regions, _ = evaluated(write(tmp_path, [scene, scene + 1.5]))
-    assert part["scene"] == "still" and part["difference"]["seconds"] == 18 * 60
-    assert part["difference"]["mean_K"]["value"] == pytest.approx(1.5, abs=0.01)
+    assert part.scene == "still" and part.difference.seconds == 18 * 60
+    assert part.difference.mean_K.value == pytest.approx(1.5, abs=0.01)
     assert dataset["difference"].values == pytest.approx(1.5, abs=0.05)
-    assert regions["whole picture"]["maximum_degC"]["value"] == pytest.approx(scene.max() + 1.5, abs=0.02)
+    assert regions["whole picture"].maximum_degC.value == pytest.approx(scene.max() + 1.5, abs=0.02)
     row, column = np.unravel_index(scene.argmax(), SHAPE)
-    place = regions["whole picture"]["maximum_at"]
-    assert (place["column_px"], place["row_px"], place["file"]) == (column, row, "A645sc_1.jpg")
+    place = regions["whole picture"].maximum_at
+    assert (place.column_px, place.row_px, place.file) == (column, row, "A645sc_1.jpg")
 
 
 def test_a_picture_that_was_changed_after_the_camera_wrote_it_is_named(tmp_path, scene):
@@ -96,9 +96,9 @@ def test_pictures_of_one_name_in_two_folders_are_told_apart(tmp_path, scene):
     assert list(load_campaign(path).input_files()) == ["campaign.toml", *names]
     dataset, part, regions, _ = evaluated(path)
     assert dataset["source"].values.tolist() == names
-    highest = regions["whole picture"]["maximum_degC"]["value"]
-    assert highest == pytest.approx(scene.max() + 3.0, abs=0.02) and part["indicated_degC"] == highest
-    assert dataset.attrs["hottest"] == regions["whole picture"]["maximum_at"]["file"] == "../d2/A645sc_0.jpg"
+    highest = regions["whole picture"].maximum_degC.value
+    assert highest == pytest.approx(scene.max() + 3.0, abs=0.02) and part.indicated_degC == highest
+    assert dataset.attrs["hottest"] == regions["whole picture"].maximum_at.file == "../d2/A645sc_0.jpg"
 
 
 REGIONS = """
@@ -121,7 +121,7 @@ def test_regions_of_the_campaign_are_evaluated_with_their_own_emissivity(tmp_pat
     counts = np.round(counts_from_temperature(scene[60, 100], SC660))
     read = float(temperature_from_counts(counts, replace(SC660, emissivity=0.5)))
     assert dataset["maximum"].sel(region="dull").values[0] == pytest.approx(read, abs=1e-3)
-    assert regions["dull"]["emissivity"] == 0.5
+    assert regions["dull"].emissivity == 0.5
 
 
 def test_a_moved_picture_is_brought_onto_the_first_and_names_no_hotspots(tmp_path, scene):
@@ -185,7 +185,7 @@ def test_a_damaged_picture_is_left_out_and_named(tmp_path, scene):
     content[middle : middle + 400] = b"\x55" * 400
     damaged.write_bytes(bytes(content))
     _, part, _, notices = evaluated(path)
-    assert part["pictures"] == 2 and part["difference"]["mean_K"]["value"] == pytest.approx(1.5, abs=0.01)
+    assert part.pictures == 2 and part.difference.mean_K.value == pytest.approx(1.5, abs=0.01)
     (left_out,) = [one for one in notices if one.code == "pictures_left_out"]
     assert "A645sc_1.jpg" in left_out.message
     # On a plan in mm the fields name what they leave out.
@@ -213,7 +213,7 @@ def test_a_picture_of_another_camera_is_no_part_of_the_series(tmp_path, scene):
     source = read_source(load_campaign(path))
     assert len(source.frames) == 4 and len(source.pictures) == 5
     _, part, _, notices = evaluated(path)
-    assert part["scene"] == "still" and [notice.code for notice in notices] == ["other_pictures"]
+    assert part.scene == "still" and [notice.code for notice in notices] == ["other_pictures"]
 
 
 @pytest.mark.real_data

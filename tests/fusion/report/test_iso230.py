@@ -61,7 +61,7 @@ def test_sheet():
 def evaluated(x: np.ndarray) -> tuple[Iso230Part, xr.Dataset]:
     """A sheet with its readings."""
     deviations = test_made(x)
-    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
+    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=None)
     dataset = joined(deviations, iso=windows, settled=settled)
     return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=None, environment=None))), dataset
 
@@ -167,7 +167,7 @@ def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_pa
 def test_a_rotary_axis_keeps_its_units_everywhere():
     deviations = test_made(X)
     deviations["deviation"].attrs["units"], deviations["position"].attrs["units"] = "arcsec", "deg"
-    windows, settled, part = evaluate_standard(deviations, ROTARY_BUDGET, drift=None, material_degC=None)
+    windows, settled, part = evaluate_standard(deviations, ROTARY_BUDGET, drift=None)
     dataset = joined(deviations, iso=windows, settled=settled)
     part = complete_sheet(part, dataset, campaign=None, environment=None)
     found = Iso230Part.model_validate(plain(part))
@@ -251,8 +251,8 @@ def test_a_coefficient_without_a_value_is_asked_for_in_words(part):
 @pytest.fixture(scope="module")
 def part():
     deviations, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
-    drift = estimate_drift(deviations)["drift"]
-    return Iso230Part.model_validate(plain(evaluate_standard(deviations, ASSUMED, drift=drift, material_degC=None)[2]))
+    drift = estimate_drift(deviations)
+    return Iso230Part.model_validate(plain(evaluate_standard(deviations, ASSUMED, drift=drift)[2]))
 
 
 def test_the_settled_window_stands_with_the_first_one(part):

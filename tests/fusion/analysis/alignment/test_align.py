@@ -223,14 +223,14 @@ def two_cells() -> xr.Dataset:
 
 def test_without_a_camera_a_rise_counts_from_the_first_reading() -> None:
     first, second = describe_sensors(join_sensors(logged(), X, Y, (), None), file="t.csv")
-    assert first["rise_K"] == pytest.approx(0.9) and second["rise_K"] == pytest.approx(1.6)
-    assert first["camera_rise_K"] is None and first["used"] and first["fault"] == "" and first["fault_time"] is None
+    assert first.rise_K == pytest.approx(0.9) and second.rise_K == pytest.approx(1.6)
+    assert first.camera_rise_K is None and first.used and first.fault == "" and first.fault_time is None
 
 
 def test_beside_a_camera_both_rises_count_from_the_first_common_sample() -> None:
     first, second = describe_sensors(join_sensors(logged(), X, Y, (), two_cells()), file="t.csv")
-    assert (first["rise_K"], first["camera_rise_K"]) == (pytest.approx(0.6), pytest.approx(0.6))
-    assert (second["rise_K"], second["camera_rise_K"]) == (pytest.approx(1.2), pytest.approx(0.6))
+    assert (first.rise_K, first.camera_rise_K) == (pytest.approx(0.6), pytest.approx(0.6))
+    assert (second.rise_K, second.camera_rise_K) == (pytest.approx(1.2), pytest.approx(0.6))
 
 
 def test_a_faulty_sensor_is_shown_up_to_its_fault() -> None:
@@ -238,8 +238,8 @@ def test_a_faulty_sensor_is_shown_up_to_its_fault() -> None:
     joined = join_sensors(logged(), X, Y, (fault,), None)
     _, second = describe_sensors(joined, file="t.csv")
     # The last sample before the fault is that of minute 4, three minutes after the sensor's first.
-    assert not second["used"] and second["rise_K"] == pytest.approx(0.6)
-    assert second["fault"].startswith("jumps by 5 K") and second["fault_time"] == "2026-03-09T06:35:00Z"
+    assert not second.used and second.rise_K == pytest.approx(0.6)
+    assert second.fault.startswith("jumps by 5 K") and second.fault_time == "2026-03-09T06:35:00Z"
     chart = plot_sensors(joined)
     assert "t2 0.60 K" in chart.seen and len(chart.columns["rise / K"]) == 20
 
