@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from enum import StrEnum
-from functools import reduce
+from functools import partial, reduce
 from importlib import import_module, metadata
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +34,6 @@ from fusion.messages import (
 from fusion.pipeline.workers import collect_garbage_less, second_process
 
 if TYPE_CHECKING:
-    from fusion.pipeline.workers import Worker
     from fusion.results.progress import Report
     from fusion.results.results import Results
 
@@ -184,6 +183,7 @@ def run(
     ] = "0.1 um",
     processes: Annotated[int, Option(min=1, max=2, help="2: a second process shares the work.")] = 2,
     quiet: Quiet = False,
+    json_progress: Annotated[bool, Option("--json-progress", hidden=True)] = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
 
@@ -200,13 +200,15 @@ def run(
         from fusion.analysis.effects.plugins import leave_plugins_out
 
         leave_plugins_out()
-    two = processes > 1 and not (resume or watch)
-    written = [folder for _, folder in folders]
+    written, progress = [folder for _, folder in folders], partial(_progress, quiet=quiet, json_progress=json_progress)
     # The libraries may take seconds to load: something is seen before that.
-    with _answering(written), _progress(quiet=quiet) as report:
+    with _answering(written), progress() as report:
         report("start", 0, 1)
         from fusion.report.findings import summary_table
 
+        # For a run that is whole the libraries of the analysis are not loaded.
+        kept = [_read_whole(*one) if resume and not watch else None for one in folders]
+        two = processes > 1 and not watch and None in kept
         if two:
             import_module("fusion.pipeline.run")
         report("start", 1, 1)
@@ -217,9 +219,16 @@ def run(
             from fusion.pipeline.compare import compare_runs, require_one_kind
 
             require_one_kind([_here(place, "two are joined from") for place in places])
-        for campaign, folder in folders:
-            with _progress(quiet=quiet) as report:
-                results = _run_or_keep(campaign, folder, worker, resume=resume, scheduler=scheduler, report=report)
+        for (campaign, folder), results in zip(folders, kept, strict=True):
+            with progress() as report:
+                if results is None:
+                    from fusion.pipeline.run import run_campaign
+
+                    results = run_campaign(
+                        campaign, folder, resume=resume, scheduler=scheduler, report=report, worker=worker
+                    )
+                else:
+                    report("run (kept)", 1, 1)
             if not quiet:
                 console.print(summary_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
@@ -247,30 +256,23 @@ def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bo
                 console.print(live_line(state), soft_wrap=True)
 
 
-def _run_or_keep(
-    campaign: Path | str, folder: Path, worker: Worker, *, resume: bool, scheduler: str | None, report: Report
-) -> Results:
-    """Run a campaign, or read the results of a run that is whole, for which the libraries of the analysis are not loaded."""
-    if resume and isinstance(campaign, Path):
-        from fusion.campaign.config import load_campaign
-        from fusion.pipeline.stages import kept_results
+def _read_whole(campaign: Path | str, folder: Path) -> Results | None:
+    """Read the results of a run that is whole; None where anything has to be done."""
+    if isinstance(campaign, str):
+        return None
+    from fusion.campaign.config import load_campaign
+    from fusion.pipeline.stages import kept_results
 
-        kept = kept_results(load_campaign(campaign), folder)
-        if kept is not None:
-            report("run (kept)", 1, 1)
-            return kept
-    from fusion.pipeline.run import run_campaign
-
-    return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report, worker=worker)
+    return kept_results(load_campaign(campaign), folder)
 
 
 @contextmanager
-def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of what is done within, or nothing."""
-    from fusion.results.progress import Reporter, silent
+def _progress(*, quiet: bool, json_progress: bool = False) -> Iterator[Report]:
+    """Show the progress of what is done within, or nothing; as JSON for a program that reads it."""
+    from fusion.results.progress import Reporter, silent, write_lines
 
-    if quiet:
-        yield silent
+    if quiet or json_progress:
+        yield write_lines if json_progress else silent
         return
     with Reporter(console) as report:
         yield report

@@ -18,7 +18,7 @@ from fusion.campaign.config import load_campaign
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.pipeline.stages import kept_results
-from fusion.pipeline.workers import start_module
+from fusion.pipeline.workers import start_command
 from fusion.report.fleet import SUMMARY, Row, as_csv, as_json, read_rows, render_fleet, with_findings, write_book
 from fusion.results.folder import MANIFEST, claim, open_folder
 from fusion.results.progress import Report, silent
@@ -200,8 +200,7 @@ def _start(member: Member, out: Path, log: str, *, jobs: int, resume: bool) -> _
     (out / log).parent.mkdir(parents=True, exist_ok=True)
     with (out / log).open("wb") as stream:
         # A session of its own: a Ctrl-C at the terminal is for the fleet, which tells its runs to stop.
-        process = start_module(
-            "fusion.cli",
+        process = start_command(
             *command,
             environment=dict.fromkeys(_THREAD_VARIABLES, threads) | {"PYTHONUNBUFFERED": "1"},
             stdout=stream,

@@ -189,12 +189,12 @@ def collect_garbage_less() -> None:
     gc.set_threshold(50_000)
 
 
-def start_module(
-    module: str, *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
+def start_command(
+    *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.Popen[Any]:
-    """Start a module as a program in a process of the same interpreter that finds the same modules as this one."""
+    """Start the command in a process of the same interpreter that finds the same modules as this one."""
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, *arguments],
+        [sys.executable, "-P", "-m", "fusion.cli", *arguments],
         stdin=subprocess.DEVNULL,
         env={**(environment or {}), **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         **options,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -101,6 +102,13 @@ _BY_PARTS, _BY_RUN = "{:.0f} s were expected from its first parts", "the whole r
 
 def silent(label: str, done: int, total: int) -> None:
     """Report nothing."""
+
+
+def write_lines(label: str, done: int, total: int) -> None:
+    """Report by one JSON object per line."""
+    # In one piece: two processes may tell their progress at a time.
+    sys.stdout.write(json.dumps({"label": label, "done": done, "total": total}) + "\n")
+    sys.stdout.flush()
 
 
 class Reporter(AbstractContextManager["Reporter"]):

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import pytest
 
 from fusion.app.parts import state_of
-from fusion.app.run_child import main, write_progress
 from fusion.app.runs import RUNS, Progress, RunError, Runs, is_begun
 from fusion.messages import ExitCode
 from fusion.pipeline.stages import noted_campaign
+from fusion.results.progress import write_lines
 
 pytestmark = pytest.mark.long
 
@@ -70,6 +70,7 @@ def test_bad_input_is_told_in_the_words_of_the_command(tmp_path, runs):
     run = runs.start(tmp_path / "campaign.toml", tmp_path / "results")
     assert run.wait(30) == ExitCode.BAD_INPUT
     assert "campaign.toml" in run.messages[0] and not run.messages[0].startswith("thermofuse")
+    assert not (tmp_path / "results").exists()
 
 
 def test_a_folder_with_anything_in_it_is_begun(tmp_path):
@@ -98,17 +99,10 @@ def test_a_step_tells_how_far_it_is_and_counts_anew_when_it_begins_again():
 
 
 def test_progress_is_one_object_per_line(capsys):
-    write_progress('a "step"', 1, 3)
+    write_lines('a "step"', 1, 3)
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [
         {"label": 'a "step"', "done": 1, "total": 3}
     ]
-
-
-def test_bad_input_ends_with_the_message_and_code_of_the_command(tmp_path, capsys):
-    (tmp_path / "campaign.toml").write_text("[campaign]\n")
-    assert main(str(tmp_path / "campaign.toml"), str(tmp_path / "results")) == 2
-    assert "thermofuse: " in capsys.readouterr().err
-    assert not (tmp_path / "results").exists()
 
 
 def opened(page):
