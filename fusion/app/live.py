@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import panel as pn
-import xarray as xr
 from bokeh.models import LinearColorMapper
 
 from fusion.app import parts as ui
@@ -17,7 +16,7 @@ from fusion.app.results.charts import draw_cells, shown_if
 from fusion.campaign.config import load_campaign
 from fusion.common import FusionError
 from fusion.messages import reported
-from fusion.pipeline.watch import Enough, LiveState, follow
+from fusion.pipeline.watch import Enough, FinishedCycle, LiveState, follow
 from fusion.report.charts.style import CATEGORIES, Chart, Courses, new_figure, palette, span_words
 from fusion.results.numbers import number
 from fusion.results.progress import counted
@@ -31,24 +30,16 @@ _MOST_WARNINGS = 30
 
 @dataclass
 class Course:
-    """What a test has shown so far; of the fields only the latest is kept.
+    """What a test has shown so far: every finished cycle, of the fields only the latest, and values by ISO 230-2 by cycle, um."""
 
-    Drifts in um, of the last target of the file in ``far_drift_um``; the rise in K; temperatures in degC; NaN where there is no value.
-    """
-
-    cycle: list[int] = field(default_factory=list)
-    mean_drift_um: list[float] = field(default_factory=list)
-    far_drift_um: list[float] = field(default_factory=list)
-    rise_K: list[float] = field(default_factory=list)
-    iso230_cycle: list[int] = field(default_factory=list)
-    iso230_um: list[dict[str, float]] = field(default_factory=list)
-    latest_field: xr.DataArray | None = None
-    field_cycle: int = 0
+    cycles: list[FinishedCycle] = field(default_factory=list)
+    iso230_um: dict[int, Mapping[str, float]] = field(default_factory=dict)
+    window: str = ""
+    with_field: FinishedCycle | None = None
     field_range_degC: tuple[float, float] = (np.inf, -np.inf)
     enough: Enough | None = None
     frames: int = 0
     readings: int = 0
-    window: str = ""
     warnings: list[str] = field(default_factory=list)
 
     def take(self, state: LiveState) -> None:
@@ -59,22 +50,13 @@ class Course:
         cycle = state.cycle
         if cycle is None:
             return
-        self.cycle.append(cycle.number)
-        self.mean_drift_um.append(cycle.mean_drift_um)
-        self.far_drift_um.append(float(cycle.drift_um[-1]) if cycle.drift_um.size else float("nan"))
-        self.rise_K.append(cycle.rise_K)
+        self.cycles.append(replace(cycle, field=None))
         if state.iso230_um:
-            self.iso230_cycle.append(cycle.number)
-            self.iso230_um.append(dict(state.iso230_um))
-            self.window = state.iso230_window
+            self.iso230_um[cycle.number], self.window = state.iso230_um, state.iso230_window
         if cycle.field is not None and cycle.field_range_degC is not None:
-            self.latest_field, self.field_cycle = cycle.field, cycle.number
+            self.with_field = cycle
             (low, high), (new_low, new_high) = self.field_range_degC, cycle.field_range_degC
             self.field_range_degC = (min(low, new_low), max(high, new_high))
-
-    def values(self, symbol: str) -> np.ndarray:
-        """Return one quantity of ISO 230-2 after every evaluation, um."""
-        return np.array([values.get(symbol, np.nan) for values in self.iso230_um])
 
 
 class LiveSession:
@@ -117,34 +99,37 @@ class LiveSession:
 
 def plot_field(course: Course) -> Chart | None:
     """Draw the latest field, on the scale of all fields so far."""
-    if course.latest_field is None:
+    if course.with_field is None or course.with_field.field is None:
         return None
+    number, shown = course.with_field.number, course.with_field.field
     low, high = course.field_range_degC
     mapper = LinearColorMapper(palette(), low=low, high=max(high, low + 0.1), nan_color="#e1e5e7")
-    drawn, _ = draw_cells(course.latest_field, mapper, "temperature", "°C", height=320)
-    seen = f"Temperature of the table in cycle {course.field_cycle}: {span_words(course.latest_field, '°C')}."
+    drawn, _ = draw_cells(shown, mapper, "temperature", "°C", height=320)
+    seen = f"Temperature of the table in cycle {number}: {span_words(shown, '°C')}."
     return Chart(drawn, seen, {})
 
 
 def plot_course(course: Course) -> Chart | None:
     """Draw the drift over the cycles."""
     series = {
-        "mean of the targets": (course.mean_drift_um, CATEGORIES[0], "circle"),
-        "at the last target": (course.far_drift_um, CATEGORIES[1], "square"),
+        "mean of the targets": ([one.mean_drift_um for one in course.cycles], CATEGORIES[0], "circle"),
+        "at the last target": ([one.last_drift_um for one in course.cycles], CATEGORIES[1], "square"),
     }
     return _since_first(course, "drift", "µm", series)
 
 
 def plot_rise(course: Course) -> Chart | None:
     """Draw the rise of the table over the cycles."""
-    return _since_first(course, "rise of the table", "K", {"mean": (course.rise_K, ACCENT, "triangle")})
+    return _since_first(
+        course, "rise of the table", "K", {"mean": ([one.rise_K for one in course.cycles], ACCENT, "triangle")}
+    )
 
 
 def _since_first(
     course: Course, quantity: str, unit: str, series: Mapping[str, tuple[Sequence[float], str, str]]
 ) -> Chart | None:
     """Draw lines of one quantity since the first cycle; None where no value is known."""
-    cycle = np.array(course.cycle, float)
+    cycle = np.array([one.number for one in course.cycles], float)
     drawn = new_figure(x="cycle", y=f"{quantity} / {unit}", legend_columns=1, zero=True)
     courses = Courses(drawn, {"cycle": cycle})
     for name, (values, colour, marker) in series.items():
@@ -158,13 +143,13 @@ def _since_first(
 
 def plot_standard(course: Course) -> Chart | None:
     """Draw accuracy A, repeatability R and reversal B of the last five cycles, after every cycle."""
-    if not course.iso230_cycle:
+    if not course.iso230_um:
         return None
-    cycle = np.array(course.iso230_cycle, float)
+    cycle = np.array([*course.iso230_um], float)
     courses = Courses(new_figure(x="cycle", y="A, R, B / µm"), {"cycle": cycle})
     marks = (("A", INK, "circle"), ("R", ACCENT, "square"), ("B", MUTED, "diamond"))
     for symbol, colour, marker in marks:
-        values = course.values(symbol)
+        values = np.array([found.get(symbol, np.nan) for found in course.iso230_um.values()])
         if np.isfinite(values).any():
             latest = f"{span_words(values[-1:], 'µm').partition(' to ')[0]} µm"
             courses.add(cycle, values, symbol, seen=latest, colour=colour, marker=marker)
@@ -173,16 +158,13 @@ def plot_standard(course: Course) -> Chart | None:
 
 def example_course() -> Course:
     """Return the course of a test that was never made, to show what the screen draws: a warm-up of exponential form."""
-    course = Course(window="cycles 26 to 30")
+    course, never = Course(window="cycles 26 to 30"), np.datetime64("NaT", "ns")
     for cycle in range(1, 31):
         warm = 1.0 - np.exp(-cycle / 12.0)
-        course.cycle.append(cycle)
-        course.rise_K.append(3.0 * warm)
-        course.mean_drift_um.append(4.0 * warm)
-        course.far_drift_um.append(9.0 * warm)
+        drift_um = np.array([-1.0, 9.0]) * warm
+        course.cycles.append(FinishedCycle(cycle, never, never, 0, None, None, 3.0 * warm, drift_um))
         if cycle >= 5:
-            course.iso230_cycle.append(cycle)
-            course.iso230_um.append({"A": 9.0 + 6.0 * warm, "R": 3.0, "B": 1.2})
+            course.iso230_um[cycle] = {"A": 9.0 + 6.0 * warm, "R": 3.0, "B": 1.2}
     return course
 
 
@@ -263,11 +245,11 @@ class LiveScreen:
 
 def standing(course: Course, wanted_u_um: float, *, runs: bool) -> str:
     """Return how the test stands, as markup that is read aloud when it changes."""
-    seen = ((len(course.cycle), "finished cycle"), (course.frames, "frame"), (course.readings, "reading"))
+    seen = ((len(course.cycles), "finished cycle"), (course.frames, "frame"), (course.readings, "reading"))
     verb = "Following" if runs else "No longer followed"
     head = f"{verb}: {', '.join(counted(count, noun) for count, noun in seen)}."
     if course.iso230_um:
-        latest = course.iso230_um[-1]
+        latest = [*course.iso230_um.values()][-1]
         values = ", ".join(f"{name} = {number(latest[name], 3)} µm" for name in sorted(latest, key="AREMB".find))
         head += f" By ISO 230-2, {course.window}: {values}."
     return f'<p role="status">{ui.as_markup(head)} {ui.as_markup(enough_words(course, wanted_u_um))}</p>'

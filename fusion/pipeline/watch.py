@@ -487,6 +487,11 @@ class FinishedCycle:
         known = self.drift_um[np.isfinite(self.drift_um)]
         return float(known.mean()) if known.size else float("nan")
 
+    @property
+    def last_drift_um(self) -> float:
+        """`drift_um` of the last target, um; NaN without a laser."""
+        return float(self.drift_um[-1]) if self.drift_um.size else float("nan")
+
 
 @dataclass(frozen=True)
 class Enough:
