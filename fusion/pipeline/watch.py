@@ -19,11 +19,12 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AlignmentError, cycle_bounds
 from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import counted, overridden_parameters, plan_grid, stack_options
+from fusion.campaign.inputs import overridden_parameters, plan_grid, stack_options
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.common import Array
 from fusion.pipeline.positioning import insufficient_for_model
 from fusion.results.numbers import number
+from fusion.results.progress import counted
 from interferometry.common import InterferometryError
 from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
@@ -42,9 +43,9 @@ from thermography.io.other_cameras import StackOptions, index_recordings
 from thermography.io.sequence import order_by_time
 from thermography.radiometry.planck import Overrides, calibrate
 from thermography.registration.displacement import RegistrationSpan
-from thermography.registration.plan import PlanGrid, read_fiducials
+from thermography.registration.plan import read_fiducials
 from thermography.registration.projection import read_lens
-from thermography.registration.register import Registration, register, register_picture
+from thermography.registration.register import register, register_picture
 
 # Mean field of every finished cycle on the plan, for a first look: what `thermofuse run` does to all frames comes
 # after the test.
@@ -63,40 +64,36 @@ class FieldsOfCycles:
         assert thermography is not None and plan is not None
         self._plan = plan
         self._moving = thermography.table == "moving"
-        self._direction = None if plan.axis is None else plan.axis.direction
+        self._direction = (1.0, 0.0) if plan.axis is None else plan.axis.direction
         self._override = Overrides(overridden_parameters(thermography))
         self._fiducials = [] if plan.fiducials is None else read_fiducials(campaign.resolve(plan.fiducials))
         self._lens = None if thermography.lens is None else read_lens(campaign.resolve(thermography.lens))
-        self._grid: PlanGrid | None = None
-        self._registration: Registration | None = None
-        self._registrations: Registrations | None = None
+        self._registered: Registrations | None = None
         self._tried, self._wait = 0, 1
-
-    @property
-    def grid(self) -> PlanGrid:
-        """Cells of the plan; of a plan that is the picture, once a frame was seen."""
-        assert self._grid is not None
-        return self._grid
 
     def reduce(self, frames: Sequence[FrameReference]) -> tuple[xr.DataArray | None, tuple[str, ...]]:
         """Return the mean temperature of a cycle's frames on the plan."""
         if not frames:
             return None, ("no frame in this cycle",)
         try:
-            registration = self._register(frames)
-            if registration is None:
+            registered = self._register(frames)
+            if registered is None:
                 return None, ()
-            usable = [frame for frame in frames if frame.shape == registration.shape]
+            usable = [frame for frame in frames if frame.shape == registered.spans[0].registration.shape]
             if not usable:
                 return None, ("the frames of this cycle have another size than the first ones",)
-            return self._moving_field(usable, registration) if self._moving else self._still_field(usable)
+            reduce = self._reduce_moving if self._moving else self._reduce_still
+            values, warnings = reduce(usable, registered)
         except (ThermographyError, OSError) as error:
             return None, (str(error),)
+        attributes = {"units": "degC", "units_metadata": "temperature: on_scale"}
+        places = {"y": registered.grid.y_mm, "x": registered.grid.x_mm}
+        return xr.DataArray(values, dims=("y", "x"), coords=places, attrs=attributes), warnings
 
-    def _register(self, frames: Sequence[FrameReference]) -> Registration | None:
+    def _register(self, frames: Sequence[FrameReference]) -> Registrations | None:
         """Register the plan on the first frames; where that fails it is tried again in ever fewer cycles, because it takes long."""
-        if self._registration is not None:
-            return self._registration
+        if self._registered is not None:
+            return self._registered
         self._tried += 1
         if self._tried < self._wait:
             return None
@@ -105,45 +102,36 @@ class FieldsOfCycles:
             : 1 if self._moving else _REGISTRATION_FRAMES
         ]
         reference = np.mean([calibrate(frame.read_counts(), self._override(frame)) for frame in first], axis=0)
-        self._grid = plan_grid(self._plan, reference.shape)
+        grid = plan_grid(self._plan, reference.shape)
         if self._plan.in_pixels:
             registration = register_picture(reference.shape)
         else:
-            registration = register(reference, self._fiducials, grid=self._grid, lens=self._lens)
-        self._registrations = Registrations([RegistrationSpan(0, registration)], self.grid)
-        self._registration = registration
-        return registration
+            registration = register(reference, self._fiducials, grid=grid, lens=self._lens)
+        self._registered = Registrations([RegistrationSpan(0, registration)], grid)
+        return self._registered
 
-    def _still_field(self, frames: Sequence[FrameReference]) -> tuple[xr.DataArray, tuple[str, ...]]:
-        assert self._registrations is not None
-        sensor = self._registrations.sensors[0]
-        total, count, moved = np.zeros((len(self.grid.y_mm), len(self.grid.x_mm))), 0, 0.0
+    def _reduce_still(
+        self, frames: Sequence[FrameReference], registered: Registrations
+    ) -> tuple[Array, tuple[str, ...]]:
+        total, moved = np.zeros(()), 0.0
         for parameters, group in groupby(frames, key=self._override):
             alike = list(group)
             for start in range(0, len(alike), BLOCK_FRAMES):
                 block = alike[start : start + BLOCK_FRAMES]
-                result = reduce_block(block, parameters, sensor)
-                total += len(block) * result.cells
-                count += len(block)
+                result = reduce_block(block, parameters, registered.sensors[0])
+                total = total + len(block) * result.cells
                 shifts = np.hypot(*result.displacement_px[:, :2].T)
                 moved = max(moved, float(np.nanmedian(shifts)) if np.isfinite(shifts).any() else 0.0)
         warnings = (f"table or camera has moved by {moved:.1f} px since the first frames",) if moved > _MOVED_PX else ()
-        return self._named(total / count), warnings
+        return total / len(frames), warnings
 
-    def _moving_field(
-        self, frames: Sequence[FrameReference], registration: Registration
-    ) -> tuple[xr.DataArray, tuple[str, ...]]:
+    def _reduce_moving(
+        self, frames: Sequence[FrameReference], registered: Registrations
+    ) -> tuple[Array, tuple[str, ...]]:
         bounds = np.array([[frames[0].time, frames[-1].time + np.timedelta64(1, "ms")]], "datetime64[ns]")
-        fields = reduce_moving_frames(
-            frames, registration, self.grid, bounds, direction=self._direction or (1.0, 0.0), override=self._override
-        )
-        return self._named(fields["temperature"].values[0]), ()
-
-    def _named(self, values: np.ndarray) -> xr.DataArray:
-        attributes = {"units": "degC", "units_metadata": "temperature: on_scale"}
-        return xr.DataArray(
-            values, dims=("y", "x"), coords={"y": self.grid.y_mm, "x": self.grid.x_mm}, attrs=attributes
-        )
+        where = (registered.spans[0].registration, registered.grid, bounds)
+        fields = reduce_moving_frames(frames, *where, direction=self._direction, override=self._override)
+        return fields["temperature"].values[0], ()
 
 
 # Frames that arrive while a test runs: files that appear, and sequences that grow; each frame is given once, when it
