@@ -29,11 +29,11 @@ def test_a_contradiction_is_refused_with_its_remedy_and_a_doubt_is_not() -> None
 
 def test_a_doubt_is_open_until_the_campaign_file_accepts_it() -> None:
     assert open_doubts([SOUND, DOUBT], ()) == [DOUBT]
-    assert inputs_part([SOUND, DOUBT], ())["state"] == "doubted"
-    assert inputs_part([SOUND], ())["state"] == "sound"
+    assert inputs_part([SOUND, DOUBT], ()).state == "doubted"
+    assert inputs_part([SOUND], ()).state == "sound"
     accepted = inputs_part([SOUND, DOUBT], ("copied_cycles",))
-    assert (accepted["state"], accepted["accepted"]) == ("sound", ["copied_cycles"])
-    assert len(accepted["checks"]) == 2
+    assert (accepted.state, accepted.accepted) == ("sound", ("copied_cycles",))
+    assert len(accepted.checks) == 2
 
 
 def test_a_doubt_is_a_warning_that_names_what_it_endangers() -> None:
