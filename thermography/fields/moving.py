@@ -16,7 +16,6 @@ from scipy import sparse
 from thermofuse.compiled import njit
 from thermography.common import VARIABLES, Array
 from thermography.fields.blocks import (
-    BLOCK_FRAMES,
     NO_CYCLE,
     Block,
     FrameSeries,
@@ -59,6 +58,7 @@ class Samples:
     valid: NDArray[np.bool_]
     coverage: Array
     centring: sparse.csr_array
+    grid: PlanGrid
 
 
 class CellSums(NamedTuple):
@@ -90,7 +90,7 @@ def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: floa
         offset = np.where(valid[..., None], points, 0.0).sum(axis=1) / valid.sum(axis=1)[:, None]
     offset -= centres
     coverage = valid.mean(axis=1).reshape(grid.shape)
-    return Samples(points, valid, coverage, centring_matrix(offset, coverage, grid))
+    return Samples(points, valid, coverage, centring_matrix(offset, coverage, grid), grid)
 
 
 class CellWeights(NamedTuple):
@@ -221,13 +221,14 @@ def _calibrate(calibration: Array, counts: float) -> float:
     return (1 - part) * calibration[low] + part * calibration[low + 1]
 
 
-def on_plan(count: Array, mean: Array, samples: Samples, grid: PlanGrid) -> Array:
+def on_plan(count: Array, mean: Array, samples: Samples) -> Array:
     """Arrange cells on the plan, those with masked points moved to their centre."""
-    seen = (count > 0).reshape(grid.shape) & (samples.coverage >= LEAST_COVERAGE)
+    shape = samples.grid.shape
+    seen = (count > 0).reshape(shape) & (samples.coverage >= LEAST_COVERAGE)
     centred = mean + samples.centring @ mean
     # Next to cells that were never in view the gradient is unknown.
     complete = np.asarray((abs(samples.centring) @ (count == 0).astype(float)) == 0)
-    return np.where(seen, np.where(complete, centred, mean).reshape(grid.shape), np.nan)
+    return np.where(seen, np.where(complete, centred, mean).reshape(shape), np.nan)
 
 
 #: Frames in which the position of the table is less certain than this are left out of the fields, mm.
@@ -280,7 +281,7 @@ def reduce_moving_frames(
     scheduler : str or None
         Address of a dask scheduler whose workers see the same files; None for threads on the cores of this machine.
     checkpoint : str, Path or None
-        Folder to which blocks are written as they are done; a run that finds it resumes at the first block that is missing.
+        Folder to which stretches of frames are written as they are done; a run that finds it resumes at the first that is missing.
     progress : callable or None
         Called with the number of frames done since the last call.
 
@@ -308,14 +309,14 @@ def reduce_moving_frames(
     )
     spans = [RegistrationSpan(0, registration)]
     blocks = cut_blocks(frames, spans, block_s=block_s)
-    store = None
+    kept = None
     if checkpoint is not None:
         description = describe_reduction(frames, grid, spans, block_s=block_s)
-        store = _BlockStore(Checkpoint(checkpoint, {**description, "axis": axis.tolist(), "reach_mm": reach_mm}))
+        kept = Checkpoint(checkpoint, {**description, "axis": axis.tolist(), "reach_mm": reach_mm})
     tracker = make_tracker(registration, grid, -axis, reach_mm=reach_mm)
     samples = sample_points(registration, grid)
-    results = _reduce_blocks(blocks, frames, (tracker, samples), store, scheduler=scheduler, progress=progress)
-    return _assemble(frames, blocks, results, samples, registration, grid, axis)
+    results = _reduce_blocks(blocks, frames, (tracker, samples), kept, scheduler=scheduler, progress=progress)
+    return _assemble(frames, results, samples, registration, axis)
 
 
 @dataclass(frozen=True)
@@ -324,6 +325,7 @@ class _BlockResult:
     mm, NaN where it is not located, and the discs used.
     """
 
+    block: Block
     count: Array
     mean: Array
     squares: Array
@@ -336,50 +338,31 @@ _PER_CELL = ("count", "mean", "squares")
 _PER_FRAME = ("shift_mm", "u_mm", "discs")
 
 
-class _BlockStore:
-    """Results of finished blocks on disk, some hundreds of frames per file."""
-
-    def __init__(self, checkpoint: Checkpoint) -> None:
-        self.checkpoint = checkpoint
-        self.saved = 0
-
-    def load(self, blocks: Sequence[Block]) -> list[_BlockResult]:
-        """Return the results of an earlier run, from the first block on."""
-        results: list[_BlockResult] = []
-        for arrays in self.checkpoint.load("blocks_*"):
-            stored = blocks[len(results) : len(results) + len(arrays["count"])]
-            ends = np.cumsum([block.stop - block.first for block in stored])
-            per_frame = [np.split(arrays[name], ends[:-1]) for name in _PER_FRAME]
-            per_cell = [arrays[name] for name in _PER_CELL]
-            results += [_BlockResult(*values) for values in zip(*per_cell, *per_frame, strict=True)]
-        self.saved = len(results)
-        return results
-
-    def save(self, blocks: Sequence[Block], results: Sequence[_BlockResult]) -> None:
-        """Write the results that are not stored yet, if they are enough for a file or the last ones."""
-        first, stop = blocks[self.saved].first, blocks[len(results) - 1].stop
-        if stop - first < BLOCK_FRAMES and len(results) < len(blocks):
-            return
-        new = results[self.saved :]
-        arrays = {name: np.stack([getattr(result, name) for result in new]) for name in _PER_CELL}
-        arrays |= {name: np.concatenate([getattr(result, name) for result in new]) for name in _PER_FRAME}
-        self.checkpoint.save(f"blocks_{self.saved:08d}", **arrays)
-        self.saved = len(results)
+def _load(checkpoint: Checkpoint, blocks: Sequence[Block]) -> list[_BlockResult]:
+    """Results of an earlier run, from the first block on."""
+    results: list[_BlockResult] = []
+    for arrays in checkpoint.load("blocks_*"):
+        stored = blocks[len(results) : len(results) + len(arrays["count"])]
+        ends = np.cumsum([block.stop - block.first for block in stored])
+        per_frame = [np.split(arrays[name], ends[:-1]) for name in _PER_FRAME]
+        per_cell = [arrays[name] for name in _PER_CELL]
+        results += [_BlockResult(*values) for values in zip(stored, *per_cell, *per_frame, strict=True)]
+    return results
 
 
 def _reduce_blocks(
     blocks: Sequence[Block],
     frames: FrameSeries,
     prepared: tuple[TableTracker, Samples],
-    store: _BlockStore | None,
+    checkpoint: Checkpoint | None,
     *,
     scheduler: str | None,
     progress: Callable[[int], None] | None,
 ) -> list[_BlockResult]:
     """Results of all blocks, those that are not stored computed by the pool."""
-    results = store.load(blocks) if store is not None else []
+    results = [] if checkpoint is None else _load(checkpoint, blocks)
     if progress is not None and results:
-        progress(blocks[len(results) - 1].stop)
+        progress(results[-1].block.stop)
     with open_pool(scheduler) as pool:
         shared = pool.share(prepared)
         stretches = (
@@ -388,12 +371,13 @@ def _reduce_blocks(
         )
         tasks = ((stretch, (_reduce_stretch, gather_frames(frames, stretch), shared)) for stretch in stretches)
         for stretch, reduced in in_order(pool, tasks):
-            for block, result in zip(stretch, reduced, strict=True):
-                results.append(result)
-                if store is not None:
-                    store.save(blocks, results)
-                if progress is not None:
-                    progress(block.stop - block.first)
+            if checkpoint is not None:
+                arrays = {name: np.stack([getattr(result, name) for result in reduced]) for name in _PER_CELL}
+                arrays |= {name: np.concatenate([getattr(result, name) for result in reduced]) for name in _PER_FRAME}
+                checkpoint.save(f"blocks_{len(results):08d}", **arrays)
+            results += reduced
+            if progress is not None:
+                progress(stretch[-1].stop - stretch[0].first)
     return results
 
 
@@ -422,34 +406,28 @@ def _reduce_stretch(blocks: Sequence[BlockFrames], prepared: tuple[TableTracker,
                     sampled_mm = position.shift_mm
                     weights = weigh_pixels(samples.points_mm, samples.valid, sampled_mm, tracker.lens, shape)
                 add_frame(counts, calibration, weights, float(correction_K[i]), sums)
-            results.append(_BlockResult(*sums, shift_mm, u_mm, discs))
+            results.append(_BlockResult(block, *sums, shift_mm, u_mm, discs))
     return results
 
 
 def _assemble(
-    frames: FrameSeries,
-    blocks: Sequence[Block],
-    results: Sequence[_BlockResult],
-    samples: Samples,
-    registration: Registration,
-    grid: PlanGrid,
-    axis: Array,
+    frames: FrameSeries, results: Sequence[_BlockResult], samples: Samples, registration: Registration, axis: Array
 ) -> xr.Dataset:
     """Fields per cycle, the frame stack, and the positions of the table, as one Dataset."""
     discs = np.concatenate([result.discs for result in results])
     if not discs.any():
         raise ReductionError("the table is found in no frame; check the fiducials and [plan.axis] direction")
-    parts = _cycle_parts(frames, blocks, results, samples, grid)
+    parts = _cycle_parts(frames, results, samples)
     if not parts:
         raise frames.outside_cycles("no frame in which the table is found")
-    block_times = np.array([frames.mean_time(slice(block.first, block.stop)) for block in blocks])
+    block_times = np.array([frames.mean_time(slice(one.block.first, one.block.stop)) for one in results])
     fields = assemble_fields(
         parts,
         len(frames.bounds),
-        grid,
-        [registration.position_covariance(grid.centres_mm)],
+        samples.grid,
+        [registration.position_covariance(samples.grid.centres_mm)],
         [samples.coverage],
-        frames=_frame_variables(blocks, results, axis, samples, grid),
+        frames=_frame_variables(results, axis, samples),
         frame_coordinates={"time": block_times, "frame_time": frames.times},
     )
     for name, attributes in VARIABLES["moving"].items():
@@ -460,19 +438,17 @@ def _assemble(
     )
 
 
-def _cycle_parts(
-    frames: FrameSeries, blocks: Sequence[Block], results: Sequence[_BlockResult], samples: Samples, grid: PlanGrid
-) -> list[CyclePart]:
+def _cycle_parts(frames: FrameSeries, results: Sequence[_BlockResult], samples: Samples) -> list[CyclePart]:
     """Every cycle in which the table is located, finished."""
-    parts = []
-    for cycle in sorted({block.cycle for block in blocks} - {NO_CYCLE}):
-        of_cycle = [(block, result) for block, result in zip(blocks, results, strict=True) if block.cycle == cycle]
-        located = np.concatenate([np.arange(b.first, b.stop)[result.discs > 0] for b, result in of_cycle])
+    parts, shape = [], samples.grid.shape
+    for cycle in sorted({result.block.cycle for result in results} - {NO_CYCLE}):
+        of_cycle = [result for result in results if result.block.cycle == cycle]
+        located = np.concatenate([np.arange(one.block.first, one.block.stop)[one.discs > 0] for one in of_cycle])
         if not located.size:
             continue
         times = frames.times[located]
-        count, mean, squares = _merge([result for _, result in of_cycle])
-        plan_mean = on_plan(count, mean, samples, grid)
+        count, mean, squares = _merge(of_cycle)
+        plan_mean = on_plan(count, mean, samples)
         seen = np.isfinite(plan_mean)
         with np.errstate(invalid="ignore", divide="ignore"):
             spread = np.sqrt(np.where(count > 1, squares / (count - 1), np.nan))
@@ -484,10 +460,10 @@ def _cycle_parts(
                 first_time=times[0],
                 seconds=float(((times - times[0]) / np.timedelta64(1, "ns")).sum()) / 1e9,
                 mean=plan_mean,
-                spread=np.where(seen, spread.reshape(grid.shape), np.nan),
+                spread=np.where(seen, spread.reshape(shape), np.nan),
                 noise_variance=np.where(seen, pixel_noise(plan_mean, seen) ** 2, np.nan),
-                fell_back=np.zeros(grid.shape, bool),
-                count=np.where(seen, count.reshape(grid.shape), 0).astype(np.int32),
+                fell_back=np.zeros(shape, bool),
+                count=np.where(seen, count.reshape(shape), 0).astype(np.int32),
             )
         )
     return parts
@@ -507,16 +483,14 @@ def _merge(results: Sequence[_BlockResult]) -> tuple[Array, Array, Array]:
     return count, mean, squares
 
 
-def _frame_variables(
-    blocks: Sequence[Block], results: Sequence[_BlockResult], axis: Array, samples: Samples, grid: PlanGrid
-) -> dict[str, Any]:
+def _frame_variables(results: Sequence[_BlockResult], axis: Array, samples: Samples) -> dict[str, Any]:
     """The frame stack and the positions of the table, as xarray takes them."""
     shift = np.concatenate([result.shift_mm for result in results])
-    stack = np.stack([on_plan(result.count, result.mean, samples, grid) for result in results]).astype(np.float32)
+    stack = np.stack([on_plan(result.count, result.mean, samples) for result in results]).astype(np.float32)
     return {
         "frame_temperature": (("time", "y", "x"), stack),
-        "frame_cycle": ("time", np.array([block.cycle + 1 for block in blocks], np.int32)),
-        "frame_count": ("time", np.array([block.stop - block.first for block in blocks], np.int32)),
+        "frame_cycle": ("time", np.array([result.block.cycle + 1 for result in results], np.int32)),
+        "frame_count": ("time", np.array([len(result.discs) for result in results], np.int32)),
         # The table moves opposite to the point under the spindle.
         "table_position": ("frame_time", -(shift @ axis)),
         "table_position_u": ("frame_time", np.concatenate([result.u_mm for result in results])),

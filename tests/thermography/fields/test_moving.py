@@ -114,7 +114,6 @@ from tests.thermography.fields.test_moving import DIRECTION, load
 from thermography.fields import moving
 from thermography.io.flir import index_frames
 
-moving.BLOCK_FRAMES = 2
 frames, _ = index_frames([sys.argv[1]])
 registration = load(Path(sys.argv[2]))
 
@@ -135,22 +134,18 @@ def load(path):
     return pickle.loads(path.read_bytes())
 
 
-def test_a_killed_run_goes_on_at_the_first_block_that_is_not_done(travel, tmp_path, monkeypatch):
+def test_a_killed_run_goes_on_at_the_first_stretch_that_is_not_done(travel, tmp_path):
     _, registration, frames, _ = travel
     (tmp_path / "registration").write_bytes(pickle.dumps(registration))
     command = [sys.executable, "-c", RUN, frames[0].path, tmp_path / "registration", tmp_path / "cp"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
-        for _ in range(5):
-            assert run.stdout.readline() == "1\n"
-            run.stdin.write("\n")
-            run.stdin.flush()
+        assert run.stdout.readline() == "3\n"
         run.kill()
     assert run.returncode != 0
-    monkeypatch.setattr(moving, "BLOCK_FRAMES", 2)
     seen, given, how = [], (frames, registration, GRID, edges(0, 3, 6)), {"direction": DIRECTION, "block_s": 1}
     again = reduce_moving_frames(*given, checkpoint=tmp_path / "cp", progress=seen.append, **how)
-    # Five frames were done, of which a file holds two.
-    assert seen == [4, 1, 1]
+    # The first of two cycles was done.
+    assert seen == [3, 3]
     assert_equal_bits(reduce_moving_frames(*given, **how), again)
     with pytest.raises(CheckpointError, match=r"holds cycles of another reduction \(other reach_mm\); remove the"):
         reduce_moving_frames(*given, checkpoint=tmp_path / "cp", reach_mm=400.0, **how)
@@ -202,7 +197,7 @@ def test_a_linear_field_is_exact_wherever_the_table_is(registration, samples, sh
     counts = (2000 + 4 * column + 6 * row).astype(np.uint16)
     sums = empty_sums(samples)
     add(counts, samples, registration, shift, sums, correction=0.5)
-    field = on_plan(sums.frames, sums.mean, samples, PLAN)
+    field = on_plan(sums.frames, sums.mean, samples)
     centres = PLAN.centres_mm + shift
     expected = 0.01 * (2000 + 4 * (10 + 2 * centres[..., 0]) + 6 * (10 + 2 * centres[..., 1])) + 0.5
     seen = np.isfinite(field)
@@ -217,7 +212,7 @@ def test_cells_partly_out_of_view_are_left_out(registration, samples):
     add(counts, samples, registration, (60.0, 0.0), sums)
     frames = sums.frames.reshape(PLAN.shape)
     assert frames[2].tolist() == [1] * 7 + [0] * 5
-    assert np.isnan(on_plan(sums.frames, sums.mean, samples, PLAN)[:, 7:]).all()
+    assert np.isnan(on_plan(sums.frames, sums.mean, samples)[:, 7:]).all()
 
 
 def test_mean_and_deviation_over_frames_and_calibration_point_by_point(registration, samples, rng):
