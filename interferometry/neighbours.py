@@ -20,7 +20,8 @@ from interferometry.common import InterferometryError, check_dataset
 TWO_SIGMA_PROBABILITY = 0.9545
 #: Number of repetitions from which the normal distribution may be taken.
 ENOUGH_REPETITIONS = 30
-DEFAULT_REFERENCE_S = 7200.0
+#: Time from the start after which a reading may be the reference of a chart, s.
+REFERENCE_S = 7200.0
 
 
 def coverage_factor(repetitions: np.ndarray) -> np.ndarray:
@@ -112,15 +113,13 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
     )
 
 
-def build_chart(
-    deviations: xr.Dataset, *, reference: str = "time", reference_s: float = DEFAULT_REFERENCE_S
-) -> xr.Dataset:
+def build_chart(deviations: xr.Dataset, *, reference: str = "time") -> xr.Dataset:
     """Build the deviation chart: a reference value at position 1, then the chain of mean differences."""
     if reference not in ("time", "first_cycle"):
         raise InterferometryError(f"reference={reference!r} is neither 'time' nor 'first_cycle'")
     x = _along_axis(deviations)
     links = evaluate_neighbours(deviations)
-    chosen = _reference_cycles(deviations, x, reference, reference_s)
+    chosen = _reference_cycles(deviations, x, reference)
     start = np.array([x.values[c, d, 0] if c >= 0 else np.nan for d, c in enumerate(chosen)])
     chain = np.cumsum(links["mean_difference"].values, axis=-1)
     chart = start[:, None] - np.concatenate([np.zeros((start.size, 1)), chain], axis=-1)
@@ -237,7 +236,7 @@ def _repeat_first(values: np.ndarray) -> np.ndarray:
     return np.concatenate([values[:, :1], values], axis=-1)
 
 
-def _reference_cycles(deviations: xr.Dataset, x: xr.DataArray, reference: str, reference_s: float) -> list[int]:
+def _reference_cycles(deviations: xr.Dataset, x: xr.DataArray, reference: str) -> list[int]:
     """Return, per direction, the index of the cycle that gives the value at position 1; -1 where none was measured."""
     first = int(np.argmin(deviations["position"].values))
     times = deviations["time"].values
@@ -249,7 +248,7 @@ def _reference_cycles(deviations: xr.Dataset, x: xr.DataArray, reference: str, r
         usable = np.flatnonzero(np.isfinite(x.values[:, direction, 0]))
         late = np.empty(0, dtype=int)
         if reference == "time":
-            late = usable[seconds[usable, direction, first] >= reference_s]
+            late = usable[seconds[usable, direction, first] >= REFERENCE_S]
             usable = usable[::-1]
         chosen.append(int(late[0]) if late.size else int(usable[0]) if usable.size else -1)
     return chosen

@@ -161,13 +161,12 @@ def _budget_of_window(
 def evaluate_windows(
     deviations: xr.Dataset,
     *,
-    length: int = STANDARD_CYCLES,
     budget: Iso230Budget | None = None,
     drift: xr.DataArray | None = None,
     material_degC: xr.DataArray | None = None,
 ) -> xr.Dataset:
     """Evaluate windows of a few cycles laid back from the last whole one, the first cycles, and the whole test as the last window."""
-    numbers = deviations["cycle"].values.tolist()
+    numbers, length = deviations["cycle"].values.tolist(), STANDARD_CYCLES
     read = deviations["deviation"].count(("direction", "target")).values
     # A test that was broken off ends with a part of a cycle.
     end = int(np.flatnonzero(read >= np.median(read))[-1]) + 1

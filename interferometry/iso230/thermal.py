@@ -48,11 +48,11 @@ class Distortion:
     settling_s: float
 
 
-def average(seconds: Array, values: Array, *, length_s: float = AVERAGED_S) -> tuple[Array, Array]:
+def average(seconds: Array, values: Array) -> tuple[Array, Array]:
     """Average values (samples, n) over pieces of time, s; NaN counts as missing. Return mean time and means of the pieces that hold
     samples.
     """
-    number = np.floor(seconds / length_s).astype(int)
+    number = np.floor(seconds / AVERAGED_S).astype(int)
     numbers, place = np.unique(number, return_inverse=True)
     known = np.isfinite(values)
     total, count = np.zeros((2, numbers.size, values.shape[1]))

@@ -15,7 +15,7 @@ from thermography.common import Array, ThermographyError
 from thermography.fields.cycle_fields import noise_of_differences
 from thermography.fields.resampling import PlanWeights
 from thermography.io.frame import CameraParameters, FrameReference, PlainFrame, PlainSamples, StoredPixels
-from thermography.io.sequence import WindowReader, frame_shapes, frame_times
+from thermography.io.sequence import FrameList, WindowReader
 from thermography.radiometry.averaging import (
     AVERAGING_LIMIT_K,
     CHUNK_FRAMES,
@@ -112,9 +112,9 @@ def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) 
     """Times of the frames, (frames,) datetime64[ns]."""
     if not references:
         raise ReductionError("there is no frame to reduce")
-    times = frame_times(references)
-    shapes = frame_shapes(references)
-    wrong = (shapes != shape).any(axis=1) | np.isnat(times)
+    listed = FrameList.of(references)
+    times = listed.times.astype("datetime64[ns]")
+    wrong = (listed.shapes() != shape).any(axis=1) | np.isnat(times)
     wrong[1:] |= times[1:] <= times[:-1]
     if not wrong.any():
         return times

@@ -149,10 +149,12 @@ class TemperatureReader(ABC):
     """Base of readers of files that hold temperatures: `contents` and `read_values` are left to each kind of file."""
 
     name: str
+    #: First bytes of a file of this kind.
+    starts: tuple[bytes, ...] = ()
 
-    @abstractmethod
     def recognises(self, path: Path, start: bytes) -> bool:
         """Return whether a file is of this kind, by its content."""
+        return start.startswith(self.starts)
 
     @abstractmethod
     def contents(self, path: Path, options: StackOptions) -> StackContents:
@@ -336,10 +338,8 @@ class TiffReader(TemperatureReader):
     """Reader of TIFF with one grey value per pixel and one page per frame: float temperatures, or 16 bits with a stated scale."""
 
     name = "TIFF of temperatures"
-
-    def recognises(self, path: Path, start: bytes) -> bool:
-        """Return whether a file is a TIFF, or a BigTIFF."""
-        return start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+    #: Of TIFF, and of BigTIFF.
+    starts = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds."""
@@ -373,10 +373,7 @@ class NumpyReader(TemperatureReader):
     """Reader of .npy: one frame (row, column), or frames (frame, row, column)."""
 
     name = "NumPy array"
-
-    def recognises(self, path: Path, start: bytes) -> bool:
-        """Return whether a file is a NumPy array."""
-        return start[:6] == b"\x93NUMPY"
+    starts = (b"\x93NUMPY",)
 
     def _open(self, path: Path) -> NDArray[np.floating]:
         # The header is text that NumPy parses as Python: a damaged one raises errors of many kinds.
@@ -403,11 +400,12 @@ class NetcdfReader(TemperatureReader):
     """Reader of a variable (time, row, column) of a NetCDF 4 or Zarr store; its units and times are those of the CF conventions."""
 
     name = "NetCDF or Zarr"
+    starts = (b"\x89HDF",)
 
     def recognises(self, path: Path, start: bytes) -> bool:
         """Return whether a file is HDF5, or a folder of Zarr or its metadata."""
         zarr = path.name in _ZARR_METADATA or (path.is_dir() and any((path / name).exists() for name in _ZARR_METADATA))
-        return zarr or start[:4] == b"\x89HDF"
+        return zarr or super().recognises(path, start)
 
     @contextmanager
     def _variable(self, path: Path, options: StackOptions) -> Iterator[xr.DataArray]:
@@ -463,10 +461,7 @@ class FpfReader(TemperatureReader):
     """Reader of the FLIR Public Format, the one frame per file that ThermaCAM Researcher exports (layout: FLIR's header fpfimg.h)."""
 
     name = "FLIR Public Format"
-
-    def recognises(self, path: Path, start: bytes) -> bool:
-        """Return whether a file begins as the format does."""
-        return start.startswith(b"FPF Public Image Format\0")
+    starts = (b"FPF Public Image Format\0",)
 
     def _header(self, path: Path) -> tuple[int, np.dtype[Any], tuple[int, int], Sequence[int]]:
         """Return first byte and type of the pixels, rows and columns, and the time as seven numbers."""

@@ -398,6 +398,11 @@ class FrameList(_Frames):
         self._starts = [0, *accumulate(len(part) for part in self._parts)]
         self._order = order
 
+    @classmethod
+    def of(cls, frames: Sequence[FrameReference]) -> FrameList:
+        """Return frames of any sequence in their order."""
+        return frames if isinstance(frames, cls) else cls([list(frames)])
+
     def __len__(self) -> int:
         """Return the number of frames."""
         return self._starts[-1] if self._order is None else len(self._order)
@@ -521,14 +526,7 @@ def _repeated(frame: FrameReference, kept: FrameReference) -> RejectedFrame:
 
 def frame_times(frames: Sequence[FrameReference]) -> Array:
     """Return the times (UTC) of frames, (n,) datetime64[ns]; NaT where a file stores none."""
-    if isinstance(frames, FrameList):
-        return frames.times.astype("datetime64[ns]")
-    return np.array([frame.time for frame in frames], "datetime64[ns]")
-
-
-def frame_shapes(frames: Sequence[FrameReference]) -> NDArray[np.int64]:
-    """Return rows and columns of frames, (n, 2)."""
-    return frames.shapes() if isinstance(frames, FrameList) else np.array([frame.shape for frame in frames], np.int64)
+    return FrameList.of(frames).times.astype("datetime64[ns]")
 
 
 def camera_names(frames: Sequence[FrameReference]) -> NDArray[np.object_]:
@@ -538,6 +536,6 @@ def camera_names(frames: Sequence[FrameReference]) -> NDArray[np.object_]:
         serial = f" {frame.camera.serial}" if frame.camera.serial else ""
         return f"{frame.camera.model or 'camera not stored'}{serial}, {frame.shape[1]} x {frame.shape[0]}"
 
-    if not isinstance(frames, FrameList):
-        return np.array([name(frame) for frame in frames], object)
-    return frames.column(lambda table: np.full(len(table), name(table.reference(0)), object), name, "object")
+    return FrameList.of(frames).column(
+        lambda table: np.full(len(table), name(table.reference(0)), object), name, "object"
+    )

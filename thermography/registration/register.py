@@ -23,6 +23,7 @@ from thermography.registration.projection import (
     DiscObservations,
     Lens,
     Projection,
+    RegistrationError,
     fit_homography,
     fit_projection,
     parameter_jacobian,
@@ -178,7 +179,7 @@ def _starts(observations: DiscObservations, ideal: Projection, wanted: int, *, c
             candidates.append((float(quantile[i]), replace(lens, plan_to_sensor=matrices[i])))
     candidates.sort(key=lambda item: item[0])
     if not candidates or not np.isfinite(candidates[0][0]):
-        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
+        raise RegistrationError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return [projection for _, projection in candidates[:_REFINED]]
 
 
@@ -202,10 +203,6 @@ _LARGEST_AREA_RATIO = 1.3
 _ALIKE = 0.75
 #: Distance within which a spot belongs to a hint in `size_contradiction`, px.
 _EVIDENCE_REACH_PX = 30.0
-
-
-class RegistrationError(ThermographyError):
-    """The table cannot be located in the frame; the message says which fiducials were located and what to do."""
 
 
 def chance_of_arrangement(
@@ -556,7 +553,7 @@ def _chance(
     observations = DiscObservations(image, plan, np.ones(len(plan)), np.full(len(plan), SPOT_U_PX))
     try:
         fit, agreeing = fit_agreeing(observations, Projection.ideal(shape), calibrated=False)
-    except ThermographyError:
+    except RegistrationError:
         return np.inf
     distance = np.linalg.norm(fit.projection.to_sensor(plan) - image, axis=1)[agreeing]
     misfit = max(float(np.sqrt(np.mean(distance**2))), _LEAST_MISFIT_PX)
@@ -968,10 +965,7 @@ def _fit(
         ideal = Projection(np.eye(3), np.array(lens.distortion), lens.focal_length_px, lens.principal_point_px)
     else:
         ideal = Projection.ideal(shape)
-    try:
-        return fit_agreeing(observations, ideal, calibrated=lens is not None)
-    except ValueError as error:
-        raise RegistrationError(str(error)) from error
+    return fit_agreeing(observations, ideal, calibrated=lens is not None)
 
 
 def _observations(located: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> DiscObservations:
