@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, ParamSpec, TypeAlias, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
+from thermofuse.resources import variables
+
 if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
@@ -36,32 +38,13 @@ DIRECTIONS = ("positive", "negative")
 #: Name of a variable -> (dims, units, kind), kind being a NumPy dtype kind.
 Contract = dict[str, tuple[tuple[str, ...], str, str]]
 
-#: Deviations per cycle, direction ("positive", "negative") and target; missing readings are NaN with time NaT.
-DEVIATIONS: Contract = {
-    "deviation": (("cycle", "direction", "target"), "um", "f"),
-    "time": (("cycle", "direction", "target"), "", "M"),
-    "position": (("target",), "mm", "f"),
-    "quality_flag": (("cycle", "direction", "target"), "1", "u"),
-}
-
-#: Logged conditions of air and material.
-ENVIRONMENT: Contract = {
-    "time": (("time",), "", "M"),
-    "air_temperature": (("time",), "degC", "f"),
-    "air_pressure": (("time",), "hPa", "f"),
-    "relative_humidity": (("time",), "percent", "f"),
-    "material_temperature": (("time",), "degC", "f"),
-}
-
-#: What the search for anomalous positions takes from the joint estimate of profile and drift.
-ESTIMATE: Contract = {
-    "standardised": (("cycle", "direction", "target"), "1", "f"),
-    "scatter": (("direction", "target"), "um", "f"),
-    "scatter_freedom": (("direction", "target"), "1", "f"),
-    "scatter_position": (("target",), "um", "f"),
-    "sigma": ((), "um", "f"),
-    "resolution": ((), "um", "f"),
-}
+DEVIATIONS: Contract
+ENVIRONMENT: Contract
+ESTIMATE: Contract
+#: Contract and attributes of deviations and of logged conditions, and what the search for anomalies takes from the joint estimate.
+DEVIATIONS, DEVIATION_ATTRIBUTES = variables("deviations")
+ENVIRONMENT, ENVIRONMENT_ATTRIBUTES = variables("environment")
+ESTIMATE, _ = variables("estimate")
 
 #: Name of a contracted argument -> its contract, and what returns such a Dataset.
 _ARGUMENTS = {

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from interferometry.common import DIRECTIONS, Array, InterferometryError
+from interferometry.common import DEVIATION_ATTRIBUTES, DIRECTIONS, Array, InterferometryError
 
 DIMS = ("cycle", "direction", "target")
 
@@ -93,35 +93,18 @@ def build_deviations(
                 f"{name} has shape {np.shape(values)}; {len(cycles)} cycles, 2 directions and {len(targets)} targets need {shape}"
             )
     missing = np.where(np.isnan(deviation_um), np.uint8(MISSING.mask), np.uint8(0))
+    flags = {
+        "flag_masks": np.array([flag.mask for flag in REGISTRY], dtype="u1"),
+        "flag_meanings": " ".join(flag.name for flag in REGISTRY),
+    }
+    described = DEVIATION_ATTRIBUTES
     return xr.Dataset(
         {
-            "deviation": (
-                DIMS,
-                deviation_um.astype("f8"),
-                {"units": "um", "long_name": "measured minus programmed position"},
-            ),
-            "time": (DIMS, time.astype("datetime64[ns]"), {"long_name": "time of the reading (UTC)"}),
-            "position": (
-                ("target",),
-                np.asarray(position_mm, dtype="f8"),
-                {"units": "mm", "long_name": "programmed position"},
-            ),
-            "quality_flag": (
-                DIMS,
-                missing,
-                {
-                    "units": "1",
-                    "standard_name": "quality_flag",
-                    "long_name": "why the reading is missing or doubtful",
-                    "flag_masks": np.array([flag.mask for flag in REGISTRY], dtype="u1"),
-                    "flag_meanings": " ".join(flag.name for flag in REGISTRY),
-                },
-            ),
-            "resolution": (
-                (),
-                resolution(deviation_um),
-                {"units": "um", "long_name": "step of the readings as recorded"},
-            ),
+            "deviation": (DIMS, deviation_um.astype("f8"), described["deviation"]),
+            "time": (DIMS, time.astype("datetime64[ns]"), described["time"]),
+            "position": (("target",), np.asarray(position_mm, dtype="f8"), described["position"]),
+            "quality_flag": (DIMS, missing, described["quality_flag"] | flags),
+            "resolution": ((), resolution(deviation_um), described["resolution"]),
         },
         coords={"cycle": list(cycles), "direction": list(DIRECTIONS), "target": list(targets)},
     )

@@ -20,6 +20,17 @@ def vocabulary(name: str) -> dict[str, Any]:
     return tomllib.loads(resource(f"vocabulary/{name}.toml").read_text(encoding="utf-8"))
 
 
+def variables(product: str) -> tuple[dict[str, tuple[tuple[str, ...], str, str]], dict[str, dict[str, str]]]:
+    """Return the contract of a product, (dims, units, kind) of the variables that others rely on, and the attributes of all of them."""
+    described = vocabulary("variables")[product]
+    contract = {
+        name: (tuple(one.pop("dims")), one.get("units", ""), one.pop("kind"))
+        for name, one in described.items()
+        if "kind" in one
+    }
+    return contract, described
+
+
 def by_word(meanings: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Return what each word stands for, of the words for each meaning."""
     return {word: meaning for meaning, words in meanings.items() for word in words}

@@ -6,7 +6,7 @@ import os
 import re
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from thermofuse.resources import vocabulary
+from thermofuse.resources import variables
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,14 +74,9 @@ def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> 
 #: Contract of the products, on which other packages rely: name of a variable -> (dims, units, kind), kind being a NumPy dtype kind
 #: (``f``, ``i``, ``u``, ``M``).
 Contract = dict[str, tuple[tuple[str, ...], str, str]]
-#: Variables of every product with their attributes, and with dims and kind those of its contract.
-VARIABLES = vocabulary("variables")
-#: Fields on the table plan; ``x`` and ``y`` are plan coordinates in mm, ``cycle`` counts from 1.
-FIELDS: Contract = {
-    name: (tuple(one["dims"]), one.get("units", ""), one["kind"])
-    for name, one in VARIABLES["fields"].items()
-    if "kind" in one
-}
+FIELDS: Contract
+#: Fields on the table plan, and the attributes of their variables; ``x`` and ``y`` are in mm, ``cycle`` counts from 1.
+FIELDS, FIELD_ATTRIBUTES = variables("fields")
 
 
 class ThermographyError(ValueError):

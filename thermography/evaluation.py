@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.common import VARIABLES, Array, ThermographyError
+from thermofuse.resources import variables
+from thermography.common import Array, ThermographyError
 from thermography.io.flir import FlirFrameReference, read_measurement_regions
 from thermography.io.frame import CameraIdentity, CameraParameters, Frame, FrameHeader, FrameReference, RejectedFrame
 from thermography.io.other_cameras import TemperatureFrame
@@ -335,8 +336,9 @@ class RegionTable:
 
         left_out = [{"path": str(one.path), "index": one.index, "reason": one.reason} for one in self.rejected]
         time = {"standard_name": "time", "units_metadata": "leap_seconds: utc"}
+        _, attributes = variables("regions")
         return xr.Dataset(
-            {name: (("time", "region"), values, VARIABLES["regions"][name]) for name, values in self.columns.items()},
+            {name: (("time", "region"), values, attributes[name]) for name, values in self.columns.items()},
             coords={
                 "time": ("time", frame_times(self.headers), time),
                 "region": ("region", np.array(list(self.kinds), object)),

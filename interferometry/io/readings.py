@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import xarray as xr
 
+from interferometry.common import ENVIRONMENT_ATTRIBUTES
 from interferometry.deviations import (
     DIRECTIONS,
     DUPLICATE,
@@ -973,10 +974,7 @@ def read_environment(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     table, time, columns = _environment_table(path)
-    on_scale = {"units_metadata": "temperature: on_scale"}
-    variables = {
-        name: {"units": unit, **(on_scale if unit == "degC" else {})} for _, name, unit, *_ in ENVIRONMENT_COLUMNS
-    }
+    variables = {name: ENVIRONMENT_ATTRIBUTES[name] for _, name, *_ in ENVIRONMENT_COLUMNS}
     beside = _further_columns(table, {time, *(text for text, _ in columns.values())} | variables.keys())
     variables |= {name: {"units": unit, "long_name": name} for name, unit in beside.values()}
 

@@ -13,7 +13,7 @@ import scipy
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography.common import MAD_TO_SIGMA, VARIABLES, Array
+from thermography.common import FIELD_ATTRIBUTES, MAD_TO_SIGMA, Array
 from thermography.fields.resampling import PlanWeights
 from thermography.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
@@ -217,8 +217,7 @@ def annotate(dataset: xr.Dataset) -> xr.Dataset:
     """Set the CF attributes of every listed variable, and no fill value for coordinates."""
     flags = {"flag_masks": np.array(list(_FLAGS.values()), np.uint8), "flag_meanings": " ".join(_FLAGS)}
     for name, variable in dataset.variables.items():
-        described = VARIABLES["fields"].get(name, {}) | (flags if name == "quality_flag" else {})
-        variable.attrs.update({key: text for key, text in described.items() if key not in ("dims", "kind")})
+        variable.attrs.update(FIELD_ATTRIBUTES.get(str(name), {}) | (flags if name == "quality_flag" else {}))
         if "ancillary_variables" in variable.attrs:
             listed = variable.attrs["ancillary_variables"].split()
             variable.attrs["ancillary_variables"] = " ".join(each for each in listed if each in dataset.variables)

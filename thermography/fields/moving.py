@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from thermofuse.compiled import njit
-from thermography.common import VARIABLES, Array
+from thermofuse.resources import variables
+from thermography.common import Array
 from thermography.fields.blocks import (
     NO_CYCLE,
     Block,
@@ -430,7 +431,7 @@ def _assemble(
         frames=_frame_variables(results, axis, samples),
         frame_coordinates={"time": block_times, "frame_time": frames.times},
     )
-    for name, attributes in VARIABLES["moving"].items():
+    for name, attributes in variables("moving")[1].items():
         fields[name].attrs.update(attributes)
     return fields.assign_attrs(
         frames_outside_cycles=json.dumps(frames.names(frames.cycles == NO_CYCLE)),
