@@ -418,6 +418,8 @@ def recognise(path: Path) -> Recognised:
         found.kind = _kind_of(found)
     except Exception as error:
         found.kind, found.reason = _why_not(path, error)
+    # Of ten thousand frames as text nobody needs the beginnings together.
+    vars(found).pop("text", None)
     return found
 
 
