@@ -9,8 +9,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from interferometry.common import InterferometryError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 class LaserFormatError(InterferometryError):
@@ -54,6 +58,11 @@ class LeftOut:
             yield
         except BadReading as fault:
             self.add(line, fault.value, fault.reason)
+
+    def note_in(self, deviations: xr.Dataset) -> None:
+        """Write into the attributes of deviations which file they are of, what was left out and how many readings are missing."""
+        missing = int(deviations["deviation"].isnull().sum())
+        deviations.attrs.update(source=self.path.name, left_out=self.as_json(), missing=missing)
 
     def as_json(self) -> str:
         """Return the lines for the attribute ``left_out`` of a Dataset."""

@@ -125,13 +125,8 @@ def check_and_assemble(given: Readings) -> xr.Dataset:
     if given.kind == "angle":
         deviations["deviation"].attrs["units"] = "arcsec"
         deviations["position"].attrs["units"] = "deg"
-    deviations.attrs.update(
-        source=path.name,
-        left_out=left_out.as_json(),
-        missing=int(np.isnan(deviations["deviation"].values).sum()),
-        columns_ignored=json.dumps(given.ignored),
-        notes=json.dumps(given.notes),
-    )
+    left_out.note_in(deviations)
+    deviations.attrs.update(columns_ignored=json.dumps(given.ignored), notes=json.dumps(given.notes))
     return deviations
 
 

@@ -70,8 +70,7 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
     time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
     dataset = build_deviations(range(1, cycles + 1), range(1, targets + 1), position * scale / 1e3, deviation, time)
     dataset["time"].attrs.update(origin="none", reference="the file holds no times")
-    missing = int(np.isnan(deviation).sum())
-    dataset.attrs.update(source=path.name, left_out=left_out.as_json(), missing=missing)
+    left_out.note_in(dataset)
     return dataset
 
 
@@ -162,10 +161,8 @@ def read_rtl(path: Path, feed_mm_per_min: float | None = None, dwell_s: float | 
     dataset = dataset.assign(_parse_environment(sections))
     # Keys of the user text are localised, their order is not.
     values = [content.split(":", 1)[1].strip() for _, content in sections.get("USER-TEXT", []) if ":" in content]
+    left_out.note_in(dataset)
     dataset.attrs.update(
-        source=path.name,
-        left_out=left_out.as_json(),
-        missing=int(np.isnan(deviation).sum()),
         runs_empty=json.dumps([run.number for run in runs if run.is_empty]),
         notes=json.dumps(notes),
         user_text=json.dumps(dict(zip(USER_TEXT, values, strict=False))),
