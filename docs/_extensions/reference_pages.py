@@ -109,6 +109,8 @@ def type_of(schema: Mapping[str, Any]) -> str:
     if "const" in schema:
         return f"`{schema['const']}`"
     kind = schema.get("type", "any value")
+    if schema.get("format") == "quantity":
+        return "number with unit"
     if kind == "array" and "prefixItems" in schema:
         return f"list of {len(schema['prefixItems'])}: {type_of(schema['prefixItems'][0])}"
     if kind == "array":
@@ -151,8 +153,8 @@ def left_out(key: str, schema: Mapping[str, Any]) -> str:
     """Say what holds where a key is left out."""
     if key in schema.get("required", []):
         return "must be given"
-    default = schema["properties"][key].get("default")
-    return "" if default in (None, "") else f"`{default}`"
+    value = schema["properties"][key]
+    return value.get("absent") or ("" if value.get("default") in (None, "") else f"`{value['default']}`")
 
 
 def kinds_table(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -170,29 +172,14 @@ def schema_page(schema: Mapping[str, Any]) -> str:
     return "".join(model_section(name, model) for name, model in models.items())
 
 
-def example_comments(text: str) -> dict[tuple[str, str], str]:
-    """Return what the commented example of a campaign file says of its keys, by table and key."""
-    comments, table = {}, ""
-    for line in "\n".join(re.findall(r"^```(?:toml|ini)\n(.*?)^```", text, re.M | re.S)).splitlines():
-        head = re.match(r"(?:# )?\[+([\w.]+)\]+", line)
-        pair = re.match(r"(?:# )?(\w+) = .*?\s# (.*)", line)
-        if head:
-            table = head[1]
-        elif pair:
-            comments.setdefault((table, pair[1]), pair[2].removeprefix("... "))
-    return comments
-
-
-def campaign_page(schema: Mapping[str, Any], example: str) -> str:
-    """Return the tables of the campaign file as a user writes them: their names in brackets, meanings from the commented example."""
-    comments = example_comments(example)
+def campaign_page(schema: Mapping[str, Any]) -> str:
+    """Return the tables of the campaign file as a user writes them: their names in brackets, meanings as the keys are declared."""
     models = {}
     for name, model in schema["$defs"].items():
         heading, _, about = first_sentence(model.get("description")).replace("`", "").partition(": ")
         table = re.fullmatch(r"\[+([\w.]+)\]+", heading)
         properties = {
-            key: written(value) | {"description": meaning(key, comments.get((table[1] if table else "", key), ""))}
-            for key, value in model.get("properties", {}).items()
+            key: written(value) | {"description": meaning(value)} for key, value in model.get("properties", {}).items()
         }
         described = {"heading": heading, "description": f"{about[:1].upper()}{about[1:]}"} if table else {}
         models[name] = model | {"properties": properties} | described
@@ -202,11 +189,10 @@ def campaign_page(schema: Mapping[str, Any], example: str) -> str:
     )
 
 
-def meaning(key: str, comment: str) -> str:
-    """Return the meaning of a key: what the example says, or of which key it is the standard uncertainty."""
-    if comment.startswith("or "):  # another way to write the value, not its meaning
-        comment = ""
-    return comment or (f"standard uncertainty of {key.removesuffix('_u')}" if key.endswith("_u") else "")
+def meaning(value: Mapping[str, Any]) -> str:
+    """Return what a key is called, what else is said of it, and what its values mean."""
+    told = [*value.get("labels", [value["title"]]), value.get("description", "")]
+    return "; ".join(filter(None, [*told, *(f"`{one}`: {text}" for one, text in (value.get("choices") or {}).items())]))
 
 
 def written(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -297,9 +283,7 @@ def write_pages(app: Sphinx) -> None:
     pages |= {
         generated / "checks.md": checks_table(),
         generated / "command.md": command_page(),
-        generated / "campaign.md": campaign_page(
-            campaign_schema(), (reference / "campaign-file.md").read_text(encoding="utf-8")
-        ),
+        generated / "campaign.md": campaign_page(campaign_schema()),
         generated / "recipe.md": schema_page(recipe_schema()),
         generated / "kinds.md": kinds_of_file(),
         generated / "results.md": schema_page(results_schema()),

@@ -626,17 +626,15 @@ def common_inputs(before: ComparedCampaign, after: ComparedCampaign, *, same_set
     The coefficient of one machine where both state the same; the laser where both name the same instruments; and what was not touched
     between the tests where the user says so.
     """
-    stated = [
-        {} if one.results.iso230 is None else {row.name: row.text for row in one.results.iso230.conditions}
-        for one in (before, after)
-    ]
+    parts = [one.results.iso230 for one in (before, after)]
+    stated = [() if part is None else part.conditions for part in parts]
 
-    def same(beginning: str) -> bool:
-        texts = [{text for name, text in rows.items() if name.startswith(beginning) and text} for rows in stated]
+    def same(key: str) -> bool:
+        texts = [{row.text for row in rows if row.key == key and row.text} for rows in stated]
         return bool(texts[0]) and texts[0] == texts[1]
 
-    common = ["expansion_coefficient"] if same("Expansion coefficient") else []
-    common += ["device"] if same_setup or same("Instrument") else []
+    common = ["expansion_coefficient"] if same("expansion_coefficient") else []
+    common += ["device"] if same_setup or same("instrument") else []
     return (*common, *(("alignment", "material_temperature") if same_setup else ()))
 
 

@@ -128,36 +128,63 @@ def _against_pixels(campaign: Campaign) -> Iterator[tuple[tuple[str, ...], str]]
 # conditions of the test.
 
 #: Unit at the end of an attribute, which the key in the file does not have.
-_UNIT = re.compile(r"_(mm|m|um|degC|K|s|ppm|ppm_per_K|mm_per_min)$")
+_UNIT = re.compile(r"_(mm|m|um|degC|K|s|ppm|ppm_per_K|mm_per_min|px)$")
+#: Tables with which a key says something.
+_AXIS, _RECORD, _TEST = ("interferometry",), ("record",), ("interferometry", "record")
+
+
+def key(default: Any, *labels: str, example: Any = "", about: str = "", rows: int | None = None, **parts: Any) -> Any:
+    """Declare a key for file, draft, form, sheet and reference; `fusion.campaign.keys.Key` describes its parts."""
+    limits = {name: parts.pop(name) for name in ("ge", "gt", "min_length", "max_length") if name in parts}
+    parts |= {"labels": labels} if len(labels) > 1 else {}
+    parts |= {} if rows is None else {"rows": rows}
+    title, examples = labels[0] if labels else None, [example] if example else None
+    return Field(default, title=title, description=about or None, examples=examples, json_schema_extra=parts, **limits)
+
+
+def _own_words(name: str, info: object) -> str:
+    """Return what a key without a label is called."""
+    words = _UNIT.sub("", name).replace("_", " ")
+    return f"Standard uncertainty of the {words[:-2]}" if words.endswith(" u") else f"{words[:1].upper()}{words[1:]}"
 
 
 class Table(BaseModel):
     """Base of all tables of a campaign file: an unknown key is a fault, and a key is the attribute without its unit."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", alias_generator=lambda name: _UNIT.sub("", name))
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        alias_generator=lambda name: _UNIT.sub("", name),
+        field_title_generator=_own_words,
+    )
 
 
-class UncertaintyTable(Table):
+class UncertaintyTable(Table, title="Standard uncertainties (k = 1)"):
     """``[interferometry.uncertainty]``: standard uncertainties (k = 1) of ISO 230-2:2014 Annex A; left out: assumed, and said so."""
 
-    device_ppm: ShareOfLengthU | None = None
-    alignment_ppm: ShareOfLengthU | None = None
-    material_temperature_K: KelvinU | None = None
-    expansion_coefficient_ppm_per_K: PartsPerMillionU | None = None
-    environmental_variation_um: MicrometresU | None = None
+    device_ppm: ShareOfLengthU | None = key(None, "Laser with its air compensation")
+    alignment_ppm: ShareOfLengthU | None = key(None, "Alignment of the beam (cosine error)")
+    material_temperature_K: KelvinU | None = key(None, "Material temperature of the compensation")
+    expansion_coefficient_ppm_per_K: PartsPerMillionU | None = key(None, about="stated here or with the coefficient")
+    environmental_variation_um: MicrometresU | None = key(
+        None, "Environmental variation, E / √12 of a drift test", absent="drift within the five cycles"
+    )
 
 
-class AcceptanceTable(Table):
+_Limit = PositiveMicrometres | None
+
+
+class AcceptanceTable(Table, title="Tolerances of the axis (ISO 230-2)"):
     """``[acceptance]``: tolerances of the axis; a quantity without one is not judged."""
 
-    A_um: PositiveMicrometres | None = None
-    R_um: PositiveMicrometres | None = None
-    E_um: PositiveMicrometres | None = None
-    M_um: PositiveMicrometres | None = None
-    B_um: PositiveMicrometres | None = None
-    A_unidirectional_um: PositiveMicrometres | None = None
-    R_unidirectional_um: PositiveMicrometres | None = None
-    E_unidirectional_um: PositiveMicrometres | None = None
+    A_um: _Limit = key(None, "A: bidirectional accuracy", example="20 um", ask=True)
+    R_um: _Limit = key(None, "R: bidirectional repeatability", example="10 um", ask=True)
+    E_um: _Limit = key(None, "E: bidirectional systematic deviation", example="15 um", ask=True)
+    M_um: _Limit = key(None, "M: range of the mean bidirectional deviation", example="10 um", ask=True)
+    B_um: _Limit = key(None, "B: reversal", example="5 um", ask=True)
+    A_unidirectional_um: _Limit = key(None, "A↑, A↓: unidirectional accuracy", example="15 um", ask=True)
+    R_unidirectional_um: _Limit = key(None, "R↑, R↓: unidirectional repeatability", example="8 um", ask=True)
+    E_unidirectional_um: _Limit = key(None, "E↑, E↓: unidirectional systematic deviation", example="12 um", ask=True)
 
     def limits(self) -> dict[str, float]:
         """Return the tolerances that are stated, um, by the symbol of their quantity."""
@@ -165,40 +192,42 @@ class AcceptanceTable(Table):
         return {symbol: float(value) for symbol, value in stated.items() if value is not None}
 
 
-class InstrumentTable(Table):
+class InstrumentTable(Table, title="Instruments"):
     """``[[report.instrument]]``: an instrument of the test."""
 
-    name: str = Field(min_length=1)
-    serial_number: str = ""
-    calibrated: date | None = None
-    certificate: str = ""
+    name: str = key(..., "Instrument", example="laser interferometer", ask=True, min_length=1)
+    serial_number: str = key("", "Its serial number", ask=True)
+    calibrated: date | None = key(None, "Day of its calibration", example="2026-01-15", ask=True)
+    certificate: str = key("", "Certificate of its calibration", ask=True)
 
 
-class ReportTable(Table):
-    """``[report]``: conditions of the test as ISO 230-2 asks for them; every key may be left out, the page then says "not stated"."""
+class ReportTable(Table, title="Machine, people and conditions, as the sheet to sign names them"):
+    """``[report]``: conditions of the test as ISO 230-2 asks for them, as the sheet names and orders them, "not stated" where left out."""
 
-    report_number: str = ""
-    machine: str = ""
-    machine_serial_number: str = ""
-    control: str = ""
-    location: str = ""
-    operator: str = ""
-    approved_by: str = ""
-    customer: str = ""
-    sign_convention: str = ""
-    axis_travel_mm: PositiveMillimetres | None = None
-    screw_lead_mm: PositiveMillimetres | None = None
-    feed_mm_per_min: Feed | None = None
-    dwell_s: PositiveSeconds | None = None
-    warm_up: str = ""
-    machine_compensation: str = ""
-    air_temperature_before_degC: Celsius | None = None
-    air_temperature_after_degC: Celsius | None = None
-    material_temperature_before_degC: Celsius | None = None
-    material_temperature_after_degC: Celsius | None = None
-    sensor_places: str = ""
-    remarks: str = ""
-    instrument: tuple[InstrumentTable, ...] = ()
+    report_number: str = key("", ask=True)
+    customer: str = key("", ask=True)
+    machine: str = key("", example="name of the machine", ask=True)
+    machine_serial_number: str = key("", "Serial number of the machine", ask=True)
+    control: str = key("", ask=True)
+    location: str = key("", ask=True)
+    operator: str = key("", ask=True)
+    approved_by: str = key("", ask=True)
+    sign_convention: str = key("", example="actual minus target position", ask=True, of=_TEST)
+    axis_travel_mm: PositiveMillimetres | None = key(None, "Travel of the axis", example="900 mm", ask=True, of=_AXIS)
+    screw_lead_mm: PositiveMillimetres | None = key(
+        None, "Lead of the screw", example="10 mm", about="targets at whole leads are named", ask=True, of=_AXIS
+    )
+    feed_mm_per_min: Feed | None = key(None, example="5000 mm/min", ask=True, of=_AXIS)
+    dwell_s: PositiveSeconds | None = key(None, "Dwell at a target", example="3 s", ask=True, of=_AXIS)
+    warm_up: str = key("", "Warm-up", ask=True, of=_TEST)
+    machine_compensation: str = key("", "Compensation of the machine", ask=True, of=_TEST)
+    air_temperature_before_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
+    air_temperature_after_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
+    material_temperature_before_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
+    material_temperature_after_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
+    sensor_places: str = key("", "Places of the sensors", ask=True, of=_TEST)
+    remarks: str = key("", show=True)
+    instrument: tuple[InstrumentTable, ...] = key((), "Instrument", rows=1)
 
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
@@ -309,23 +338,21 @@ def _key(table: Table, name: str) -> str:
     return type(table).model_fields[name].alias or name
 
 
-class CampaignTable(Table):
+_ZONE = "Time zone of times without one"
+
+
+class CampaignTable(Table, title="Test"):
     """``[campaign]``: what was measured."""
 
-    title: str = Field(min_length=1)
-    axis: str = Field(default="", max_length=20)
-    time_zone: TimeZone | None = None
-
-
-#: Keys that may be written with their standard uncertainty, ``"0.97 +- 0.01"``; it is kept under the name with ``_u``.
-_WITH_UNCERTAINTY = (
-    "emissivity", "reflected_temperature", "atmospheric_temperature", "relative_humidity", "object_distance", "window_transmission",
-    "window_temperature", "temperature", "expansion_coefficient",
-)  # fmt: skip
+    title: str = key(..., "Title of the report", needed=True, min_length=1)
+    axis: str = key("", "Axis that was measured", example="X", ask=True, of=_TEST, max_length=20)
+    time_zone: TimeZone | None = key(
+        None, _ZONE, example="Europe/Vienna", absent='shown as logged, "(no zone)", and taken as UTC', ask=True
+    )
 
 
 class _Measured(Table):
-    """A table in which a value may be written with its standard uncertainty."""
+    """A table in which a value may be written with its standard uncertainty, ``"0.97 +- 0.01"``: the key with ``_u`` takes it."""
 
     @model_validator(mode="before")
     @classmethod
@@ -333,9 +360,9 @@ class _Measured(Table):
         """Give the uncertainty of ``"value +- uncertainty"`` a key of its own."""
         if not isinstance(content, dict):
             return content
-        parted = dict(content)
-        for name in _WITH_UNCERTAINTY:
-            if isinstance(content.get(name), str):
+        parted, known = dict(content), {field.alias for field in cls.model_fields.values()}
+        for name in (str(field.alias).removesuffix("_u") for field in cls.model_fields.values()):
+            if f"{name}_u" in known and isinstance(content.get(name), str):
                 parted[name], u = split_uncertainty(content[name])
                 if u is not None:
                     parted.setdefault(f"{name}_u", u)
@@ -435,20 +462,22 @@ class RegionTable(_Measured):
         return stated and self.unit == "mm" and self.shape in ("rectangle", "polygon")
 
 
-class StackTable(Table):
+class StackTable(Table, title="Files of temperatures"):
     """``[thermography.stack]``: what files of temperatures of other cameras do not hold themselves."""
 
-    unit: Literal["degC", "K"] | None = None
-    scale: float = Field(default=1.0, gt=0.0)
-    offset: float = 0.0
-    variable: str | None = None
-    time_in_name: str | None = None
-    times: ExistingFile | None = None
-    start: str | None = None
-    interval_s: PositiveSeconds | None = None
-    time_zone: TimeZone = "UTC"
-    emissivity: Fraction | None = None
-    reflected_temperature_degC: Celsius | None = None
+    unit: Literal["degC", "K"] | None = key(None, "Unit of the temperatures")
+    scale: float = key(1.0, "Temperature of one count", example="0.04", gt=0.0)
+    offset: float = key(0.0, "Temperature of count 0")
+    variable: str | None = key(None, "Variable of the file")
+    time_in_name: str | None = key(None, "Pattern of the time in the name", example="%Y%m%d_%H%M%S")
+    times: ExistingFile | None = key(
+        None, "File of the times of the frames", example="times.csv", about="its columns are file, frame, time"
+    )
+    start: str | None = key(None, "Time of the first frame")
+    interval_s: PositiveSeconds | None = key(None, "Time from one frame to the next")
+    time_zone: TimeZone = key("UTC", _ZONE, example="Europe/Vienna")
+    emissivity: Fraction | None = key(None, "Emissivity set in the camera's program, 0 to 1", example="0.95")
+    reflected_temperature_degC: Celsius | None = key(None, "Reflected temperature set in the camera's program")
 
     @model_validator(mode="after")
     def _says_times_once(self) -> StackTable:
@@ -458,33 +487,65 @@ class StackTable(Table):
         return self
 
 
-class ThermographyTable(_Measured):
+_STORED = "as stored in the frames"
+_ESTIMATED = "estimated where the table moves in view, else 0 s"
+_TABLE = {"still": "at rest in every frame", "moving": "moves with the axis"}
+
+
+class ThermographyTable(_Measured, title="Camera"):
     """``[thermography]``: the frames, the camera parameters that override the stored ones, and standard uncertainties."""
 
-    frames: FramePatterns
-    emissivity: Fraction | None = None
-    emissivity_u: FractionU | None = None
-    reflected_temperature_degC: Celsius | None = None
+    frames: FramePatterns = key(
+        ..., "Files of frames", about="radiometric JPEG, .seq, .csq, .fff; other cameras: the page on file formats"
+    )
+    emissivity: Fraction | None = key(
+        None, "Emissivity of the surface, 0 to 1", example="0.95 +- 0.02", absent=_STORED, ask=True
+    )
+    emissivity_u: FractionU | None = key(None, absent="assumed, and named so")
+    reflected_temperature_degC: Celsius | None = key(None, absent=_STORED, show=True)
     reflected_temperature_u_K: KelvinU | None = None
-    atmospheric_temperature_degC: Celsius | None = None
+    atmospheric_temperature_degC: Celsius | None = key(None, absent=_STORED, show=True)
     atmospheric_temperature_u_K: KelvinU | None = None
-    relative_humidity: Fraction | None = None
+    relative_humidity: Fraction | None = key(
+        None, "Relative humidity, 0 to 1", example="0.45", absent=_STORED, show=True
+    )
     relative_humidity_u: FractionU | None = None
-    object_distance_m: Metres | None = None
+    object_distance_m: Metres | None = key(None, "Distance from camera to surface", absent=_STORED, show=True)
     object_distance_u_m: MetresU | None = None
-    window_transmission: Fraction | None = None
+    window_transmission: Fraction | None = key(
+        None, "Transmission of a window before the lens, 0 to 1", example="0.95 +- 0.01"
+    )
     window_transmission_u: FractionU | None = None
-    window_temperature_degC: Celsius | None = None
+    window_temperature_degC: Celsius | None = key(None, "Temperature of that window")
     window_temperature_u_K: KelvinU | None = None
-    camera_offset_u_K: KelvinU | None = None
-    camera_scale_u: FractionU | None = None
-    camera_drift_u_K: KelvinU | None = None
+    camera_offset_u_K: KelvinU | None = key(
+        None,
+        "Standard uncertainty of the camera at all temperatures",
+        about="cancels in a rise",
+        absent="uncooled camera",
+    )
+    camera_scale_u: FractionU | None = key(
+        None,
+        "Standard uncertainty of the camera as a share of the reading in °C",
+        example="1.2 %",
+        about="does not cancel",
+    )
+    camera_drift_u_K: KelvinU | None = key(
+        None, "Standard uncertainty of the change of its zero", about="between cycles; at least what the frames leave"
+    )
     region: tuple[RegionTable, ...] = ()
-    clock_offset_s: Seconds | None = None
-    window_s: PositiveSeconds | None = None
-    table: Literal["still", "moving"] = "still"
-    reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
-    lens: ExistingFile | None = None
+    clock_offset_s: Seconds | None = key(
+        None, "Camera clock minus laser clock", example="0 s", absent=_ESTIMATED, show=True, of=_AXIS
+    )
+    window_s: PositiveSeconds | None = key(None, "Time over which frames are averaged", about="of a camera alone")
+    table: Literal["still", "moving"] = key("still", "The table in the frames", show=True, of=_AXIS, choices=_TABLE)
+    reference_patch_px: PixelPatch | None = key(
+        None,
+        *(f"Patch of constant temperature, {one} (px)" for one in ("first column", "first row", "columns", "rows")),
+    )
+    lens: ExistingFile | None = key(
+        None, "Calibration of the lens (OpenCV)", example="lens.yaml", about="camera_matrix, distortion_coefficients"
+    )
     stack: StackTable | None = None
 
     @property
@@ -509,11 +570,15 @@ class ThermographyTable(_Measured):
         return self
 
 
-class AxisTable(Table):
+class AxisTable(Table, title="Axis on the plan"):
     """``[plan.axis]``: where the measured line lies on the plan."""
 
-    origin_mm: tuple[Millimetres, Millimetres]
-    direction: tuple[float, float]
+    origin_mm: tuple[Millimetres, Millimetres] = key(
+        ..., *(f"Spindle at axis position 0, {one}" for one in "xy"), example=("500 mm", "90 mm"), needed=True
+    )
+    direction: tuple[float, float] = key(
+        ..., "It moves, as the position grows", example="left", about="[-1, 0] left, [0, 1] down", needed=True
+    )
 
     @model_validator(mode="after")
     def _has_length(self) -> AxisTable:
@@ -522,14 +587,29 @@ class AxisTable(Table):
         return self
 
 
-class PlanTable(Table):
+_REGISTRATION = {"fiducials": "by fiducials, in mm", "pixels": "the picture is the plan, in px"}
+
+
+class PlanTable(Table, title="Plan of the table"):
     """``[plan]``: the table plan in millimetres and its fiducials; or, by ``registration = "pixels"``, the picture itself."""
 
-    registration: Literal["fiducials", "pixels"] = "fiducials"
-    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] | None = None
-    cell_size_mm: PositiveMillimetres | None = None
-    fiducials: ExistingFile | None = None
-    regions: ExistingFile | None = None
+    registration: Literal["fiducials", "pixels"] = key(
+        "fiducials", "How the frames are placed on the plan", choices=_REGISTRATION
+    )
+    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] | None = key(
+        None, "Width of the plan, x", "Height of the plan, y", example=("700 mm", "180 mm"), needed=True
+    )
+    cell_size_mm: PositiveMillimetres | None = key(
+        None, "Size of a cell of the field", about="it divides both sides", ask=True
+    )
+    fiducials: ExistingFile | None = key(
+        None,
+        "Table of the fiducials",
+        about="name,x_mm,y_mm,diameter_mm[,column_px,row_px,marker]; a point has no diameter",
+    )
+    regions: ExistingFile | None = key(
+        None, "Table of the parts that are tested as sources", about="name,x_mm,y_mm of their corners"
+    )
     axis: AxisTable | None = None
 
     @property
@@ -562,34 +642,64 @@ class PlanTable(Table):
         return self
 
 
-class SensorsTable(Table):
+_LATE = "by how much the clock is late"
+
+
+class SensorsTable(Table, title="Contact sensors"):
     """``[sensors]``: temperatures of contact sensors over time, and the places of the sensors on the plan."""
 
-    file: ExistingFile
-    places: ExistingFile
-    time_zone: TimeZone | None = None
-    clock_offset_s: Seconds = 0.0
-    temperature_u_K: KelvinU = 0.2
+    file: ExistingFile = key(
+        ..., "Log of the contact sensors", about='a time, then a column "name [degC]" for each sensor'
+    )
+    places: ExistingFile = key(
+        ..., "Table of their places on the plan", about="name,x_mm,y_mm; two over half of the travel replace the camera"
+    )
+    time_zone: TimeZone | None = key(None, _ZONE)
+    clock_offset_s: Seconds = key(0.0, f"Contact sensors: {_LATE}")
+    temperature_u_K: KelvinU = key(0.2, "Standard uncertainty of a contact sensor")
 
 
-class InterferometryTable(_Measured):
+class InterferometryTable(_Measured, title="Laser"):
     """``[interferometry]``: the readings, and the parameters of the laser's compensation."""
 
-    deviations: ExistingFile
-    sheet: str | None = None
-    environment: ExistingFile | None = None
-    time_zone: TimeZone | None = None
-    clock_offset_s: Seconds = 0.0
-    environment_clock_offset_s: Seconds = 0.0
-    dead_path_mm: Millimetres = 0.0
-    expansion_coefficient_ppm_per_K: PartsPerMillion = 11.7
+    deviations: ExistingFile = key(
+        ...,
+        "Table of the deviations",
+        about="cycle,direction,target,position_mm,time,deviation_um; others: file formats",
+    )
+    sheet: str | None = key(None, "Sheet of the workbook")
+    environment: ExistingFile | None = key(
+        None, "Log of air and material", example="environment.csv", about="and of what else the drift may follow"
+    )
+    time_zone: TimeZone | None = key(None, _ZONE)
+    clock_offset_s: Seconds = key(0.0, f"Readings: {_LATE}")
+    environment_clock_offset_s: Seconds = key(0.0, f"Log of air and material: {_LATE}")
+    dead_path_mm: Millimetres = key(0.0, "Dead path of the laser", example="0 mm", ask=True)
+    expansion_coefficient_ppm_per_K: PartsPerMillion = key(
+        11.7,
+        example="11.7 +- 0.3 ppm/K",
+        about="of the part with scale or workpiece",
+        absent="11.7 +- 2 ppm/K",
+        ask=True,
+    )
     expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = None
-    feed_mm_per_min: Feed | None = None
-    dwell_s: PositiveSeconds | None = None
-    compensation: Literal["as recorded", "redo"] = "as recorded"
-    material_temperature: Literal["logged", "camera"] = "logged"
-    material_sensor_mm: tuple[Millimetres, Millimetres] | None = None
-    environment_factor_mm: tuple[Millimetres, Millimetres] | None = None
+    feed_mm_per_min: Feed | None = key(None, "Feed between the targets", about="with dwell: times of a .rtl")
+    dwell_s: PositiveSeconds | None = key(None, "Dwell at a target")
+    compensation: Literal["as recorded", "redo"] = key(
+        "as recorded", "Compensation of the readings", choices={"redo": "again, with the logged conditions"}
+    )
+    material_temperature: Literal["logged", "camera"] = key(
+        "logged", "Material temperature of the compensation", choices={"camera": "as the camera sees it"}
+    )
+    material_sensor_mm: tuple[Millimetres, Millimetres] | None = key(
+        None,
+        *(f"Material sensor on the plan, {one}" for one in "xy"),
+        example=("350 mm", "90 mm"),
+        about="confirms the camera",
+    )
+    environment_factor_mm: tuple[Millimetres, Millimetres] | None = key(
+        None, *(f"Environment factor at the {one}" for one in ("start", "end")), example=("0.316382 um", "0.316385 um")
+    )
     uncertainty: UncertaintyTable = UncertaintyTable()
 
     @model_validator(mode="after")
@@ -630,12 +740,12 @@ StatedColumn = Annotated[
 ]
 
 
-class HeaderRows(Table):
+class HeaderRows(Table, title="Lines of the table"):
     """``header_rows`` of a record: lines of the file, from 1, that hold the names, the units and the first values."""
 
-    names: int | None = Field(default=None, ge=1)
-    units: int | None = Field(default=None, ge=1)
-    values: int = Field(ge=1)
+    names: int | None = key(None, "Line of the names", ge=1)
+    units: int | None = key(None, "Line of the units", ge=1)
+    values: int = key(..., "First line of values", ge=1)
 
     @model_validator(mode="after")
     def _values_come_last(self) -> HeaderRows:
@@ -654,37 +764,48 @@ Headings = Annotated[
 ]
 
 
-class LongTable(Table):
+_TIMES = "Column of the times"
+
+
+class LongTable(Table, title="Record with a line for every change"):
     """``long`` of a record: headings of a table with a line for every change, its time, its channel and its value."""
 
-    time: Headings
-    channel: str
-    value: str
+    time: Headings = key(..., _TIMES)
+    channel: str = key(..., "Column of the channels")
+    value: str = key(..., "Column of the values")
 
 
 class LoggedTable(Table):
     """How a logged table is laid out, and role and unit of its columns, where the table does not say it itself."""
 
-    sheet: str | None = None
-    time: Headings | None = None
-    every_s: PositiveSeconds | None = None
-    time_format: str | None = None
-    time_unit: Literal["ms", "s", "min", "h"] | None = None
-    start: str | None = None
-    time_zone: TimeZone | None = None
+    sheet: str | None = key(None, "Sheet of the workbook")
+    time: Headings | None = key(None, _TIMES, about='or two columns, ["Date", "Time"]')
+    every_s: PositiveSeconds | None = key(
+        None, "Time from one row to the next", example="60 s", about="where the table has no times"
+    )
+    time_format: str | None = key(
+        None, "How the times are written (strptime)", example="%Y/%m/%d-%H:%M:%S", about="where they are not ISO 8601"
+    )
+    time_unit: Literal["ms", "s", "min", "h"] | None = key(
+        None, "Unit of times that are numbers", absent="that in the heading"
+    )
+    start: str | None = key(None, "Time from which they count")
+    time_zone: TimeZone | None = key(None, _ZONE)
     header_rows: HeaderRows | None = None
-    missing: tuple[float | str, ...] = ()
+    missing: tuple[float | str, ...] = key((), "Marks for no reading")
     columns: dict[str, StatedColumn] = {}
 
 
-class DriversTable(LoggedTable):
+class DriversTable(LoggedTable, title="Logged quantities"):
     """``[drivers]``: other logged quantities, and the law by which some of them were switched at random."""
 
-    file: ExistingFile
-    clock_offset_s: Seconds = 0.0
-    randomised: tuple[str, ...] = ()
-    mean_dwell_s: PositiveSeconds | None = None
-    least_dwell_s: Seconds = 0.0
+    file: ExistingFile = key(
+        ..., "Table of the logged quantities", about='a time, then columns "name [unit]"; or laid out as in a record'
+    )
+    clock_offset_s: Seconds = key(0.0, f"Logged quantities: {_LATE}")
+    randomised: tuple[str, ...] = key((), "Loads that were switched at random", about="as thermofuse plan proposes")
+    mean_dwell_s: PositiveSeconds | None = key(None, "Mean time between their switchings")
+    least_dwell_s: Seconds = key(0.0, "Shortest time between their switchings")
 
     @property
     def layout(self) -> LoggedTable | None:
@@ -704,20 +825,20 @@ class DriversTable(LoggedTable):
         return self
 
 
-class RecordTable(LoggedTable):
+class RecordTable(LoggedTable, title="Record"):
     """``[record]``: temperature sensors and displacement channels over time, in one table per run (text or XLSX).
 
     Columns are named as in the file's heading; ``*`` matches any text. Roles are stated either by ``temperatures``, ``displacements`` and
     ``drivers`` or by ``columns``. ``test`` names the runs that are held out; left out: the last one.
     """
 
-    file: ExistingFile | None = None
-    files: RunPatterns = ()
-    test: RunPatterns = ()
+    file: ExistingFile | None = key(None, "Table of the record")
+    files: RunPatterns = key((), "Tables of the runs of one test", about="in place of file; each run has its own zero")
+    test: RunPatterns = key((), "Runs that are held out", absent="the last one, run_10 after run_9")
     long: LongTable | None = None
-    temperatures: tuple[str, ...] = ()
-    displacements: tuple[str, ...] = ()
-    drivers: tuple[str, ...] = ()
+    temperatures: tuple[str, ...] = key((), "Columns of temperatures", about="as in the heading; * matches any text")
+    displacements: tuple[str, ...] = key((), "Columns of displacements")
+    drivers: tuple[str, ...] = key((), "Columns of what makes heat")
 
     @model_validator(mode="after")
     def _times_are_stated_once(self) -> RecordTable:
@@ -764,34 +885,59 @@ class RecordTable(LoggedTable):
         return self
 
 
-class TiltTable(Table):
+class TiltTable(Table, title="Tilts from two displacements of one direction"):
     """Two displacements of one direction whose difference is a tilt, and the distance of their sensors along the tool or the axis."""
 
-    channels: tuple[str, str]
-    distance_mm: Annotated[PositiveMillimetres, Field(gt=0.0)]
+    channels: tuple[str, str] = key(..., "First displacement", "Second displacement")
+    distance_mm: Annotated[PositiveMillimetres, Field(gt=0.0)] = key(..., "Distance of their sensors", example="150 mm")
 
 
-class ThermalTestTable(Table):
+_TESTED = {
+    "environment": "environment (temperature variation)",
+    "spindle": "spindle running",
+    "linear axis": "linear axis moving",
+    "rotary axis": "rotary axis moving",
+}
+
+
+class ThermalTestTable(Table, title="Test of thermal effects (ISO 230-3)"):
     """``[thermal_test]``: what a test by ISO 230-3 needs to be told."""
 
-    kind: Literal["environment", "spindle", "linear axis", "rotary axis"] | None = None
-    tilts: dict[str, TiltTable] = {}
-    #: Standard uncertainty of the sensitivity of the displacement sensors, as a share.
-    sensor_calibration: FractionU | None = None
-    mounting_length_mm: PositiveMillimetres | None = None
-    mounting_expansion_ppm_per_K: PartsPerMillion = 11.7
+    kind: Literal["environment", "spindle", "linear axis", "rotary axis"] | None = key(
+        None, "What was tested", example="spindle", ask=True, of=_TEST, choices=_TESTED
+    )
+    tilts: dict[str, TiltTable] = key({}, "Tilt", rows=0, of=_RECORD)
+    sensor_calibration: FractionU | None = key(
+        None,
+        "Standard uncertainty of the sensitivity of displacement sensors",
+        example="0.5 %",
+        absent="1 %",
+        show=True,
+        of=_RECORD,
+    )
+    mounting_length_mm: PositiveMillimetres | None = key(
+        None,
+        "Length of what holds sensors and target",
+        example="100 mm",
+        absent="not in the budget",
+        show=True,
+        of=_RECORD,
+    )
+    mounting_expansion_ppm_per_K: PartsPerMillion = key(11.7, "Its expansion coefficient", show=True, of=_RECORD)
 
 
-class ModelTable(Table):
+class ModelTable(Table, title="Model of the drift"):
     """``[model]``: the effects that are known to act."""
 
-    declared: DeclaredEffects = ("axis_expansion", "table_offset")
+    declared: DeclaredEffects = key(("axis_expansion", "table_offset"), "Effects that are known to act", of=_AXIS)
 
 
-class AcceptTable(Table):
+class AcceptTable(Table, title="Doubts that are settled"):
     """``[accept]``: what the user knows of the inputs, so that it is no doubt any more."""
 
-    doubts: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ()
+    doubts: Annotated[tuple[str, ...], AfterValidator(_each_once)] = key(
+        (), "Codes of the doubts that you know of", about="every code is in results.json"
+    )
 
 
 class Campaign(Table):
@@ -807,7 +953,7 @@ class Campaign(Table):
     record: RecordTable | None = None
     model: ModelTable = ModelTable()
     accept: AcceptTable = AcceptTable()
-    acceptance: AcceptanceTable = AcceptanceTable()
+    acceptance: AcceptanceTable = key(AcceptanceTable(), of=_AXIS)
     report: ReportTable = ReportTable()
     thermal_test: ThermalTestTable = ThermalTestTable()
 

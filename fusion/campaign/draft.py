@@ -6,16 +6,18 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from fusion.campaign.columns import ROLES, ColumnsError, TableProposal, propose_runs
 from fusion.campaign.inspect import FolderContent, Kind, Recognised, scan_folder
-from fusion.campaign.values import QuantityError, column_conversion, read_quantity, role_of_unit
+from fusion.campaign.keys import Key, keys_of, known_keys
+from fusion.campaign.values import column_conversion, read_quantity, role_of_unit
 from fusion.common import FusionError
 from fusion.results.progress import counted
 from fusion.results.store import is_text, write_text
@@ -32,6 +34,9 @@ TO_FILL = "FILL IN"
 Ask = Callable[[str, str], str]
 
 
+T = TypeVar("T")
+
+
 @dataclass(frozen=True)
 class Asker:
     """Answers to questions from the terminal, or from defaults where ``ask`` is None; ``say`` shows what a question is about."""
@@ -43,39 +48,50 @@ class Asker:
         """Return an answer of any text."""
         return default if self.ask is None else self.ask(question, default)
 
-    def quantity(self, question: str, unit: str, default: str = "") -> str:
-        """Return a number with unit as the campaign file writes it, quoted; the mark of a line to fill in where there is no answer."""
+    def checked(self, question: str, default: str, check: Callable[[str], T]) -> T:
+        """Return what `check` makes of an answer; one that it refuses is asked for again, after the reason."""
         while True:
-            answer = self.text(question, default).strip()
-            if not answer:
-                return json.dumps(TO_FILL)
             try:
-                read_quantity(answer, unit)
-            except QuantityError as error:
+                return check(self.text(question, default).strip())
+            except ValueError as error:
                 if self.ask is None:
                     raise
                 self.say(str(error))
-                continue
-            return json.dumps(answer, ensure_ascii=False)
+
+    def value(self, key: Key, default: str = "") -> str:
+        """Return the answer to a key of the campaign file, empty where nothing is stated."""
+
+        def check(answer: str) -> str:
+            if answer and key.kind == "quantity":
+                read_quantity(answer, key.unit)
+            if answer and key.kind == "date":
+                date.fromisoformat(answer)
+            return answer
+
+        absent = "to be filled in" if key.needed else key.absent or "not stated"
+        example = f", such as {key.example}" if key.example else ""
+        return self.checked(
+            (key.told or key.label) + ("" if default else f"{example}; empty: {absent}"), default, check
+        )
 
     def unit(self, question: str, target: str, default: str) -> str:
         """Return the unit of a column that can be converted to `target`."""
-        while True:
-            answer = self.text(question, default).strip()
-            try:
-                column_conversion(answer, target)
-            except QuantityError as error:
-                self.say(str(error))
-                continue
+
+        def check(answer: str) -> str:
+            column_conversion(answer, target)
             return answer
+
+        return self.checked(question, default, check)
 
     def choice(self, question: str, names: tuple[str, ...]) -> str:
         """Return one of several names; the first where nothing is asked."""
-        while True:
-            answer = self.text(f"{question} ({', '.join(names)})", names[0]) if len(names) > 1 else names[0]
-            if answer in names:
-                return answer
-            self.say(f'"{answer}" is not one of the choices')
+
+        def check(answer: str) -> str:
+            if answer not in names:
+                raise DraftError(f'"{answer}" is not one of the choices')
+            return answer
+
+        return names[0] if len(names) == 1 else self.checked(f"{question} ({', '.join(names)})", names[0], check)
 
 
 _FILE = "campaign.toml"
@@ -97,42 +113,10 @@ _AXIS_LINE = re.compile(r"^\W*(?:axis|axe|achse|TGT_SET_PV)\b.*", re.IGNORECASE 
 _HEADER = 4096
 
 
-#: The line that says whether the table moves in the frames.
-_STILL = 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
-#: What a sheet to sign states beside the machine, by its key under [report], as it is asked for; the same of an instrument.
-_SHEET = {
-    "machine_serial_number": "Serial number of the machine",
-    "control": "Control",
-    "customer": "Customer",
-    "location": "Location of the machine",
-    "operator": "Operator",
-    "approved_by": "Who approves the report",
-    "report_number": "Number of the report",
-    "sign_convention": "Sign convention of the deviations",
-    "warm_up": "Warm-up before the test",
-    "machine_compensation": "Compensation that was active in the machine",
-    "sensor_places": "Places of the sensors",
-}
-_INSTRUMENT = {"serial_number": "Serial number of the instrument", "certificate": "Certificate of its calibration"}
-#: Tolerances of an axis with an example, and what each is of.
-_TOLERANCES = {
-    "A": ("20 um", "bidirectional accuracy"),
-    "R": ("10 um", "bidirectional repeatability"),
-    "E": ("15 um", "bidirectional systematic deviation"),
-    "M": ("10 um", "range of the mean bidirectional deviation"),
-    "B": ("5 um", "reversal"),
-    "A_unidirectional": ("15 um", "of either approach"),
-    "R_unidirectional": ("8 um", "of either approach"),
-    "E_unidirectional": ("12 um", "of either approach"),
-}
-#: Conditions of a positioning test that are asked for together: key under [report] and an example.
-_MOTION = {
-    "travel": ("axis_travel", "900 mm"),
-    "lead": ("screw_lead", "10 mm"),
-    "feed": ("feed", "5000 mm/min"),
-    "dwell": ("dwell", "3 s"),
-}
-_KINDS = ("not stated", "spindle", "environment", "linear axis", "rotary axis")
+#: Directions along the plan.
+DIRECTIONS = {"right": (1, 0), "left": (-1, 0), "down": (0, 1), "up": (0, -1)}
+#: Most quantities that a question shows as its example.
+_MOST = 4
 
 
 class DraftError(FusionError):
@@ -285,15 +269,15 @@ def _axis(readings: Recognised, asker: Asker) -> Iterator[str]:
         if len(found) == 1:
             yield f'axis = "{found.pop()}"   # as the file or its name says'
             return
-    answer = asker.text(f"Axis that {path.name} is of; empty: not stated", "")
-    yield f"axis = {_quoted(answer)}" if answer else '# axis = "X"'
+    axis = known_keys()["campaign.axis"]
+    yield _line(axis, asker.text(f"Axis that {path.name} is of; empty: not stated", ""))
 
 
 def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
     """Yield the zone of times that the readings give without one."""
     without = [one.path.name for one in readings if _attributes(one).get("reference") == NO_ZONE]
     if not without:
-        yield '# time_zone = "Europe/Vienna"            # only where files give times without their zone'
+        yield _line(known_keys()["campaign.time_zone"])
         return
     zone = asker.text("Time zone of the times of the deviations, an IANA name such as Europe/Vienna", "UTC")
     doubt = "   # taken, as the file gives none: check it" if asker.ask is None else ""
@@ -306,18 +290,8 @@ def _thermography(content: FolderContent, asker: Asker, *, along_axis: bool) -> 
     if content.of_temperatures:
         yield from _stack(content, asker, along_axis=along_axis)
         return
-    emissivity = asker.text(
-        "Emissivity of the surface, such as 0.95 or 0.95 +- 0.02; empty: as stored in the frames", ""
-    )
-    example = '# emissivity = "0.95 +- 0.02"            # left out: as stored in the frames'
-    yield f"emissivity = {_quoted(emissivity)}" if emissivity else example
-    yield '# reflected_temperature = "22 degC"        # this and the next three: left out = as stored in the frames'
-    yield '# atmospheric_temperature = "22 degC"'
-    yield "# relative_humidity = 0.45"
-    yield '# object_distance = "1.2 m"'
-    if along_axis:
-        yield '# clock_offset = "0 s"                     # camera clock minus laser clock; 0 s where both follow one time server'
-        yield _STILL
+    keys = [one for one in keys_of("thermography") if along_axis or not one.of]
+    yield from _lines(keys, {one.key: asker.value(one) for one in keys if one.ask})
     yield from _optional("lens", content, Kind.LENS)
 
 
@@ -325,12 +299,13 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
     """Yield what files of temperatures do not hold themselves."""
     first = content.frame_files[0]
     _, contents, values = read_stack(first)
-    yield '# camera_offset_u = "1 K"                  # accuracy in the camera\'s data sheet; left out = that of an uncooled camera'
-    yield from [_STILL] if along_axis else []
+    known = {one.key: one for one in keys_of("thermography", "stack")}
+    yield _line(known_keys()["thermography.camera_offset_u"])
+    yield from [_line(known_keys()["thermography.table"])] if along_axis else []
     yield from _optional("lens", content, Kind.LENS)
     yield from ("", "[thermography.stack]                     # temperatures of another camera: docs/formats.md")
     if values.dtype.kind in "iu":
-        yield f'scale = {_quoted(TO_FILL)}   # of one count, for example 0.04 with unit = "K"'
+        yield _line(known["scale"], TO_FILL)
     if not contents.unit:
         guess = "K" if np.nanmedian(values) > _WARMEST_DEGC else "degC"
         yield f"unit = {_quoted(asker.choice('Unit of the temperatures', tuple(sorted(('degC', 'K'), key=guess.__ne__))))}"
@@ -339,11 +314,11 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
         if pattern:
             yield f"time_in_name = {_quoted(pattern)}   # local time: write its time_zone below"
         else:
-            yield f'start = {_quoted(TO_FILL)}   # or times = "times.csv" (file,frame,time), or time_in_name = "%Y%m%d_%H%M%S"'
+            yield f"{_line(known['start'], TO_FILL)}; or times, or time_in_name"
+            yield from (_line(known[key]) for key in ("times", "time_in_name"))
     if contents.frames > 1 and contents.times is None:
-        yield f"interval = {asker.quantity('Time from one frame to the next', 's')}"
-    yield '# time_zone = "Europe/Vienna"              # of these times; left out = UTC'
-    yield "# emissivity = 0.95                        # as it was set in the camera's program, with reflected_temperature"
+        yield _line(known["interval"], asker.value(known["interval"]) or TO_FILL)
+    yield from (_line(known[key]) for key in ("time_zone", "emissivity", "reflected_temperature"))
 
 
 def _time_in_name(name: str) -> str:
@@ -370,26 +345,33 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
     yield "[plan]                                   # the table in mm: x to the right, y down, from one corner"
     fiducials: list[Fiducial] = listed[0].content if listed else []
     width, height = _extent(fiducials)
-    sides = {"Width (x)": width, "Height (y)": height}
-    size = [asker.quantity(f"{name} of the plan", "mm", default) for name, default in sides.items()]
+    known = known_keys()
     guess = "   # guessed from the fiducials, with the same margin on both sides: check it"
-    guessed = guess if asker.ask is None and width else ""
-    yield f"size = [{', '.join(size)}]{guessed}"
-    yield f"cell_size = {asker.quantity('Size of a cell of the field; it divides both sides', 'mm', '5 mm')}"
+    yield _pair("plan.size", asker, width, height) + (guess if asker.ask is None and width else "")
+    cell = known["plan.cell_size"]
+    yield _line(cell, asker.value(cell, cell.example) or TO_FILL)
     name = _quoted(content.relative(listed[0].path) if listed else TO_FILL)
-    yield f"fiducials = {name}   # name,x_mm,y_mm,diameter_mm[,column_px,row_px]"
+    yield f"fiducials = {name}   # {known['plan.fiducials'].about}"
     if not listed:
-        yield "# a table of at least four places that are known in mm: discs on the table, or points picked by hand with their pixel"
-        yield "# (column_px,row_px) and an empty diameter; init finds it in the folder"
+        yield "# a table of at least four places that are known in mm, discs on the table or picked points; init finds it in the folder"
     yield from _others("fiducials", content, listed)
     yield from _optional("regions", content, Kind.REGIONS)
     if not along_axis:
         return
     yield from ("", "[plan.axis]")
-    x = asker.quantity("Plan point under the spindle at axis position 0, x", "mm")
-    y = asker.quantity("Plan point under the spindle at axis position 0, y", "mm")
-    yield f"origin = [{x}, {y}]   # plan point under the spindle at axis position 0"
-    yield f"direction = {_direction(asker)}   # how that point moves as the axis position grows: [1, 0] right, [-1, 0] left, [0, 1] down"
+    yield f"{_pair('plan.axis.origin', asker)}   # plan point under the spindle at axis position 0"
+    direction = known["plan.axis.direction"]
+    chosen = asker.ask and DIRECTIONS[asker.choice(direction.label, tuple(DIRECTIONS))]
+    yield f"direction = {list(chosen) if chosen else _quoted(TO_FILL)}   # {direction.about}"
+
+
+def _pair(name: str, asker: Asker, *defaults: str) -> str:
+    """Return the line of a key of two items with the answers to both."""
+    items = [known_keys()[f"{name}.{item}"] for item in (0, 1)]
+    answers = [asker.value(one, default) for one, default in zip(items, defaults or ("", ""), strict=True)]
+    if not any(answers) and not items[0].needed:
+        return f"# {items[0].key} = {_toml([one.example for one in items])}   # {items[0].about}"
+    return f"{items[0].key} = {_toml([answer or TO_FILL for answer in answers])}"
 
 
 def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
@@ -398,43 +380,20 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield from ("", "[interferometry]")
     yield f"deviations = {_quoted(chosen)}"
     yield from (f"# deviations = {_quoted(name)}   # also found" for name in readings if name != chosen)
-    yield from _optional(
-        "environment", content, Kind.ENVIRONMENT, lacking='# environment = "environment.csv"   # none was found'
-    )
+    yield from _optional("environment", content, Kind.ENVIRONMENT)
     known = _attributes(readings[chosen])
     if known.get("units") == "arcsec":
         yield "# a rotary axis: neither expansion nor dead path enter its angles"
         return
-    if content.frame_files and content.of(Kind.ENVIRONMENT):
-        yield _material_sensor(asker)
-    coefficient = asker.quantity(
-        "Expansion coefficient of the part that carries the scale or the workpiece", "ppm/K", "11.7 ppm/K"
-    )
-    yield f"expansion_coefficient = {coefficient}"
-    yield f"dead_path = {asker.quantity('Dead path of the laser', 'mm', '0 mm')}"
+    keys = {one.name.removeprefix("interferometry."): one for one in keys_of("interferometry")}
+    if not content.of(Kind.ENVIRONMENT):
+        yield _line(keys["environment"])
+    elif content.frame_files:
+        yield _pair("interferometry.material_sensor", asker)
+    for key, default in (("expansion_coefficient", "11.7 ppm/K"), ("dead_path", "0 mm")):
+        yield _line(keys[key], asker.value(keys[key], default) or TO_FILL)
     if known.get("origin") == "reconstructed":
-        yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
-        yield '# dwell = "2 s"'
-
-
-def _material_sensor(asker: Asker) -> str:
-    """Return the line with the place of the material sensor, which confirms the scale of the temperatures."""
-    example = (
-        '# material_sensor = ["350 mm", "90 mm"]   # its place on the plan: confirms the scale of the temperatures'
-    )
-    question = "Plan point of the material temperature sensor, such as 350 mm, 90 mm; empty: not known"
-    while answer := asker.text(question, "").strip():
-        parts = [part.strip() for part in answer.split(",")]
-        try:
-            for part in parts:
-                read_quantity(part, "mm")
-        except QuantityError as error:
-            asker.say(str(error))
-            continue
-        if len(parts) == 2:
-            return f"material_sensor = [{_quoted(parts[0])}, {_quoted(parts[1])}]"
-        asker.say(f'"{answer}" is not x and y')
-    return example
+        yield from (_line(keys[key]) for key in ("feed", "dwell"))
 
 
 def _attributes(readings: Recognised) -> dict[str, str]:
@@ -449,89 +408,75 @@ def _attributes(readings: Recognised) -> dict[str, str]:
 
 def _report(asker: Asker, *, linear: bool) -> Iterator[str]:
     """Yield what the sheet to sign prints: machine, people and conditions, of a test along a linear axis its tolerances and motion too."""
-    motion = {}
+    keys = keys_of("report", of="interferometry" if linear else "record")
     if linear:
-        yield from _acceptance(asker)
-        asked = "Travel of the axis, lead of the screw, feed and dwell, such as"
-        units = {name: example.partition(" ")[2] for name, (_, example) in _MOTION.items()}
-        example = ", ".join(f"{name} {value}" for name, (_, value) in _MOTION.items())
-        motion = _by_name(asker, f"{asked} {example}; empty: not stated", units)
-    machine = asker.text("Machine; empty: the names on the sheet to sign stay to be filled in", "").strip()
-    mark = "" if machine or motion else "# "
-    yield ""
-    yield f"{mark}[report]                               # identity and conditions of the test, for the sheet to sign"
-    yield f"{'' if machine else '# '}machine = {_quoted(machine or 'name of the machine')}"
-    for key, question in _SHEET.items():
-        answer = asker.text(f"{question}; empty: not stated", "").strip() if machine else ""
-        yield f"{key} = {_quoted(answer)}" if answer else f'# {key} = ""'
-    if linear:
-        for name, (key, example) in _MOTION.items():
-            yield f"{key} = {_quoted(motion[name])}" if name in motion else f"# {key} = {_quoted(example)}"
-        for of in ("air", "material"):
-            yield f'# {of}_temperature_before = "20.0 degC"    # left out: as logged'
-            yield f'# {of}_temperature_after = "20.0 degC"'
-    yield '# remarks = ""'
-    name = asker.text("Instrument; empty: not stated", "").strip() if machine else ""
-    mark = "" if name else "# "
-    yield from ("", f"{mark}[[report.instrument]]", f"{mark}name = {_quoted(name or 'laser interferometer')}")
-    for key, question in _INSTRUMENT.items():
-        answer = asker.text(f"{question}; empty: not stated", "").strip() if name else ""
-        yield f"{key} = {_quoted(answer)}" if answer else f'# {key} = ""'
-    yield _calibrated(asker) if name else "# calibrated = 2026-01-15"
-
-
-def _acceptance(asker: Asker) -> Iterator[str]:
-    """Yield the tolerances of the axis."""
-    question = "Tolerances of the axis by ISO 230-2, such as A 20 um, R 10 um; empty: none"
-    stated = _by_name(asker, question, dict.fromkeys(_TOLERANCES, "um"))
-    yield from (
-        "",
-        f"{'' if stated else '# '}[acceptance]                           # tolerances: what has none is not judged",
+        tolerances = {one.key: one for one in keys_of("acceptance")}
+        yield from _section(
+            "acceptance", tolerances.values(), _by_name(asker, "Tolerances of the axis by ISO 230-2", tolerances)
+        )
+    motion = {one.key.rpartition("_")[2]: one for one in keys if one.unit and one.ask}
+    asked = [one for one in keys if one.ask and one not in motion.values()]
+    answers = _by_name(asker, ", ".join(one.label for one in motion.values()), motion) if motion else {}
+    answers["machine"] = asker.text("Machine; empty: the names on the sheet to sign stay to be filled in", "").strip()
+    if answers["machine"]:
+        answers |= {one.key: asker.value(one) for one in asked if one.key != "machine"}
+    yield from _section("report", keys, answers)
+    name, *others = keys_of("report", "instrument")
+    named = {name.key: asker.value(name) if answers["machine"] else ""}
+    yield from _section(
+        "[report.instrument]", [name, *others], named | {one.key: asker.value(one) for one in others if named[name.key]}
     )
-    for symbol, (example, of) in _TOLERANCES.items():
-        line = f"{symbol} = {_quoted(stated.get(symbol, example))}"
-        yield line if symbol in stated else f"# {line}   # {of}"
 
 
-def _by_name(asker: Asker, question: str, units: dict[str, str]) -> dict[str, str]:
-    """Return quantities that are answered by their names in one line, such as "A 20 um, R 10 um"."""
-    while answer := asker.text(question, "").strip():
-        pairs = [part.strip().replace("=", " ").partition(" ")[::2] for part in answer.split(",")]
-        found = {name: quantity.strip() for name, quantity in pairs}
-        try:
-            for name, quantity in found.items():
-                if name not in units:
-                    raise DraftError(f'"{name}" is none of {", ".join(units)}')
-                read_quantity(quantity, units[name])
-        except (DraftError, QuantityError) as error:
-            asker.say(str(error))
-            continue
-        return found
-    return {}
+def _by_name(asker: Asker, question: str, keys: Mapping[str, Key]) -> dict[str, str]:
+    """Return quantities by their keys that are answered by names in one line, such as "A 20 um, R 10 um"."""
+
+    def check(answer: str) -> dict[str, str]:
+        pairs = [part.strip().replace("=", " ").partition(" ")[::2] for part in answer.split(",") if answer]
+        for name, quantity in pairs:
+            if name not in keys:
+                raise DraftError(f'"{name}" is none of {", ".join(keys)}')
+            read_quantity(quantity.strip(), keys[name].unit)
+        return {keys[name].key: quantity.strip() for name, quantity in pairs}
+
+    example = ", ".join(f"{name} {one.example}" for name, one in [*keys.items()][:_MOST])
+    return asker.checked(f"{question}, such as {example}; empty: not stated", "", check)
 
 
 def _thermal_test(asker: Asker) -> Iterator[str]:
     """Yield what the sheet of ISO 230-3 needs to be told of a record."""
-    kind = asker.choice("What was tested by ISO 230-3", _KINDS)
-    mark = "# " if kind == _KINDS[0] else ""
-    yield from ("", f"{mark}[thermal_test]                         # test of thermal effects by ISO 230-3")
-    others = ", ".join(f'"{one}"' for one in _KINDS[2:])
-    yield f'# kind = "spindle"                       # or {others}' if mark else f"kind = {_quoted(kind)}"
-    yield '# sensor_calibration = "0.5 %"           # standard uncertainty of the sensitivity of the displacement sensors; left out: 1 %'
-    yield '# mounting_length = "100 mm"             # of what holds sensors and target; left out: its expansion is not in the uncertainty'
-    yield '# mounting_expansion = "11.7 ppm/K"'
-    yield "# [thermal_test.tilts]                   # two displacements of one direction whose difference is a tilt"
+    keys = keys_of("thermal_test")
+    unstated, *kinds = ("not stated", *keys[0].options[1:])
+    kind = asker.choice("What was tested by ISO 230-3", (unstated, *kinds))
+    yield from _section("thermal_test", keys, {} if kind == unstated else {keys[0].key: kind})
+    yield f"# [thermal_test.tilts]   # {keys_of('thermal_test', 'tilts')[0].title}"
     yield '# A = {channels = ["Y1", "Y2"], distance = "150 mm"}'
 
 
-def _calibrated(asker: Asker) -> str:
-    """Return the line with the day of the last calibration."""
-    while answer := asker.text("Day of its calibration, such as 2026-01-15; empty: not stated", "").strip():
-        try:
-            return f"calibrated = {date.fromisoformat(answer)}"
-        except ValueError:
-            asker.say(f'"{answer}" is no day; write year-month-day')
-    return "# calibrated = 2026-01-15"
+def _section(name: str, keys: Collection[Key], answers: Mapping[str, str]) -> Iterator[str]:
+    """Yield a table of the file, in comments where nothing of it was answered."""
+    title = next(iter(keys)).title
+    yield from ("", f"{'' if any(answers.values()) else '# '}[{name}]   # {title}")
+    yield from _lines(keys, answers)
+
+
+def _lines(keys: Iterable[Key], answers: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of keys that are answered or shown."""
+    yield from (_line(one, answers.get(one.key, "")) for one in keys if one.first)
+
+
+def _line(key: Key, answer: str = "") -> str:
+    """Return the line of a key with its answer, else its example as a comment with what it is."""
+    if answer and answer != TO_FILL:
+        return f"{key.key} = {_written(key, answer)}"
+    line = f"{key.key} = {_quoted(answer)}" if answer else f"# {key.key} = {_written(key, key.example)}"
+    return f"{line}   # {key.remark}" if key.remark else line
+
+
+def _written(key: Key, text: str) -> str:
+    """Return a text as the file holds it: numbers and dates without quotes."""
+    bare = key.kind == "date" or (key.kind == "number" and re.fullmatch(r"[\d.]+", text))
+    return text if bare else _quoted(text)
 
 
 def _drivers(content: FolderContent) -> Iterator[str]:
@@ -593,7 +538,7 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             units = (keys[key], *(unit for unit in ("s", "min", "h") if unit != keys[key]))
             keys[key] = asker.choice(f"Unit of the times in {table.of('time')[0].heading}, {shown}", units)
         else:
-            keys[key] = json.loads(asker.quantity("Time from one row to the next", "s", "60 s" if asker.ask else ""))
+            keys[key] = asker.value(known_keys()["record.every"], "60 s" if asker.ask else "") or TO_FILL
     guessed = [column for column in table.of("displacement") if column.remark]
     for unit in dict.fromkeys(column.unit for column in guessed):
         group = [column for column in guessed if column.unit == unit]
@@ -604,14 +549,12 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
     return replace(table, keys=keys)
 
 
-def _optional(key: str, content: FolderContent, kind: Kind, *, lacking: str = "") -> Iterator[str]:
+def _optional(key: str, content: FolderContent, kind: Kind) -> Iterator[str]:
     """Yield the line of a file that a campaign may have."""
     listed = content.of(kind)
     if listed:
         yield f"{key} = {_quoted(content.relative(listed[0].path))}"
         yield from _others(key, content, listed)
-    elif lacking:
-        yield lacking
 
 
 def _others(
@@ -633,14 +576,6 @@ def _extent(fiducials: Sequence[Fiducial]) -> tuple[str, str]:
         return f"{10 * tens} mm"
 
     return side([one.x_mm for one in fiducials]), side([one.y_mm for one in fiducials])
-
-
-def _direction(asker: Asker) -> str:
-    """Return the direction of the axis on the plan as a list of two numbers."""
-    known = {"right": "[1, 0]", "left": "[-1, 0]", "down": "[0, 1]", "up": "[0, -1]"}
-    if asker.ask is None:
-        return _quoted(TO_FILL)
-    return known[asker.choice("How that point moves over the plan as the axis position grows", tuple(known))]
 
 
 def _toml(value: object) -> str:

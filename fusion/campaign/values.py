@@ -209,7 +209,7 @@ def _fraction(value: object) -> object:
 
 def _written(example: str) -> WithJsonSchema:
     """How a quantity looks in the file, for the JSON Schema."""
-    return WithJsonSchema({"type": "string", "description": "number with unit", "examples": [example]})
+    return WithJsonSchema({"type": "string", "format": "quantity", "examples": [example]})
 
 
 Millimetres = Annotated[float, _quantity("mm"), _written("5 mm")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,11 +22,12 @@ from fusion.campaign.config import (
     load_campaign,
 )
 from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
+from fusion.campaign.keys import Key, keys_of
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.campaign.time_zones import is_dated, shown_zone
 from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window
 from fusion.results.numbers import exact, moment
-from fusion.results.parts import Iso230Tolerance, Quantity, decide, is_determined
+from fusion.results.parts import Iso230Condition, Iso230Tolerance, Quantity, decide, is_determined
 from fusion.results.progress import left_out_notices
 from fusion.results.results import Notice, read_results
 from fusion.results.store import file_sha256, group, has, is_file_list, joined, plain, read_json_object, read_product
@@ -195,8 +196,9 @@ def _contribution(
 # standards.
 
 _ARROWS = {"positive": "↑", "negative": "↓"}
-#: Conditions that a rotary axis does not have.
-_OF_LENGTHS = ("Travel of the axis", "Lead of the screw", "Feed", "Expansion coefficient", "Dead path", "Readings")
+_COMPENSATION = {"as recorded": "as the laser compensated them", "redo": "compensated again with the logged conditions"}
+#: Key, name and text of a condition.
+_Stated = tuple[str, str, str]
 
 
 def complete_sheet(
@@ -212,9 +214,7 @@ def complete_sheet(
     sheet = {
         "tolerances": [row for symbol, limit in limits.items() for row in _judge(part, symbol, limit)],
         "checks": [vars(check) for check in checks],
-        "conditions": [
-            {"name": name, "text": text} for name, text in _conditions(dataset, report, campaign, environment).items()
-        ],
+        "conditions": _conditions(dataset, report, campaign, environment),
         "other_standards": [vars(value) for value in others],
     }
     return Iso230Part.model_validate({**vars(part), **sheet})
@@ -236,60 +236,61 @@ def _judge(part: Iso230Part, symbol: str, limit: float) -> Iterator[Iso230Tolera
 
 def _conditions(
     dataset: xr.Dataset, report: ReportTable, campaign: Campaign | None, environment: xr.Dataset | None
-) -> dict[str, str]:
-    """Return the conditions of the test by name, empty where they are not stated; logged values where there is a log."""
+) -> tuple[Iso230Condition, ...]:
+    """Return the conditions of the test, empty where they are not stated; logged values where there is a log."""
     laser = None if campaign is None else campaign.interferometry
     position, rotary = dataset["position"].values, is_rotary(dataset)
     unit = "°" if rotary else " mm"
-    feed = report.feed_mm_per_min or (laser.feed_mm_per_min if laser else None)
-    dwell = report.dwell_s or (laser.dwell_s if laser else None)
-    compensation = {
-        "as recorded": "as the laser compensated them",
-        "redo": "compensated again with the logged conditions",
-    }
-    temperatures = {
-        name: _pair(
-            getattr(report, f"{name}_before_degC"), getattr(report, f"{name}_after_degC"), dataset, environment, name
-        )
-        for name in ("air_temperature", "material_temperature")
-    }
+    travel = f"{exact(np.ptp(position))}{unit}, {exact(position.min())} to {exact(position.max())}{unit}"
+    temperatures: list[_Stated] = []
+    for name in ("air_temperature", "material_temperature"):
+        before, after = (getattr(report, f"{name}_{when}_degC") for when in ("before", "after"))
+        text = _pair(before, after, dataset, environment, name)
+        temperatures.append((name, f"{name.replace('_', ' ').capitalize()} before, after", text))
+    of_lengths: list[_Stated] = []
+    if not rotary:
+        dead = f"{laser.dead_path_mm:g} mm" if laser and "dead_path_mm" in laser.model_fields_set else ""
+        of_lengths = [
+            ("expansion_coefficient", "Expansion coefficient", _coefficient(laser)),
+            ("dead_path", "Dead path", dead),
+            ("compensation", "Readings", _COMPENSATION[laser.compensation] if laser else ""),
+        ]
+    stated = report.model_dump(by_alias=True)
+    if laser is not None:
+        stated |= {"feed": report.feed_mm_per_min or laser.feed_mm_per_min, "dwell": report.dwell_s or laser.dwell_s}
     zone = shown_zone(dataset, None if campaign is None else campaign.zone_of("interferometry"))
-    conditions = {
-        **identity(report, date_of(dataset["time"].values, zone), "" if campaign is None else campaign.campaign.axis),
-        "Travel of the axis": "" if report.axis_travel_mm is None else f"{report.axis_travel_mm:g} mm",
-        "Measured travel": f"{exact(np.ptp(position))}{unit}, {exact(position.min())} to {exact(position.max())}{unit}",
-        "Lead of the screw": "" if report.screw_lead_mm is None else f"{report.screw_lead_mm:g} mm",
-        "Feed": "" if feed is None else f"{feed:g} mm/min",
-        "Dwell at a target": "" if dwell is None else f"{dwell:g} s",
-        "Warm-up": report.warm_up,
-        "Compensation of the machine": report.machine_compensation,
-        "Air temperature before, after": temperatures["air_temperature"],
-        "Material temperature before, after": temperatures["material_temperature"],
-        "Places of the sensors": report.sensor_places,
-        "Expansion coefficient": _coefficient(laser),
-        "Dead path": f"{laser.dead_path_mm:g} mm" if laser and "dead_path_mm" in laser.model_fields_set else "",
-        "Readings": "" if laser is None else compensation[laser.compensation],
-        "Remarks": report.remarks,
-    }
-    return {name: text for name, text in conditions.items() if not (rotary and name in _OF_LENGTHS)}
+    return state_conditions(
+        [
+            one
+            for one in keys_of("report", of="interferometry")
+            if one.unit != "degC" and not (rotary and one.unit.startswith("mm"))
+        ],
+        stated,
+        date_of(dataset["time"].values, zone),
+        "" if campaign is None else campaign.campaign.axis,
+        {
+            "dwell" if rotary else "screw_lead": [("measured_travel", "Measured travel", travel)],
+            "sensor_places": temperatures,
+            "remarks": of_lengths,
+        },
+    )
 
 
-def identity(report: ReportTable, date: str, axis: str) -> dict[str, str]:
-    """Return whose test of which machine it was, when and with what, by name; empty where it is not stated."""
-    return {
-        "Report number": report.report_number,
-        "Customer": report.customer,
-        "Date of the test": date,
-        "Machine": report.machine,
-        "Serial number of the machine": report.machine_serial_number,
-        "Control": report.control,
-        "Location": report.location,
-        "Operator": report.operator,
-        "Approved by": report.approved_by,
-        "Axis": axis,
-        **_instruments(report),
-        "Sign convention": report.sign_convention,
+def state_conditions(
+    keys: Iterable[Key], stated: Mapping[str, Any], date: str, axis: str, others: Mapping[str, Sequence[_Stated]]
+) -> tuple[Iso230Condition, ...]:
+    """Return whose test it was and under which conditions: keys of ``[report]`` in their order, before some of them what no key states."""
+    placed = {
+        "machine": [("date", "Date of the test", date)],
+        "sign_convention": [("axis", "Axis", axis), *_instruments(stated["instrument"])],
+        **others,
     }
+    rows: list[_Stated] = []
+    for one in keys:
+        value = stated[one.key] or ""
+        text = f"{value:g} {one.unit}" if one.unit and value else value
+        rows += [*placed.get(one.key, ()), (one.key, one.label, text)]
+    return tuple(Iso230Condition(key=key, name=name, text=text) for key, name, text in rows)
 
 
 def date_of(times: NDArray[np.datetime64], zone: str | None) -> str:
@@ -308,18 +309,15 @@ def _coefficient(laser: InterferometryTable | None) -> str:
     return f"{laser.expansion_coefficient_ppm_per_K:g} ppm/K{'' if stated else ' (assumed)'}"
 
 
-def _instruments(report: ReportTable) -> dict[str, str]:
+def _instruments(stated: Sequence[Mapping[str, Any]]) -> list[_Stated]:
     """Return each instrument with serial number and date of its calibration."""
-    if not report.instrument:
-        return {"Instruments": ""}
-    named = {}
-    for k, item in enumerate(report.instrument, start=1):
-        parts = [item.name, f"serial number {item.serial_number or 'not stated'}"]
-        parts.append(f"calibrated {item.calibrated.isoformat()}" if item.calibrated else "calibration not stated")
-        named[f"Instrument {k}"] = ", ".join(
-            [*parts, *([f"certificate {item.certificate}"] if item.certificate else [])]
-        )
-    return named
+    named = []
+    for k, item in enumerate(stated, start=1):
+        parts = [item["name"], f"serial number {item['serial_number'] or 'not stated'}"]
+        parts.append(f"calibrated {item['calibrated'].isoformat()}" if item["calibrated"] else "calibration not stated")
+        parts += [f"certificate {item['certificate']}"] if item["certificate"] else []
+        named.append(("instrument", f"Instrument {k}", ", ".join(parts)))
+    return named or [("instrument", "Instruments", "")]
 
 
 def _pair(

@@ -13,18 +13,11 @@ import xarray as xr
 
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
+from fusion.campaign.keys import keys_of
 from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
-from fusion.pipeline.iso230 import date_of, files_of_run, hashed, identity
-from fusion.results.parts import (
-    Iso230Condition,
-    Quantity,
-    TestKind,
-    ThermalContribution,
-    ThermalCourse,
-    ThermalDistortion,
-    ThermalTest,
-)
+from fusion.pipeline.iso230 import date_of, files_of_run, hashed, state_conditions
+from fusion.results.parts import Quantity, TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
 from fusion.results.results import read_results
 from interferometry.deviations import ROUNDING, resolution
 from interferometry.iso230.thermal import (
@@ -244,15 +237,8 @@ def thermal_tests(campaign: Campaign, table: xr.Dataset) -> tuple[ThermalTest, .
     evaluate = evaluate_axis_test if campaign.record is None else evaluate_record_test
     tests = evaluate(table, campaign.thermal_test)
     zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
-    report, date = campaign.report, date_of(table["time"].values, zone)
-    conditions = {
-        **identity(report, date, campaign.campaign.axis),
-        "Warm-up": report.warm_up,
-        "Compensation of the machine": report.machine_compensation,
-        "Places of the sensors": report.sensor_places,
-        "Remarks": report.remarks,
-    }
-    stated = tuple(Iso230Condition(name=name, text=text) for name, text in conditions.items())
+    date, keys = date_of(table["time"].values, zone), keys_of("report", of="record")
+    stated = state_conditions(keys, campaign.report.model_dump(by_alias=True), date, campaign.campaign.axis, {})
     return tuple(one.model_copy(update={"conditions": stated}) for one in tests)
 
 

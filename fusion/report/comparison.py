@@ -335,7 +335,7 @@ def describe_pair(pair: PairComparison) -> Sheet:
             identity.append((name, both[0]))
         else:
             identity += [(f"{name}, {which}", text) for which, text in zip(("as found", "as left"), both, strict=True)]
-    remarks = [{row.name: row.text for row in rows}.get("Remarks", "") for rows in conditions]
+    remarks = [{row.key: row.text for row in rows}.get("remarks", "") for rows in conditions]
     done = remarks[1] if remarks[1] != remarks[0] else ""
     files = {f"results.json {which}": one.sha256 for which, one in (("as found", pair.before), ("as left", pair.after))}
     return Sheet(

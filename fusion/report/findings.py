@@ -171,7 +171,7 @@ def sharpen(iso: Iso230Part | None) -> Sharper | None:
         expanded = 2 * (found.u**2 - term**2 + (term * stated_u / one.u) ** 2) ** 0.5
         if expanded < _WORTH * min(told.sharper_um, told.expanded_um):
             value = next(
-                (row.text.split()[0] for row in iso.conditions if row.name == "Expansion coefficient" and row.text), ""
+                (row.text.split()[0] for row in iso.conditions if row.key == "expansion_coefficient" and row.text), ""
             )
             line = line.format(value=value) if value or "{value}" not in line else _STATED_WITHOUT_VALUE
             limit = next((row.limit_um for row in iso.tolerances if row.quantity == symbol), None)

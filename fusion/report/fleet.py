@@ -132,7 +132,7 @@ def with_findings(row: Row, folder: Path) -> Row:
         maps = read_product(folder, "fields") if (folder / "fields.nc").is_file() else None
     except (FusionError, OSError) as error:
         return replace(row, state="failed", message=str(error))
-    loop, conditions = results.loop, conditions_of(results)
+    loop, conditions = results.loop, {one.key: one.text for one in conditions_of(results)}
     stated = read_json_object(folder / "provenance.json").get("parameters", {}).get("report", {})
     decided = [one.decision for one in results.iso230.tolerances] if results.iso230 else []
     maxima = {one.maximum_degC: one.overrange_pictures > 0 for one in results.regions or ()}
@@ -146,18 +146,18 @@ def with_findings(row: Row, folder: Path) -> Row:
     return replace(
         row,
         title=results.campaign,
-        machine=conditions.get("Machine") or stated.get("machine", ""),
-        serial=conditions.get("Serial number of the machine") or stated.get("machine_serial_number", ""),
+        machine=conditions.get("machine") or stated.get("machine", ""),
+        serial=conditions.get("machine_serial_number") or stated.get("machine_serial_number", ""),
         date=_day(results, conditions, maps),
         decision=next((one for one in _DECISIONS if one in decided), ""),
         above_range=maxima.get(hottest, False),
         verdict="" if loop is None else loop.verdict,
         headline="" if loop is None else headline(results),
-        axis=conditions.get("Axis", ""),
+        axis=conditions.get("axis", ""),
         anomalies=None if results.anomalies is None else len(results.anomalies),
         warnings=len(results.warnings),
         inputs="" if results.inputs is None else results.inputs.state,
-        conditions=conditions,
+        conditions={one.name: one.text for one in conditions_of(results)},
         # Of an axis in another unit than the columns have there is none.
         **{name: number for name, number in numbers.items() if name in _COLUMNS},
     )
@@ -187,7 +187,7 @@ def _day(results: Results, conditions: Mapping[str, str], maps: xr.Dataset | Non
         return min(first)[:10]
     if maps is not None and (taken := maps["time"].values.min()) > DATED:
         return str(np.datetime_as_string(taken, "D"))
-    return conditions.get("Date of the test", "")[:10]
+    return conditions.get("date", "")[:10]
 
 
 def as_json(rows: Sequence[Row], *, started: str, finished: str) -> dict[str, Any]:

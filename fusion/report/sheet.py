@@ -30,13 +30,10 @@ from thermography.common import ACTING
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Conditions that say whose test of which axis a sheet is of; the others follow the values. Instruments are numbered.
-_IDENTITY = (
-    "Report number", "Customer", "Date of the test", "Machine", "Serial number of the machine", "Control", "Location", "Axis", "Operator",
-    "Instrument", "Sign convention",
-)  # fmt: skip
-#: Conditions that stand where somebody signs.
-_SIGNED = {"Measured by": "Operator", "Approved by": "Approved by"}
+#: The last condition that says whose test of which axis a sheet is of; the others follow the values.
+_LAST = "sign_convention"
+#: Conditions that stand where somebody signs; who approves stands only there.
+_SIGNED = {"Measured by": "operator", "Approved by": "approved_by"}
 #: What the standard means by a deviation, where a laboratory states no convention.
 _CONVENTION = "not stated; taken as actual minus target position (ISO 230-2)"
 #: Dashes of lines as matplotlib names them.
@@ -57,17 +54,11 @@ class Stated:
     @classmethod
     def of(cls, rows: Sequence[Iso230Condition], convention: str) -> Stated:
         """Sort the conditions of a test; `convention` stands where no sign convention is stated."""
-        stated = {row.name: row.text for row in rows}
-        told = {
-            name: text or (convention if name == "Sign convention" else "not stated") for name, text in stated.items()
-        }
-        identity = [(name, text) for name, text in told.items() if name.startswith(_IDENTITY)]
-        named = dict(identity).keys() | _SIGNED.values()
-        return cls(
-            identity,
-            [(name, text) for name, text in told.items() if name not in named],
-            [(role, stated.get(name, "")) for role, name in _SIGNED.items()],
-        )
+        texts = {row.key: row.text for row in rows}
+        shown = [row for row in rows if row.key != "approved_by"]
+        told = [(row.name, row.text or (convention if row.key == _LAST else "not stated")) for row in shown]
+        count = next((k for k, row in enumerate(shown, start=1) if row.key == _LAST), len(shown))
+        return cls(told[:count], told[count:], [(role, texts.get(key, "")) for role, key in _SIGNED.items()])
 
 
 @dataclass(frozen=True)

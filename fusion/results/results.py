@@ -93,6 +93,8 @@ _WITHOUT_BUDGET: dict[str, Any] = {
     "u_without_sampling_um": {},
     "contributions": [],
 }
+#: Keys of conditions whose earlier names are not their words.
+_CONDITIONS = {"Date of the test": "date", "Serial number of the machine": "machine_serial_number"}
 #: Objects whose keys are names of a campaign: fiducials and channels.
 _NAMED_BY_THE_CAMPAIGN = ("leave_one_out_mm", "channels", "rms_by_channel_um")
 #: Faults of a file of which the first is named: each one that is written out takes a kilobyte.
@@ -323,6 +325,9 @@ def _renamed(part: Any, key: str = "") -> Any:
         return [_renamed(one, key) for one in part]
     if not isinstance(part, dict):
         return part
+    if key == "conditions" and isinstance(name := part.get("name"), str):
+        known = "instrument" if name.startswith("Instrument") else name.lower().replace(" ", "_")
+        part = {"key": _CONDITIONS.get(name, known), **part}
     names = RENAMED_TESTS if key == "p_values" else {} if key in _NAMED_BY_THE_CAMPAIGN else RENAMED_KEYS
     return {names.get(name, name): _renamed(one, name) for name, one in part.items()}
 

@@ -117,7 +117,7 @@ PARTS: dict[str, Any] = {
         "range_um": {name: {"lowest": 0.5, "highest": 1.5} for name in "BREMA"},
         "tolerances": [{"quantity": "A", "limit_um": 10.0, "value_um": 1.0, "expanded_u_um": 0.2, "decision": "pass"}],
         "checks": [{"name": "5 cycles", "met": None, "evidence": "5 cycles are evaluated."}],
-        "conditions": [{"name": "Machine", "text": ""}],
+        "conditions": [{"key": "machine", "name": "Machine", "text": ""}],
         "other_standards": [{"standard": "VDI/DGQ 3441", "name": "P", "value_um": 1.0, "definition": "range"}],
     },
     "neighbours": {"conventional_s_um": BOTH, "pair_s_um": BOTH, "ratio": BOTH},

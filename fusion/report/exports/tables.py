@@ -24,6 +24,7 @@ from fusion.report.findings import summary_rows
 from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import print_unit
+from fusion.results.parts import Iso230Condition
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
 from interferometry import iso230
@@ -38,14 +39,14 @@ def findings_table(results: Results) -> pd.DataFrame:
     return pd.DataFrame([("campaign", results.campaign), *summary_rows(results)], columns=["finding", "value"])
 
 
-def conditions_of(results: Results) -> dict[str, str]:
-    """Return the conditions of the test by name, empty where they are not stated; nothing where the results hold none."""
+def conditions_of(results: Results) -> tuple[Iso230Condition, ...]:
+    """Return the conditions of the test; nothing where the results hold none."""
     tests = [one for one in (results.iso230, *(results.iso230_3 or ())) if one is not None]
-    return {one.name: one.text for one in tests[0].conditions} if tests else {}
+    return tests[0].conditions if tests else ()
 
 
 def _conditions_table(results: Results) -> pd.DataFrame:
-    rows = [(name, text or "not stated") for name, text in conditions_of(results).items()]
+    rows = [(one.name, one.text or "not stated") for one in conditions_of(results)]
     return pd.DataFrame(rows, columns=["condition", "stated or logged"])
 
 

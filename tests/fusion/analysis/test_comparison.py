@@ -311,7 +311,10 @@ def test_an_error_that_both_tests_have_in_common_cancels_as_far_as_it_is_equal(t
         }
         shares = {"expansion_coefficient": share, "device": 1.0, "alignment": 1.0, "material_temperature": 1.0}
         rows = [{**row, "contributor": name, "A_um": value} for name, value in shares.items()]
-        stated = {**PARTS["iso230"], "conditions": [{"name": "Expansion coefficient", "text": coefficient}]}
+        stated = {
+            **PARTS["iso230"],
+            "conditions": [{"key": "expansion_coefficient", "name": "Expansion coefficient", "text": coefficient}],
+        }
         return {**stated, "A_um": {"value": 2 * u, "u": u}, "contributions": rows}
 
     def u_of(folders: list[Path], *, same_setup: bool = False) -> float:
@@ -338,7 +341,10 @@ def test_achieved_is_held_against_what_a_table_was_predicted_to_leave(tmp_path: 
     def part(a_um: float, coefficient: str) -> dict[str, Any]:
         row = {"contributor": "expansion_coefficient", "u": 2.0, "unit": "ppm/K", "origin": "assumed", "A_um": 4.0}
         shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
-        stated = {**PARTS["iso230"], "conditions": [{"name": "Expansion coefficient", "text": coefficient}]}
+        stated = {
+            **PARTS["iso230"],
+            "conditions": [{"key": "expansion_coefficient", "name": "Expansion coefficient", "text": coefficient}],
+        }
         return {
             **stated,
             "A_um": {"value": a_um, "u": 5.0},

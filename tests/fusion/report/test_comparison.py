@@ -143,10 +143,12 @@ def test_two_tests_are_a_sheet_to_sign_and_what_changed(pairs):
 
 def test_the_sheet_states_whose_axis_it_was_what_was_done_and_the_decisions(tmp_path):
     def part(day, a_um, decision, **more):
-        stated = {"Date of the test": day, "Machine": "Mill 7", "Operator": "R. Meyer", **more}
+        stated = {"date": day, "machine": "Mill 7", "operator": "R. Meyer", **more}
         judged = {"quantity": "A", "limit_um": 2.0, "value_um": a_um, "expanded_u_um": 0.2, "decision": decision}
         whole = {
-            **copy.deepcopy(PARTS["iso230"]), "conditions": [{"name": name, "text": text} for name, text in stated.items()],
+            **copy.deepcopy(PARTS["iso230"]), "conditions": [
+                {"key": key, "name": key.capitalize(), "text": text} for key, text in stated.items()
+            ],
             "tolerances": [judged],
         }  # fmt: skip
         whole["A_um"] = {"value": a_um, "u": 0.1}
@@ -154,14 +156,14 @@ def test_the_sheet_states_whose_axis_it_was_what_was_done_and_the_decisions(tmp_
 
     readings = readings_of(31)
     found = write_results(tmp_path / "found", readings, iso230=part("1 March", 3.0, "fail"))
-    left = write_results(tmp_path / "left", readings, iso230=part("2 March", 1.0, "pass", Remarks="gib adjusted"))
+    left = write_results(tmp_path / "left", readings, iso230=part("2 March", 1.0, "pass", remarks="gib adjusted"))
     sheet = describe_pair(compare_campaigns([found, left])[0])
     identity = dict(sheet.stated.identity)
     assert identity["Machine"] == "Mill 7"
-    assert identity["Date of the test, as found"] == "1 March" and identity["Date of the test, as left"] == "2 March"
+    assert identity["Date, as found"] == "1 March" and identity["Date, as left"] == "2 March"
     assert identity["Done between the tests"] == "gib adjusted"
     (back,) = compare_campaigns(
-        [left, write_results(tmp_path / "again", readings, iso230=part("3 March", 1.0, "pass", Remarks="gib adjusted"))]
+        [left, write_results(tmp_path / "again", readings, iso230=part("3 March", 1.0, "pass", remarks="gib adjusted"))]
     )
     assert dict(describe_pair(back).stated.identity)["Done between the tests"] == "not stated"
     assert sheet.stated.signatures[0] == ("Measured by", "R. Meyer")
@@ -225,7 +227,7 @@ def test_bars_of_a_trend_leave_out_what_all_tests_have_in_common(tmp_path):
         row = {"contributor": "expansion_coefficient", "u": 2.0, "unit": "ppm/K", "origin": "assumed"}
         shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
         whole = copy.deepcopy(PARTS["iso230"])
-        whole["conditions"] = [{"name": "Expansion coefficient", "text": "11.7 ppm/K"}]
+        whole["conditions"] = [{"key": "expansion_coefficient", "name": "Expansion coefficient", "text": "11.7 ppm/K"}]
         whole |= {"A_um": {"value": 9.0, "u": 5.0}, "contributions": [{**row, "A_um": 4.0, **shares}]}
         return whole
 

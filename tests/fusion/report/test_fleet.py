@@ -132,8 +132,8 @@ def test_the_drift_of_a_record_is_its_largest_displacement(tmp_path):
         "kind": "spindle", "duration_h": 46.3, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
         "distortions": [moved("ch1", "um", 25.0), moved("ch3", "um", 89.2), moved("tilt", "um/m", 120.0)],
         "conditions": [
-            {"name": "Date of the test", "text": "2026-01-05 06:00 UTC to 2026-01-06 06:00 UTC"},
-            {"name": "Machine", "text": "Mill 9"},
+            {"key": "date", "name": "Date of the test", "text": "2026-01-05 06:00 UTC to 2026-01-06 06:00 UTC"},
+            {"key": "machine", "name": "Machine", "text": "Mill 9"},
         ],
     }  # fmt: skip
     row = row_of(tmp_path, loop=RECORD_LOOP, iso230_3=[test])

@@ -16,7 +16,6 @@ from fusion.app.setup.form import (
     Form,
     direction_text,
     form_fields,
-    known_fields,
     missing,
     read_direction,
     read_fields,
@@ -24,6 +23,7 @@ from fusion.app.setup.form import (
 )
 from fusion.campaign.config import campaign_schema, load_campaign
 from fusion.campaign.draft import DraftError
+from fusion.campaign.keys import known_keys
 from fusion.results.numbers import print_unit
 
 
@@ -170,7 +170,7 @@ def test_every_key_of_the_schema_has_a_field_but_those_that_are_drawn_or_chosen_
             yield from keys((*table, key), inner) if "properties" in inner else [".".join((*table, key))]
 
     schema = campaign_schema()
-    fields = {".".join((*field.table, field.key)) for field in known_fields().values()}
+    fields = {".".join((*field.table, field.key)) for field in known_keys().values()}
     apart = set(keys((), schema)) - fields
     assert {name for name in apart if not name.startswith("thermography.region.")} == {
         "record.columns", "drivers.columns",
@@ -205,7 +205,7 @@ def test_each_instrument_has_a_row_of_its_own_that_is_added_and_removed(copied):
         ]
         return [(one[0].object, [widget.label for widget in one[1][:4]]) for one in titles]
 
-    labels = ["Instrument", "Serial number", "Day of its calibration", "Certificate of its calibration"]
+    labels = ["Instrument", "Its serial number", "Day of its calibration", "Certificate of its calibration"]
     assert rows() == [("<h4>Instrument 1</h4>", labels)]
     press("Add an instrument")
     press("Add an instrument")
@@ -256,9 +256,9 @@ def test_what_a_test_by_iso_230_3_must_be_told_is_in_the_form(record, copied):
 
 
 def test_the_form_speaks_of_what_was_measured_with_its_units(copied, record, tmp_path_factory):
-    assert known_fields()["acceptance.A"].label == "A: bidirectional accuracy (µm)"
-    for field in known_fields().values():
-        assert not field.unit or f"({print_unit(field.unit)})" in field.label
+    assert known_keys()["acceptance.A"].shown == "A: bidirectional accuracy (µm)"
+    for field in known_keys().values():
+        assert not field.unit or f"({print_unit(field.unit)})" in field.shown
         assert "_" not in field.label
     form = Form(lambda name: None)
     form.show(open_campaign(copied))
@@ -289,7 +289,7 @@ def test_lists_and_numbers_are_written_as_such_and_words_in_place_of_numbers_ref
     assert campaign.value("model", "declared") == ["table_offset"]
     assert campaign.value("thermography", "camera_scale_u") == 0.5
     assert campaign.value("interferometry", "compensation") == "redo"
-    with pytest.raises(FieldError, match=r"Standard uncertainty of the camera, as a share.*no number"):
+    with pytest.raises(FieldError, match=r"Standard uncertainty of the camera as a share.*no number"):
         write_fields(campaign, {"thermography.camera_scale_u": "half"})
 
 

@@ -191,7 +191,10 @@ def write_record(folder):
     test = {
         "kind": "spindle", "duration_h": 40.0, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
         "distortions": [{"name": "X", "unit": "um", "settling_min": 90.0, **periods}],
-        "conditions": [{"name": "Machine", "text": "Mill 9"}, {"name": "Operator", "text": ""}],
+        "conditions": [
+            {"key": "machine", "name": "Machine", "text": "Mill 9"},
+            {"key": "operator", "name": "Operator", "text": ""},
+        ],
     }  # fmt: skip
     parts = {"loop": RECORD_LOOP, "iso230_3": [test]}
     write_json(folder / "results.json", assemble("R", parts, []).as_json())
