@@ -397,37 +397,15 @@ SOUND = {
 }
 
 
-def doubts(**changed):
+def doubts(**changed) -> list[str]:
     checks = run_checks("plan", Inputs(registration={**SOUND, **changed}, fiducials_file="fiducials.csv"))
-    assert all(bool(check.remedy) != check.passed for check in checks)
-    return [(check.code, check.evidence) for check in checks if not check.passed]
+    return [check.code for check in checks if not check.passed]
 
 
 def test_a_sound_registration_is_not_doubted():
     assert doubts() == []
     assert doubts(area_ratio=None) == []
     assert doubts(contradicted_hints=["F1", "F2"], leave_one_out_mm={f"F{i}": 0.0 for i in range(6)}) == []
-
-
-@pytest.mark.parametrize(
-    ("changed", "code", "evidence"),
-    [
-        (
-            {"leave_one_out_mm": dict.fromkeys("ABCDE", 0.1)},
-            "fiducials_found",
-            "5 of the 12 fiducials of fiducials.csv",
-        ),
-        ({"unchecked": ["F1", "F3"]}, "fiducials_unchecked", "If F1, F3 were elsewhere than fiducials.csv says"),
-        ({"contradicted_hints": list("ABCDEFG")}, "fiducial_hints", "7 of 12 fiducials lie more than 25 px"),
-        ({"area_ratio": 1.06}, "fiducial_diameters", "1.060 times the area that diameter_mm of fiducials.csv says"),
-        ({"span": 0.24}, "fiducials_span", "The fiducials in use span 24 % of the plan"),
-        ({"mirrored": True}, "plan_mirrored", "appears mirrored"),
-    ],
-)
-def test_each_doubt_is_named(changed, code, evidence):
-    ((named, text),) = doubts(**changed)
-    assert named == code
-    assert evidence in text
 
 
 @pytest.mark.parametrize(("pattern_K", "zero_K"), [(0.03, 0.02), (0.4, 0.02), (0.03, 0.5)])
