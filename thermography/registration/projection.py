@@ -38,10 +38,6 @@ _SQUARE = 0.01
 _MOST_BYTES = 200_000
 
 
-class RegistrationError(ThermographyError):
-    """The table cannot be located in the frame; the message says which fiducials were located and what to do."""
-
-
 class LensError(ThermographyError):
     """A lens file does not hold a calibration that can be used; the message names file, entry and remedy."""
 
@@ -348,7 +344,7 @@ def fit_homography(observations: DiscObservations, ideal: Projection) -> Project
     undistorted_px = ideal.undistort(observations.points_px).astype(float)
     matrix, _ = cv2.findHomography(observations.centres_mm.astype(float), undistorted_px, 0)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
-        raise RegistrationError("the fiducials are collinear or coincide; spread at least four over the whole plan")
+        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return replace(ideal, plan_to_sensor=matrix)
 
 

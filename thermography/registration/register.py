@@ -23,7 +23,6 @@ from thermography.registration.projection import (
     DiscObservations,
     Lens,
     Projection,
-    RegistrationError,
     fit_homography,
     fit_projection,
     parameter_jacobian,
@@ -179,7 +178,7 @@ def _starts(observations: DiscObservations, ideal: Projection, wanted: int, *, c
             candidates.append((float(quantile[i]), replace(lens, plan_to_sensor=matrices[i])))
     candidates.sort(key=lambda item: item[0])
     if not candidates or not np.isfinite(candidates[0][0]):
-        raise RegistrationError("the fiducials are collinear or coincide; spread at least four over the whole plan")
+        raise ThermographyError("the fiducials are collinear or coincide; spread at least four over the whole plan")
     return [projection for _, projection in candidates[:_REFINED]]
 
 
@@ -203,6 +202,10 @@ _LARGEST_AREA_RATIO = 1.3
 _ALIKE = 0.75
 #: Distance within which a spot belongs to a hint in `size_contradiction`, px.
 _EVIDENCE_REACH_PX = 30.0
+
+
+class RegistrationError(ThermographyError):
+    """The table cannot be located in the frame; the message says which fiducials were located and what to do."""
 
 
 def chance_of_arrangement(
@@ -553,7 +556,7 @@ def _chance(
     observations = DiscObservations(image, plan, np.ones(len(plan)), np.full(len(plan), SPOT_U_PX))
     try:
         fit, agreeing = fit_agreeing(observations, Projection.ideal(shape), calibrated=False)
-    except RegistrationError:
+    except ThermographyError:
         return np.inf
     distance = np.linalg.norm(fit.projection.to_sensor(plan) - image, axis=1)[agreeing]
     misfit = max(float(np.sqrt(np.mean(distance**2))), _LEAST_MISFIT_PX)
@@ -965,7 +968,11 @@ def _fit(
         ideal = Projection(np.eye(3), np.array(lens.distortion), lens.focal_length_px, lens.principal_point_px)
     else:
         ideal = Projection.ideal(shape)
-    return fit_agreeing(observations, ideal, calibrated=lens is not None)
+    try:
+        return fit_agreeing(observations, ideal, calibrated=lens is not None)
+    except ValueError as error:
+        # Also a fit that cannot be solved.
+        raise RegistrationError(str(error)) from error
 
 
 def _observations(located: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> DiscObservations:
