@@ -81,7 +81,7 @@ def _plot_campaigns(
             add_band(drawn, x, value - half, value + half, looks["colour"])
         courses.columns[f"position, {name} / mm"] = x
         heading, marker = f"{quantity.split()[0]}, {name} / µm", _MARKS[k % len(_MARKS)]
-        courses.add(x, value, name, heading=heading, half=half, marker=marker, line=line, **looks)
+        courses.add(x, value, name, column=heading, half=half, marker=marker, line=line, **looks)
     if not courses.told:
         return None
     if not line:

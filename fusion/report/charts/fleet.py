@@ -30,6 +30,6 @@ def plot_history(dates: np.ndarray, found: Mapping[str, tuple[np.ndarray, np.nda
                 drawn.hspan(level, line_color=colour, line_dash=dash, line_width=1.1)
             beyond = int(((value < limits.low) | (value > limits.high)).sum())
             told += f", control limits {number(limits.low)} to {number(limits.high)} µm, {beyond} outside"
-        courses.add(dates[order], value, name, seen=f"{name} {told}", half=half, colour=colour, marker=marker)
-        courses.columns[f"U({name}) (k = 2) / µm"] = half
+        looks = {"half": half, "colour": colour, "marker": marker}
+        courses.add(dates[order], value, name, "", f"U({name}) (k = 2) / µm", seen=told, **looks)
     return courses.chart(f"{dates.size} tests")

@@ -248,7 +248,7 @@ def plot_residual_spectrum(loop: xr.Dataset) -> Chart:
         limit, at = float(power.attrs["limit"]), int(np.nanargmax(power.values))
         seen = f"{number(float(power[at]), 2)} at {number(float(power['period'][at]), 2)} min"
         heading = f"{text}, power over that of noise"
-        courses.add(power["period"].values, power.values, text, heading=heading, seen=seen, **looks)
+        courses.add(power["period"].values, power.values, text, column=heading, seen=seen, **looks)
         highest = max(highest, float(power[at]))
     drawn.hspan(limit, line_color=MUTED, line_dash="dashed", line_width=1.5, legend_label="95 % limit of noise")
     fix_range(drawn, 0.0, 1.08 * max(highest, limit))
@@ -267,7 +267,7 @@ def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
         walk = np.cumsum(values[order]) / np.sqrt(order.size)
         courses.columns.setdefault(_TIME, hours[order])
         heading, seen = f"{text}, sum of innovations / √n", span_words(walk, "").strip()
-        courses.add(hours[order], walk, text, heading=heading, seen=seen, **looks)
+        courses.add(hours[order], walk, text, column=heading, seen=seen, **looks)
     return courses.chart("Running sum of the innovations over time")
 
 
@@ -330,7 +330,7 @@ def plot_predicted_measured(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
         courses.columns["measured deviation / µm"] = read
         heading = f"predicted, {text} / µm"
         seen = f"{number(float(np.sqrt(np.mean((read - predicted) ** 2))))} µm rms from the line"
-        courses.add(read, predicted, text, heading=heading, seen=seen, line=False, marker=marker, size=4.5, **looks)
+        courses.add(read, predicted, text, column=heading, seen=seen, line=False, marker=marker, size=4.5, **looks)
     ends = [float(end(courses.columns["measured deviation / µm"])) for end in (np.min, np.max)]
     courses.figure.line(ends, ends, line_color=MUTED, line_dash="dashed", legend_label="predicted = measured")
     return courses.chart("Predicted against measured deviation of the held-out cycles")
@@ -345,18 +345,17 @@ def plot_block_errors(errors: xr.Dataset, hours: np.ndarray, along: str) -> Char
     others = [name for name in errors.dims if name != along]
     x = "time since first reading / h" if along == "cycle" else "time since start / h"
     drawn = new_figure(x=x, y="prediction error, rms / µm", height=300)
-    columns: dict[str, np.ndarray] = {along: errors[along].values, x: hours} if along == "cycle" else {x: hours}
+    courses = Courses(drawn, {along: errors[along].values, x: hours} if along == "cycle" else {x: hours})
     for name, text, looks in (("before", "without the effect", _DECLARED), ("after", "with it", _FINAL)):
         size = np.sqrt((errors[name] ** 2).mean(others).values)
-        add_series(drawn, hours, size, name=text, marker="circle" if along == "cycle" else None, **looks)
-        columns[f"{text} / µm"] = size
-    highest = np.nanmax([columns["without the effect / µm"], columns["with it / µm"]])
+        courses.add(hours, size, text, marker="circle" if along == "cycle" else None, **looks)
+    highest = np.nanmax([courses.columns["without the effect / µm"], courses.columns["with it / µm"]])
     fix_range(drawn, 0.0, 1.05 * float(highest))
     before, after = alike([float(np.sqrt((errors[name] ** 2).mean())) for name in ("before", "after")])
-    counted = int(np.isfinite(columns["with it / µm"]).sum())
+    counted = int(np.isfinite(courses.columns["with it / µm"]).sum())
     unit = "cycles" if along == "cycle" else "blocks of time"
     seen = (
         f"Errors in {counted} {unit} that were left out and predicted from the others: {before} µm rms without the effect, {after} µm "
         "with it."
     )
-    return Chart(drawn, seen, columns)
+    return Chart(drawn, seen, courses.columns)

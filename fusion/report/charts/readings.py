@@ -17,6 +17,7 @@ from fusion.report.charts.style import (
     DIVERGING,
     MARKERS,
     Chart,
+    Courses,
     add_band,
     add_colour_bar,
     add_hover,
@@ -80,23 +81,16 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
 
 def plot_profile(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     """Draw the drift-free profile of both approaches with its 95 % band."""
-    drawn = new_figure(x="position / mm", y="deviation / µm", zero=True)
     order = np.argsort(position.values, kind="stable")
     drift, x = drift.isel(target=order), position.values[order].astype(float)
-    columns: dict[str, np.ndarray] = {"position / mm": x}
+    courses = Courses(new_figure(x="position / mm", y="deviation / µm", zero=True), {"position / mm": x})
     for direction in drift["direction"].values:
-        row = drift.sel(direction=direction)
+        row, name = drift.sel(direction=direction), ARROWS[direction]
         value, half = row["profile"].values, 2 * row["profile_u"].values
-        add_band(drawn, x, value - half, value + half, COLOURS[direction])
-        add_series(drawn, x, value, name=ARROWS[direction], half=half, **of_direction(direction))
-        columns[f"profile, {ARROWS[direction]} / µm"] = value
-        columns[f"95 % band ±, {ARROWS[direction]} / µm"] = half
-    rows = "; ".join(
-        f"{ARROWS[direction]} {span_words(drift['profile'].sel(direction=direction), 'µm')}"
-        for direction in drift["direction"].values
-    )
-    seen = f"Drift-free deviation over {span_words(x, 'mm')} of the axis: {rows}."
-    return Chart(drawn, seen, columns)
+        add_band(courses.figure, x, value - half, value + half, COLOURS[direction])
+        looks = {"half": half, **of_direction(direction)}
+        courses.add(x, value, name, f"profile, {name} / µm", f"95 % band ±, {name} / µm", **looks)
+    return courses.chart(f"Drift-free deviation over {span_words(x, 'mm')} of the axis")
 
 
 def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
@@ -118,20 +112,18 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Se
         place = float(position.sel(target=target))
         sides = {"left": place - 0.4 * step, "right": place + 0.4 * step}
         drawn.add_layout(BoxAnnotation(**sides, fill_color=ACCENT, fill_alpha=0.12, level="underlay"))
-    columns: dict[str, np.ndarray] = {"position / mm": x}
+    courses = Courses(drawn, {"position / mm": x})
     for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
         value, half = (drift[name].sel(direction=direction).values for name in ("scatter", "scatter_u"))
-        looks = of_direction(direction)
-        add_series(drawn, x + shift * step, value, name=ARROWS[direction], line=False, half=2 * half, **looks)
-        columns[f"scatter, {ARROWS[direction]} / µm"] = value
-        columns[f"95 % interval ±, {ARROWS[direction]} / µm"] = 2 * half
+        name, looks = ARROWS[direction], {"line": False, "half": 2 * half, **of_direction(direction)}
+        courses.add(x + shift * step, value, name, f"scatter, {name} / µm", f"95 % interval ±, {name} / µm", **looks)
     highest = float((drift["scatter"] + 2 * drift["scatter_u"]).max())
     fix_range(drawn, 0.0, 1.06 * highest if np.isfinite(highest) else 1.0)
     places = join([f"{float(position.sel(target=target)):g} mm" for target in sorted(flagged)])
     seen = f"Random scatter of {x.size} positions: {span_words(drift['scatter'], 'µm')}; " + (
         f"marked as standing out: {places}." if flagged else "none is marked as standing out."
     )
-    return Chart(drawn, seen, columns)
+    return Chart(drawn, seen, courses.columns)
 
 
 def plot_drift_map(drift: xr.Dataset, position: xr.DataArray) -> Chart:
@@ -283,17 +275,16 @@ def plot_scatter_comparison(comparison: xr.Dataset, position: xr.DataArray) -> C
     """Draw the standard deviation of the differences of neighbours and the conventional one of each position."""
     place, _ = _links(comparison["link"], position)
     drawn = new_figure(x="position / mm", y="standard deviation / µm", y_type="log")
-    columns: dict[str, np.ndarray] = {"position / mm": place}
+    courses = Courses(drawn, {"position / mm": place})
     for name, text, dash in (("differenced", "differences", "solid"), ("conventional", "conventional", "dashed")):
         for direction in comparison["direction"].values:
-            values = comparison[name].sel(direction=direction).values
-            add_series(drawn, place, values, name=f"{text}, {direction}", dash=dash, **of_direction(direction))
-            columns[f"s of the {text}, {ARROWS[direction]} / µm"] = values
+            values, looks = comparison[name].sel(direction=direction).values, {"dash": dash, **of_direction(direction)}
+            courses.add(place, values, f"{text}, {direction}", f"s of the {text}, {ARROWS[direction]} / µm", **looks)
     seen = (
         f"Standard deviation of {place.size} positions: of the differences {span_words(comparison['differenced'], 'µm')}, conventional "
         f"{span_words(comparison['conventional'], 'µm')}."
     )
-    return Chart(drawn, seen, columns)
+    return Chart(drawn, seen, courses.columns)
 
 
 def plot_mean_differences(neighbours: xr.Dataset, position: xr.DataArray) -> Chart:
@@ -301,18 +292,17 @@ def plot_mean_differences(neighbours: xr.Dataset, position: xr.DataArray) -> Cha
     further, nearer = _links(neighbours["link"], position)
     middle, step = (further + nearer) / 2, float(np.median(further - nearer))
     drawn = new_figure(x="middle of the pair / mm", y="nearer − further position, mean / µm", zero=True)
-    columns: dict[str, np.ndarray] = {"nearer position / mm": nearer, "further position / mm": further}
+    courses = Courses(drawn, {"nearer position / mm": nearer, "further position / mm": further})
     for shift, direction in zip((-0.1, 0.1), neighbours["direction"].values, strict=False):
-        value = neighbours["mean_difference"].sel(direction=direction).values
-        half = 2 * neighbours["mean_difference_u"].sel(direction=direction).values
-        looks = of_direction(direction)
-        add_series(drawn, middle + shift * step, value, name=ARROWS[direction], line=False, half=half, **looks)
-        columns |= {f"nearer − further, {ARROWS[direction]} / µm": value, f"95 % ±, {ARROWS[direction]} / µm": half}
+        value, u = (neighbours[key].sel(direction=direction).values for key in ("mean_difference", "mean_difference_u"))
+        name, looks = ARROWS[direction], {"line": False, "half": 2 * u, **of_direction(direction)}
+        x, headings = middle + shift * step, (f"nearer − further, {name} / µm", f"95 % ±, {name} / µm")
+        courses.add(x, value, name, *headings, **looks)
     seen = (
         f"Mean difference of {middle.size} pairs of neighbours, nearer minus further: {span_words(neighbours['mean_difference'], 'µm')}; "
         "below zero the deviation grows along the axis."
     )
-    return Chart(drawn, seen, columns)
+    return Chart(drawn, seen, courses.columns)
 
 
 def plot_reference_chart(chart: xr.Dataset, position: xr.DataArray) -> Chart:
@@ -388,17 +378,17 @@ def plot_windows(windows: xr.Dataset) -> Chart:
     short, whole = windows.isel(window=slice(None, -1)), windows.isel(window=-1)
     drawn = new_figure(x="middle cycle of the window", y=f"A, R, B / {unit}")
     middle = short["middle_cycle"].values
-    columns: dict[str, np.ndarray] = {"middle cycle": middle}
+    courses = Courses(drawn, {"middle cycle": middle})
     shown = (
         ("A", INK, "accuracy A", "circle"),
         ("R", ACCENT, "repeatability R", "square"),
         ("B", MUTED, "reversal B", "diamond"),
     )
     for shift, (name, colour, text, marker) in enumerate(shown):
-        value, half = short[name].values, 2 * short[f"{name}_u"].values
-        add_series(drawn, middle + 0.25 * (shift - 1), value, name=text, colour=colour, marker=marker, half=half)
+        x, value = middle + 0.25 * (shift - 1), short[name].values
+        looks: dict[str, Any] = {"colour": colour, "marker": marker, "half": 2 * short[f"{name}_u"].values}
+        courses.add(x, value, text, f"{name} / {unit}", f"U({name}), k = 2 / {unit}", **looks)
         drawn.hspan(float(whole[name]), line_color=colour, line_dash="dotted", line_width=1.5)
-        columns |= {f"{name} / {unit}": value, f"U({name}), k = 2 / {unit}": half}
     top = max(float(np.nanmax(short[name] + 2 * short[f"{name}_u"])) for name in "ARB")
     fix_range(drawn, 0.0, 1.05 * max(top, float(whole["A"])))
     seen = (
@@ -406,7 +396,7 @@ def plot_windows(windows: xr.Dataset) -> Chart:
         f"{span_words(short['B'], unit)}; all cycles as one window give A {number(float(whole['A']))} {unit} and "
         f"R {number(float(whole['R']))} {unit}."
     )
-    return Chart(drawn, seen, columns)
+    return Chart(drawn, seen, courses.columns)
 
 
 # What was recorded when, and the environment and the drivers on the same time axis.

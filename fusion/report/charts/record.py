@@ -75,7 +75,7 @@ def plot_residuals(record: xr.Dataset, channel: str) -> Chart:
     stages = (("declared", "declared model", BEFORE, "dashed"), ("final", "final model", _AFTER, "solid"))
     for ending, name, colour, dash in stages:
         missed = (chosen["displacement"] - chosen[f"predicted_{ending}"]).values
-        courses.add(hours, missed, name, heading=f"measured − {name} / µm", colour=colour, dash=dash)
+        courses.add(hours, missed, name, column=f"measured − {name} / µm", colour=colour, dash=dash)
     return courses.chart(f"What the models miss in {channel} over time")
 
 
@@ -177,17 +177,8 @@ def draw_thermal_tests(tests: Sequence[ThermalTest]) -> dict[str, Chart]:
                 y=f"{'temperature' if unit == 'degC' else 'drift'} / {printed}",
                 legend_columns=4,
             )
-            courses = Courses(drawn, {"time since start / h": np.array(shown[0].hours)})
+            courses = Courses(drawn, {"time since start / h": np.array(shown[0].hours)}, unit=printed)
             for rank, one in enumerate(shown):
-                values = np.array([np.nan if value is None else value for value in one.values])
-                told = span_words(values, printed)
-                courses.add(
-                    np.array(one.hours),
-                    values,
-                    one.name,
-                    heading=f"{one.name} / {printed}",
-                    seen=f"{one.name} {told}",
-                    **of_rank(rank),
-                )
+                courses.add(np.array(one.hours), np.array(one.values, float), one.name, **of_rank(rank))
             charts[f"thermal_{k}_{unit.replace('/', '_')}"] = courses.chart("Course of the test")
     return charts

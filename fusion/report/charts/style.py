@@ -199,16 +199,18 @@ def add_series(
 class Courses:
     """Named series of one figure as they are drawn: what the reader can download of them, and what is seen of each, in words."""
 
-    def __init__(self, drawn: figure, columns: Mapping[str, np.ndarray] | None = None) -> None:
-        self.figure, self.columns, self.told = drawn, dict(columns or {}), list[str]()
+    def __init__(self, drawn: figure, columns: Mapping[str, np.ndarray] | None = None, *, unit: str = "µm") -> None:
+        self.figure, self.columns, self.told, self.unit = drawn, dict(columns or {}), list[str](), unit
 
     def add(
-        self, x: np.ndarray, y: np.ndarray, name: str, *, heading: str = "", seen: str | None = None, **looks: Any
+        self, x: np.ndarray, y: np.ndarray, name: str, column: str = "", bars: str = "", seen: str = "", **looks: Any
     ) -> None:
-        """Draw a series of values in µm; `heading` and `seen` where they are not its name with the unit, and the span of its values."""
+        """Draw a series; `column` and `seen` where they are not its name with the unit and its span, `bars` heads half its error bars."""
         add_series(self.figure, x, y, name=name, **looks)
-        self.columns[own_name(heading or f"{name} / µm", self.columns)] = y
-        self.told.append(f"{name} {span_words(y, 'µm') if seen is None else seen}")
+        self.columns[own_name(column or f"{name} / {self.unit}", self.columns)] = y
+        if bars:
+            self.columns[bars] = looks["half"]
+        self.told.append(f"{name} {seen or span_words(y, self.unit)}")
 
     def chart(self, subject: str) -> Chart:
         """Return the chart, with what is seen of every series after the subject."""

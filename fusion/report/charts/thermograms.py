@@ -12,7 +12,7 @@ from bokeh.plotting import figure
 
 from fusion.common import own_name
 from fusion.report.charts.plan import add_marks, add_names, draw_picture
-from fusion.report.charts.style import DIVERGING, Chart, add_series, new_figure, of_rank, span_words
+from fusion.report.charts.style import DIVERGING, Chart, Courses, add_series, new_figure, of_rank, span_words
 from fusion.results.numbers import fixed
 from interferometry.plots import ACCENT, INK
 from thermography.evaluation import count_temperatures, read_profile
@@ -156,19 +156,15 @@ def plot_regions(thermograms: xr.Dataset) -> Chart:
 def plot_profiles(picture: xr.Dataset, lines: Sequence[Region]) -> Chart:
     """Draw the temperatures along lines."""
     drawn = new_figure(x="distance along the line / px", y="temperature / °C", legend_columns=3)
-    columns: dict[str, Any] = {}
-    told = []
+    courses = Courses(drawn, unit="°C")
     for rank, line in enumerate(lines):
         along = read_profile(picture, line)
-        add_series(drawn, along["distance"].values, along.values, name=line.name, **of_rank(rank))
-        columns[own_name(f"{line.name}, distance / px", columns)] = along["distance"].values
-        columns[own_name(f"{line.name} / °C", columns)] = along.values
-        told.append(f"{line.name} {span_words(along.values, '°C')}")
-    longest = max(len(values) for values in columns.values())
-    padded = {
-        name: np.pad(values, (0, longest - len(values)), constant_values=np.nan) for name, values in columns.items()
-    }
-    return Chart(drawn, f"Temperatures along lines: {'; '.join(told)}.", padded)
+        courses.columns[own_name(f"{line.name}, distance / px", courses.columns)] = along["distance"].values
+        courses.add(along["distance"].values, along.values, line.name, **of_rank(rank))
+    longest = max(len(values) for values in courses.columns.values())
+    for name, values in courses.columns.items():
+        courses.columns[name] = np.pad(values, (0, longest - len(values)), constant_values=np.nan)
+    return courses.chart("Temperatures along lines")
 
 
 def plot_histogram(picture: xr.Dataset) -> Chart:
