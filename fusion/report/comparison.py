@@ -18,6 +18,7 @@ from fusion.report.charts.comparison import (
     plot_scatters,
 )
 from fusion.report.charts.style import embed
+from fusion.report.findings import findings
 from fusion.report.page import render_page
 from fusion.report.sheet import Sheet, Stated
 from fusion.report.wording import (
@@ -247,11 +248,9 @@ def side_by_side(pairs: Sequence[PairComparison]) -> Table:
 
 def _figures(campaign: ComparedCampaign) -> dict[str, str]:
     """The main figures of a campaign by name, in the order of the report."""
-    results, figures = campaign.results, {}
-    if results.drift is not None and results.drift.range_um:
-        ranges = zip(results.drift.range_um, results.drift.range_u_um, strict=True)
-        if known := [(value, u) for value, u in ranges if value is not None]:
-            figures["largest drift during the test"] = measured(*max(known, key=lambda one: one[0] or 0.0), "µm")
+    results = campaign.results
+    tiles = [one.tile for one in findings(results) if one.code == "drift"]
+    figures = {f"{tile.name.lower()} during the test": tile.value for tile in tiles if tile}
     if isinstance(results.loop, AxisLoop):
         for declared in results.loop.declared_coefficients:
             figures[effect_words(declared.effect).name] = measured(

@@ -27,7 +27,6 @@ from fusion.results.numbers import print_unit
 from fusion.results.parts import Iso230Condition
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
-from interferometry import iso230
 from thermography.common import ACTING
 
 #: Bytes of a row of fields.csv, measured on the demo.
@@ -123,9 +122,7 @@ def iso230_axis_table(deviations: xr.Dataset) -> pd.DataFrame:
 
 def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFrame:
     """Return mean, standard deviation, reversal and repeatability per target in the window whose values are quoted, um."""
-    name = "" if results.iso230 is None else results.iso230.window
-    window = _cycles_of(name, deviations)
-    evaluated = iso230.evaluate_iso230(deviations, cycles=window)
+    evaluated = group(deviations, "settled")
     columns = {"position_mm": deviations["position"]}
     for direction in ("positive", "negative"):
         chosen = evaluated.sel(direction=direction, drop=True)
@@ -137,8 +134,8 @@ def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFr
         "mean_bidirectional_um": evaluated["mean_bidirectional"],
         "repeatability_bidirectional_um": evaluated["repeatability_bidirectional"],
     }
-    table = xr.Dataset(columns).to_dataframe().reset_index().assign(window=evaluated.attrs["window"])
-    return _in_its_units(table, deviations)
+    window = results.iso230.window if results.iso230 else ""
+    return _in_its_units(xr.Dataset(columns).to_dataframe().reset_index().assign(window=window), deviations)
 
 
 # Of a record.
@@ -342,13 +339,6 @@ def fields_megabytes(folder: Path) -> float | None:
         return None
     with opened(path) as fields:
         return require_kind(fields, "fields", path)["temperature"].size * _FIELD_ROW_BYTES / 1e6
-
-
-def _cycles_of(window: str, deviations: xr.Dataset) -> list[int] | None:
-    """Return the cycles between the two numbers that a window's name begins with; None, all of them, where it names none."""
-    ends = [int(text) for text in re.findall(r"\d+", window)[:2]]
-    measured = deviations["cycle"].values.tolist()
-    return [cycle for cycle in measured if ends[0] <= cycle <= ends[1]] or None if len(ends) == 2 else None
 
 
 # Workbooks of tables: headings in words with units, uncertainties as U (k = 2), formats, filters and charts.

@@ -434,8 +434,6 @@ def test_positions_are_of_the_window_that_the_results_state(small_run):
     assert (positions["count_positive"] == 5).all()
     np.testing.assert_allclose(positions["mean_positive_um"], deviations["deviation"].values[5:10, 0].mean(axis=0))
     assert set(positions["window"]) == {"cycles 6 to 10"}
-    whole = tables.iso230_position_table(deviations, results.model_copy(update={"iso230": None}))
-    assert (whole["count_positive"] == 12).all()
 
 
 def test_fields_are_tabulated_on_request(tmp_path):
