@@ -48,7 +48,7 @@ from fusion.report.wording import (
     untouched,
     with_values,
 )
-from fusion.results.axis import CorrelationPart, Evidence, Iso230Direction, Iso230Part, Iso230Window, PlacePart
+from fusion.results.axis import AnomalyPart, CorrelationPart, Iso230Direction, Iso230Part, Iso230Window, PlacePart
 from fusion.results.loop import AxisLoop, AxisStep, Coefficient, Loop, Nothing, RecordLoop, RunnerUp, StepPart
 from fusion.results.numbers import (
     alike,
@@ -521,9 +521,12 @@ def describe_candidates(loop: AxisLoop) -> Table:
     return table(["Round", Words("Effect"), Words("Best parameters"), *titles], rows)
 
 
-def describe_evidence(evidence: Evidence) -> dict[str, Any]:
-    """Return the evidence of an anomaly: size, sentences for and against, what to inspect, and all numbers."""
+def describe_anomaly(anomaly: AnomalyPart) -> dict[str, Any]:
+    """Return what a position that stands out shows: size, sentences for and against, what to inspect, and all numbers."""
+    evidence = anomaly.evidence
     return {
+        "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",
+        "sentence": say("anomaly_sentence", anomaly),
         "stands_out": say("stands_out", evidence),
         "support": evidence.support,
         "against": evidence.against,
@@ -627,16 +630,7 @@ def describe_campaign(
         "comparison": None if results.neighbours is None or deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
         "thermal_tests": describe_thermal_tests(results.iso230_3) if results.iso230_3 else None,
-        "anomalies": None
-        if results.anomalies is None
-        else [
-            {
-                "title": f"{upper_first(anomaly_place(anomaly))}: {anomaly_cause(anomaly)}",
-                "sentence": say("anomaly_sentence", anomaly),
-                **describe_evidence(anomaly.evidence),
-            }
-            for anomaly in results.anomalies
-        ],
+        "anomalies": None if results.anomalies is None else [describe_anomaly(one) for one in results.anomalies],
         "sensors": results.sensors or None,
         "registration": results.registration,
         "correlation": None if fused is None else describe_correlation(fused, results, joint),
@@ -744,7 +738,6 @@ def _camera(fields: xr.Dataset) -> dict[str, Any]:
         "cells": (fields.sizes["x"], fields.sizes["y"]),
         "cell_size": float(np.median(np.diff(fields["x"]))),
         "visible": float(np.isfinite(rise).mean()),
-        "mean_rise_K": float(rise.mean()),
         "fiducials": list(zip(*(fields[f"fiducial_{name}"].values.tolist() for name in names), strict=True)),
     }
 

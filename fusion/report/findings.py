@@ -253,27 +253,20 @@ def findings(results: Results) -> list[Finding]:
     loop, drift, pictures, regions = results.loop, results.drift, results.thermograms, results.regions or ()
 
     def add(
-        code: str,
-        name: str = "",
-        of: object = results,
-        *,
-        text: str | None = None,
-        tile: str | Tile = "",
-        rests_on: Figures | None = None,
-        value: Quantity | None = None,
-        unit: str = "",
-    ) -> None:
-        text = say(code, of) if name and text is None else text or ""
-        shown = Tile(tile, *sentences(f"{code}_tile", of)) if isinstance(tile, str) and tile else tile or None
-        if text or shown or value:
+        code: str, name: str = "", of: object = results, *, text: str = "", tile: str = "", rests_on: Figures | None = None,
+        value: Quantity | None = None, unit: str = "",
+    ) -> None:  # fmt: skip
+        text = text or (say(code, of) if name else "")
+        if text or tile or value:
             limits = condition(results.inputs, rests_on) if rests_on else ""
+            shown = Tile(tile, *sentences(f"{code}_tile", of)) if tile else None
             found.append(Finding(code, name if text else "", f"{text} {limits}".rstrip(), shown, value, unit))
 
     if results.inputs is not None and (pictures is None or pictures.series):
         add("inputs", "inputs", text="\n".join(sentences("inputs", results)))
-    for quoted in _quoted_tiles(results):
-        add("quoted", tile=quoted)
     if results.iso230 is not None:
+        for symbol, quoted in _quoted(results, results.iso230).items():
+            add("quoted", of=(quoted, results.iso230.window), tile=f"{symbol}, ISO 230-2")
         for symbol in ISO230_TERMS:
             add(symbol, value=getattr(results.iso230, f"{symbol}_um"), unit=results.iso230.unit)
     if isinstance(loop, RecordLoop):
@@ -284,7 +277,7 @@ def findings(results: Results) -> list[Finding]:
         largest, _ = drift_extremes(drift)
         add("drift", of=largest, tile="Largest drift", value=largest.size, unit="um")
     if results.field is not None:
-        add("mean_rise", tile=Tile("Table, mean rise", quantity(results.field.mean_rise_K, "K")))
+        add("mean_rise", of=results.field, tile="Table, mean rise")
     elif pictures is not None:
         own = [one for one in regions if one.camera == pictures.series] or regions
         for code, name in (("highest", "Highest"), ("lowest", "Lowest"), ("mean", "Mean")):
@@ -319,16 +312,12 @@ def findings(results: Results) -> list[Finding]:
     return found
 
 
-def _quoted_tiles(results: Results) -> list[Tile]:
+def _quoted(results: Results, iso: Iso230Part) -> dict[str, str]:
     """Return A by ISO 230-2, and where the readings of the laser say nothing else the other values that are quoted."""
-    iso = results.iso230
-    if iso is None:
-        return []
-    alone = results.loop is None and results.drift is None and results.field is None
-    quoted = dict(list(quoted_values(iso).items())[: 3 if alone else 1])
-    if alone and iso.A_um.value is not None:
-        quoted["M"] = quantity(iso.M_um, print_unit(iso.unit))
-    return [Tile(f"{name}, ISO 230-2", value, iso.window.split(" (")[0]) for name, value in quoted.items()]
+    quoted = quoted_values(iso)
+    if results.loop is not None or results.drift is not None or results.field is not None:
+        return dict(list(quoted.items())[:1])
+    return quoted | ({} if iso.A_um.value is None else {"M": quantity(iso.M_um, print_unit(iso.unit))})
 
 
 def _scatter_range(drift: DriftPart) -> str:

@@ -19,8 +19,8 @@ from fusion.app.results.data import CYCLE, HOURS, POSITION, Linker, Place, Produ
 from fusion.campaign.inputs import lacks_course
 from fusion.report.campaign import (
     DECIDED_BEFORE,
+    describe_anomaly,
     describe_candidates,
-    describe_evidence,
     describe_model,
     errors_table,
     shown_channels,
@@ -43,9 +43,7 @@ from fusion.report.charts.style import CATEGORIES, Chart, add_colour_bar, add_se
 from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import (
     Table,
-    anomaly_cause,
     anomaly_figures,
-    anomaly_place,
     conditional,
     effect_words,
     iso230_values,
@@ -505,17 +503,16 @@ def anomaly_cards(products: Products, selection: Selection) -> ui.Parts:
 
 def _card(products: Products, selection: Selection, anomaly: AnomalyPart) -> pn.viewable.Viewable:
     """Return what stands out, what it rests on, what to inspect, and the field around it."""
-    evidence = describe_evidence(anomaly.evidence)
-    sentence = conditional(say("anomaly_sentence", anomaly), products.results.inputs, *anomaly_figures(anomaly))
-    place = anomaly_place(anomaly)
+    told = describe_anomaly(anomaly)
+    sentence = conditional(told["sentence"], products.results.inputs, *anomaly_figures(anomaly))
     show = pn.widgets.Button(label=f"Show position {anomaly.target} everywhere")
     show.on_click(lambda event: selection.param.update(target=anomaly.target))
     parts = [
-        ui.heading(f"{place[:1].upper()}{place[1:]}: {anomaly_cause(anomaly)}", level=3),
-        ui.paragraph(f"{sentence} It stands out by {evidence['stands_out']}."),
-        *([ui.paragraph("For:"), ui.bullets(evidence["support"])] if evidence["support"] else []),
-        *([ui.paragraph("Against:"), ui.bullets(evidence["against"])] if evidence["against"] else []),
-        ui.paragraph(f"What to inspect: {evidence['check']}"),
+        ui.heading(told["title"], level=3),
+        ui.paragraph(f"{sentence} It stands out by {told['stands_out']}."),
+        *([ui.paragraph("For:"), ui.bullets(told["support"])] if told["support"] else []),
+        *([ui.paragraph("Against:"), ui.bullets(told["against"])] if told["against"] else []),
+        ui.paragraph(f"What to inspect: {told['check']}"),
         show,
     ]
     return ui.column(*parts, *_field_around(products, selection, anomaly.target))

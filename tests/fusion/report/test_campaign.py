@@ -207,7 +207,7 @@ def test_the_model_and_its_errors_are_told_in_numbers():
 def test_candidates_evidence_and_errors_are_told_with_their_numbers():
     (row,) = model_section.describe_candidates(LOOP).rows
     assert row.cells == ["1", "sudden step or new zero", "", "9.0", "8.0", "0.01", "4.0", "0.01"]
-    told = model_section.describe_evidence(RESULTS.anomalies[0].evidence)
+    told = model_section.describe_anomaly(RESULTS.anomalies[0])
     assert told["stands_out"] == "extra scatter of 0.30 \u00b5m"
     assert ("step, gain in log-likelihood on the other approach", "0") in told["numbers"] and (
         "step, cycle",
