@@ -24,6 +24,7 @@ from fusion.campaign.inputs import CameraInputs, LaserInputs, Source, is_rotary,
 from fusion.campaign.inputs import Inputs as Read
 from fusion.common import FusionError
 from fusion.report.wording import check_words
+from fusion.results.axis import RegistrationPart
 from fusion.results.parts import CheckPart, Figures, InputsPart
 from fusion.results.results import Notice
 from thermography.io.other_cameras import TemperatureFrame
@@ -185,7 +186,7 @@ def _together(checks: Sequence[Check]) -> Iterator[Check]:
         yield check.model_copy(update=changed)
 
 
-def check_plan(source: CameraInputs, registration: Mapping[str, Any]) -> list[Check]:
+def check_plan(source: CameraInputs, registration: RegistrationPart | None) -> list[Check]:
     """Check what the registration found."""
     return run_checks("plan", Inputs(registration=registration, fiducials_file=source.fiducials_file))
 

@@ -395,7 +395,7 @@ def _check(
     if field_checks is not None and maps_written is not None:
         maps_written()
         assert isinstance(source, CameraInputs)
-        checks += [*check_plan(source, plain(run.parts.registration)), *field_checks()]
+        checks += [*check_plan(source, run.parts.registration), *field_checks()]
     if model is not None:
         assert isinstance(source, LaserInputs)
         checks += check_loop(plain(run.parts.loop), source)

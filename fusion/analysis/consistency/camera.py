@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,8 @@ from fusion.analysis.alignment.align import covered_share, likely_zone_shift
 from fusion.analysis.consistency.checks import CAMERA, CLOCK, Found, check, judge
 from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
 from fusion.common import Array
+from fusion.results.axis import RegistrationPart
+from fusion.results.parts import is_determined
 from thermography.common import ThermographyError
 from thermography.evaluation import share_outside_range, thermogram
 from thermography.inspection import FileWarning, check_series
@@ -534,48 +536,49 @@ _LEAST_SPAN = 0.25
 
 
 @check("plan", CAMERA)
-def fiducials_found(registration: Mapping[str, Any]) -> Found:
+def fiducials_found(registration: RegistrationPart) -> Found:
     """Share of the listed fiducials that are in view and agree: at least `_LEAST_FOUND`."""
-    used, listed = len(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
+    used, listed = len(registration.leave_one_out_mm), registration.fiducials_listed
     found = used / listed
     return judge(found, _LEAST_FOUND, passed=found >= _LEAST_FOUND, used=used, listed=listed)
 
 
 @check("plan", CAMERA)
-def fiducials_unchecked(registration: Mapping[str, Any]) -> Found:
+def fiducials_unchecked(registration: RegistrationPart) -> Found:
     """Fiducials that the others predict to no better than a quarter of a diameter, all of four: none."""
-    return judge(len(registration["unchecked"]), 0.0, unchecked=registration["unchecked"])
+    return judge(len(registration.unchecked), 0.0, unchecked=registration.unchecked)
 
 
 @check("plan", CAMERA)
-def fiducial_hints(registration: Mapping[str, Any]) -> Found:
+def fiducial_hints(registration: RegistrationPart) -> Found:
     """Share of the fiducials in use that lie more than 25 px from their approximate pixel position: at most
     `_LARGEST_CONTRADICTED`; hints that all lie by the same shift from their discs, and most not on another one, were read in another view
     and agree (named, not counted).
     """
-    hints, used = len(registration["contradicted_hints"]), len(registration["leave_one_out_mm"])
+    hints, used = len(registration.contradicted_hints), len(registration.leave_one_out_mm)
     return judge(hints / used, _LARGEST_CONTRADICTED, hints=hints, used=used)
 
 
 @check("plan", CAMERA)
-def fiducial_diameters(registration: Mapping[str, Any]) -> Found:
+def fiducial_diameters(registration: RegistrationPart) -> Found:
     """Median ratio of the imaged to the listed area of the discs, at the scale of their places: at most `_LARGEST_AREA_RATIO`, and its
     inverse.
     """
     # Points without a disc have no area.
-    area = registration["area_ratio"]
-    ratio = 1.0 if area is None or not np.isfinite(area) else float(area)
+    area = registration.area_ratio
+    ratio = area if is_determined(area) else 1.0
     passed = bool(abs(np.log(ratio)) <= np.log(_LARGEST_AREA_RATIO))
     return judge(ratio, _LARGEST_AREA_RATIO, passed=passed)
 
 
 @check("plan", CAMERA)
-def fiducials_span(registration: Mapping[str, Any]) -> Found:
+def fiducials_span(registration: RegistrationPart) -> Found:
     """Share of the plan's area that the fiducials in use span: at least `_LEAST_SPAN`."""
-    return judge(registration["span"], _LEAST_SPAN, passed=registration["span"] >= _LEAST_SPAN)
+    span = registration.span or 0.0
+    return judge(span, _LEAST_SPAN, passed=span >= _LEAST_SPAN)
 
 
 @check("plan", CAMERA)
-def plan_mirrored(registration: Mapping[str, Any]) -> Found:
+def plan_mirrored(registration: RegistrationPart) -> Found:
     """Sense in which the plan turns in the frame: the same; a plan drawn with y upwards appears mirrored and is accepted once."""
-    return judge(bool(registration["mirrored"]), 0.0)
+    return judge(registration.mirrored, 0.0)

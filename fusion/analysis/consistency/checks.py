@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fusion.analysis.consistency.camera import Motion
     from fusion.analysis.consistency.field_series import FieldSeries
     from fusion.analysis.consistency.material import Logged
+    from fusion.results.axis import RegistrationPart
     from thermography.inspection import FileWarning
     from thermography.io.frame import FrameReference
 
@@ -118,7 +119,7 @@ class Inputs:
     sensor_x_mm: Array | None = None
     sensor_y_mm: Array | None = None
     sensor_u_K: float | None = None
-    registration: Mapping[str, Any] | None = None
+    registration: RegistrationPart | None = None
     fiducials_file: str | None = None
     loop: Mapping[str, Any] | None = None
     travel_mm: float | None = None

@@ -25,7 +25,7 @@ from fusion.pipeline.thermal import (
 )
 from fusion.results.progress import silent
 from fusion.results.results import Outcome, assemble
-from fusion.results.store import plain, read_dataset
+from fusion.results.store import read_dataset
 from fusion.twin import simulate
 from fusion.twin.instruments import write_campaign
 from fusion.twin.recipe import Recipe
@@ -109,7 +109,7 @@ def test_points_picked_by_hand_and_a_calibrated_lens_serve_a_campaign(tmp_path):
         table.to_csv(campaign.parent / "fiducials.csv", index=False)
         part = _reduce(campaign).parts.registration
         source = read_source(load_campaign(campaign))
-        assert [check.code for check in check_plan(source, plain(part)) if not check.passed] == []
+        assert [check.code for check in check_plan(source, part) if not check.passed] == []
         return part
 
     by_discs = registered(fiducials)

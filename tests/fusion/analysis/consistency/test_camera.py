@@ -23,6 +23,7 @@ from fusion.analysis.consistency.camera import (
 from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.library import RULES
 from fusion.pipeline.consistency import Check, _worded, run_checks
+from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency.twin_fields import recorded
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CalibratedRange
@@ -394,11 +395,14 @@ SOUND = {
     "mirrored": False,
     "span": 0.66,
     "area_ratio": 1.004,
+    "rms_mm": 0.02,
+    "frames_rejected": [],
 }
 
 
 def doubts(**changed) -> list[str]:
-    checks = run_checks("plan", Inputs(registration={**SOUND, **changed}, fiducials_file="fiducials.csv"))
+    part = RegistrationPart.model_validate({**SOUND, **changed})
+    checks = run_checks("plan", Inputs(registration=part, fiducials_file="fiducials.csv"))
     return [check.code for check in checks if not check.passed]
 
 
