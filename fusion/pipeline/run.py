@@ -456,20 +456,15 @@ def _without_frames(source: Any) -> Any:
 
 def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
     """Remove products of an earlier run of another campaign in this folder: of an instrument that is gone, of cycles that are not there."""
-    of_stages = {
-        "thermograms": "thermograms.nc",
-        "fields": "fields.nc",
-        "deviations": "deviations.nc",
-        "sensors": _SENSORS,
-    }
-    stale = [name for dataset, name in of_stages.items() if dataset not in datasets]
+    kept = {name: STAGES[name].file for name in ("thermograms", "fields", "deviations")}
+    stale = [file for name, file in {**kept, "sensors": _SENSORS}.items() if name not in datasets]
     if not {"fusion", "record"} & set(datasets):
         stale.append("fusion.nc")
     cycles = datasets["fields"]["cycle"].values if "fields" in datasets else ()
     maps = {f"maps/{thermal.map_name(cycle)}" for cycle in cycles}
     stale += [name for name in read_manifest(run.folder) if name.startswith("maps/") and name not in maps]
     discard(run.folder, *stale)
-    for name in {"thermograms", "fields", "deviations"} - set(datasets):
+    for name in set(kept) - set(datasets):
         run.stamps.forget(name)
 
 
