@@ -12,7 +12,7 @@ from threading import Lock, Thread
 from typing import Any
 
 from fusion.common import FusionError
-from fusion.pipeline.workers import start_command
+from fusion.pipeline.workers import start_run
 from fusion.results.numbers import duration
 
 # How far a run is, stage by stage, and how long the present one still takes.
@@ -85,10 +85,9 @@ class RunProcess:
         self.progress = Progress()
         self.messages: list[str] = []
         self.version = 0
-        command = ["run", str(campaign), "--out", str(results), "--quiet", "--json-progress"]
-        command += ["--resume"] if self.resumed else []
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8"}
-        self._process = start_command(*command, errors="replace", **pipes)
+        options = ("--quiet", "--json-progress")
+        self._process = start_run(campaign, results, *options, resume=self.resumed, errors="replace", **pipes)
         self._thread = Thread(target=self._read, daemon=True)
         self._thread.start()
 

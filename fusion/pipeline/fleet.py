@@ -18,7 +18,7 @@ from fusion.campaign.config import load_campaign
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
 from fusion.pipeline.stages import kept_results
-from fusion.pipeline.workers import start_command
+from fusion.pipeline.workers import start_run
 from fusion.report.fleet import SUMMARY, Row, as_csv, as_json, read_rows, render_fleet, with_findings, write_book
 from fusion.results.folder import MANIFEST, claim, open_folder
 from fusion.results.progress import Report, silent
@@ -192,21 +192,14 @@ def has_room(running: Sequence[_Running], jobs: int, largest: float) -> bool:
 
 def _start(member: Member, out: Path, log: str, *, jobs: int, resume: bool) -> _Running:
     """Start the run of a campaign; everything that it says goes to its log."""
-    folder = out / member.name
-    command = ["run", str(member.campaign), "--out", str(folder), "--processes", "1"]
-    command += ["--resume"] if resume and folder.is_dir() else []
-    threads = str(max(usable_processors() // jobs, 1))
-
+    folder, threads = out / member.name, str(max(usable_processors() // jobs, 1))
+    usual = dict.fromkeys(_THREAD_VARIABLES, threads) | {"PYTHONUNBUFFERED": "1"}
     (out / log).parent.mkdir(parents=True, exist_ok=True)
     with (out / log).open("wb") as stream:
         # A session of its own: a Ctrl-C at the terminal is for the fleet, which tells its runs to stop.
-        process = start_command(
-            *command,
-            environment=dict.fromkeys(_THREAD_VARIABLES, threads) | {"PYTHONUNBUFFERED": "1"},
-            stdout=stream,
-            stderr=stream,
-            start_new_session=True,
-        )
+        streams = {"stdout": stream, "stderr": stream, "start_new_session": True}
+        resumed, options = resume and folder.is_dir(), ("--processes", "1")
+        process = start_run(member.campaign, folder, *options, resume=resumed, usual=usual, **streams)
     return _Running(process, time.monotonic())
 
 

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -189,13 +190,11 @@ def collect_garbage_less() -> None:
     gc.set_threshold(50_000)
 
 
-def start_command(
-    *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
+def start_run(
+    campaign: Path, results: Path, *options: str, resume: bool, usual: Mapping[str, str] | None = None, **process: Any
 ) -> subprocess.Popen[Any]:
-    """Start the command in a process of the same interpreter that finds the same modules as this one."""
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", "fusion.cli", *arguments],
-        stdin=subprocess.DEVNULL,
-        env={**(environment or {}), **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        **options,
-    )
+    """Start `thermofuse run` in a process of the same interpreter that finds the same modules; `usual` holds for what nobody has set."""
+    command = [sys.executable, "-P", "-m", "fusion.cli", "run", str(campaign), "--out", str(results), *options]
+    command += ["--resume"] if resume else []
+    environment = {**(usual or {}), **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **process)
