@@ -37,34 +37,14 @@ from fusion.report.wording import (
     table,
 )
 from fusion.results.loop import AxisLoop
-from fusion.results.numbers import fixed, join, measured, number, p_cell, place, print_unit
+from fusion.results.numbers import fixed, join, measured, p_cell, place, print_unit
 from fusion.results.parts import Quantity
 from fusion.results.store import plain
 
-#: Quantities of a comparison in words; others are effects.
-_WORDS = {
-    "slope": "slope over the travel",
-    "bow": "bow over the travel",
-    "mean reversal": "mean reversal error",
-    "position": "deviation",
-    "reversal at a position": "reversal error",
-    "scatter": "scatter",
-    "step": "deviation",
-    "block": "deviation",
-    "profile": "profile beyond offset, slope and bow",
-    "rest of the profile": "rest of the profile",
-}
 #: What is left of a difference of profiles, as a whole.
 _REST = ("profile", "rest of the profile")
 #: Tests beside each other in a table on paper.
 _MOST_COLUMNS = 5
-#: Inputs of the budget of ISO 230-2 that two tests may have in common.
-_INPUTS = {
-    "expansion_coefficient": "the error of the expansion coefficient (material on the same side of 20 °C in both)",
-    "device": "that of the laser",
-    "alignment": "that of its alignment",
-    "material_temperature": "that of the material sensor",
-}
 #: Verdict on a difference that a thermal state alone can cause.
 _STATE = "differs; the thermal state of a test alone can cause that"
 
@@ -95,40 +75,20 @@ def short_names(pairs: Sequence[PairComparison]) -> list[str]:
 
 def conclude_comparison(pair: PairComparison) -> str:
     """Return what a comparison shows."""
-    if not pair.changes:
-        return "Nothing can be compared."
-    machine = [_change_words(change) for change in pair.changes if change.significant and change.machine]
-    state = [_change_words(change) for change in pair.changes if change.significant and not change.machine]
-    unchanged = "what no thermal state can cause stayed within its uncertainties"
-    if machine:
-        text = f"Changed by more than the uncertainties: {join(machine)}."
-        if state:
-            text += f" Also different, which another thermal state of the test alone can cause: {join(state)}."
-    elif state:
-        text = f"Different by more than the uncertainties: {join(state)}. These tests do not show whether the machine changed or only the "
-        text += f"thermal state in which it was measured: {unchanged}."
-    else:
-        text = f"No change of the machine is shown: {unchanged}."
-    for campaign in (pair.before, pair.after):
+    machine, state = (
+        [_change_words(change) for change in pair.changes if change.significant and change.machine is machine]
+        for machine in (True, False)
+    )
+    text = say("comparison_outcome", bool(pair.changes), machine, state)
+    for campaign in (pair.before, pair.after) if pair.changes else ():
         text = conditional(text, campaign.results.inputs, "positions")
     return text
 
 
 def conclude_table(pair: PairComparison) -> list[str]:
     """Return whether a table that was loaded did what was predicted of it; nothing where none was named."""
-    if not pair.achieved:
-        return []
     missed = [one.quantity for one in pair.achieved if not one.as_predicted]
-    if not missed:
-        are = "is" if len(pair.achieved) == 1 else "are"
-        return [
-            f"With the table {join([one.quantity for one in pair.achieved])} {are} as predicted within the uncertainty."
-        ]
-    differ = "differs" if len(missed) == 1 else "differ"
-    return [
-        f"With the table {join(missed)} {differ} from the prediction by more than the uncertainty: look for a wrong sign or scale, a table "
-        "that was not active, or another thermal state."
-    ]
+    return sentences("table_outcome", [one.quantity for one in pair.achieved], missed)
 
 
 def achieved_table(pair: PairComparison) -> Table:
@@ -146,25 +106,14 @@ def comparison_notes(pairs: Sequence[PairComparison]) -> list[str]:
     """Return what holds for all comparisons with the reference: level, what was presumed, common errors, and what cannot be compared."""
     tests = max(pair.tests for pair in pairs)
     standard = max((one.family for pair in pairs for one in pair.changes if one.group == "ISO 230-2"), default=0)
-    levels = [f"all {tests} tests on profile, scatter and drift per kelvin together"] if tests else []
-    levels += [f"all {standard} values by ISO 230-2 together"] if standard else []
-    notes = []
-    if levels:
-        notes.append(
-            f"Each counts at {100 * CHANGE_LEVEL:.0f} % over {', and over '.join(levels)}. Positions are compared beyond offset, slope and "
-            "bow of the profile; that presumes that the laser measured along the same line."
-        )
+    notes = sentences("comparison_level", CHANGE_LEVEL, tests, standard)
     names = _letters(pairs)[1:]
-    for common, whose in _shared([(pair.common, name) for pair, name in zip(pairs, names, strict=True) if pair.common]):
-        which = "" if len(whose) == len(pairs) else f" ({join(whose)})"
-        inputs = join([_INPUTS[name] for name in common])
-        notes.append(
-            f"Common to the tests{which}, and therefore not counted twice in the differences by ISO 230-2: {inputs}."
-        )
+    common = [(pair.common, name) for pair, name in zip(pairs, names, strict=True) if pair.common]
     lacks = [(lack, name) for pair, name in zip(pairs, names, strict=True) for lack in lacks_in_words(pair)]
+    for inputs, whose in _shared(common):
+        notes.append(say("common_to_tests", inputs, whose if len(whose) < len(pairs) else []))
     for lack, whose in _shared(lacks):
-        which = "" if len(whose) == len(pairs) else f" ({join(whose)})"
-        notes.append(f"Not compared{which}: {lack}")
+        notes.append(f"Not compared{f' ({join(whose)})' if len(whose) < len(pairs) else ''}: {lack}")
     return notes
 
 
@@ -188,17 +137,7 @@ def _change_words(change: Change) -> str:
 
 def change_name(change: Change) -> str:
     """Return what a change is a change of."""
-    if change.group == "ISO 230-2":
-        return f"{change.quantity} by ISO 230-2"
-    words = _WORDS.get(change.quantity) or effect_words(change.quantity).name
-    if change.position_mm is None:
-        return words
-    at = f"{change.position_mm:g} mm"
-    if change.quantity == "step":
-        return f"{words} from {at} on"
-    if change.until_mm is not None:
-        return f"{words} from {change.position_mm:g} to {change.until_mm:g} mm"
-    return f"{words}, most at {at}," if change.quantity in _REST else f"{words} at {at}"
+    return say("change_name", change, effect_words(change.quantity).name)
 
 
 def _size(change: Change) -> str:
@@ -392,15 +331,7 @@ def _differs(change: Change) -> str:
 
 def trend_caption(trend: Trend) -> str:
     """Return which values of a trend lie outside its control limits."""
-    if trend.limits is None or not trend.outside.any():
-        return ""
-    days, last = [str(day) for day in trend.when[trend.outside].astype("datetime64[D]")], trend.outside[-1]
-    low, high, value = (number(one) for one in (trend.limits.low, trend.limits.high, float(trend.value[-1])))
-    limits = f"outside the control limits {low} to {high} {trend.unit}"
-    if not last:
-        return f"{trend.name} lay {limits}: {join(days)}."
-    earlier = f" So did those of {join(days[:-1])}." if days[1:] else ""
-    return f"{trend.name} of the last test, {value} {trend.unit}, lies {limits}.{earlier}"
+    return say("trend_outside", trend, [str(day) for day in trend.when[trend.outside].astype("datetime64[D]")])
 
 
 def trend_sentences(trends: Sequence[Trend]) -> list[str]:
@@ -410,17 +341,7 @@ def trend_sentences(trends: Sequence[Trend]) -> list[str]:
 
 def trend_notes(pairs: Sequence[PairComparison], trends: Sequence[Trend]) -> str:
     """Return how trends are drawn."""
-    common = [_INPUTS[name] for name in common_to_all(pairs)]
-    told = [
-        f"Bars: expanded uncertainty (k = 2){f' without what all tests have in common: {join(common)}' if common else ''}."
-    ]
-    if any(trend.limits is not None for trend in trends):
-        told.append(
-            "Dashed: control limits given by the tests before the last (individuals, moving ranges); ringed: outside."
-        )
-    if any(trend.tolerance is not None for trend in trends):
-        told.append("Dotted: the tolerance.")
-    return " ".join(told)
+    return say("trend_notes", common_to_all(pairs), trends)
 
 
 def changes_of_all(pairs: Sequence[PairComparison]) -> Table:
