@@ -14,7 +14,6 @@ from fusion.analysis.attribution.correlate import (
     correlate,
     find_source,
     mode_cells,
-    recommend_measurement,
 )
 from fusion.analysis.attribution.duty import randomisation_test
 from fusion.analysis.attribution.modes import Region, cluster_cells, disc
@@ -23,6 +22,7 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.campaign.inputs import Source
 from fusion.pipeline.drift_model import place_scale_u, scaled
 from fusion.pipeline.positioning import average_cycles
+from fusion.report.wording import say
 from fusion.results import axis as schema
 from fusion.results.parts import AreaPart, Quantity, Sensitivity
 from fusion.results.progress import Report
@@ -119,7 +119,10 @@ def _describe_correlation(
 ) -> schema.CorrelationPart:
     """What the correlation found."""
     session = maps.to_dataset()
-    drift, strength = session["unexplained_drift"], source.sensitivity_um_per_K.model_dump(exclude_unset=True)
+    drift, channels = session["unexplained_drift"], session["channel"].values
+    known = session.sel(channel="common" if "common" in channels else channels[0])
+    noise_um, drift_um = float(known["noise"]), max(float(known["unexplained_drift"]), 0.01)
+    strength = source.sensitivity_um_per_K.model_dump(exclude_unset=True)
     scale_u = place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float))
     area = regions[source.name] if source.kind == "region" else source.area
     completed = {"area": area, "sensitivity_um_per_K": Sensitivity(**scaled(strength, scale_u))}
@@ -129,7 +132,7 @@ def _describe_correlation(
         excitation=maps.attrs["excitation"],
         false_alarm_rate=session["false_alarm_rate"],
         source=source.model_copy(update=completed),
-        recommended_test=recommend_measurement(maps, source),
+        recommended_test=say("recommended_test", maps.attrs["verdict"], source, noise_um, drift_um),
         unexplained_drift_um_per_h={
             str(name): drift.sel(channel=name) for name in drift["channel"].values if name != "joint"
         },

@@ -305,8 +305,9 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first, measured, moment, number, p_cell, p_words,
-        parameters, percent, place, print_unit, quantity, region_words, small, upper_first, variance_left,
+        anomaly_cause, anomaly_place, condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first,
+        measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small,
+        upper_first, variance_left,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {

@@ -519,26 +519,3 @@ def _split(
     """The connected piece of equal cells with the strongest one, and the strongest cell (x, y in mm) of every other piece."""
     piece, others = _pieces(strength, equal)
     return piece, [(float(plan["x"][column]), float(plan["y"][row])) for row, column in others]
-
-
-def recommend_measurement(maps: xr.DataTree, source: SourcePart) -> str:
-    """Say which measurement would decide what these data leave open."""
-    session = maps.to_dataset()
-    common = session.sel(channel="common") if "common" in session["channel"].values else session.isel(channel=0)
-    plan = (
-        f"thermofuse plan --source NAME=TIME proposes when to switch each heat source at random; give it the noise and drift of this "
-        f'session: --noise "{float(common["noise"]):.2g} um" --drift "{max(float(common["unexplained_drift"]), 0.01):.2g} um"'
-    )
-    if maps.attrs["verdict"] == "not separable":
-        return f"Switch the heat sources at random times instead of letting all of them warm up once. {plan}."
-    if maps.attrs["verdict"] == "not attributable":
-        return (
-            f"From {source.detectable_um_per_K:.2g} µm/K on, a source at the best place would have been found in four sessions of five. "
-            f"For less: more cycles, or loads that switch more often. {plan}."
-        )
-    if source.equivalent_places_mm:
-        places = "; ".join(f"x {x:.0f} mm, y {y:.0f} mm" for x, y in source.equivalent_places_mm[:4])
-        return (
-            f"Other places explain the drift equally well ({places}): switch the heat sources there separately. {plan}."
-        )
-    return f"A second session that finds the same place, or randomised duty, would establish causation. {plan}."

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fusion.common import FusionError
-from fusion.report.wording import environment
+from fusion.report.wording import environment, sentences
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import Recursion, RecursionInput
 from fusion.results.results import Results
@@ -623,18 +623,8 @@ _PREFIX = "thermofuse"
 
 def objections_to_model(results: Results) -> list[str]:
     """Return why a control should not run the model of a run."""
-    found = []
-    if results.loop is not None and results.loop.verdict == "no_skill":
-        found.append("the model predicts the hold-out set no better than its last value or the mean of the time before")
-    doubts = results.inputs.doubts if results.inputs is not None else ()
-    found += [f"an input is doubted ({one.code}): {one.evidence.rstrip('.')}" for one in doubts]
     faults = results.loop.sensor_faults if isinstance(results.loop, RecordLoop) else ()
-    found += [
-        f"{one.sensor} is suspected ({one.kind}): {one.reason or 'look at contact, cable and input'}"
-        for one in faults
-        if one.state == "suspected"
-    ]
-    return found
+    return sentences("objections_to_model", results, [one for one in faults if one.state == "suspected"])
 
 
 def emit(model: Recursion, format: str) -> tuple[str, str]:
@@ -656,31 +646,12 @@ def emit(model: Recursion, format: str) -> tuple[str, str]:
         model=model,
         prefix=_PREFIX,
         sampling=_number(model.sampling_s),
-        header=[_plain(line) for line in header(model)],
+        header=[_plain(line) for line in sentences("model_header", model)],
         arrays={name: [_number(one) for one in values] for name, values in arrays.items()},
         whole=("input", "exponent"),
         coefficients=[[_number(value) for value in one.coefficients] for one in model.outputs],
     )
     return file, text
-
-
-def header(model: Recursion) -> list[str]:
-    """Return where a model comes from and what to know of it."""
-    return [
-        "Thermal compensation by thermofuse",
-        f"campaign: {model.campaign}",
-        *model.remarks,
-        f"uncertainties judged on: {model.held_out}",
-        *(
-            f"{one.name}: displacement of the hold-out set {one.before:.3g} {one.unit} rms from its last value, error of the prediction "
-            f"{one.u:.3g} {one.unit}"
-            for one in model.outputs
-        ),
-        "Start it with the machine, which is cold then: what a load warms counts as cold at the first step.",
-        "Do not add to a compensation that is active already, unless it was active during the test.",
-        "How to try it: let the correction of one axis be 10 um and check with an indicator in which direction the axis moves.",
-        f"source: results.json, SHA-256 {model.results_sha256}",
-    ]
 
 
 def _number(value: float) -> str:

@@ -38,11 +38,9 @@ from fusion.report.exports.controls import (
     siemens_temperature,
     tabulate,
 )
-from fusion.report.findings import headline
-from fusion.report.wording import anomaly_cause, anomaly_place
+from fusion.report.wording import sentences
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
-from fusion.results.numbers import number
 from fusion.results.parts import ENDING, Quantity, TablePrediction
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically
@@ -51,40 +49,15 @@ from thermography.common import write_csv
 
 # The guard of compensation tables: why a run's profile should not go into a control, and what to know where it may.
 
-#: Verdicts under which nothing is left in the drift that these data can show.
-_SOUND_VERDICTS = ("complete", "explained")
-
 
 def objections(results: Results) -> list[str]:
     """Return why a compensation table should not be made from a run."""
-    found = []
-    if results.loop is None:
-        found.append("the drift was not modelled, so that nothing says whether the profile is free of it")
-    elif results.loop.verdict not in _SOUND_VERDICTS:
-        found.append(f"the verdict is {results.loop.verdict}: {headline(results).rstrip('.')}")
-    if results.inputs is None:
-        found.append("the inputs were not checked against each other")
-    else:
-        found += [
-            f"an input is doubted ({check.code}): {check.evidence.rstrip('.')}" for check in results.inputs.doubts
-        ]
-    found += [
-        f"{anomaly_place(anomaly)}, drifts or steps unlike the others ({anomaly.evidence.kind}, cause: {anomaly_cause(anomaly)}), "
-        "so that its mean is no property of the axis"
-        for anomaly in results.anomalies or ()
-        if _moves(anomaly)
-    ]
-    return found
+    return sentences("objections", results, [one for one in results.anomalies or () if _moves(one)])
 
 
 def remarks(results: Results) -> list[str]:
     """Return what to know of single positions of a table that may be made."""
-    return [
-        f"{anomaly_place(anomaly)}, stands out ({anomaly_cause(anomaly)}, scatter {number(anomaly.scatter_um, 2)} um): "
-        "a table does not correct that"
-        for anomaly in results.anomalies or ()
-        if not _moves(anomaly)
-    ]
+    return sentences("not_corrected", [one for one in results.anomalies or () if not _moves(one)])
 
 
 def _moves(anomaly: AnomalyPart) -> bool:
@@ -273,38 +246,31 @@ def export_results(
     """
     if format not in FORMATS:
         raise ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
-    results, out = Path(results), Path(out)
+    folder, found = Path(results), read_results(Path(results))
     if format in MODELS:
-        return _export_model(
-            results, format, out, sampling_s=sampling_s, reduced=reduced, force=force, overwrite=overwrite
+        content, notes = _model_text(folder, found, format, sampling_s=sampling_s, reduced=reduced, force=force)
+    elif not (folder / "deviations.nc").is_file():
+        content, notes = _written(_tables_without_laser(folder, found, format), format), []
+    elif format in ("csv", "xlsx"):
+        deviations = read_product(folder, "deviations")
+        made = (
+            _csv_tables(folder, found, deviations, with_fields=fields)
+            if format == "csv"
+            else tables.axis_tables(found, deviations)
         )
-    if not (results / "deviations.nc").is_file():
-        return _export_without_laser(results, format, out, overwrite=overwrite)
-    found, deviations = read_results(results), read_product(results, "deviations")
-    content: dict[str, Writer]
-    if format == "csv":
-        content = _csv_files(results, found, deviations, with_fields=fields)
-        size = None if fields else tables.fields_megabytes(results)
-        left = () if size is None else (f"fields.csv (about {size:.0f} MB) is written where --fields is given",)
-        return Exported(_write(out, content, overwrite=overwrite), left)
-    if format == "xlsx":
-        return Exported(_write(out, _workbook(tables.axis_tables(found, deviations)), overwrite=overwrite))
-    if not has(deviations, "drift"):
-        raise ExportError(
-            f"{results}: the readings have no times, or are too few, so there is neither drift nor profile to write; --format csv and xlsx "
-            "give the values by ISO 230-2"
-        )
-    run = _Run(results, found, deviations, read_origin(results, found, read_thermal_state(results, deviations)))
-    with naming(results):
-        texts, notes = (
-            _temperature_text(run, axis, reference_mm, force=force)
-            if format == TEMPERATURE_FORMAT
-            else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, force=force)
-        )
-    writers: dict[str, Writer] = {
-        name: partial(Path.write_text, data=text, encoding="ascii") for name, text in texts.items()
-    }
-    return Exported(_write(out, writers, overwrite=overwrite), tuple(notes))
+        size = None if fields or format == "xlsx" else tables.fields_megabytes(folder)
+        content = _written(made, format)
+        notes = [] if size is None else [f"fields.csv (about {size:.0f} MB) is written where --fields is given"]
+    else:
+        run = _read_run(folder, found)
+        with naming(folder):
+            texts, notes = (
+                _temperature_text(run, axis, reference_mm, force=force)
+                if format == TEMPERATURE_FORMAT
+                else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, force=force)
+            )
+        content = {name: partial(Path.write_text, data=text, encoding="ascii") for name, text in texts.items()}
+    return Exported(_write(Path(out), content, overwrite=overwrite), tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -315,6 +281,17 @@ class _Run:
     results: Results
     deviations: xr.Dataset
     origin: Origin
+
+
+def _read_run(folder: Path, results: Results) -> _Run:
+    """Read the run that the table of a control is made from."""
+    deviations = read_product(folder, "deviations")
+    if not has(deviations, "drift"):
+        raise ExportError(
+            f"{folder}: the readings have no times, or are too few, so there is neither drift nor profile to write; --format csv and xlsx "
+            "give the values by ISO 230-2"
+        )
+    return _Run(folder, results, deviations, read_origin(folder, results, read_thermal_state(folder, deviations)))
 
 
 def _table_texts(
@@ -380,11 +357,10 @@ def _temperature_text(
     return {f"temperature_{name}.MPF": siemens_temperature(line, name, header)}, _forced(against)
 
 
-def _export_model(
-    folder: Path, format: str, out: Path, *, sampling_s: float, reduced: bool, force: bool, overwrite: bool
-) -> Exported:
-    """Write the drift model of a record for a control."""
-    results = read_results(folder)
+def _model_text(
+    folder: Path, results: Results, format: str, *, sampling_s: float, reduced: bool, force: bool
+) -> tuple[dict[str, Writer], list[str]]:
+    """Return the file of a record's drift model for a control, and what to tell the user."""
     if not isinstance(results.loop, RecordLoop):
         if not (folder / "deviations.nc").is_file():
             raise ExportError(f"{folder}: {_NO_LASER}")
@@ -408,13 +384,12 @@ def _export_model(
             remarks=against,
         )
         file, text = emit(model, format)
-    writer: Writer = partial(Path.write_text, data=text, encoding="utf-8")
     curve = [
         f"{len(one.sensors)} of {len(model.sensor_curve[0].sensors)} sensors: {one.cross_rmse:.3g} um by cross-validation, "
         f"{one.held_out_rmse:.3g} um on the hold-out set ({', '.join(one.sensors) or 'none'})"
         for one in model.sensor_curve
     ]
-    return Exported(_write(out, {file: writer}, overwrite=overwrite), (*model.remarks, *curve))
+    return {file: partial(Path.write_text, data=text, encoding="utf-8")}, [*model.remarks, *curve]
 
 
 def _judge(against: list[str], *, force: bool) -> list[str]:
@@ -442,9 +417,8 @@ def _axis_name(run: _Run, given: str | None, *, needed: bool) -> str:
     raise ExportError(f"{why}; write a letter and up to nine letters or digits, for example --axis X1")
 
 
-def _export_without_laser(folder: Path, format: str, out: Path, *, overwrite: bool) -> Exported:
-    """Write what a record has, or a campaign of the camera alone; nothing of it is the table of a control."""
-    results = read_results(folder)
+def _tables_without_laser(folder: Path, results: Results, format: str) -> dict[str, pd.DataFrame]:
+    """Return the tables by title that a record has, or a campaign of the camera alone; nothing of it is the table of a control."""
     record = isinstance(results.loop, RecordLoop)
     if format not in ("csv", "xlsx"):
         raise ExportError(
@@ -454,43 +428,39 @@ def _export_without_laser(folder: Path, format: str, out: Path, *, overwrite: bo
             else f"{folder}: {_NO_LASER}"
         )
     if record:
-        frames = tables.record_tables(results, read_product(folder, "record"))
-    elif (folder / "fields.nc").is_file() and format == "csv":
-        frames = {"fields": tables.fields_table(folder)}
-    else:
-        frames = tables.camera_tables(results, folder)
-    if not frames:
+        return tables.record_tables(results, read_product(folder, "record"))
+    if (folder / "fields.nc").is_file() and format == "csv":
+        return {"fields": tables.fields_table(folder)}
+    if not (frames := tables.camera_tables(results, folder)):
         raise ExportError(f"{folder}: it holds results.json alone, no product to write; run the campaign again")
+    return frames
+
+
+def _written(frames: dict[str, pd.DataFrame], format: str) -> dict[str, Writer]:
+    """Return what writes tables by title: one workbook, or a CSV file of each."""
     if format == "xlsx":
-        return Exported(_write(out, _workbook(frames), overwrite=overwrite))
-    named = {f"{title.lower().replace(' ', '_')}.csv": _frame_writer(frame) for title, frame in frames.items()}
-    return Exported(_write(out, named, overwrite=overwrite))
+        return {"results.xlsx": lambda path: tables.write_workbook(path, frames)}
+    return {f"{title.lower().replace(' ', '_')}.csv": partial(write_csv, frame) for title, frame in frames.items()}
 
 
-def _workbook(frames: dict[str, pd.DataFrame]) -> dict[str, Writer]:
-    return {"results.xlsx": lambda path: tables.write_workbook(path, frames)}
-
-
-def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_fields: bool) -> dict[str, Writer]:
-    """Return the writers of the CSV tables by file name."""
+def _csv_tables(
+    folder: Path, results: Results, deviations: xr.Dataset, *, with_fields: bool
+) -> dict[str, pd.DataFrame]:
+    """Return the tables of an axis by the name of their file."""
     timed = has(deviations, "drift")
     frames = {
-        "drift.csv" if timed else "readings.csv": tables.readings_table(deviations),
-        **({"profile.csv": tables.profile_table(deviations)} if timed else {}),
-        "iso230.csv": tables.iso230_axis_table(deviations),
-        "iso230_positions.csv": tables.iso230_position_table(deviations, results),
+        "drift" if timed else "readings": tables.readings_table(deviations),
+        **({"profile": tables.profile_table(deviations)} if timed else {}),
+        "iso230": tables.iso230_axis_table(deviations),
+        "iso230_positions": tables.iso230_position_table(deviations, results),
     }
     if with_fields:
         if not (folder / "fields.nc").is_file():
             raise ExportError(
                 f"{folder}: there is no fields.nc in it, so that no fields.csv can be written; leave --fields out"
             )
-        frames["fields.csv"] = tables.fields_table(folder)
-    return {name: _frame_writer(frame) for name, frame in frames.items()}
-
-
-def _frame_writer(frame: pd.DataFrame) -> Writer:
-    return lambda path: write_csv(frame, path)
+        frames["fields"] = tables.fields_table(folder)
+    return frames
 
 
 def _write(out: Path, content: dict[str, Writer], *, overwrite: bool) -> tuple[Path, ...]:

@@ -561,3 +561,18 @@ def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
     assert step.startswith("Repeat the test") and "whether the place around x 355 mm, y 95 mm is a cause" in step
     shown = seen.model_copy(update={"randomised_duty": (DutyPart.model_construct(name="spindle", cause=True),)})
     assert "Nothing has to be done" in next_steps(results(loop("complete"), correlation=shown))[0]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "places", "told"),
+    [
+        ("not separable", (), "Switch the heat sources at random times"),
+        ("not attributable", (), "From 0.12 µm/K on, a source at the best place"),
+        ("attributable", ((1.0, 2.0),), "Other places explain the drift equally well (x 1 mm, y 2 mm): switch"),
+        ("attributable", (), "A second session that finds the same place"),
+    ],
+)
+def test_the_next_test_is_recommended_with_its_noise_and_drift(verdict, places, told):
+    source = SourcePart.model_construct(detectable_um_per_K=0.123, equivalent_places_mm=places)
+    text = say("recommended_test", verdict, source, 0.2, 0.01)
+    assert text.startswith(told) and text.endswith('--noise "0.2 um" --drift "0.01 um".')

@@ -15,7 +15,6 @@ from fusion.analysis.attribution.correlate import (
     find_source,
     mode_cells,
     piece_with_peak,
-    recommend_measurement,
 )
 from fusion.analysis.diagnosis.diagnose import diagnose
 from fusion.results.parts import AreaPart
@@ -167,16 +166,13 @@ def test_the_answer_comes_from_the_mode_of_the_right_source(maps):
         < 240.0
     )
     assert float(np.nanmax(maps["modes/pattern"])) == pytest.approx(1.0)
-    assert "A second session that finds the same place" in recommend_measurement(maps, source)
 
 
 def test_without_a_source_the_detection_limit_and_a_plan_are_stated(null):
     maps = correlate(null.fused, null.field[:, ::4, ::4], draws=99, checks=1)
     source = find_source(maps)
     assert maps.attrs["verdict"] == "not attributable" and source.p_value > 0.05
-    text = recommend_measurement(maps, source)
-    assert f"From {source.detectable_um_per_K:.2g} µm/K on" in text
-    assert f'--noise "{float(maps["noise"].sel(channel="common")):.2g} um"' in text
+    assert source.detectable_um_per_K > 0.0
 
 
 def test_places_that_warm_alike_are_named_as_equal(rng):

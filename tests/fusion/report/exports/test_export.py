@@ -14,13 +14,14 @@ import xarray as xr
 from fusion import cli
 from fusion.report.exports import tables
 from fusion.report.exports.controls import ExportError, header_lines, read_origin, read_thermal_state
-from fusion.report.exports.export import FORMATS, _frame_writer, export_results, objections, remarks
+from fusion.report.exports.export import FORMATS, export_results, objections, remarks
 from fusion.report.exports.tables import profile_table, readings_table, write_workbook
 from fusion.results.parts import TablePredictionError, read_table_prediction
 from fusion.results.results import Results, ResultsError, assemble, read_results
 from fusion.results.store import read_dataset, write_dataset, write_json
 from tests.fusion.report.exports.small_run import measured, write_fields, write_run
 from tests.fusion.results_sample import PARTS, RECORD_LOOP
+from thermography.common import write_csv
 
 pytestmark = pytest.mark.long
 
@@ -51,7 +52,7 @@ def test_csv_holds_every_number_as_it_was_computed(small_run, tmp_path):
     for folder, dataset in ((written[0].parent, deviations), (tmp_path / "far", moved)):
         folder.mkdir(exist_ok=True)
         for name, made in (("drift", readings_table(dataset)), ("profile", profile_table(dataset))):
-            _frame_writer(made)(folder / f"{name}.csv")
+            write_csv(made, folder / f"{name}.csv")
             back = pd.read_csv(folder / f"{name}.csv", dtype=str)
             for column in made.select_dtypes(float):
                 assert back[column].map(float).tolist() == made[column].tolist()
