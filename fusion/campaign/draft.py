@@ -8,7 +8,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import date
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,7 +16,7 @@ import numpy as np
 from fusion.campaign.columns import ROLES, ColumnsError, TableProposal, propose_runs
 from fusion.campaign.inspect import FolderContent, Kind, Recognised, scan_folder
 from fusion.campaign.keys import Key, keys_of, known_keys
-from fusion.campaign.values import column_conversion, read_quantity, role_of_unit
+from fusion.campaign.values import column_conversion, role_of_unit
 from fusion.common import FusionError
 from fusion.results.progress import counted
 from fusion.results.store import is_text, write_text
@@ -60,19 +59,10 @@ class Asker:
 
     def value(self, key: Key, default: str = "") -> str:
         """Return the answer to a key of the campaign file, empty where nothing is stated."""
-
-        def check(answer: str) -> str:
-            if answer and key.kind == "quantity":
-                read_quantity(answer, key.unit)
-            if answer and key.kind == "date":
-                date.fromisoformat(answer)
-            return answer
-
         absent = "to be filled in" if key.needed else key.absent or "not stated"
         example = f", such as {key.example}" if key.example else ""
-        return self.checked(
-            (key.told or key.label) + ("" if default else f"{example}; empty: {absent}"), default, check
-        )
+        question = (key.told or key.label) + ("" if default else f"{example}; empty: {absent}")
+        return self.checked(question, default, lambda answer: answer and key.check(answer))
 
     def unit(self, question: str, target: str, default: str) -> str:
         """Return the unit of a column that can be converted to `target`."""
@@ -436,7 +426,7 @@ def _by_name(asker: Asker, question: str, keys: Mapping[str, Key]) -> dict[str, 
         for name, quantity in pairs:
             if name not in keys:
                 raise DraftError(f'"{name}" is none of {", ".join(keys)}')
-            read_quantity(quantity.strip(), keys[name].unit)
+            keys[name].check(quantity)
         return {keys[name].key: quantity.strip() for name, quantity in pairs}
 
     example = ", ".join(f"{name} {one.example}" for name, one in [*keys.items()][:_MOST])

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
 from fusion.campaign.config import campaign_schema
+from fusion.campaign.values import QuantityError, canonical_unit, read_quantity
 from fusion.results.numbers import print_unit
+
+_DAY = re.compile(r"\d{4}-\d\d-\d\d")
 
 
 class Key(NamedTuple):
@@ -51,6 +55,14 @@ class Key(NamedTuple):
     def shown(self) -> str:
         """Its label with the unit of a quantity."""
         return f"{self.label} ({print_unit(self.unit)})" if self.unit else self.label
+
+    def check(self, text: str) -> str:
+        """Return a text that is a quantity of its unit, or a day, where it has to be."""
+        if self.kind == "quantity":
+            read_quantity(text, canonical_unit(self.unit))
+        elif self.kind == "date" and not _DAY.fullmatch(text):
+            raise QuantityError(f'"{text}" is no day; write year-month-day, for example {self.example}')
+        return text
 
     @property
     def first(self) -> bool:

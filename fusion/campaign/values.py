@@ -75,6 +75,11 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     return known[name]
 
 
+def canonical_unit(unit: str) -> str:
+    """Return the canonical unit of what a unit measures."""
+    return unit if unit in _UNITS else next(target for target, units in _UNITS.items() if unit in units)
+
+
 def column_conversion(unit: str, target: str) -> tuple[float, float]:
     """Return ``(factor, offset)`` of a column in `unit`, which may be that of one count: ``"0.0125 mm"``."""
     count = _QUANTITY.fullmatch(unit)

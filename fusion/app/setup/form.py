@@ -14,7 +14,6 @@ from fusion.app.parts import Parts, column, heading
 from fusion.app.setup.campaign import CampaignText
 from fusion.campaign.draft import DIRECTIONS, TO_FILL
 from fusion.campaign.keys import Key, known_keys
-from fusion.campaign.values import read_quantity
 from fusion.common import FusionError
 from fusion.results.progress import counted
 
@@ -192,9 +191,7 @@ def _written(text: str, field: Key) -> Any:
             if not re.match(r"[+-]?\.?\d", text):
                 raise FieldError(f'"{text}" is no number; write digits, with a point before the decimals') from None
     text = with_unit(text, field.unit)
-    if field.unit and "+-" not in text and "±" not in text:
-        read_quantity(text, field.unit)
-    return text
+    return text if "+-" in text or "±" in text else field.check(text)
 
 
 def with_unit(text: str, unit: str) -> str:

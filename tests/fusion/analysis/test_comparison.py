@@ -313,7 +313,7 @@ def test_an_error_that_both_tests_have_in_common_cancels_as_far_as_it_is_equal(t
         rows = [{**row, "contributor": name, "A_um": value} for name, value in shares.items()]
         stated = {
             **PARTS["iso230"],
-            "conditions": [{"key": "expansion_coefficient", "name": "Expansion coefficient", "text": coefficient}],
+            "conditions": [{"key": "expansion_coefficient", "name": "Reworded", "text": coefficient}],
         }
         return {**stated, "A_um": {"value": 2 * u, "u": u}, "contributions": rows}
 
@@ -343,7 +343,7 @@ def test_achieved_is_held_against_what_a_table_was_predicted_to_leave(tmp_path: 
         shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
         stated = {
             **PARTS["iso230"],
-            "conditions": [{"key": "expansion_coefficient", "name": "Expansion coefficient", "text": coefficient}],
+            "conditions": [{"key": "expansion_coefficient", "name": "Reworded", "text": coefficient}],
         }
         return {
             **stated,

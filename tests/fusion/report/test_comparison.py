@@ -227,7 +227,7 @@ def test_bars_of_a_trend_leave_out_what_all_tests_have_in_common(tmp_path):
         row = {"contributor": "expansion_coefficient", "u": 2.0, "unit": "ppm/K", "origin": "assumed"}
         shares = dict.fromkeys(("R_um", "E_um", "M_um", "B_um", "mean_reversal_um"), 0.0)
         whole = copy.deepcopy(PARTS["iso230"])
-        whole["conditions"] = [{"key": "expansion_coefficient", "name": "Expansion coefficient", "text": "11.7 ppm/K"}]
+        whole["conditions"] = [{"key": "expansion_coefficient", "name": "Reworded", "text": "11.7 ppm/K"}]
         whole |= {"A_um": {"value": 9.0, "u": 5.0}, "contributions": [{**row, "A_um": 4.0, **shares}]}
         return whole
 
