@@ -56,25 +56,16 @@ class Anomaly:
 
     Attributes
     ----------
-    direction : str
-        "positive", "negative" or "both".
-    kind : str
-        "scatter", "slow", "step" or "periodic".
-    p_value : float
-        Family-wise: corrected for all positions, directions and kinds.
-    scatter_um : float
-        Random standard deviation of the position and direction, um.
-    extra_um : float
-        Standard deviation beyond that of the other positions, um; the height of a step, the amplitude of a period.
-    stands_out : bool
-        Whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme Studentized
-        deviate test at `ESD_LEVELS`).
-    at_cycle : int or None
-        Number of the first cycle after a step.
-    period_s : float or None
-        Period of a periodic motion, s.
-    least_p_value : float
-        Smallest p-value that the number of permutations can show; 0 of a periodic motion, whose p-value is calculated.
+    direction : "positive", "negative" or "both"
+    kind : "scatter", "slow", "step" or "periodic"
+    p_value : family-wise: corrected for all positions, directions and kinds
+    scatter_um : random standard deviation of the position and direction, um
+    extra_um : standard deviation beyond that of the other positions, um; the height of a step, the amplitude of a period
+    stands_out : whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme
+        Studentized deviate test at `ESD_LEVELS`)
+    at_cycle : number of the first cycle after a step
+    period_s : period of a periodic motion, s
+    least_p_value : smallest p-value that the number of permutations can show; 0 of a periodic motion, whose p-value is calculated
     """
 
     target: int

@@ -67,15 +67,11 @@ class FlirInspection:
 
     Attributes
     ----------
-    frames : tuple of FrameReference
-        Usable frames in order of time.
-    rejected : tuple of RejectedFrame
-        Frames that cannot be used, and why.
-    evaluation : RegionTable or None
-        Maximum, minimum and mean of every frame and of the regions that it stores, see
-        `thermography.evaluation.evaluate_regions`; None where the parameters give no temperature.
-    warnings : tuple of FileWarning
-        Everything that is implausible or damaged.
+    frames : usable frames in order of time
+    rejected : frames that cannot be used, and why
+    evaluation : maximum, minimum and mean of every frame and of the regions that it stores, see
+        `thermography.evaluation.evaluate_regions`; None where the parameters give no temperature
+    warnings : everything that is implausible or damaged
     """
 
     path: Path

@@ -76,14 +76,10 @@ class Mirror:
 
     Attributes
     ----------
-    address : str
-        What the user named.
-    path : Path
-        The file that it names, here.
-    base, folder : str, Path
-        Address of its folder, and that folder here.
-    files, fetched, fetched_bytes : int
-        Files, those of them that had to be fetched now, and their size.
+    address : what the user named
+    path : the file that it names, here
+    base, folder : address of its folder, and that folder here
+    files, fetched, fetched_bytes : files, those of them that had to be fetched now, and their size
     """
 
     address: str

@@ -348,14 +348,10 @@ class StandardTest:
 
     Attributes
     ----------
-    part : Iso230Part
-        Values; those that need a standard deviation are null of a test of one cycle.
-    dataset : Dataset
-        Readings; the group ``settled`` holds the quoted window.
-    remarks : tuple of str
-        What was left out or assumed when the file was read.
-    files : dict of str to str
-        SHA-256 of the files that it was read from, by name.
+    part : values; those that need a standard deviation are null of a test of one cycle
+    dataset : readings; the group ``settled`` holds the quoted window
+    remarks : what was left out or assumed when the file was read
+    files : SHA-256 of the files that it was read from, by name
     """
 
     title: str

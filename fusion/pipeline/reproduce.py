@@ -30,10 +30,8 @@ class Reproduction:
 
     Attributes
     ----------
-    equal : bool
-        Whether ``results.json`` is the same, byte for byte.
-    lines : tuple of str
-        What was compared, or what differs.
+    equal : whether ``results.json`` is the same, byte for byte
+    lines : what was compared, or what differs
     """
 
     equal: bool

@@ -224,16 +224,12 @@ class Stage:
 
     Attributes
     ----------
-    label : str
-        What it is called in progress.
-    file : str
-        Its product; what ends up in fusion.nc is kept apart while it may have to be resumed.
+    label : what it is called in progress
+    file : its product; what ends up in fusion.nc is kept apart while it may have to be resumed
     tables : tuple of str
         Tables of the campaign file that its result depends on, with the files that they name; see `Run.taken` for parts of another one.
-    after : tuple of str
-        Stages that its result depends on where the run made them before; it is computed again whenever one of them is.
-    read : callable
-        Reads the product.
+    after : stages that its result depends on where the run made them before; it is computed again whenever one of them is
+    read : reads the product
     """
 
     label: str
@@ -287,28 +283,17 @@ class Run:
 
     Attributes
     ----------
-    inputs : mapping
-        Size and SHA-256 of each input.
-    seen : mapping
-        Size and time of change of each input before it was read.
-    started : datetime
-        Start of the run, UTC.
-    address : str or None
-        Where the campaign file was fetched from.
-    worker : Worker
-        Takes stages that the next one does not wait for.
-    depends : tuple
-        What every stage depends on besides campaign and files, as it was at the start.
-    drawn : list of callable
-        Each waits for a part of the charts and returns it.
-    taken : dict
-        By stage, what its result depends on of tables that it does not list whole.
-    parts, notices : Parts, list
-        Parts of results.json and notices of the stages so far.
-    seconds, keys : dict
-        Wall time (s) and input digest by stage.
-    products : list of Path
-        What the run wrote or kept.
+    inputs : size and SHA-256 of each input
+    seen : size and time of change of each input before it was read
+    started : start of the run, UTC
+    address : where the campaign file was fetched from
+    worker : takes stages that the next one does not wait for
+    depends : what every stage depends on besides campaign and files, as it was at the start
+    drawn : each waits for a part of the charts and returns it
+    taken : by stage, what its result depends on of tables that it does not list whole
+    parts, notices : parts of results.json and notices of the stages so far
+    seconds, keys : wall time (s) and input digest by stage
+    products : what the run wrote or kept
     """
 
     campaign: Campaign

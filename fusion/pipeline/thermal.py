@@ -94,8 +94,7 @@ class CameraState:
 
     Attributes
     ----------
-    correction_K : (frames,) ndarray, K, or None
-        To be added to the temperature of every usable frame; None where nothing is corrected.
+    correction_K : (frames,), to be added to the temperature of every usable frame; None where nothing is corrected
     u_K : (frames,) ndarray, K
         Standard uncertainty of the camera's zero since the first frame, common to the whole frame; 0 where only the table is in view.
     part, notices

@@ -239,12 +239,10 @@ class Arrived:
 
     Attributes
     ----------
-    readings : int
-        Number of new readings, in finished and unfinished cycles.
+    readings : number of new readings, in finished and unfinished cycles
     cycles : Dataset or None
         Finished cycles that were not given before, and the one that is still being measured last; None where none has been finished.
-    faults : tuple of str
-        Lines that cannot be used, or why the file cannot be read.
+    faults : lines that cannot be used, or why the file cannot be read
     """
 
     readings: int = 0
@@ -447,17 +445,12 @@ class FinishedCycle:
 
     Attributes
     ----------
-    number : int
-        As the readings number it, or of the window of time where there is no laser.
-    start, end : datetime64[ns]
-        First instant of the cycle and of the next one, on the laser's clock; NaT where the readings have no times.
-    field : (y, x) DataArray or None
-        Mean temperature of the table in the cycle, degC; None where no frame of it can be used.
-    rise_K : float
-        Mean rise of the table since the first cycle that has a field, K; NaN where it is not known.
-    drift_um : (target,) ndarray
-        Change of the deviation at every target since the first cycle, mean of the directions, um; NaN where a reading is missing. Empty
-        without a laser.
+    number : as the readings number it, or of the window of time where there is no laser
+    start, end : first instant of the cycle and of the next one, on the laser's clock; NaT where the readings have no times
+    field : (y, x), mean temperature of the table in the cycle, degC; None where no frame of it can be used
+    rise_K : mean rise of the table since the first cycle that has a field, K; NaN where it is not known
+    drift_um : (target,), change of the deviation at every target since the first cycle, mean of the directions, um; NaN where a
+        reading is missing. Empty without a laser.
     """
 
     number: int
@@ -487,12 +480,9 @@ class Enough:
 
     Attributes
     ----------
-    u_um : float
-        Standard uncertainty of a position against the first one that all cycles so far reach, um; the largest of the targets.
-    cycles_for_wanted : int
-        Number of cycles that reaches the wanted uncertainty.
-    lacks : str
-        What an analysis still lacks, in words; empty where nothing is lacking.
+    u_um : standard uncertainty of a position against the first one that all cycles so far reach, um; the largest of the targets
+    cycles_for_wanted : number of cycles that reaches the wanted uncertainty
+    lacks : what an analysis still lacks, in words; empty where nothing is lacking
     """
 
     cycles: int
@@ -512,14 +502,10 @@ class LiveState:
 
     Attributes
     ----------
-    cycle : FinishedCycle or None
-        The cycle that has just been finished; None where only frames or readings have come.
-    iso230_um : mapping of str to float
-        Quantities of ISO 230-2 (B, R, E, M, A) of the last five cycles, `iso230_window`, um; empty before there are two.
-    enough : Enough or None
-        Whether the cycles are enough; None before it can be determined.
-    warnings : tuple of str
-        What has been noticed since the last state.
+    cycle : the cycle that has just been finished; None where only frames or readings have come
+    iso230_um : quantities of ISO 230-2 (B, R, E, M, A) of the last five cycles, `iso230_window`, um; empty before there are two
+    enough : whether the cycles are enough; None before it can be determined
+    warnings : what has been noticed since the last state
     """
 
     frames: int

@@ -44,34 +44,23 @@ class Row:
 
     Attributes
     ----------
-    state : str
-        "finished" now, "kept" from an earlier fleet, "failed", "stopped" in the middle, or "waiting" to be run.
-    verdict, headline : str
-        Of the closed loop, and as a sentence; empty where there is none.
+    state : "finished" now, "kept" from an earlier fleet, "failed", "stopped" in the middle, or "waiting" to be run
+    verdict, headline : of the closed loop, and as a sentence; empty where there is none
     drift_um, drift_u_um : float or None, um
         Largest range of the drift over the targets, of a record over its displacements, and its standard uncertainty.
-    axis : str
-        As the campaign file names it.
+    axis : as the campaign file names it
     A_um, A_u_um and so on : float or None, um
         Values by ISO 230-2 of the quoted window, each with its standard uncertainty.
-    machine, serial, date : str
-        As the campaign file names them, and the day of the first reading.
-    decision : str
-        The least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated.
+    machine, serial, date : as the campaign file names them, and the day of the first reading
+    decision : the least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated
     maximum_degC, maximum_u_degC : float or None, degC
         Highest temperature that a camera measured in a picture, a region or a field, and its standard uncertainty.
-    above_range : bool
-        Whether it is the end of the calibrated range, which pixels are above.
-    held_out_um : float or None, um
-        Root mean square error of the final model on what was held out.
-    anomalies, warnings : int or None
-        Positions that stand out, and warnings.
-    seconds, peak_MB : float
-        Wall time of its run, s, and largest memory of its process; 0 where it was not measured.
-    log : str
-        File with everything that its run said, as seen from the summary.
-    conditions : mapping of str to str
-        Conditions of the test by name, empty where they are not stated.
+    above_range : whether it is the end of the calibrated range, which pixels are above
+    held_out_um : um, root mean square error of the final model on what was held out
+    anomalies, warnings : positions that stand out, and warnings
+    seconds, peak_MB : wall time of its run, s, and largest memory of its process; 0 where it was not measured
+    log : file with everything that its run said, as seen from the summary
+    conditions : conditions of the test by name, empty where they are not stated
     """
 
     name: str

@@ -148,10 +148,8 @@ class Corrections:
 
     Attributes
     ----------
-    correction : (steps, outputs) ndarray
-        In the unit of each output.
-    status : (steps,) ndarray of int
-        `OK`, `SATURATED` or `FAILED`.
+    correction : (steps, outputs), in the unit of each output
+    status : (steps,), `OK`, `SATURATED` or `FAILED`
     """
 
     correction: Array

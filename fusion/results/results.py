@@ -385,12 +385,9 @@ class Outcome(Generic[Product]):
 
     Attributes
     ----------
-    dataset : Dataset or DataTree
-        Its product.
-    parts : Parts
-        Its parts of results.json.
-    notices : tuple of Notice
-        What it left out.
+    dataset : its product
+    parts : its parts of results.json
+    notices : what it left out
     """
 
     dataset: Product

@@ -58,13 +58,10 @@ class RecordTruth:
 
     Attributes
     ----------
-    recipe : Recipe
-        The recipe asked for.
-    table : xarray.Dataset
-        As logged: `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min. And every part of the
-        displacements (time, channel), um.
-    parts : tuple of str
-        Names of the parts that the displacement is the sum of.
+    recipe : the recipe asked for
+    table : as logged: `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min. And every part
+        of the displacements (time, channel), um.
+    parts : names of the parts that the displacement is the sum of
     """
 
     recipe: Recipe

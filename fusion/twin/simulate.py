@@ -50,21 +50,15 @@ class Truth:
 
     Attributes
     ----------
-    recipe : Recipe
-        The recipe asked for, with the size of a sensor fault that gives its rms.
-    schedule : Schedule
-        When and where each reading is taken.
-    session : Session
-        The states behind the readings.
-    plate : Plate
-        The true temperature field, at any point and time.
-    readings : xarray.Dataset
-        (cycle, direction, target): `deviation` as measured, um (NaN where lost), `time`, one variable in um for every part of the
-        deviation, `mean_profile` and `scatter`.
+    recipe : the recipe asked for, with the size of a sensor fault that gives its rms
+    schedule : when and where each reading is taken
+    session : the states behind the readings
+    plate : the true temperature field, at any point and time
+    readings : (cycle, direction, target): `deviation` as measured, um (NaN where lost), `time`, one variable in um for every part of
+        the deviation, `mean_profile` and `scatter`
     frames : xarray.Dataset
         (frame,): true time `time_s`, offset `camera_offset_K`, `reflected_K`, `housing` temperature, `table_position` and `knocked`.
-    parts : tuple of str
-        Names of the parts that the deviation is the sum of.
+    parts : names of the parts that the deviation is the sum of
     """
 
     recipe: Recipe

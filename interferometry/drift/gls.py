@@ -97,22 +97,14 @@ class DriftFit:
 
     Attributes
     ----------
-    system : DriftSystem
-        With the estimated variance ratios, and the variances of down-weighted readings.
-    response : (n,) ndarray
-        Readings, in the order of time.
-    design : (n, p) ndarray
-        The caller's columns, then the rate columns of an integrated random walk.
-    coefficients : (p,) ndarray
-        In the response's unit per unit of the column.
-    covariance : (p, p) ndarray
-        Of the coefficients.
-    sigma : float
-        Standard deviation of one ordinary reading (relative variance 1), in the response's unit.
-    log_likelihood : float
-        Restricted log-likelihood; comparable only between fits with the same design.
-    rss : float
-        Whitened residual sum of squares.
+    system : with the estimated variance ratios, and the variances of down-weighted readings
+    response : (n,), readings, in the order of time
+    design : (n, p), the caller's columns, then the rate columns of an integrated random walk
+    coefficients : (p,), in the response's unit per unit of the column
+    covariance : (p, p), of the coefficients
+    sigma : standard deviation of one ordinary reading (relative variance 1), in the response's unit
+    log_likelihood : restricted log-likelihood; comparable only between fits with the same design
+    rss : whitened residual sum of squares
     """
 
     system: DriftSystem
@@ -622,10 +614,8 @@ class Autoregression:
 
     Attributes
     ----------
-    weights : (order,) ndarray
-        Of the values one, two, ... cycles before; empty for noise without memory.
-    innovation_share : float
-        Variance of the innovations over that of the series, 1 without memory.
+    weights : (order,), of the values one, two, ... cycles before; empty for noise without memory.
+    innovation_share : variance of the innovations over that of the series, 1 without memory
     """
 
     weights: Array

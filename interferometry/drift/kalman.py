@@ -397,15 +397,11 @@ class Smoothed(NamedTuple):
 
     Attributes
     ----------
-    levels : (n, components, p) ndarray
-        Smoothed drift levels, in the units of the columns.
-    level_covariance : (n, components, components) ndarray
-        Covariance of the levels, the columns' coefficients being known.
-    u : (n, p) ndarray
-        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is each reading's own estimated noise, ``u / D`` its
-        deletion residual, the reading minus its prediction from all others.
-    D : (n,) ndarray
-        Variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.
+    levels : (n, components, p), smoothed drift levels, in the units of the columns
+    level_covariance : (n, components, components), covariance of the levels, the columns' coefficients being known
+    u : (n, p), smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is each reading's own estimated noise, ``u /
+        D`` its deletion residual, the reading minus its prediction from all others.
+    D : (n,), variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.
     """
 
     levels: Array
@@ -419,10 +415,8 @@ class Memory(NamedTuple):
 
     Attributes
     ----------
-    share : float
-        Of the variance of an ordinary reading, 0 to 1.
-    time_s : float
-        Correlation time, s.
+    share : of the variance of an ordinary reading, 0 to 1
+    time_s : correlation time, s
     """
 
     share: float
@@ -435,22 +429,15 @@ class DriftSystem:
 
     Attributes
     ----------
-    seconds : (n,) ndarray
-        Time of each reading, s, not decreasing.
-    loadings : (n, components) ndarray
-        How each drift component enters each reading.
+    seconds : (n,), time of each reading, s, not decreasing
+    loadings : (n, components), how each drift component enters each reading
     order : {1, 2}
         1 random walk, 2 integrated random walk.
-    ratios : (components,) ndarray
-        Process noise over reading variance, per s (order 1) or per s^3 (order 2).
-    variance : (n,) ndarray
-        Relative variance of each reading, 1 for an ordinary one.
-    observed : (n,) ndarray of bool
-        False for a held-out reading: it does not update the drift and is predicted in open loop.
-    process_noise_scale : (n,) ndarray or None
-        Factor on the ratios in the step before each reading; None where the process noise is constant.
-    memory : Memory or None
-        Of the noise; None where the readings' noise is independent.
+    ratios : (components,), process noise over reading variance, per s (order 1) or per s^3 (order 2)
+    variance : (n,), relative variance of each reading, 1 for an ordinary one
+    observed : (n,), false for a held-out reading: it does not update the drift and is predicted in open loop
+    process_noise_scale : (n,), factor on the ratios in the step before each reading; None where the process noise is constant
+    memory : of the noise; None where the readings' noise is independent
     """
 
     seconds: Array
@@ -535,16 +522,11 @@ class Whitening:
 
     Attributes
     ----------
-    system : DriftSystem
-        Of n readings.
-    gains : (n, m) ndarray
-        Of the filter.
-    roots : (n,) ndarray
-        Square roots of the innovation variances, in units of sigma.
-    state : (m, p) ndarray
-        Of every column, after the readings so far.
-    done : int
-        Number of these readings.
+    system : of n readings
+    gains : (n, m), of the filter
+    roots : (n,), square roots of the innovation variances, in units of sigma
+    state : (m, p), of every column, after the readings so far
+    done : number of these readings
     """
 
     system: DriftSystem

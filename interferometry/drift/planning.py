@@ -31,12 +31,9 @@ class MeasurementPlan:
     Attributes
     ----------
     cycles : int
-    duration_s : float
-        Time of these cycles at the pace of the trial, s.
-    u_um : float
-        Standard uncertainty of a position against the first one that these cycles reach, um.
-    warnings : tuple of str
-        About the target spacing; empty where there is nothing to warn about, or no lead was given.
+    duration_s : time of these cycles at the pace of the trial, s
+    u_um : standard uncertainty of a position against the first one that these cycles reach, um
+    warnings : about the target spacing; empty where there is nothing to warn about, or no lead was given
     """
 
     cycles: int
@@ -51,14 +48,11 @@ class Settling:
 
     Attributes
     ----------
-    component : str
-        Name of the drift component.
-    t63_s, t95_s : float
-        Since the first reading, s.
+    component : name of the drift component
+    t63_s, t95_s : since the first reading, s
     t63_low_s, t63_high_s, t95_low_s, t95_high_s : float
         Limits of the 95 % confidence intervals, s; infinite where the test is too short to show the end.
-    amplitude_um : float
-        Final drift where the component's loading is 1, um.
+    amplitude_um : final drift where the component's loading is 1, um
     """
 
     component: str

@@ -28,18 +28,13 @@ class Hotspot:
 
     Attributes
     ----------
-    x_mm, y_mm : float, mm
-        Position of the peak on the plan.
-    peak_rise_K : float, K
-        Rise at the peak.
+    x_mm, y_mm : mm, position of the peak on the plan
+    peak_rise_K : K, rise at the peak
     prominence_K : float, K
         Height of the peak above the highest level at which it is connected to a higher peak, or above the lowest rise on the plan.
-    area_mm2, centroid_x_mm, centroid_y_mm, mean_rise_K : float, mm2, mm, mm and K
-        Of the connected zone above half the prominence.
-    extent_mm : (float, float, float, float), mm
-        Smallest and largest x, smallest and largest y of that zone: edges of its outermost cells.
-    at_edge : bool
-        The zone reaches the edge of the seen plan: the true peak may lie outside.
+    area_mm2, centroid_x_mm, centroid_y_mm, mean_rise_K : mm2, mm, mm and K, of the connected zone above half the prominence
+    extent_mm : mm, smallest and largest x, smallest and largest y of that zone: edges of its outermost cells
+    at_edge : the zone reaches the edge of the seen plan: the true peak may lie outside
     """
 
     x_mm: float

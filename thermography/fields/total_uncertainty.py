@@ -44,10 +44,8 @@ class EmissivityRegion:
 
     Attributes
     ----------
-    outline : Polygon
-        Name and corners, plan mm.
-    emissivity, emissivity_u : float
-        Emissivity, above 0 and up to 1, and its standard uncertainty.
+    outline : name and corners, plan mm
+    emissivity, emissivity_u : emissivity, above 0 and up to 1, and its standard uncertainty
     """
 
     outline: Polygon
@@ -61,12 +59,9 @@ class Surface:
 
     Attributes
     ----------
-    name : str
-        Name of the region; empty for the rest of the table.
-    emissivity, emissivity_u : float
-        Emissivity and its standard uncertainty.
-    cells : (y, x) ndarray of bool
-        Its cells.
+    name : name of the region; empty for the rest of the table
+    emissivity, emissivity_u : emissivity and its standard uncertainty
+    cells : (y, x), its cells
     """
 
     name: str
@@ -184,10 +179,8 @@ class Nonlinearity:
 
     Attributes
     ----------
-    temperature_degC, ratio : (n,) ndarray
-        Of temperatures, increasing.
-    rise_ratio : float
-        Of the largest rise.
+    temperature_degC, ratio : (n,), of temperatures, increasing
+    rise_ratio : of the largest rise
     """
 
     temperature_degC: Array
@@ -201,12 +194,9 @@ class ShownRange:
 
     Attributes
     ----------
-    lowest_degC, highest_degC : (cycle,) ndarray
-        NaN for a cycle that does not show it.
-    start_degC : float
-        Mean of temperature minus rise.
-    lowest_rise_K, highest_rise_K : float
-        A cell that the first cycle does not show counts as one without rise.
+    lowest_degC, highest_degC : (cycle,), NaN for a cycle that does not show it
+    start_degC : mean of temperature minus rise
+    lowest_rise_K, highest_rise_K : A cell that the first cycle does not show counts as one without rise
     """
 
     lowest_degC: Array
@@ -312,16 +302,11 @@ class _Part:
     Attributes
     ----------
     cells, cycles : (y, x) and (cycle,) ndarray of bool
-    grid : (n,) ndarray, degC
-        Temperatures of the table.
-    u : (n,) ndarray, K
-        Common standard uncertainty of temperatures.
-    scale : (n,) ndarray
-        Common standard uncertainty of rises about a temperature, as a share of the rise.
-    sensitivity : (n,) ndarray
-        Error of a temperature per error of what the camera reads.
-    shares : list
-        Sum and number of the shares `scale` of the cells, piece by piece.
+    grid : (n,), degC, temperatures of the table
+    u : (n,), K, common standard uncertainty of temperatures
+    scale : (n,), common standard uncertainty of rises about a temperature, as a share of the rise
+    sensitivity : (n,), error of a temperature per error of what the camera reads
+    shares : sum and number of the shares `scale` of the cells, piece by piece
     """
 
     cells: NDArray[np.bool_]

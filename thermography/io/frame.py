@@ -91,12 +91,9 @@ class CameraIdentity:
 
     Attributes
     ----------
-    model, part, serial, software : str
-        Model name, part number, serial number and firmware version of the camera.
-    lens_model, lens_part, lens_serial : str
-        Name, part number and serial number of the lens.
-    field_of_view_deg : float
-        Horizontal field of view of the lens, degrees; 0 where it is not stored.
+    model, part, serial, software : model name, part number, serial number and firmware version of the camera
+    lens_model, lens_part, lens_serial : name, part number and serial number of the lens
+    field_of_view_deg : horizontal field of view of the lens, degrees; 0 where it is not stored
     """
 
     model: str = ""
@@ -115,10 +112,8 @@ class CalibratedRange:
 
     Attributes
     ----------
-    minimum_K, maximum_K : float
-        Limits in temperature, K; both 0 where the file does not store them.
-    raw_minimum, raw_maximum : int
-        Limits in counts; 0 and 65535 where the file does not store them.
+    minimum_K, maximum_K : limits in temperature, K; both 0 where the file does not store them
+    raw_minimum, raw_maximum : limits in counts; 0 and 65535 where the file does not store them
     """
 
     minimum_K: float = 0.0
@@ -138,14 +133,11 @@ class CameraSettings:
 
     Attributes
     ----------
-    focus_distance_m : float
-        Distance to which the lens is focused, m.
-    frame_rate_Hz : float
-        Frame rate, Hz.
+    focus_distance_m : distance to which the lens is focused, m
+    frame_rate_Hz : frame rate, Hz
     clip_maximum_K, clip_minimum_K, warn_maximum_K, warn_minimum_K, saturated_maximum_K, saturated_minimum_K : float
         Temperatures (K) at which the display of the camera clips, warns and shows saturation.
-    raw_median, raw_range : int
-        Centre and width of the displayed range, counts.
+    raw_median, raw_range : centre and width of the displayed range, counts
     """
 
     focus_distance_m: float = 0.0
@@ -181,23 +173,15 @@ class FrameHeader:
 
     Attributes
     ----------
-    parameters : CameraParameters
-        Parameters of the measurement formula as stored.
-    time : datetime64[ms]
-        UTC; NaT where the file stores none.
-    utc_offset_minutes : int
-        Local time minus UTC as set in the camera, minutes.
-    camera : CameraIdentity
-        Camera and lens.
-    limits : CalibratedRange
-        Range in which the camera is calibrated.
-    settings : CameraSettings
-        Focus, frame rate and display settings.
-    housekeeping : dict of str to float
-        Temperatures measured inside the camera by sensor name, K (lens, shutter, aperture, capsule, detector); "sensor 1" to
-        "sensor 4" in files that do not name them.
-    notes : tuple of str
-        Corrections and assumptions that the reader made.
+    parameters : parameters of the measurement formula as stored
+    time : UTC; NaT where the file stores none
+    utc_offset_minutes : local time minus UTC as set in the camera, minutes
+    camera : camera and lens
+    limits : range in which the camera is calibrated
+    settings : focus, frame rate and display settings
+    housekeeping : temperatures measured inside the camera by sensor name, K (lens, shutter, aperture, capsule, detector); "sensor 1"
+        to "sensor 4" in files that do not name them
+    notes : corrections and assumptions that the reader made
     """
 
     parameters: CameraParameters
@@ -216,14 +200,10 @@ class Frame(FrameHeader):
 
     Attributes
     ----------
-    counts : (row, column) ndarray of uint16
-        Signal of the detector, counts.
-    source : str
-        Path of the file.
-    index : int
-        Index of the frame in the file, from 0.
-    camera_info : bytes
-        The camera-information record as stored in the file.
+    counts : (row, column), signal of the detector, counts
+    source : path of the file
+    index : index of the frame in the file, from 0
+    camera_info : the camera-information record as stored in the file
     """
 
     counts: NDArray[np.uint16]
@@ -246,10 +226,8 @@ class FrameReference(FrameHeader, ABC):
 
     Attributes
     ----------
-    path : Path
-        Path of the file.
-    index : int
-        Index of the frame in the file, from 0.
+    path : path of the file
+    index : index of the frame in the file, from 0
     """
 
     path: Path
@@ -308,12 +286,9 @@ class RejectedFrame:
 
     Attributes
     ----------
-    path : Path
-        Path of the file.
-    index : int
-        Index of the frame in its file, from 0; 0 where the whole file is rejected.
-    reason : str
-        Why it was rejected, with file and offset.
+    path : path of the file
+    index : index of the frame in its file, from 0; 0 where the whole file is rejected
+    reason : why it was rejected, with file and offset
     """
 
     path: Path

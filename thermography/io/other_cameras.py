@@ -128,12 +128,9 @@ class StackContents:
 
     Attributes
     ----------
-    unit : str
-        "degC" or "K" where the file says it, else "".
-    times : sequence of datetime64, or None
-        UTC or, without `zoned`, in the zone that `StackOptions` names; None where the file holds none.
-    emissivity, reflected_temperature_K : float or None
-        With which the temperatures were calculated, where the file says it.
+    unit : "degC" or "K" where the file says it, else ""
+    times : UTC or, without `zoned`, in the zone that `StackOptions` names; None where the file holds none
+    emissivity, reflected_temperature_K : with which the temperatures were calculated, where the file says it
     """
 
     frames: int
@@ -694,8 +691,7 @@ class FrameReader(Protocol):
 
     Attributes
     ----------
-    name : str
-        Kind of file, for messages.
+    name : kind of file, for messages
     """
 
     name: str

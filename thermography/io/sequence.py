@@ -348,18 +348,12 @@ class FrameTable(_Frames):
 
     Attributes
     ----------
-    path : Path
-        Of the file.
-    first_index : int
-        Index of the first frame in the file.
-    shape : tuple of int
-        Number of rows and columns.
-    times : (n,) ndarray of datetime64[ms]
-        UTC; NaT where the file stores none.
-    parameter_sets : list of CameraParameters
-        Those that occur.
-    parameter_set : (n,) ndarray of int
-        Which of them every frame has.
+    path : of the file
+    first_index : index of the first frame in the file
+    shape : number of rows and columns
+    times : (n,), UTC; NaT where the file stores none
+    parameter_sets : those that occur
+    parameter_set : (n,), which of them every frame has
     """
 
     path: Path

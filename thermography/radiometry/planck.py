@@ -316,10 +316,8 @@ class Overrides:
 
     Attributes
     ----------
-    constants : mapping of str to float
-        Values by name of the parameter, in its unit.
-    logs : mapping of str to ParameterLog
-        Logs by name of the parameter; they take precedence over constants.
+    constants : values by name of the parameter, in its unit
+    logs : logs by name of the parameter; they take precedence over constants
 
     Examples
     --------

@@ -58,23 +58,17 @@ class InputUncertainty:
 
     Attributes
     ----------
-    emissivity, relative_humidity, window_transmission : float
-        Standard uncertainties of these parameters, without unit.
+    emissivity, relative_humidity, window_transmission : standard uncertainties of these parameters, without unit
     reflected_temperature_K, atmospheric_temperature_K, window_temperature_K : float
         Standard uncertainties of the reflected apparent temperature, the air and the window, K.
-    object_distance_m : float
-        Standard uncertainty of the distance, m.
-    camera_offset_K : float
-        Standard uncertainty of the camera's reading of a black body that is the same at all temperatures, K.
+    object_distance_m : standard uncertainty of the distance, m
+    camera_offset_K : standard uncertainty of the camera's reading of a black body that is the same at all temperatures, K
     camera_scale : float
         Standard uncertainty of that reading as a share of the reading in degC ("2 % of reading" of a data sheet), without unit.
-    camera_drift_K : float
-        Standard uncertainty of the change of the camera's zero between two cycles, K; it enters rises only, because the accuracy of the
-        camera holds at all times. No data sheet states it: 0 by default.
-    netd_K : float
-        Noise equivalent temperature difference: standard deviation of one pixel in one frame on a black body, K.
-    netd_temperature_degC : float
-        Temperature of this black body, degC.
+    camera_drift_K : standard uncertainty of the change of the camera's zero between two cycles, K; it enters rises only, because the
+        accuracy of the camera holds at all times. No data sheet states it: 0 by default.
+    netd_K : noise equivalent temperature difference: standard deviation of one pixel in one frame on a black body, K
+    netd_temperature_degC : temperature of this black body, degC
 
     Raises
     ------
@@ -108,10 +102,8 @@ class TemperatureBudget:
 
     Attributes
     ----------
-    common : dict of str to ndarray
-        Contribution of each input that all frames share, K: sensitivity coefficient, with its sign, times standard uncertainty.
-    per_frame : dict of str to ndarray
-        Contributions of noise and quantisation, K.
+    common : contribution of each input that all frames share, K: sensitivity coefficient, with its sign, times standard uncertainty
+    per_frame : contributions of noise and quantisation, K
     """
 
     common: dict[str, Array]

@@ -92,12 +92,9 @@ class FiducialMonitor:
 
     Attributes
     ----------
-    places : (discs, 5) ndarray of int
-        Top, left, height and width of every disc's patch in the window, and the index of its first weight.
-    weights : (3, entries) ndarray of float32
-        For the sum and the first moments along columns and rows, patch after patch, row by row.
-    noise_gain : (discs,) ndarray
-        Standard deviation of a disc's sum for pixels of unit noise.
+    places : (discs, 5), top, left, height and width of every disc's patch in the window, and the index of its first weight
+    weights : (3, entries), for the sum and the first moments along columns and rows, patch after patch, row by row
+    noise_gain : (discs,), standard deviation of a disc's sum for pixels of unit noise
     arms : (discs, 2) ndarray
         Place (column, row) of every disc from the middle of all registered fiducials, over their root mean square distance.
     """

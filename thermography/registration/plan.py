@@ -130,14 +130,11 @@ class Fiducial:
     Attributes
     ----------
     name : str
-    x_mm, y_mm : float, mm
-        Centre on the plan.
-    diameter_mm : float, mm
-        Of the disc, or of the circle that contains the marker with its quiet zone; 0 for a point.
+    x_mm, y_mm : mm, centre on the plan
+    diameter_mm : mm, of the disc, or of the circle that contains the marker with its quiet zone; 0 for a point
     column_px, row_px : float or None, px
         Hint where the disc appears in the frame; it may be wrong by tens of pixels. None: no hint. Of a point, its place itself.
-    marker : int or None
-        Number in the dictionary of 4 x 4 ArUco markers, 0 to 49; None for a disc.
+    marker : number in the dictionary of 4 x 4 ArUco markers, 0 to 49; None for a disc
     """
 
     name: str

@@ -48,14 +48,10 @@ class Lens:
 
     Attributes
     ----------
-    focal_length_px : float, px
-        Unit of the normalised image coordinates.
-    principal_point_px : (column, row), px
-        Centre of the distortion.
-    distortion : (k1, k2, p1, p2)
-        Of the normalised image coordinates.
-    size_px : (int, int) or None
-        (columns, rows) of the frames that the calibration was made with; None where it is not stated.
+    focal_length_px : px, unit of the normalised image coordinates
+    principal_point_px : px, centre of the distortion
+    distortion : of the normalised image coordinates
+    size_px : (columns, rows) of the frames that the calibration was made with; None where it is not stated
     """
 
     focal_length_px: float

@@ -36,14 +36,10 @@ class Series:
 
     Attributes
     ----------
-    seconds : (m,) ndarray, s
-        Time since the first reading, increasing.
-    values : (m,) or (m, targets) ndarray, in `units`
-        One value for all sites, or one per target position.
-    units : str
-        Unit of the values.
-    first : tuple of int
-        Number of the sample with which every run begins; runs have nothing to do with each other.
+    seconds : (m,), s, time since the first reading, increasing
+    values : (m,) or (m, targets), one value for all sites, or one per target position
+    units : unit of the values
+    first : number of the sample with which every run begins; runs have nothing to do with each other
     """
 
     seconds: Array

@@ -105,20 +105,13 @@ class Diagnosis:
 
     Attributes
     ----------
-    target : int
-        Target number, from 1.
-    direction : str
-        Affected direction: "positive", "negative" or "both".
-    cause : str
-        Name of the cause, "undetermined" where the data do not decide.
-    probability : float
-        Of that cause among the explanations tried; for "undetermined", that of the best explanation.
-    evidence : dict
-        Numbers by name; the name states the unit (um, um_per_K, s, nats), or that it is a probability.
-    for_it, against_it : tuple of str
-        Sentences with numbers for the leading explanation, and against it.
-    check : str
-        What to check on the machine.
+    target : target number, from 1
+    direction : affected direction: "positive", "negative" or "both"
+    cause : name of the cause, "undetermined" where the data do not decide
+    probability : of that cause among the explanations tried; for "undetermined", that of the best explanation
+    evidence : numbers by name; the name states the unit (um, um_per_K, s, nats), or that it is a probability
+    for_it, against_it : sentences with numbers for the leading explanation, and against it
+    check : what to check on the machine
     """
 
     target: int

@@ -18,14 +18,10 @@ class EmbeddedChart:
 
     Attributes
     ----------
-    name : str
-        Unique in its page; a word of letters, digits and underscores.
-    seen : str
-        Text alternative.
-    height : int
-        CSS px that are kept free until it is drawn.
-    item : Markup
-        Bokeh's document as JSON that may stand in a ``<script>``.
+    name : unique in its page; a word of letters, digits and underscores
+    seen : text alternative
+    height : CSS px that are kept free until it is drawn
+    item : Bokeh's document as JSON that may stand in a ``<script>``
     """
 
     name: str
@@ -39,12 +35,9 @@ class MapControls(NamedTuple):
 
     Attributes
     ----------
-    quantities : list of str
-        Entries of the menu.
-    cycles : list of int
-        Cycles that the slider goes through.
-    note : str
-        What was thinned or averaged; empty where nothing was.
+    quantities : entries of the menu
+    cycles : cycles that the slider goes through
+    note : what was thinned or averaged; empty where nothing was
     """
 
     quantities: list[str]
@@ -57,10 +50,8 @@ class Drawn(NamedTuple):
 
     Attributes
     ----------
-    charts : dict of str to EmbeddedChart
-        By name.
-    thermal_map : MapControls or None
-        What the reader can choose of the thermal map; None where it is not among the charts.
+    charts : by name
+    thermal_map : what the reader can choose of the thermal map; None where it is not among the charts
     """
 
     charts: dict[str, EmbeddedChart]

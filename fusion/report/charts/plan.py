@@ -320,14 +320,10 @@ class Layer(NamedTuple):
 
     Attributes
     ----------
-    variable : str
-        Its name in fields.nc.
-    words, unit : str
-        As they are shown; "1" for a number without unit.
-    decimals : int
-        That are shown.
-    colours : str
-        Name of its scale.
+    variable : its name in fields.nc
+    words, unit : as they are shown; "1" for a number without unit
+    decimals : that are shown
+    colours : name of its scale
     """
 
     variable: str

@@ -74,12 +74,9 @@ class Chart:
 
     Attributes
     ----------
-    figure : LayoutDOM
-        Bokeh figure, or a layout of several.
-    seen : str
-        One sentence that says what is seen, for readers who do not see it: extent, extremes, direction of change.
-    columns : mapping of str to sequence
-        What the reader can download: heading with unit, values; all of one length.
+    figure : Bokeh figure, or a layout of several
+    seen : one sentence that says what is seen, for readers who do not see it: extent, extremes, direction of change
+    columns : what the reader can download: heading with unit, values; all of one length
     """
 
     figure: LayoutDOM

@@ -53,12 +53,9 @@ class Profile:
 
     Attributes
     ----------
-    position_mm : (n,) ndarray
-        Targets, increasing.
-    deviation_um : (2, n) ndarray
-        Approach in positive and in negative direction.
-    covariance_um2 : (2, n, 2, n) ndarray
-        Of the deviations.
+    position_mm : (n,), targets, increasing
+    deviation_um : (2, n), approach in positive and in negative direction
+    covariance_um2 : (2, n, 2, n), of the deviations
     """
 
     position_mm: Array
@@ -72,18 +69,13 @@ class ErrorTable:
 
     Attributes
     ----------
-    position_mm : (m,) ndarray
-        Points of the table, increasing.
+    position_mm : (m,), points of the table, increasing
     deviation_um : (2, m) ndarray
         Approach in positive and in negative direction; zero at the reference position approached in positive direction.
-    u_um : (2, m) ndarray
-        Standard uncertainty, that of the interpolation included.
-    reference_mm : float
-        Position at which the correction is zero.
-    widest_gap_mm : float
-        Largest distance of two neighbouring targets.
-    resampled : bool
-        Whether the points are others than the targets.
+    u_um : (2, m), standard uncertainty, that of the interpolation included
+    reference_mm : position at which the correction is zero
+    widest_gap_mm : largest distance of two neighbouring targets
+    resampled : whether the points are others than the targets
     """
 
     position_mm: Array
@@ -230,22 +222,14 @@ class Control:
 
     Attributes
     ----------
-    words : str
-        Its name.
-    write : callable
-        Returns the table's text from the error table, the axis name and the lines of its header.
-    file_name : str
-        Name of the file; ``{axis}`` is replaced by the axis.
-    sign : str
-        Sign convention, a sentence.
-    comment : str
-        What begins a comment; empty where its dialect has none, so that the header goes into a file of its own.
-    equal_spacing : bool
-        Whether the points must be equally spaced.
-    names_axis : bool
-        Whether the axis is named in the table.
-    one_table : bool
-        Whether it knows one table for both approaches.
+    words : its name
+    write : returns the table's text from the error table, the axis name and the lines of its header
+    file_name : name of the file; ``{axis}`` is replaced by the axis
+    sign : sign convention, a sentence
+    comment : what begins a comment; empty where its dialect has none, so that the header goes into a file of its own
+    equal_spacing : whether the points must be equally spaced
+    names_axis : whether the axis is named in the table
+    one_table : whether it knows one table for both approaches
     """
 
     words: str
@@ -373,10 +357,8 @@ class ThermalState:
 
     Attributes
     ----------
-    first, last : datetime64 or None
-        Time of the first and the last reading, UTC; None where the file has no times.
-    cycles : tuple of int
-        Number of the first and the last cycle.
+    first, last : time of the first and the last reading, UTC; None where the file has no times
+    cycles : number of the first and the last cycle
     temperatures_degC : dict of str to (mean, lowest, highest) or None
         Of material and air at the readings, the mean over cycles of equal weight, as for the profile; None where it was not logged.
     """
@@ -415,10 +397,8 @@ class Origin:
 
     Attributes
     ----------
-    active : str
-        The compensation during the test.
-    verdict : str
-        Verdict of the closed loop.
+    active : the compensation during the test
+    verdict : verdict of the closed loop
     """
 
     campaign: str
@@ -492,16 +472,11 @@ class TemperatureLine:
 
     Attributes
     ----------
-    offset_um_per_K, gradient_ppm_per_K : float
-        Shift and stretch per kelvin.
-    offset_u_um_per_K, gradient_u_ppm_per_K : float
-        Standard uncertainty by the jackknife over blocks of cycles.
-    reference_mm : float
-        P0.
-    mean_degC : float
-        T0, at which the profile holds.
-    range_degC : tuple of float
-        Lowest and highest temperature of the test.
+    offset_um_per_K, gradient_ppm_per_K : shift and stretch per kelvin
+    offset_u_um_per_K, gradient_u_ppm_per_K : standard uncertainty by the jackknife over blocks of cycles
+    reference_mm : P0
+    mean_degC : T0, at which the profile holds
+    range_degC : lowest and highest temperature of the test
     before_um, after_um : float
         Root mean square of the readings less the profile, and of the error of predicting each block of cycles from the others.
     """

@@ -76,16 +76,11 @@ class Prediction:
 
     Attributes
     ----------
-    before_um : float
-        Without the table.
-    after_um : float
-        With it, median over repetitions of the test, each with its own errors of measurement.
-    own_um : float
-        What the table leaves of the profile that it was made from: what its points and the control's model cannot follow.
-    resampling_um : float
-        Largest departure, at a target, of the table's straight lines from the profile.
-    value_u_um : float
-        Largest standard uncertainty of a value of the table within the targets.
+    before_um : without the table
+    after_um : with it, median over repetitions of the test, each with its own errors of measurement
+    own_um : what the table leaves of the profile that it was made from: what its points and the control's model cannot follow
+    resampling_um : largest departure, at a target, of the table's straight lines from the profile
+    value_u_um : largest standard uncertainty of a value of the table within the targets
     """
 
     before_um: float
@@ -169,10 +164,8 @@ class Exported:
 
     Attributes
     ----------
-    files : tuple of Path
-        The files.
-    remarks : tuple of str
-        What to know of them, one sentence each.
+    files : the files
+    remarks : what to know of them, one sentence each
     """
 
     files: tuple[Path, ...]
