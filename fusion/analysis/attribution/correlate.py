@@ -15,7 +15,7 @@ Source: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations); docs/m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,6 +52,7 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array, FusionError
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart, Sensitivity
+from thermofuse.resources import vocabulary
 from thermography.large_arrays import piece_slices
 
 # Places on the plan as areas: the cells that belong together around a peak, and the rectangle that names them.
@@ -100,34 +101,10 @@ _FLAG_MEANINGS = "not_attributable attributable not_separable"
 #: Thermal modes get a larger share of the error probability: few, of low noise and each one place, they find what single cells miss, and
 #: cells mostly draw the map around them. A quarter of the unit costs the cells 1 % of power and finds 3 % more sources (simulated).
 _FAVOUR = {"modes": 0.25}
-#: Units and long name of every result per channel, column or session.
-_MEANINGS = {
-    "statistic": ("1", "profile likelihood ratio"),
-    "p_value": ("1", "family-wise p value"),
-    "q_value": ("1", "false-discovery rate"),
-    "sensitivity": ("um/K", "drift per rise of this place"),
-    "sensitivity_u": ("um/K", "standard uncertainty of the sensitivity"),
-    "detectable_sensitivity": ("um/K", "sensitivity found with 80 % power at this place"),
-    "lag": ("s", "time constant of the response"),
-    "naive_correlation": ("1", "plain correlation, for contrast only: two trending series always correlate"),
-    "p_beside": ("1", "family-wise p value of what this mode adds to the leading one"),
-    "threshold": ("1", "statistic at a family-wise p of 0.05"),
-    "noise": ("um", "noise of one value of the channel"),
-    "unexplained_drift": ("um", "standard deviation over one hour of the unexplained drift"),
-    "drift_order": ("1", "0 none, 1 random walk, 2 integrated random walk"),
-    "false_alarm_rate": ("1", "share of fresh nulls flagged"),
-    "cells_false_alarm_rate": ("1", "share of fresh nulls flagged"),
-    "warm_up_share": ("1", "share of the field's time course that one warm-up explains"),
-}
-_FLAGS = {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS}
-#: The same of targets and directions by themselves.
-_TARGET_MEANINGS = {
-    "statistic": {"units": "1", "long_name": "likelihood ratio, whitening fixed under the null"},
-    "p_value": {"units": "1", "long_name": "family-wise p value over all series"},
-    "sensitivity": {"units": "um/K"},
-    "sensitivity_u": {"units": "um/K"},
-    "lag": {"units": "s"},
-}
+#: Attributes of every result per channel, column or session; and of targets and directions by themselves.
+_VARIABLES = vocabulary("variables")
+_MEANINGS, _OF_TARGETS = _VARIABLES["correlation"], _VARIABLES["correlation_of_targets"]
+_MEANINGS["verdict"] = {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS}
 #: Cells on which fields are correlated, about.
 _CELL_MM = 10.0
 #: Cells with gaps in up to this share of the frames are filled by interpolation in time; others are left out.
@@ -220,13 +197,13 @@ def correlate(
     result = session.evaluate(candidates.sets, checks, seed, progress=progress, favour=_FAVOUR)
     groups: dict[str, xr.Dataset] = {}
     for name, test in result.sets.items():
-        groups[name] = candidates.lay_out(name, "channel", session.quantities(name, test), _meaning)
+        groups[name] = candidates.lay_out(name, "channel", session.quantities(name, test), _MEANINGS)
         if name != "cells":
             rate = {"false_alarm_rate": _variable("false_alarm_rate", test.false_alarm_rate)}
             groups[name] = groups[name].assign({"threshold": _variable("threshold", test.threshold), **rate})
     if "modes" in groups:
         p_given = session.p_given_leading_mode(result.sets["modes"])
-        groups["modes"]["p_beside"] = (("channel", "mode"), p_given, _meaning("p_beside"))
+        groups["modes"]["p_beside"] = (("channel", "mode"), p_given, _MEANINGS["p_beside"])
     if per_target:
         groups |= session.screen_targets(readings)
     root = _describe_session(result, excitation).assign(groups.pop("cells"))
@@ -242,17 +219,9 @@ def coarsen_field(fields: xr.Dataset) -> xr.DataArray:
     return xr.concat(parts, "time")
 
 
-def _meaning(name: str) -> dict[str, Any]:
-    """Attributes of a result."""
-    if name == "verdict":
-        return _FLAGS
-    units, long_name = _MEANINGS[name]
-    return {"units": units, "long_name": long_name}
-
-
 def _variable(name: str, values: Any) -> tuple[tuple[str, ...], Any, dict[str, Any]]:
     """A result per channel, or of the session, as a variable."""
-    return (("channel",) if np.ndim(values) else (), values, _meaning(name))
+    return (("channel",) if np.ndim(values) else (), values, _MEANINGS[name])
 
 
 def flatten_field(field: xr.DataArray, frame_seconds: Array) -> tuple[FieldSeries, NDArray[np.bool_]]:
@@ -290,15 +259,15 @@ class _Candidates:
         return _Candidates({"cells": cells, **few}, field, seen, modes, regions)
 
     def lay_out(
-        self, name: str, leading: str, quantities: _Quantities, meaning: Callable[[str], dict[str, Any]]
+        self, name: str, leading: str, quantities: _Quantities, meaning: Mapping[str, dict[str, Any]]
     ) -> xr.Dataset:
         """Quantities (leading, columns) of one set as variables, with the places of its columns."""
         if name == "cells":
-            maps = {quantity: self._map(leading, values, meaning(quantity)) for quantity, values in quantities.items()}
+            maps = {quantity: self._map(leading, values, meaning[quantity]) for quantity, values in quantities.items()}
             return xr.Dataset(maps, {"y": self.field["y"], "x": self.field["x"]})
         kind, mm = {"modes": "mode", "regions": "region"}[name], {"units": "mm"}
         columns = xr.Dataset(
-            {one: ((leading, kind), _without_infinities(values), meaning(one)) for one, values in quantities.items()}
+            {one: ((leading, kind), _without_infinities(values), meaning[one]) for one, values in quantities.items()}
         )
         if name == "regions":
             columns = columns.assign_coords(region=[region.name for region in self.regions])
@@ -401,7 +370,7 @@ class _Session:
                 "sensitivity_u": found.sensitivity_u,
                 "lag": np.asarray(self.lags_s, float)[found.lag_index],
             }
-            laid_out = self.candidates.lay_out(name, "series", quantities, _TARGET_MEANINGS.__getitem__)
+            laid_out = self.candidates.lay_out(name, "series", quantities, _OF_TARGETS)
             groups[group] = laid_out.assign_coords(coords)
         return groups
 
