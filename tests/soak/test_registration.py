@@ -14,6 +14,7 @@ import pytest
 
 from fusion.analysis.consistency.checks import Inputs
 from fusion.pipeline.consistency import run_checks
+from fusion.results.axis import RegistrationPart
 from tests.soak.table_views import DISCS, GRID, Table, View, draw_view, hinted
 from thermography.common import ThermographyError
 from thermography.registration.plan import Fiducial
@@ -311,15 +312,17 @@ def _wrong_discs(registration: Registration, table: Table, view: View) -> int:
 
 def _doubts(registration: Registration, listed: list[Fiducial]) -> tuple[str, ...]:
     """Codes of the checks that are not passed."""
-    part = {
-        "leave_one_out_mm": registration.leave_one_out_mm,
-        "fiducials_listed": len(listed),
-        "unchecked": registration.unchecked,
-        "contradicted_hints": registration.contradicted_hints,
-        "mirrored": registration.mirrored,
-        "span": 1.0,
-        "area_ratio": registration.area_ratio,
-    }
+    part = RegistrationPart(
+        rms_mm=registration.rms_mm,
+        leave_one_out_mm=registration.leave_one_out_mm,
+        fiducials_listed=len(listed),
+        unchecked=registration.unchecked,
+        contradicted_hints=registration.contradicted_hints,
+        mirrored=registration.mirrored,
+        span=1.0,
+        area_ratio=registration.area_ratio,
+        frames_rejected=(),
+    )
     return tuple(check.code for check in run_checks("plan", Inputs(registration=part)) if not check.passed)
 
 

@@ -19,6 +19,7 @@ from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.library import RULES
 from fusion.analysis.consistency.material import log_with_camera
 from fusion.pipeline.consistency import Check, _worded
+from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency import test_camera, test_logs, test_model, test_readings
 from tests.fusion.analysis.consistency.twin_fields import FILES, SENSOR_MM, late, recorded, scaled
 from tests.soak.lies.logs import starts
@@ -157,7 +158,7 @@ def lit() -> np.ndarray:
 
 
 def registered(**changed: Any) -> Lie:
-    return other(registration=test_camera.SOUND | changed)
+    return other(registration=RegistrationPart.model_validate(test_camera.SOUND | changed))
 
 
 def clocks(*names: str) -> Inputs:
@@ -272,7 +273,7 @@ def sound(campaign_folder: Path) -> dict[str, Inputs]:
             sensor_u_K=0.1,
         ),
         "clocks": clocks(),
-        "plan": Inputs(registration=test_camera.SOUND, fiducials_file="fiducials.csv"),
+        "plan": registered()(Inputs(fiducials_file="fiducials.csv")),
         "loop": loop()(Inputs(travel_mm=300.0)),
     }  # fmt: skip
 
