@@ -52,8 +52,6 @@ from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from fusion.campaign.columns import TableProposal
 
 
@@ -99,7 +97,9 @@ class Recognised:
     @cached_property
     def content(self) -> Any:
         """What the reader of its kind returns."""
-        return (self.kind is Kind.RECORD and self.logged) or self.kind.value.read(self.path)
+        if self.kind is Kind.RECORD and self.logged is not None:
+            return self.logged
+        return self.kind.value.read(self.path)
 
     @property
     def headings(self) -> tuple[str, ...]:
@@ -335,7 +335,7 @@ def _describe_log(found: Recognised) -> list[str]:
     log = found.content
     name = "drivers" if found.kind is Kind.DRIVERS else "environment"
     first, last = log["time"].values[0], log["time"].values[-1]
-    lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}{_zone(log)}"]
+    lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}, {log['time'].attrs['reference']}"]
     for variable, values in log.data_vars.items():
         unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
         lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
@@ -349,7 +349,7 @@ def _describe_deviations(found: Recognised) -> list[str]:
     values, time, position = (deviations[name] for name in ("deviation", "time", "position"))
     timed = time.values[~np.isnat(time.values)]
     when = (
-        f"{moment(timed.min())} to {moment(timed.max())}, times {time.attrs['origin']}{_zone(deviations)}"
+        f"{moment(timed.min())} to {moment(timed.max())}, times {time.attrs['origin']}, {time.attrs['reference']}"
         if timed.size
         else "no times: thermofuse run evaluates them by ISO 230-2, and needs one per reading for drift and causes"
     )
@@ -364,12 +364,6 @@ def _describe_deviations(found: Recognised) -> list[str]:
     ]
 
 
-def _zone(table: xr.Dataset) -> str:
-    """Say how times came to UTC, where the reader says it."""
-    reference = table["time"].attrs.get("reference", "")
-    return f", {reference}" if reference else ""
-
-
 def _warnings(table: Read) -> list[str]:
     notices = [*left_out_notices(table, "left_out"), *clock_notices(table)]
     return [f"warning: {notice.message} {notice.remedy}" for notice in notices]
@@ -378,6 +372,7 @@ def _warnings(table: Read) -> list[str]:
 class Kind(Enum):
     """Kinds of files, in the order in which a file is held against them."""
 
+    # A name of a package, as fusion.load_campaign, loads what it needs when it is called: pydantic, xarray.
     RECIPE = FileKind("recipe of a simulation", _is_recipe, lambda path: read_toml(path)[0], _describe_recipe)
     CAMPAIGN = FileKind("campaign file", _is_campaign, lambda path: fusion.load_campaign(path), _describe_campaign)
     FRAMES = FileKind("thermal frames", _holds_counts, inspect_file, _describe_frames, "thermography.frames")
@@ -442,8 +437,7 @@ def _kind_of(found: Recognised) -> Kind:
     try:
         return next(kind for kind in Kind if kind.value.sniff(found))
     except InterferometryError as error:
-        kind = next((kind for kind in Kind if kind.value.may_be(found)), None)
-        if kind is not None:
+        if (kind := next((one for one in Kind if one.value.may_be(found)), None)) is not None:
             return kind
         _, reason = _why_not(path, error)
         shortened = reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
