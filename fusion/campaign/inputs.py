@@ -47,6 +47,7 @@ from fusion.campaign.time_zones import DATED, bring_to_utc, refuse_mixed_zones, 
 from fusion.campaign.values import in_order, matching_pipes, name_and_unit
 from fusion.common import FusionError
 from fusion.messages import naming
+from fusion.results import axis as schema
 from fusion.results.progress import clock_notices, counted, left_out_notices, listed
 from fusion.results.results import Notice
 from fusion.results.store import check
@@ -255,7 +256,7 @@ class CameraInputs(Inputs):
     fiducials_file: str
     frames: Sequence[FrameReference]
     pictures: FrameList
-    frames_rejected: list[dict[str, Any]]
+    frames_rejected: list[schema.RejectedFrame]
     cycles: Cycles
     regions: list[Region] = field(default_factory=list)
     lens: Lens | None = None
@@ -508,19 +509,22 @@ def plan_grid(plan: PlanTable, shape: tuple[int, int]) -> PlanGrid:
     return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 
 
-def _read_frames(campaign: Campaign, *, several_cameras: bool) -> tuple[FrameList, list[dict[str, Any]]]:
-    """Return the usable frames sorted by time, and file, index and reason of the others."""
+def _read_frames(campaign: Campaign, *, several_cameras: bool) -> tuple[FrameList, list[schema.RejectedFrame]]:
+    """Return the usable frames sorted by time, and those that were left out."""
     frames, rejected = index_recordings(campaign.frame_paths(), stack_options(campaign))
-    left_out: list[tuple[Any, str]] = [(frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected]
+    left_out: list[tuple[Any, str]] = [(frame, frame.reason) for frame in rejected]
     if not several_cameras:
         has_time = ~np.isnat(frames.times)
         left_out += [(frame, "the frame has no time") for frame in frames.choose(~has_time)]
         frames, odd = _of_one_camera(frames.choose(has_time), campaign.path)
         left_out += odd
-    return frames, [
-        {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
-        for frame, reason in left_out
-    ]
+    return frames, [left_out_frame(campaign, frame.path, frame.index, reason) for frame, reason in left_out]
+
+
+def left_out_frame(campaign: Campaign, path: Path, index: int, reason: str) -> schema.RejectedFrame:
+    """Return a frame that was left out, with file and reason as seen from the campaign file."""
+    file, seen = relative_name(path, campaign.folder), reason.replace(f"{campaign.folder}/", "")
+    return schema.RejectedFrame(file=file, index=index, reason=seen)
 
 
 def _by_camera(frames: FrameList) -> tuple[NDArray[np.str_], dict[str, int]]:
@@ -664,7 +668,7 @@ def _raise_if_too_few_readings(deviations: xr.Dataset, left_out: Sequence[Notice
 
 
 def _raise_if_too_few_frames(
-    campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[Mapping[str, Any]], *, least: int
+    campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[schema.RejectedFrame], *, least: int
 ) -> None:
     """Raise if no frame is left, or beside a laser too few to show a rise."""
     if len(frames) < least:
@@ -737,11 +741,11 @@ class SourceError(FusionError):
     """The inputs of a campaign cannot be used together; the message says which and what to do."""
 
 
-def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_rejected") -> list[Notice]:
+def frames_notices(rejected: Sequence[schema.RejectedFrame], code: str = "frames_rejected") -> list[Notice]:
     """Return one notice that counts frames that were left out and lists the first of them."""
     if not rejected:
         return []
-    named = [f"{item['file']} ({_reason(item)})" for item in rejected]
+    named = [f"{item.file} ({_reason(item)})" for item in rejected]
     remedy = "Copy damaged files again from the camera."
     if all(_OTHER_CAMERA in _reason(item) for item in rejected):
         remedy = "Name the frames of one camera and one size only in thermography.frames."
@@ -768,10 +772,9 @@ def pipe_notices(campaign: Campaign) -> list[Notice]:
     return notices
 
 
-def _reason(item: Mapping[str, Any]) -> str:
+def _reason(item: schema.RejectedFrame) -> str:
     """Return why a frame was left out without the absolute path that the reader's message starts with."""
-    text = str(item["reason"])
-    return text.split(f"{Path(item['file']).name}: ", 1)[-1]
+    return item.reason.split(f"{Path(item.file).name}: ", 1)[-1]
 
 
 # A record of one run or of several: every table read, the runs in the order of their times, held to the same columns.

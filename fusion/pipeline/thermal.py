@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.material import rise_share_u
-from fusion.campaign.config import RegionTable, ThermographyTable, relative_name
+from fusion.campaign.config import RegionTable, ThermographyTable
 from fusion.campaign.inputs import (
     OVERRIDABLE,
     CameraInputs,
     Source,
     SourceError,
     frames_notices,
+    left_out_frame,
     overridden_parameters,
 )
 from fusion.campaign.time_zones import utc
@@ -183,11 +184,7 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     ]
     kept = np.array([index not in disturbed for index in range(len(survey.frames))])
     frames = [frame for frame, keep in zip(survey.frames, kept, strict=True) if keep]
-    folder = source.campaign.folder
-    rejected = [
-        {"file": relative_name(item.path, folder), "index": item.index, "reason": item.reason.replace(f"{folder}/", "")}
-        for item in left_out
-    ]
+    rejected = [left_out_frame(source.campaign, one.path, one.index, one.reason) for one in left_out]
     usable = replace(source, frames=frames, frames_rejected=[*source.frames_rejected, *rejected])
     notices = [
         *frames_notices(rejected, "frames_damaged"),

@@ -14,7 +14,14 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import RegionTable, relative_name
-from fusion.campaign.inputs import CameraInputs, LaserInputs, frames_notices, overridden_parameters, picture_region
+from fusion.campaign.inputs import (
+    CameraInputs,
+    LaserInputs,
+    frames_notices,
+    left_out_frame,
+    overridden_parameters,
+    picture_region,
+)
 from fusion.campaign.time_zones import utc
 from fusion.pipeline.thermal import (
     PIXEL_FRAMES,
@@ -24,14 +31,7 @@ from fusion.pipeline.thermal import (
     repeat_notices,
     stated_uncertainty,
 )
-from fusion.results.parts import (
-    CameraPicturesPart,
-    DifferencePart,
-    PicturePlace,
-    Quantity,
-    TemperatureRegionPart,
-    ThermogramsPart,
-)
+from fusion.results import parts as schema
 from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome, Parts
 from thermography.common import Array, ThermographyError, write_csv
@@ -125,12 +125,12 @@ def evaluate_thermograms(source: CameraInputs, *, report: Report) -> Outcome[xr.
     if isinstance(source, LaserInputs):
         return Outcome(dataset, parts, tuple(cut))
     scene, shifts = _scene(source, override)
-    compared: dict[str, DifferencePart] = {}
+    compared: dict[str, schema.DifferencePart] = {}
     if (change := _difference(source, override, scene, shifts)) is not None:
         dataset["difference"] = change
         shift_px = shifts[-1] if scene == "still" else None
         compared["difference"] = _describe_difference(source, override, change, shift_px)
-    part = parts.thermograms = ThermogramsPart(
+    part = parts.thermograms = schema.ThermogramsPart(
         pictures=table.sizes["time"],
         cameras=[_describe_camera(each) for each in tables],
         series=of_series,
@@ -231,7 +231,7 @@ def _difference(source: CameraInputs, override: Overrides, scene: Scene, shifts:
 
 def _describe_difference(
     source: CameraInputs, override: Overrides, change: xr.DataArray, shift_px: Array | None
-) -> DifferencePart:
+) -> schema.DifferencePart:
     """The largest change and the mean one; what both pictures share cancels but for its effect on the scale of the difference.
 
     A shift adds its length times the gradient; where it is not known, or was taken out, the uncertainty of a single pixel is not known.
@@ -253,10 +253,10 @@ def _describe_difference(
         parts = [*(float(share) * value for share in scale.values()), inputs.camera_drift_K, *more_K]
         return float(np.linalg.norm(parts))
 
-    return DifferencePart(
+    return schema.DifferencePart(
         seconds=(source.frame_times[-1] - source.frame_times[0]) / np.timedelta64(1, "s"),
-        mean_K=Quantity(value=mean, u=u(mean)),
-        largest_K=Quantity(value=largest, u=None if edge is None else u(largest, noise, edge)),
+        mean_K=schema.Quantity(value=mean, u=u(mean)),
+        largest_K=schema.Quantity(value=largest, u=None if edge is None else u(largest, noise, edge)),
         largest_column_px=column,
         largest_row_px=row,
     )
@@ -268,21 +268,21 @@ def _reduced(pixels: np.ndarray) -> np.ndarray:
     return cv2.resize(np.ascontiguousarray(pixels), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
-def _describe_camera(table: xr.Dataset) -> CameraPicturesPart:
+def _describe_camera(table: xr.Dataset) -> schema.CameraPicturesPart:
     """The pictures of one camera."""
     times = table["time"].values
     known = np.sort(times[~np.isnat(times)])
     first, last = (utc(known[0]), utc(known[-1])) if known.size else (None, None)
-    return CameraPicturesPart(name=str(table["camera"].values[0]), pictures=times.size, first=first, last=last)
+    return schema.CameraPicturesPart(name=str(table["camera"].values[0]), pictures=times.size, first=first, last=last)
 
 
-def _describe_regions(table: xr.Dataset) -> Iterator[TemperatureRegionPart]:
+def _describe_regions(table: xr.Dataset) -> Iterator[schema.TemperatureRegionPart]:
     """Extremes of every region over the pictures of one camera."""
     for region in table["region"].values:
         one = table.sel(region=region)
         one = one.isel(time=np.flatnonzero(one["pixels"].values > 0))
         if one.sizes["time"]:
-            yield TemperatureRegionPart(
+            yield schema.TemperatureRegionPart(
                 name=region,
                 kind=one["kind"].item(),
                 camera=one["camera"].values[0],
@@ -290,7 +290,7 @@ def _describe_regions(table: xr.Dataset) -> Iterator[TemperatureRegionPart]:
                 emissivity=one["emissivity"][0],
                 **_extreme(one, "maximum", np.lexsort((one["overrange"].values, one["maximum"].values))[-1]),
                 **_extreme(one, "minimum", np.lexsort((-one["underrange"].values, one["minimum"].values))[0]),
-                mean_degC=Quantity(value=one["mean"].mean(), u=one["mean_u"].mean()),
+                mean_degC=schema.Quantity(value=one["mean"].mean(), u=one["mean_u"].mean()),
                 overrange_pictures=(one["overrange"] > 0).sum(),
                 overrange_pixels=one["overrange"].max(),
                 underrange_pictures=(one["underrange"] > 0).sum(),
@@ -298,18 +298,18 @@ def _describe_regions(table: xr.Dataset) -> Iterator[TemperatureRegionPart]:
             )
 
 
-def _extreme(one: xr.Dataset, name: str, at: Any) -> dict[str, Quantity | PicturePlace]:
+def _extreme(one: xr.Dataset, name: str, at: Any) -> dict[str, schema.Quantity | schema.PicturePlace]:
     """The highest or lowest temperature of a region over its pictures, with picture and place."""
     there = one.isel(time=int(at))
     time = np.datetime64(there["time"].item(), "ns")
-    place = PicturePlace(
+    place = schema.PicturePlace(
         file=there["source"].item(),
         frame=there["frame"],
         time=None if np.isnat(time) else utc(time),
         column_px=there[f"{name}_column"],
         row_px=there[f"{name}_row"],
     )
-    return {f"{name}_degC": Quantity(value=there[name], u=there[f"{name}_u"]), f"{name}_at": place}
+    return {f"{name}_degC": schema.Quantity(value=there[name], u=there[f"{name}_u"]), f"{name}_at": place}
 
 
 def _cut_notices(regions: Iterable[Region], shape: tuple[int, int]) -> Iterator[Notice]:
@@ -325,11 +325,10 @@ def _cut_notices(regions: Iterable[Region], shape: tuple[int, int]) -> Iterator[
 
 def _rejected_notices(source: CameraInputs, rejected: Sequence[dict[str, Any]]) -> list[Notice]:
     """Return a notice for pictures that could not be evaluated; those of a series on a plan in mm are named where its fields are made."""
-    folder = source.campaign.folder
     has_fields = not source.plan.in_pixels and len(source.cycles.number) > 1
     named_there = {str(frame.path) for frame in source.frames} if has_fields else set()
     named = [
-        {**one, "file": relative_name(Path(one["path"]), folder), "reason": one["reason"].replace(f"{folder}/", "")}
+        left_out_frame(source.campaign, Path(one["path"]), one["index"], one["reason"])
         for one in rejected
         if one["path"] not in named_there
     ]
@@ -350,7 +349,7 @@ def _series_notices(source: CameraInputs, table: xr.Dataset, camera: str, scene:
         yield from pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
 
 
-def _scene_notices(source: CameraInputs, part: ThermogramsPart) -> Iterator[Notice]:
+def _scene_notices(source: CameraInputs, part: schema.ThermogramsPart) -> Iterator[Notice]:
     """Return what the pictures cannot show as a series, and why."""
     others = part.pictures - len(source.frames)
     if part.scene == "no series":

@@ -23,6 +23,7 @@ from fusion.campaign.inputs import (
     window_notice,
 )
 from fusion.pipeline.positioning import evaluate_interferometry
+from fusion.results.axis import RejectedFrame
 from interferometry.io.readings import read_deviations
 from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import change, keep_cycles, without
@@ -44,7 +45,7 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     (copied / "laser.csv").write_text("\n".join(lines) + "\n")
 
     source = read_source(load_campaign(copied / "campaign.toml"))
-    rejected = {item["file"]: item["reason"] for item in source.frames_rejected}
+    rejected = {item.file: item.reason for item in source.frames_rejected}
     assert set(rejected) == {
         f"thermal/{frames[3].name}", f"thermal/{frames[5].name}", f"thermal/{max(frames[7].name, 'copy_of_a_frame.jpg')}",
     }  # fmt: skip
@@ -117,14 +118,11 @@ def test_a_region_that_cannot_be_used_is_refused(copied: Path, corners: str, kno
 
 
 def test_a_frame_of_another_size_is_not_called_damaged() -> None:
-    other = {
-        "file": "b.seq",
-        "index": 0,
-        "reason": "FLIR E40 7, 160 x 120, taken 2012-11-21T10:00:00Z, among frames of FLIR T1020 9, 320 x 240",
-    }
+    why = "FLIR E40 7, 160 x 120, taken 2012-11-21T10:00:00Z, among frames of FLIR T1020 9, 320 x 240"
+    other = RejectedFrame(file="b.seq", index=0, reason=why)
     (notice,) = frames_notices([other])
     assert notice.remedy == "Name the frames of one camera and one size only in thermography.frames."
-    (notice,) = frames_notices([other, {"file": "c.seq", "index": 0, "reason": "c.seq: cut off"}])
+    (notice,) = frames_notices([other, RejectedFrame(file="c.seq", index=0, reason="c.seq: cut off")])
     assert notice.remedy.startswith("Copy damaged files again")
 
 
@@ -139,8 +137,8 @@ def test_frames_of_another_camera_are_the_odd_ones_out(copied: Path) -> None:
     source = read_source(load_campaign(path))
     assert isinstance(source, Source) and isinstance(sound, Source)
     assert source.frames == sound.frames
-    assert [one["file"] for one in source.frames_rejected] == ["thermal/IR_other0.jpg", "thermal/IR_other1.jpg"]
-    assert "FLIR A645sc 55, 640 x 480, taken 2012-11-21T10:00:00Z, among" in source.frames_rejected[0]["reason"]
+    assert [one.file for one in source.frames_rejected] == ["thermal/IR_other0.jpg", "thermal/IR_other1.jpg"]
+    assert "FLIR A645sc 55, 640 x 480, taken 2012-11-21T10:00:00Z, among" in source.frames_rejected[0].reason
     for frame in frames[2:]:
         frame.unlink()
     with pytest.raises(SourceError, match=r"4 frames of 2 cameras, none of which .* 2 of FLIR A645sc 55, 640 x 480"):
