@@ -98,9 +98,7 @@ def answering(console: Console, *, kept: Callable[[], str] = lambda: "") -> Iter
         raise typer.Exit(_SIGNAL_BASE + number) from None
     except (typer.Exit, BrokenPipeError):
         raise
-    except (FusionError, ThermographyError, InterferometryError) as error:
-        say(str(error))
-    except MemoryError as error:
+    except (FusionError, ThermographyError, InterferometryError, MemoryError) as error:
         say(reported(error))
     except Exception as error:
         place = f"{error.filename}: " if isinstance(error, OSError) and error.filename is not None else ""

@@ -162,19 +162,13 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
 
 def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Difference, int]:
     """Return the differences at common positions and approaches, and how many positions one test has alone."""
-    pairs = [
-        (i, j)
-        for i, place in enumerate(before["position"].values)
-        for j in np.flatnonzero(np.abs(after["position"].values - place) <= SAME_POSITION_MM)[:1]
-    ]
-    if len(pairs) < LEAST_POSITIONS:
+    one, other = _at_common_positions(before, after)
+    common = one.sizes["target"]
+    if common < LEAST_POSITIONS:
         raise ComparisonError(
-            f"{len(pairs)} positions are the same within {SAME_POSITION_MM:g} mm; {LEAST_POSITIONS} are needed to tell a changed position "
+            f"{common} positions are the same within {SAME_POSITION_MM:g} mm; {LEAST_POSITIONS} are needed to tell a changed position "
             "from a changed thermal state: measure at the same targets"
         )
-    first, second = (list(places) for places in zip(*pairs, strict=True))
-    one = before.isel(target=first, other_target=first)
-    other = after.isel(target=second, other_target=second)
     sides = [side for side in one["direction"].values if side in other["direction"].values]
     one, other = (_by_direction(test, sides) for test in (one, other))
     present = np.isfinite(one["profile"].values) & np.isfinite(other["profile"].values)
@@ -186,10 +180,17 @@ def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Differe
     values = (other["profile"].values - one["profile"].values)[present]
     freedom = min(float(np.nansum(test["scatter_freedom"].values)) for test in (one, other))
     signs = np.broadcast_to(sign[:, None], present.shape)[present]
-    left_out = before.sizes["target"] + after.sizes["target"] - 2 * len(pairs)
+    left_out = before.sizes["target"] + after.sizes["target"] - 2 * common
     return _Difference(
         place, signs, values, np.asarray(np.linalg.cholesky(covariance), float), max(freedom, 1.0)
     ), left_out
+
+
+def _at_common_positions(before: xr.Dataset, after: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return two tests at the positions that both have, in the order of the first."""
+    gaps = np.abs(before["position"].values[:, None] - after["position"].values)
+    first, second = np.nonzero(gaps <= SAME_POSITION_MM)
+    return before.isel(target=first, other_target=first), after.isel(target=second, other_target=second)
 
 
 def _by_direction(test: xr.Dataset, sides: Sequence[str]) -> xr.Dataset:
@@ -546,10 +547,7 @@ def _scatters(before: ComparedCampaign, after: ComparedCampaign) -> list[Change]
     """The scatter at positions that both campaigns have."""
     if before.drift is None or after.drift is None:
         return []
-    one, other = (campaign.drift.sortby("position") for campaign in (before, after) if campaign.drift is not None)
-    gaps = np.abs(one["position"].values[:, None] - other["position"].values)
-    first, second = np.nonzero(gaps <= SAME_POSITION_MM)
-    one, other = one.isel(target=first), other.isel(target=second)
+    one, other = _at_common_positions(before.drift.sortby("position"), after.drift)
     freedom = [test["scatter_freedom"].sum("direction").values for test in (one, other)]
     return compare_scatters(
         one["position"].values, one["scatter_position"].values, other["scatter_position"].values, *freedom

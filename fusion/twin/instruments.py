@@ -29,13 +29,6 @@ IDENTITY = CameraIdentity(
     model="FLIR SC660", part="TWIN", serial="0", software="1.0", lens_model="FOL38", field_of_view_deg=23.9
 )
 RANGE = CalibratedRange(minimum_K=233.15, maximum_K=393.15, raw_minimum=8812, raw_maximum=57240)
-#: Variables of the environment log with their units.
-LOGGED = (
-    ("air_temperature", "degC"),
-    ("air_pressure", "hPa"),
-    ("relative_humidity", "percent"),
-    ("material_temperature", "degC"),
-)
 
 
 def simulate_campaign(recipe: str | Path, out: str | Path, *, progress: Progress | None = None) -> Path:
@@ -154,7 +147,7 @@ def _write_laser(truth: Truth, out: Path) -> None:
     deviations = truth.readings[["deviation", "time"]]
     if truth.recipe.laser.file == "rtl":
         log = environment_log(truth)
-        ends = {f"{name}_{unit}": (float(log[name][0]), float(log[name][-1])) for name, unit in LOGGED}
+        ends = {f"{name}_{one.attrs['units']}": (float(one[0]), float(one[-1])) for name, one in log.items()}
         write_rtl(out / "laser.rtl", deviations, environment=ends, user_text={"axis": truth.recipe.campaign.axis})
     else:
         write_deviations_csv(out / "laser.csv", deviations)

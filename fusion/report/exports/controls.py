@@ -23,7 +23,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from fusion.common import FusionError
+from fusion.common import Array, FusionError
 from fusion.report.wording import environment, sentences
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import Recursion, RecursionInput
@@ -39,8 +39,6 @@ class ExportError(FusionError):
 
 # The drift-free profile of an axis as a compensation needs it: relative to a reference, at the points of a table,
 # with its uncertainty.
-
-Array = NDArray[np.float64]
 
 #: Order of the approaches along the first axis of every array.
 APPROACHES = ("positive", "negative")

@@ -15,12 +15,12 @@ import pandas as pd
 import xarray as xr
 
 from fusion.analysis.drift_model.recursion import make_recursion
+from fusion.common import Array
 from fusion.messages import naming
 from fusion.report.exports import tables
 from fusion.report.exports.controls import (
     CONTROLS,
     MODELS,
-    Array,
     Control,
     ErrorTable,
     ExportError,
