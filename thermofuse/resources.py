@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ def resource(name: str) -> Path:
     return (installed if installed.is_dir() else package.with_name("data")) / name
 
 
+@cache
 def vocabulary(name: str) -> dict[str, Any]:
     """Return the words of a file in `data/vocabulary/`."""
     return tomllib.loads(resource(f"vocabulary/{name}.toml").read_text(encoding="utf-8"))
@@ -22,7 +25,7 @@ def vocabulary(name: str) -> dict[str, Any]:
 
 def variables(product: str) -> tuple[dict[str, tuple[tuple[str, ...], str, str]], dict[str, dict[str, str]]]:
     """Return the contract of a product, (dims, units, kind) of the variables that others rely on, and the attributes of all of them."""
-    described = vocabulary("variables")[product]
+    described = deepcopy(vocabulary("variables")[product])
     contract = {
         name: (tuple(one.pop("dims")), one.get("units", ""), one.pop("kind"))
         for name, one in described.items()

@@ -19,6 +19,7 @@ from fusion.analysis.alignment.sensor_health import SensorFault
 from fusion.common import Array, FusionError
 from fusion.results.parts import ContactSensorPart
 from interferometry.deviations import resolution_um
+from thermofuse.resources import variables
 from thermography.large_arrays import in_pieces, piece_slices
 
 _DIMS = ("cycle", "direction", "target")
@@ -180,7 +181,7 @@ def align(
     inside = ~np.isnat(reading_time) & (reading_time >= frame_time[0]) & (reading_time <= frame_time[-1])
 
     fused = _kept(deviations).assign_coords(frame_time=frame_time)
-    fused["inside_frames"] = (_DIMS, inside, {"long_name": "the reading is between the first and the last frame"})
+    fused["inside_frames"] = (_DIMS, inside, _ATTRIBUTES["inside_frames"])
     for name, values in series.items():
         at_readings = np.where(inside, interpolate_series(deviations["time"].values, frame_time, values), np.nan)
         fused[name] = (_DIMS, at_readings, _ATTRIBUTES[name])
@@ -224,14 +225,7 @@ def _add_logs(fused: xr.Dataset, environment: xr.Dataset | None, drivers: xr.Dat
     return fused
 
 
-_DIFFERENCE = {"units_metadata": "temperature: difference"}
-_ATTRIBUTES: dict[str, dict[str, str]] = {
-    "mean_rise": {"units": "K", "long_name": "mean temperature rise of the seen table", **_DIFFERENCE},
-    "axis_integral": {"units": "K mm", "long_name": "integral of the seen rise from axis position 0 to the target"},
-    "local_rise": {"units": "K", "long_name": "temperature rise of the table at the target", **_DIFFERENCE},
-    "patch_mean_rise": {"units": "K", "long_name": "share of a switching patch in the mean rise", **_DIFFERENCE},
-    "patch_axis_integral": {"units": "K mm", "long_name": "share of a switching patch in the axis integral"},
-}
+_ATTRIBUTES = variables("aligned")[1]
 
 
 def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> dict[str, Array]:

@@ -52,7 +52,7 @@ from fusion.analysis.levels import ATTRIBUTION_LEVEL, CHECKS
 from fusion.common import Array, FusionError
 from fusion.results.axis import SourcePart
 from fusion.results.parts import AreaPart, Sensitivity
-from thermofuse.resources import vocabulary
+from thermofuse.resources import variables
 from thermography.large_arrays import piece_slices
 
 # Places on the plan as areas: the cells that belong together around a peak, and the rectangle that names them.
@@ -102,9 +102,11 @@ _FLAG_MEANINGS = "not_attributable attributable not_separable"
 #: cells mostly draw the map around them. A quarter of the unit costs the cells 1 % of power and finds 3 % more sources (simulated).
 _FAVOUR = {"modes": 0.25}
 #: Attributes of every result per channel, column or session; and of targets and directions by themselves.
-_VARIABLES = vocabulary("variables")
-_MEANINGS, _OF_TARGETS = _VARIABLES["correlation"], _VARIABLES["correlation_of_targets"]
-_MEANINGS["verdict"] = {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS}
+_MEANINGS: dict[str, dict[str, Any]] = {
+    **variables("correlation")[1],
+    "verdict": {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS},
+}
+_OF_TARGETS: dict[str, dict[str, Any]] = {**variables("correlation_of_targets")[1]}
 #: Cells on which fields are correlated, about.
 _CELL_MM = 10.0
 #: Cells with gaps in up to this share of the frames are filled by interpolation in time; others are left out.
