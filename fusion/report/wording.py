@@ -305,9 +305,9 @@ def environment(*, html: bool) -> jinja2.Environment:
         finalize=_without_control if html else None, bytecode_cache=_compiled(f"{'page' if html else 'text'}_%s.jinja"),
     )  # fmt: skip
     formats = (
-        anomaly_cause, anomaly_place, condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first,
-        measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small,
-        upper_first, variance_left,
+        anomaly_cause, anomaly_place, caption, condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first,
+        measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small, upper_first,
+        variance_left,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
@@ -348,6 +348,12 @@ def sentences(name: str, *facts: Any, template: str = "sentences.j2") -> list[st
 def say(name: str, *facts: Any) -> str:
     """Return a statement of ``sentences.j2`` as plain text on one line."""
     return " ".join(sentences(name, *facts))
+
+
+def caption(chart: str) -> str:
+    """Return what a chart of the report shows, by its name, of which a number at its end tells one of several."""
+    captions = environment(html=False).get_template("captions.j2").module.captions  # type: ignore[attr-defined]
+    return str(captions[re.sub(r"_\d+$", "", chart)])
 
 
 def iso230_values(iso: Iso230Window) -> dict[str, str]:

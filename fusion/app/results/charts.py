@@ -44,6 +44,7 @@ from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import (
     Table,
     anomaly_figures,
+    caption,
     conditional,
     effect_words,
     iso230_values,
@@ -96,11 +97,11 @@ def _drift_charts(
     linker.link(course.figure, x=HOURS)
     linker.link(field.figure, x=CYCLE, y=POSITION)
     _highlight(read, joint, selection, course)
-    band = f"with its 95 % band ({say('drift_uncertainty', products.results.iso230)})"
+    profile_words = f"{caption('profile').rstrip('.')} ({say('drift_uncertainty', products.results.iso230)})."
     return [
         ui.heading("Profile and drift", level=3),
-        shown(profile, f"Deviation along the axis without drift, {band}. A click chooses the position."),
-        shown(course, "Drift of every position over time; thick: the chosen position. A click chooses the cycle."),
+        shown(profile, f"{profile_words} A click chooses the position."),
+        shown(course, f"{caption('drift')} Thick: the chosen position. A click chooses the cycle."),
         shown(field, "Drift over cycle and position. A click chooses both."),
         position_history(read, joint, selection, linker),
     ]
@@ -129,7 +130,7 @@ def position_history(read: xr.Dataset, joint: xr.Dataset, selection: Selection, 
         if selection.target is not None:
             chart = readings.plot_history(read, joint, selection.target)
             unlink.append(linker.link(chart.figure, x=HOURS))
-            view[:] = [shown(chart, "Readings of the chosen position, with profile and drift through them.")]
+            view[:] = [shown(chart, caption("history"))]
 
     selection.watch(show, "target")
     show()
@@ -154,7 +155,7 @@ def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui
     if readings.has_windows(windows):
         chart = readings.plot_windows(windows)
         linker.link(chart.figure, x=CYCLE)
-        parts.append(shown(chart, "A, R and B of windows of five cycles along the test. A click chooses the cycle."))
+        parts.append(shown(chart, f"{caption('windows')} A click chooses the cycle."))
     return parts
 
 
@@ -187,33 +188,20 @@ def loop_steps(products: Products, linker: Linker) -> ui.Parts:
     return [*parts, ui.heading("What to do next", level=3), *(ui.paragraph(step) for step in next_steps(results)[:6])]
 
 
-#: Charts of a record and of each of its displacements, with what they show.
-_OF_RECORD = {
-    "temperatures": "Rise of every sensor; the four with the largest rise are named.",
-    "drivers": "Logged drivers of the machine's heat.",
-    "block_errors": "Errors of predicting every part of the record before and after this step.",
-}
-_OF_DISPLACEMENT = {
-    "prediction": "Measured and predicted. Shaded: held out, predicted without taking part in any fit.",
-    "residual": "Measured minus predicted.",
-    "contribution": "What each term of the final model contributes, about its mean.",
-}
-
-
 def record_charts(record: xr.Dataset) -> ui.Parts:
     """Return the charts of a record, and those of the displacement that a menu chooses; first the one that moves most."""
-    charts = draw_record(record)
+    charts, of_each = draw_record(record), ("prediction", "residual", "contribution")
 
     def of(channel: int) -> pn.viewable.Viewable:
-        drawn = {name: charts.get(f"{name}_{channel}") for name in _OF_DISPLACEMENT}
-        return ui.column(*(part for name, chart in drawn.items() for part in shown_if(chart, _OF_DISPLACEMENT[name])))
+        drawn = [f"{name}_{channel}" for name in of_each if f"{name}_{channel}" in charts]
+        return ui.column(*(shown(charts[name], caption(name)) for name in drawn))
 
     names = list(shown_channels(record))
     moved = np.ptp(np.nan_to_num(record["displacement"].sel(channel=names).transpose("channel", ...).values), axis=1)
     builders = {name: partial(of, k) for k, name in enumerate(names)}
     menu, chosen = ui.switched("Displacement", builders, names[int(moved.argmax())], menu=True)
-    common = [(name, _OF_RECORD.get(re.sub(r"_\d+$", "", name))) for name in charts]
-    return [menu, chosen, *(shown(charts[name], caption) for name, caption in common if caption)]
+    common = [shown(chart, caption(name)) for name, chart in charts.items() if not name.startswith(of_each)]
+    return [menu, chosen, *common]
 
 
 def _require_same_run(products: Products, loop: AxisLoop, stored: xr.Dataset) -> None:

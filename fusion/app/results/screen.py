@@ -20,7 +20,7 @@ from fusion.report.charts.thermograms import draw_thermograms
 from fusion.report.findings import findings, first_screen
 from fusion.report.page import ProductsError, print_pdf, report_of
 from fusion.report.sheet import describe_sheet, write_iso230, write_thermal_tests
-from fusion.report.wording import say
+from fusion.report.wording import caption, say
 from fusion.results.results import Results
 from fusion.results.store import write_atomically
 
@@ -169,7 +169,7 @@ def _pictures(products: Products) -> ui.Parts:
     hottest = thermograms.attrs["hottest"]
     captions = {
         "thermogram": f"{hottest}, the hottest picture. △ highest, ▽ lowest.",
-        "region_history": "Temperature over time, by the camera's clock.",
+        "region_history": caption("region_history"),
         "profile": f"Temperature along the lines in {hottest}.",
         "difference": "Last picture minus first.",
         "histogram": f"How many pixels of {hottest} have which temperature.",
@@ -177,10 +177,10 @@ def _pictures(products: Products) -> ui.Parts:
     charts = draw_thermograms(thermograms, part.series)
     return [
         ui.column(
-            ui.heading(caption, level=3),
+            ui.heading(words, level=3),
             pn.pane.Bokeh(charts[name].figure, sizing_mode="scale_width", max_width=820),
             ui.note(charts[name].seen),
         )
-        for name, caption in captions.items()
+        for name, words in captions.items()
         if name in charts
     ]
