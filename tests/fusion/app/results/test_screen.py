@@ -39,7 +39,8 @@ def page(app, new_page):
 def test_the_screen_says_what_the_report_says_first(products):
     told = texts(_outcome(products.results))
     report = unescape((products.folder / "report.html").read_text(encoding="utf-8"))
-    sentences = [line for line in re.sub("<[^>]*>", "\n", told).splitlines() if line.strip()]
+    headings = {"In numbers", "Finding", "Value", "Of"}
+    sentences = {line for line in re.sub("<[^>]*>", "\n", told).splitlines() if line.strip()} - headings
     assert len(sentences) >= 2 and all(sentence in report for sentence in sentences)
 
 
