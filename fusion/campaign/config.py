@@ -475,9 +475,11 @@ class StackTable(Table, title="Files of temperatures"):
     )
     start: str | None = key(None, "Time of the first frame")
     interval_s: PositiveSeconds | None = key(None, "Time from one frame to the next")
-    time_zone: TimeZone = key("UTC", _ZONE, example="Europe/Vienna")
-    emissivity: Fraction | None = key(None, "Emissivity set in the camera's program, 0 to 1", example="0.95")
-    reflected_temperature_degC: Celsius | None = key(None, "Reflected temperature set in the camera's program")
+    time_zone: TimeZone = key("UTC", _ZONE, example="Europe/Vienna", show=True)
+    emissivity: Fraction | None = key(None, "Emissivity set in the camera's program, 0 to 1", example="0.95", show=True)
+    reflected_temperature_degC: Celsius | None = key(
+        None, "Reflected temperature set in the camera's program", show=True
+    )
 
     @model_validator(mode="after")
     def _says_times_once(self) -> StackTable:
@@ -519,16 +521,10 @@ class ThermographyTable(_Measured, title="Camera"):
     window_temperature_degC: Celsius | None = key(None, "Temperature of that window")
     window_temperature_u_K: KelvinU | None = None
     camera_offset_u_K: KelvinU | None = key(
-        None,
-        "Standard uncertainty of the camera at all temperatures",
-        about="cancels in a rise",
-        absent="uncooled camera",
+        None, "Standard uncertainty of the camera, as an offset", about="cancels in a rise", absent="uncooled camera"
     )
     camera_scale_u: FractionU | None = key(
-        None,
-        "Standard uncertainty of the camera as a share of the reading in °C",
-        example="1.2 %",
-        about="does not cancel",
+        None, "Standard uncertainty of the camera, share of the reading", example="1.2 %", about="does not cancel"
     )
     camera_drift_u_K: KelvinU | None = key(
         None, "Standard uncertainty of the change of its zero", about="between cycles; at least what the frames leave"
@@ -603,9 +599,7 @@ class PlanTable(Table, title="Plan of the table"):
         None, "Size of a cell of the field", about="it divides both sides", ask=True
     )
     fiducials: ExistingFile | None = key(
-        None,
-        "Table of the fiducials",
-        about="name,x_mm,y_mm,diameter_mm[,column_px,row_px,marker]; a point has no diameter",
+        None, "Table of the fiducials", about="name,x_mm,y_mm,diameter_mm[,column_px,row_px,marker]"
     )
     regions: ExistingFile | None = key(
         None, "Table of the parts that are tested as sources", about="name,x_mm,y_mm of their corners"
@@ -663,9 +657,7 @@ class InterferometryTable(_Measured, title="Laser"):
     """``[interferometry]``: the readings, and the parameters of the laser's compensation."""
 
     deviations: ExistingFile = key(
-        ...,
-        "Table of the deviations",
-        about="cycle,direction,target,position_mm,time,deviation_um; others: file formats",
+        ..., "Table of the deviations", about="cycle,direction,target,position_mm,time,deviation_um"
     )
     sheet: str | None = key(None, "Sheet of the workbook")
     environment: ExistingFile | None = key(
@@ -676,11 +668,7 @@ class InterferometryTable(_Measured, title="Laser"):
     environment_clock_offset_s: Seconds = key(0.0, f"Log of air and material: {_LATE}")
     dead_path_mm: Millimetres = key(0.0, "Dead path of the laser", example="0 mm", ask=True)
     expansion_coefficient_ppm_per_K: PartsPerMillion = key(
-        11.7,
-        example="11.7 +- 0.3 ppm/K",
-        about="of the part with scale or workpiece",
-        absent="11.7 +- 2 ppm/K",
-        ask=True,
+        11.7, example="11.7 +- 0.3 ppm/K", about="of scale or workpiece", absent="11.7 +- 2 ppm/K", ask=True
     )
     expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = None
     feed_mm_per_min: Feed | None = key(None, "Feed between the targets", about="with dwell: times of a .rtl")
@@ -693,9 +681,9 @@ class InterferometryTable(_Measured, title="Laser"):
     )
     material_sensor_mm: tuple[Millimetres, Millimetres] | None = key(
         None,
-        *(f"Material sensor on the plan, {one}" for one in "xy"),
+        *(f"Material sensor, {one}" for one in "xy"),
         example=("350 mm", "90 mm"),
-        about="confirms the camera",
+        about="on the plan, against the camera",
     )
     environment_factor_mm: tuple[Millimetres, Millimetres] | None = key(
         None, *(f"Environment factor at the {one}" for one in ("start", "end")), example=("0.316382 um", "0.316385 um")
@@ -908,20 +896,10 @@ class ThermalTestTable(Table, title="Test of thermal effects (ISO 230-3)"):
     )
     tilts: dict[str, TiltTable] = key({}, "Tilt", rows=0, of=_RECORD)
     sensor_calibration: FractionU | None = key(
-        None,
-        "Standard uncertainty of the sensitivity of displacement sensors",
-        example="0.5 %",
-        absent="1 %",
-        show=True,
-        of=_RECORD,
+        None, "Standard uncertainty of the displacement sensors", example="0.5 %", absent="1 %", show=True, of=_RECORD
     )
     mounting_length_mm: PositiveMillimetres | None = key(
-        None,
-        "Length of what holds sensors and target",
-        example="100 mm",
-        absent="not in the budget",
-        show=True,
-        of=_RECORD,
+        None, "Length of the mounting of the sensors", example="100 mm", absent="not budgeted", show=True, of=_RECORD
     )
     mounting_expansion_ppm_per_K: PartsPerMillion = key(11.7, "Its expansion coefficient", show=True, of=_RECORD)
 

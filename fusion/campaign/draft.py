@@ -308,7 +308,7 @@ def _stack(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterato
             yield from (_line(known[key]) for key in ("times", "time_in_name"))
     if contents.frames > 1 and contents.times is None:
         yield _line(known["interval"], asker.value(known["interval"]) or TO_FILL)
-    yield from (_line(known[key]) for key in ("time_zone", "emissivity", "reflected_temperature"))
+    yield from _lines(known.values(), {})
 
 
 def _time_in_name(name: str) -> str:
@@ -352,7 +352,7 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
     yield f"{_pair('plan.axis.origin', asker)}   # plan point under the spindle at axis position 0"
     direction = known["plan.axis.direction"]
     chosen = asker.ask and DIRECTIONS[asker.choice(direction.label, tuple(DIRECTIONS))]
-    yield f"direction = {list(chosen) if chosen else _quoted(TO_FILL)}   # {direction.about}"
+    yield f"direction = {list(chosen) if chosen else _quoted(TO_FILL)}   # {direction.told}"
 
 
 def _pair(name: str, asker: Asker, *defaults: str) -> str:
@@ -380,8 +380,7 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
         yield _line(keys["environment"])
     elif content.frame_files:
         yield _pair("interferometry.material_sensor", asker)
-    for key, default in (("expansion_coefficient", "11.7 ppm/K"), ("dead_path", "0 mm")):
-        yield _line(keys[key], asker.value(keys[key], default) or TO_FILL)
+    yield from (_line(one, asker.value(one, one.default) or TO_FILL) for one in keys.values() if one.ask)
     if known.get("origin") == "reconstructed":
         yield from (_line(keys[key]) for key in ("feed", "dwell"))
 

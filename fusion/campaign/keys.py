@@ -30,6 +30,7 @@ class Key(NamedTuple):
     kind: str = "text"
     unit: str = ""
     example: str = ""
+    default: str = ""
     about: str = ""
     absent: str = ""
     ask: bool = False
@@ -134,10 +135,12 @@ def _values_of(
         kind = "text" if "prefixItems" in one else one.get("format") or kinds.get(one.get("type", ""), "text")
         options = tuple(map(str, one.get("enum", ())))
         absent = "" if optional else str(given.get("default", options[:1] and options[0]) or "")
+        unit, number = written.rpartition(" ")[2] if kind == "quantity" else "", given.get("default")
         value = common._replace(
             label=label,
             kind=kind,
-            unit=written.rpartition(" ")[2] if kind == "quantity" else "",
+            unit=unit,
+            default=f"{number:g} {unit}" if unit and number is not None else "",
             example=written or next(filter(None, options), ""),
             options=tuple(dict.fromkeys((absent, *options))) if options else (),
         )

@@ -26,8 +26,8 @@ ANSWERS = {
     "Spindle at axis position 0, x": "500 mm",
     "Spindle at axis position 0, y": "90 mm",
     "It moves, as the position grows": "left",
-    "Material sensor on the plan, x": "640 mm",
-    "Material sensor on the plan, y": "30 mm",
+    "Material sensor, x": "640 mm",
+    "Material sensor, y": "30 mm",
     "Size of a cell of the field": "20 mm",
 }
 

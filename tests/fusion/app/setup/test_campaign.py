@@ -264,7 +264,7 @@ def test_lists_and_numbers_are_written_as_such_and_words_in_place_of_numbers_ref
     assert campaign.value("model", "declared") == ["table_offset"]
     assert campaign.value("thermography", "camera_scale_u") == 0.5
     assert campaign.value("interferometry", "compensation") == "redo"
-    with pytest.raises(FieldError, match=r"Standard uncertainty of the camera as a share.*no number"):
+    with pytest.raises(FieldError, match=r"Standard uncertainty of the camera, share of.*no number"):
         write_fields(campaign, {"thermography.camera_scale_u": "half"})
 
 
