@@ -124,9 +124,9 @@ def check_campaign(path: Path) -> CampaignCheck:
 def _check_record(campaign: Campaign) -> CampaignCheck:
     """Check a campaign whose data are a record."""
     # The model of a record loads for longer than a laser is read.
-    from fusion.pipeline.record import read_source as read_record
+    from fusion.pipeline.record import read_record_source
 
-    source = read_record(campaign)
+    source = read_record_source(campaign)
     runs, table = len(campaign.record_paths()), source.health.table
     content = (
         f"record: {counted(runs, 'run')}, {counted(table.sizes['sensor'], 'temperature')}, "

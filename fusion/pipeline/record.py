@@ -40,7 +40,7 @@ class RecordSource:
     health: SensorHealth
 
 
-def read_source(campaign: Campaign) -> RecordSource:
+def read_record_source(campaign: Campaign) -> RecordSource:
     """Read a record and refuse what cannot be modelled."""
     table = read_record(campaign)
     declared, notices = declared_effects(campaign)

@@ -30,7 +30,6 @@ from fusion.campaign.remote import fetched_campaign, is_address, require_outside
 from fusion.campaign.time_zones import time_part
 from fusion.messages import naming
 from fusion.pipeline import attribution, drift_model, positioning, thermal
-from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import (
     Check,
     check_fields,
@@ -45,6 +44,7 @@ from fusion.pipeline.consistency import (
 )
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.iso230_3 import thermal_tests
+from fusion.pipeline.record import RecordSource, model_record, read_record_source
 from fusion.pipeline.stages import (
     STAGES,
     Run,
@@ -161,7 +161,7 @@ def _run_loaded(
     laser = campaign.interferometry
     if campaign.record is not None:
         with naming(campaign.path):
-            made["record_source"] = record_stage.read_source(campaign)
+            made["record_source"] = read_record_source(campaign)
     else:
         source = read_source(campaign)
         checks = check_source(source)
@@ -415,9 +415,9 @@ def _join_sensors(run: Run, source: Inputs, fields: Maybe = None) -> Maybe:
     return joined
 
 
-def _model_record(run: Run, record_source: record_stage.RecordSource) -> xr.Dataset:
+def _model_record(run: Run, record_source: RecordSource) -> xr.Dataset:
     """The loop of a record."""
-    record: xr.Dataset = run.stage("record", partial(record_stage.model_record, record_source))
+    record: xr.Dataset = run.stage("record", partial(model_record, record_source))
     table = record_source.health.table
     run.parts.iso230_3 = thermal_tests(run.campaign, table)
     if (taken := time_part(table, run.campaign.zone_of("record"))) is not None:

@@ -23,7 +23,7 @@ from fusion.campaign.inspect import Kind as Contents
 from fusion.campaign.inspect import inspect_paths
 from fusion.campaign.logs import read_drivers
 from fusion.common import FusionError
-from fusion.pipeline.record import read_source
+from fusion.pipeline.record import read_record_source
 from interferometry.io.readings import read_environment
 from tests.soak.fuzz.harness import Kind
 
@@ -212,7 +212,7 @@ def read_timed_record(path: Path) -> None:
         shown = table["driver"].sel(driver_name="shown").values
         agree(table, shown, rows_of(path, of_a_log=False))
         if path.stat().st_size % _CHECKED == 0:
-            read_source(campaign)
+            read_record_source(campaign)
     finally:
         shutil.rmtree(folder)
 
