@@ -275,7 +275,7 @@ class Iso230Condition(ResultPart):
     """A condition of the test as it was stated or logged."""
 
     key: str
-    """Which one, in every language: the key under which the campaign file states it, or ``date``, ``axis``, ``measured_travel``,
+    """Which one, whatever its name: the key under which the campaign file states it, or ``date``, ``axis``, ``measured_travel``,
     ``air_temperature``, ``material_temperature``, ``compensation``. Instruments share one. New in schema 4."""
     name: str
     """What it is."""
