@@ -196,3 +196,16 @@ def told(code: str, *, passed: bool, verified: bool = True) -> Check:
         code=code, value=1.0, limit=0.5, passed=passed, verified=verified, evidence="It is off.", remedy="Check it.",
         endangers="figures", assumption=assumption, conditional=figures,
     )  # fmt: skip
+
+
+#: A test by ISO 230-3 in which two displacements and a tilt moved.
+MOVED: dict[str, Any] = {
+    "kind": "spindle", "duration_h": 9.0, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
+    "distortions": [
+        {
+            "name": name, "unit": unit, "whole": {"value": value, "u": 0.9}, "settling_min": None,
+            **{key: {"value": None, "u": None} for key in ("first_hour", "last_hour", "change")},
+        }
+        for name, unit, value in (("Y", "um", 25.0), ("X", "um", 89.2), ("tilt", "um/m", 120.0))
+    ],
+}  # fmt: skip

@@ -23,18 +23,8 @@ from tests.fusion.app.texts import texts
 from tests.fusion.report.test_campaign import ORIGIN
 from tests.fusion.report.test_fleet import PICTURES
 from tests.fusion.report.test_record import record
-from tests.fusion.results_sample import PARTS, RECORD_LOOP, told
+from tests.fusion.results_sample import MOVED, PARTS, RECORD_LOOP, told
 
-MOVED: dict[str, Any] = {
-    "kind": "spindle", "duration_h": 9.0, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
-    "distortions": [
-        {
-            "name": name, "unit": unit, "whole": {"value": value, "u": 0.9}, "settling_min": None,
-            **{key: {"value": None, "u": None} for key in ("first_hour", "last_hour", "change")},
-        }
-        for name, unit, value in (("X", "um", 89.2), ("tilt", "um/m", 120.0))
-    ],
-}  # fmt: skip
 DRIFT = {**PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [3.1, 11.127], "range_u_um": [0.1, 0.17]}
 FIELD = {
     "fields": 9, "frames": 9, "duration_s": 60.0, "mean_rise_K": {"value": 1.05, "u": 0.2}, "largest_rise_K": {"value": 2.0, "u": 0.2},

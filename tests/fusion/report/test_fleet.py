@@ -33,7 +33,7 @@ from fusion.results.results import assemble, read_results
 from fusion.results.store import open_dataset, write_json
 from tests.browser import CHROMIUM, record_faults
 from tests.fusion.report.exports.small_run import write_fields
-from tests.fusion.results_sample import RECORD_LOOP
+from tests.fusion.results_sample import MOVED, RECORD_LOOP
 
 FAILED = Row("b", state="failed", exit_code=2, message='=HYPERLINK("x")', seconds=1.5, log="logs/b.log")
 
@@ -122,22 +122,13 @@ def test_fields_without_a_laser_have_a_date_and_a_maximum(tmp_path):
     assert (row.date, row.maximum_degC, row.maximum_u_degC) == ("2026-03-09", 1.0, 1.0)
 
 
-def test_the_drift_of_a_record_is_its_largest_displacement(tmp_path):
-    def moved(name, unit, value):
-        whole = {"value": value, "u": 0.9}
-        periods = {key: {"value": None, "u": None} for key in ("first_hour", "last_hour", "change")}
-        return {"name": name, "unit": unit, "whole": whole, "settling_min": None, **periods}
-
-    test = {
-        "kind": "spindle", "duration_h": 46.3, "temperatures": [], "contributions": [], "courses": [], "remarks": [],
-        "distortions": [moved("ch1", "um", 25.0), moved("ch3", "um", 89.2), moved("tilt", "um/m", 120.0)],
-        "conditions": [
-            {"key": "date", "name": "Date of the test", "text": "2026-01-05 06:00 UTC to 2026-01-06 06:00 UTC"},
-            {"key": "machine", "name": "Machine", "text": "Mill 9"},
-        ],
-    }  # fmt: skip
-    row = row_of(tmp_path, loop=RECORD_LOOP, iso230_3=[test])
-    assert (row.drift_um, row.drift_u_um, row.date, row.machine) == (89.2, 0.9, "2026-01-05", "Mill 9")
+def test_the_date_and_the_machine_of_a_record_are_those_of_its_test(tmp_path):
+    conditions = [
+        {"key": "date", "name": "Date of the test", "text": "2026-01-05 06:00 UTC to 2026-01-06 06:00 UTC"},
+        {"key": "machine", "name": "Machine", "text": "Mill 9"},
+    ]
+    row = row_of(tmp_path, loop=RECORD_LOOP, iso230_3=[{**MOVED, "conditions": conditions}])
+    assert (row.drift_um, row.date, row.machine) == (89.2, "2026-01-05", "Mill 9")
 
 
 def monthly(whole, count):
