@@ -2,9 +2,12 @@ from .analysis.alignment.align import AxisGeometry, align, cycle_bounds
 from .analysis.alignment.readings import Readings
 from .analysis.attribution.correlate import correlate
 from .analysis.diagnosis.diagnose import diagnose
-from .analysis.drift_model.axis import LoopResult, close_loop
+from .analysis.drift_model.closed_loop import close_loop
+from .analysis.drift_model.evaluation import LoopResult
+from .analysis.drift_model.record_data import Record, reduce_record
 from .analysis.effects.effect import Candidate, Effect
 from .campaign.config import load_campaign
+from .campaign.inputs import read_record
 from .campaign.logs import read_drivers
 from .campaign.remote import fetch_sample
 from .common import FusionError
@@ -22,6 +25,7 @@ __all__ = [
     "FusionError",
     "LoopResult",
     "Readings",
+    "Record",
     "Results",
     "align",
     "close_loop",
@@ -34,7 +38,9 @@ __all__ = [
     "plot_correlation",
     "plot_loop",
     "read_drivers",
+    "read_record",
     "read_results",
+    "reduce_record",
     "render_report",
     "results_schema",
     "run_campaign",

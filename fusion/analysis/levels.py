@@ -29,3 +29,13 @@ CAUSE_LEVELS = {"step": 0.05, "local_temperature": 0.02}
 SERIAL_LEVEL = 0.05
 #: Of saying that campaigns of one machine differ, over everything that is compared.
 CHANGE_LEVEL = 0.05
+#: That an effect which is absent passes its confirmation; the multiplicity of the search is accounted for before.
+CONFIRMATION_LEVEL = 0.1
+#: Of evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks undecided.
+STRONG_LEVEL = 0.001
+#: From which on an effect by itself is no rival of the one that was added.
+RIVAL_LEVEL = 0.05
+#: Of bearing out any effect that is not there, and of contradicting any that is, over all effects of a model.
+ANSWER_LEVEL = 0.05
+#: That a right effect is denied its name, because its pattern along the axis is another, or its size on unseen readings.
+DENIAL_LEVEL = 0.001

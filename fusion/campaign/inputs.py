@@ -784,7 +784,27 @@ _BETWEEN = np.timedelta64(1, "D").astype("m8[ns]")
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:
-    """Read a ``[record]``, all of its runs."""
+    """Read the record of a campaign, all of its runs.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        What `load_campaign` returns, with a ``[record]``.
+
+    Returns
+    -------
+    Dataset
+        ``temperature`` (time, sensor) in degC, ``displacement`` (time, channel) in um, and ``driver`` (time, driver_name) as logged.
+
+    Raises
+    ------
+    TableError
+        If a table cannot be read, or runs do not fit together.
+
+    Examples
+    --------
+    >>> read_record(load_campaign("record/campaign.toml"))  # doctest: +SKIP
+    """
     paths = campaign.record_paths()
     if len(paths) == 1:
         return read_run(campaign, paths[0])

@@ -16,16 +16,16 @@ from fusion.analysis.consistency.camera import mean_rise, zero_share
 from fusion.analysis.consistency.model import compare_lines, with_line, withhold_names
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
+    AxisResult,
     FieldFault,
-    LoopResult,
-    close_loop,
+    close_axis,
     correct_fields,
     corrected_variables,
     find_field_errors,
     on_corrected_fields,
     set_aside_sites,
 )
-from fusion.analysis.drift_model.fit import ModelFit, fit_model
+from fusion.analysis.drift_model.model import ModelFit, fit_model
 from fusion.analysis.effects.effect import Effect, Prior
 from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import EXPANSION_U_PPM_PER_K
@@ -170,7 +170,7 @@ def model_drift(
     """Close the loop, then judge the positions that stand out from what the model explains."""
     readings = read_fused(fused)
     effects = library_for(source)
-    result = close_loop(
+    result = close_axis(
         readings,
         source.campaign.declared,
         effects=effects,
@@ -214,7 +214,7 @@ def model_drift(
 
 
 def correct_camera(
-    source: Source, result: LoopResult, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset
+    source: Source, result: AxisResult, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset
 ) -> CorrectedCamera | None:
     """Take the camera's errors that entered the model out of the fields, and align both recordings again."""
     errors = find_field_errors(result, fields, fused)
@@ -227,7 +227,7 @@ def correct_camera(
     return CorrectedCamera(errors, aligned)
 
 
-def both_models(result: LoopResult) -> dict[str, ModelFit]:
+def both_models(result: AxisResult) -> dict[str, ModelFit]:
     """The declared and the final model, each fitted to all readings."""
     return {"declared": fit_model(result.before.readings, result.before.terms), "final": result.after}
 
@@ -334,7 +334,7 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
     return xr.Dataset(variables, coords={"effect": unique, "period": period})
 
 
-def with_event_times(steps: Sequence[Mapping[str, Any]], result: LoopResult, fused: xr.Dataset) -> list[dict[str, Any]]:
+def with_event_times(steps: Sequence[Mapping[str, Any]], result: AxisResult, fused: xr.Dataset) -> list[dict[str, Any]]:
     """Entries of ``loop.steps`` with the time of day of every event."""
     start = fused["time"].values[fused["deviation"].notnull().values].min()
     events_s = [term.candidate.event_s for term in result.state.added]
@@ -344,7 +344,7 @@ def with_event_times(steps: Sequence[Mapping[str, Any]], result: LoopResult, fus
     ]
 
 
-def prediction_variables(fused: xr.Dataset, result: LoopResult) -> dict[str, xr.Variable]:
+def prediction_variables(fused: xr.Dataset, result: AxisResult) -> dict[str, xr.Variable]:
     """Lay the errors that the loop reports out by cycle, direction and target: those on the hold-out cycles, and of left-out blocks."""
     held_out = result.before.readings.subset(~result.before.used)
     variables = {

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.alignment.sensor_health import describe_fault
+from fusion.analysis.drift_model.predictions import channel_rmse
 from fusion.analysis.drift_model.record import (
     RecordResult,
     SensorHealth,
     close_record,
     declare,
     examine_record,
-    known_mean,
     together,
 )
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, reduce_record
@@ -107,10 +108,10 @@ def model_record(source: RecordSource, *, report: Report) -> Outcome:
 
 def digit_notices(result: RecordResult) -> Iterator[Notice]:
     """Notice of the columns whose digits hide the noise: half a step of what they leave in a displacement exceeds it."""
-    record, step = result.record, together(result.steps)
+    record, step = result.record, together(result.rounding)
     hidden = np.greater(0.5 * step, result.whole.sigma)
     # Of several columns those with no less than an equal share.
-    large = hidden & (len(result.steps) * result.steps**2 >= step**2)
+    large = hidden & (len(result.rounding) * result.rounding**2 >= step**2)
     named = [
         f"{name} in steps of {record.digits[name]:.3g} µm"
         for name, one in zip(record.channels, large[0], strict=True)
@@ -258,7 +259,6 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
         for exponent in EXPONENTS
     )
     sizes, units = ([record.driver_sizes[name][k] for name in record.drivers] for k in (0, 1))
-    contributions = np.array([result.contribution(term) for term in terms])
     um: dict[str, Any] = {"units": "um"}
     celsius = {"units": "degC", "units_metadata": "temperature: on_scale"}
     elapsed = "time since the first sample" + (", time between runs left out" if record.runs else "")
@@ -266,7 +266,9 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
     dims = ("time", "channel")
     # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the hold-out set.
     chained = np.array([one.channel_rmse_final_um for one in result.chained]).reshape(-1, len(record.channels))
-    spread = np.fmax(result.final_um, np.sqrt(known_mean(chained**2, axis=0)) if len(chained) else 0.0)
+    spread = np.fmax(
+        channel_rmse(result.hold_out_errors["final"]), np.sqrt(known_mean(chained**2, axis=0)) if len(chained) else 0.0
+    )
     dataset = xr.Dataset(
         {
             "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
@@ -277,9 +279,13 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             "driver_units": ("driver_name", np.array(units, dtype=object)),
             **_predictions(record, result),
             "predicted_u": ("channel", spread, {**um, "long_name": f"standard uncertainty of a prediction, {unseen}"}),
-            "contribution": (("effect", *dims), contributions.reshape(len(terms), *record.displacement.shape), um),
+            "contribution": (
+                ("effect", *dims),
+                np.array(result.contributions).reshape(len(terms), *record.displacement.shape),
+                um,
+            ),
             "noise": ("channel", result.noise, {**um, "long_name": "noise of a block mean"}),
-            "sealed": ("time", result.hold_out, {"long_name": "held-out block"}),
+            "sealed": ("time", result.is_held_out, {"long_name": "held-out block"}),
             "elapsed": ("time", record.seconds, {"units": "s", "long_name": elapsed}),
             "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),
         },
@@ -301,12 +307,10 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
 def _predictions(record: Record, result: RecordResult) -> dict[str, Any]:
     """Predictions from the training part, and the errors of predicting every part from all others before and after each step, um."""
     dims = ("time", "channel")
-    named = {
-        "declared": result.predictions[0].predicted,
-        "final": result.forecast.predicted,
-        "last_value": result.plain["last_value"],
+    variables: dict[str, Any] = {
+        f"predicted_{name}": (dims, result.predicted[name], {"units": "um"})
+        for name in ("declared", "final", "last_value")
     }
-    variables: dict[str, Any] = {f"predicted_{name}": (dims, values, {"units": "um"}) for name, values in named.items()}
     after, *before = (record.displacement - predicted for predicted in result.left_out)
     if before:
         for stage, errors in {"before": before, "after": [after] * len(before)}.items():

@@ -184,7 +184,9 @@ class Unexplained(ResultPart):
     shape: str
     """Description; empty where nothing is left."""
     rms_um: Number
-    """Its root mean square, um: the larger of what the shape describes and the random drift that the model allows."""
+    """Root mean square of what no named effect explains beyond the noise, um: the larger of the shape (along an axis over the readings,
+    on a record and of an error of prediction what the hold-out error holds beside the noise) and the random drift that the model allows,
+    0 where there is no shape; and, as the root of the sum of squares, of the added effects without a name."""
     p_value: Number
     """p-value of any structure in the residual, family-wise over the shapes."""
     closest_effect: str

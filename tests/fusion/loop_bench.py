@@ -13,8 +13,11 @@ import numpy as np
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.drift_model.axis import LoopResult, close_loop, hold_out, rmse
-from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
+from fusion.analysis.drift_model.axis import hold_out
+from fusion.analysis.drift_model.closed_loop import close_loop
+from fusion.analysis.drift_model.evaluation import LoopResult
+from fusion.analysis.drift_model.model import ModelFit, Term, fit_model
+from fusion.analysis.drift_model.predictions import rmse
 from fusion.analysis.effects.library import library
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fusion.analysis.alignment.readings import Readings, Series
-from fusion.analysis.drift_model.fit import ModelFit, Term
+from fusion.analysis.drift_model.model import ModelFit, Term
 from fusion.analysis.effects.effect import Candidate
 from interferometry.drift.gls import drift_system, fit_fixed_effects
 

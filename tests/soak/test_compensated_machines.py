@@ -9,7 +9,8 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.alignment.sensor_health import describe_fault
-from fusion.analysis.drift_model.record import close_record, examine_record, predict
+from fusion.analysis.drift_model.predictions import predict
+from fusion.analysis.drift_model.record import close_record, examine_record
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from fusion.analysis.drift_model.recursion import make_recursion, record_of_product
 from fusion.analysis.drift_model.verification import ChannelVerdict, verify

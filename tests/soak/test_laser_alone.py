@@ -10,7 +10,7 @@ import pytest
 
 from fusion.analysis.alignment.align import align_logs
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.drift_model.axis import close_loop
+from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.twin import simulate
 from fusion.twin.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log

@@ -13,7 +13,8 @@ import pytest
 
 from fusion.analysis.alignment.reflections import find_switching_patch
 from fusion.analysis.attribution.correlate import correlate
-from fusion.analysis.drift_model.axis import LoopResult, close_loop
+from fusion.analysis.drift_model.closed_loop import close_loop
+from fusion.analysis.drift_model.evaluation import LoopResult
 from fusion.analysis.drift_model.search import Reason
 from fusion.pipeline.positioning import average_cycles
 from fusion.twin import simulate

@@ -14,7 +14,7 @@ import pytest
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.drift_model.axis import close_loop
+from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.twin import simulate
 from fusion.twin.recipe import Recipe
 from fusion.twin.simulate import driver_log, environment_log

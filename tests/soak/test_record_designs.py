@@ -15,7 +15,8 @@ import pytest
 
 from fusion.analysis.drift_model import record as effects
 from fusion.analysis.drift_model import record_data as blocks
-from fusion.analysis.drift_model.record import chain_forward, channel_rmse, declare, plain_predictions
+from fusion.analysis.drift_model.predictions import channel_rmse, plain_predictions
+from fusion.analysis.drift_model.record import chain_forward, declare
 from fusion.analysis.drift_model.record_data import Record, reduce_record
 from tests.fusion.record_tables import SPINDLE, spindle_table
 
@@ -77,5 +78,5 @@ def _plain(record: Record) -> dict[str, float]:
     for number in np.unique(record.chained)[2:]:
         before, part = record.chained < number, record.chained == number
         for name, predicted in plain_predictions(record, before).items():
-            missed.setdefault(name, []).append(float(np.mean(channel_rmse(record, predicted, part))))
+            missed.setdefault(name, []).append(float(np.mean(channel_rmse((record.displacement - predicted)[part]))))
     return {name: float(np.mean(values)) for name, values in missed.items()}

@@ -13,7 +13,8 @@ import pytest
 from scipy.signal import lfilter
 
 from fusion.analysis.alignment.readings import Readings, Series
-from fusion.analysis.drift_model.axis import _MISFIT_SHARE, close_loop
+from fusion.analysis.drift_model.closed_loop import close_loop
+from fusion.analysis.drift_model.evaluation import _MISFIT_SHARE
 from fusion.analysis.drift_model.search import DISCREPANCY
 from tests.fusion.loop_bench import DECLARED, visible_rms, without
 from tests.soak.rates import campaigns, first_seed, rate, wilson

@@ -13,7 +13,7 @@ from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.field_series import thin_fields
 from fusion.analysis.consistency.model import compare_lines
-from fusion.analysis.drift_model.axis import close_loop
+from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.pipeline.consistency import run_checks
 from fusion.results.loop import ResidualTestsPart
 from fusion.twin import simulate

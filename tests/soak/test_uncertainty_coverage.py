@@ -17,8 +17,9 @@ from scipy import stats
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import read_fused
-from fusion.analysis.drift_model.axis import average_over_drifts, close_loop, coefficients_of, declare
-from fusion.analysis.drift_model.fit import fit_model
+from fusion.analysis.drift_model.axis import average_over_drifts, coefficients_of, declare
+from fusion.analysis.drift_model.closed_loop import close_loop
+from fusion.analysis.drift_model.model import fit_model
 from fusion.analysis.effects.library import library
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source

@@ -21,8 +21,8 @@ from fusion.analysis.consistency.clocks import COURSES, QUARTER_S, QUARTERS, Evi
 from fusion.analysis.consistency.field_series import FieldSeries
 from fusion.analysis.consistency.logs import SOURCE_S, even_times, loads_of
 from fusion.analysis.consistency.material import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_LAGS_S, compare_course
-from fusion.analysis.drift_model.fit import SHIFT_AND_STRETCH, Term, fit_model, scaled_systems
 from fusion.analysis.drift_model.gains import by_width, profile_gains
+from fusion.analysis.drift_model.model import SHIFT_AND_STRETCH, Term, fit_model, scaled_systems
 from fusion.analysis.effects.effect import Candidate
 from fusion.common import Array
 from interferometry.drift.kalman import DriftModelError

@@ -15,7 +15,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
-from fusion.analysis.drift_model.fit import ModelFit, Term, place_of, refit_fixed
+from fusion.analysis.drift_model.model import ModelFit, Term, place_of, refit_fixed
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.analysis.levels import LINE_LEVEL
 from fusion.common import Array

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import Readings
-from fusion.analysis.drift_model.fit import ModelFit, unexplained_drift
+from fusion.analysis.drift_model.model import ModelFit, unexplained_drift
 from fusion.analysis.drift_model.null_simulation import family_wise, rank_p_value
 from fusion.analysis.effects.events import off_the_cycle
 from fusion.analysis.levels import REMAINDER_LEVEL
@@ -69,7 +69,7 @@ class ResidualStructure:
     p_value : probability of so much structure where nothing is missing, family-wise over all statistics
     p_values : the same for each statistic alone
     shape : in words, empty where nothing remains
-    rms_um : root mean square of the described shape over the readings, of a record the hold-out error that it stands for
+    rms_um : root mean square of the described shape over the readings; 0 where its size is that of the hold-out error beside the noise
     """
 
     p_value: float

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from fusion.analysis.alignment.readings import Readings, Series, sample_noise
-from fusion.analysis.drift_model.fit import (
+from fusion.analysis.drift_model.gains import (
+    Gains,
+    Products,
+    by_width,
+    gains_by_products,
+    sum_products,
+    sum_products_apart,
+)
+from fusion.analysis.drift_model.model import (
     SHIFT_AND_STRETCH,
     ModelFit,
     Moments,
@@ -31,7 +39,6 @@ from fusion.analysis.drift_model.fit import (
     scaled_systems,
     solve,
 )
-from fusion.analysis.drift_model.gains import Products, by_width, gains_by_products, sum_products, sum_products_apart
 from fusion.analysis.drift_model.null_simulation import DRAWS, rank_p_value, simulate_null
 from fusion.analysis.drift_model.search import (
     TIE_GAIN,
@@ -39,12 +46,12 @@ from fusion.analysis.drift_model.search import (
     Confirmed,
     Decision,
     Families,
-    Gains,
     Reason,
     Score,
 )
 from fusion.analysis.effects.effect import Candidate, Effect, warm_up
 from fusion.analysis.effects.events import cycle_starts
+from fusion.analysis.levels import CONFIRMATION_LEVEL, DENIAL_LEVEL, STRONG_LEVEL
 from fusion.common import Array
 from interferometry.drift.gls import DriftFit, fit_fixed_effects
 from interferometry.drift.kalman import DriftSystem
@@ -227,8 +234,6 @@ def _gain(model: ModelFit, candidate: Candidate, beside: Array | None) -> float:
 # Does an effect act along the axis as its physics says? If the same course in time fits better with another pattern,
 # it has no name.
 
-#: Chance at which a right effect is denied its name.
-LEVEL = 1e-3
 #: Share of a column that must lie outside the model for a site to have a say.
 _SEPARABLE = 1e-6
 
@@ -239,7 +244,7 @@ def inconsistent_patterns(model: ModelFit, terms: Sequence[Term], effects: Mappi
     courses = {k: _course(model, term) for k, term in enumerate(terms) if term.candidate.event_s is None}
     for k in courses:
         p_value = pattern_p_value(model, terms[k])
-        if p_value < LEVEL:
+        if p_value < DENIAL_LEVEL:
             wrong[k] = Decision(terms[k].effect, Reason.INCONSISTENT_PATTERN, {"p_value": p_value})
     patterned = [k for k in courses if terms[k].effect in effects and effects[terms[k].effect].patterned]
     for first, second in combinations(patterned, 2):
@@ -317,10 +322,6 @@ def _course(model: ModelFit, term: Term) -> Array:
 # Confirmation of an effect on readings that its coefficients were not fitted to, and the one question to the hold-out
 # set.
 
-#: Probability that an effect which is absent passes its confirmation; the multiplicity of the search is accounted for before.
-CONFIRMATION_LEVEL = 0.1
-#: Evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks undecided.
-STRONG_LEVEL = 0.001
 #: A confirmation with a larger p-value is not inconclusive, it speaks against the effect: half of the campaigns without it gain as much.
 #: Then the evidence must be that of five standard deviations.
 _CONTRADICTED = 0.5

@@ -11,17 +11,16 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from html import escape
 from itertools import product
 from operator import is_
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.align import cycle_bounds
-from fusion.analysis.alignment.readings import Readings, read_fused
+from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.alignment.reflections import find_switching_patch
 from fusion.analysis.diagnosis import residual as remainder
 from fusion.analysis.diagnosis.residual import Remainder
@@ -35,7 +34,20 @@ from fusion.analysis.drift_model.admissibility import (
     refuse_in_heteroscedastic_drift,
     warm_up_share,
 )
-from fusion.analysis.drift_model.fit import (
+from fusion.analysis.drift_model.evaluation import (
+    Answer,
+    Contribution,
+    LoopResult,
+    Surroundings,
+    Unseen,
+    answers,
+    describe_step,
+    leading_pattern,
+    left_out_of_forecast,
+    withhold_names,
+)
+from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
+from fusion.analysis.drift_model.model import (
     SHIFT_AND_STRETCH,
     ModelFit,
     Term,
@@ -48,19 +60,15 @@ from fusion.analysis.drift_model.fit import (
     size_camera_errors,
     solve,
     unexplained_drift,
+    wandering_um,
 )
-from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
+from fusion.analysis.drift_model.predictions import error_interval, plain_errors, rmse, track_cycles
 from fusion.analysis.drift_model.search import (
-    BASELINE_LAGS_MIN,
-    BEYOND_PLAIN,
     FINAL,
     HOLD_OUT_SHARE,
     LEVEL_TO_CONFIRM,
     MOST_EFFECTS,
     MOST_EVENTS,
-    PENALTIES,
-    SUPERFLUOUS_GAIN,
-    Answer,
     Confirmation,
     Confirmed,
     Decision,
@@ -71,18 +79,9 @@ from fusion.analysis.drift_model.search import (
     Round,
     Score,
     Step,
-    Unseen,
-    answers,
     blur,
     choose,
-    error_interval,
-    errors_of_predictions,
-    exceeds_noise,
-    excess_um,
-    has_skill,
-    is_separable,
     kept_on_disk,
-    left_out_of_forecast,
     no_progress,
     open_hold_out,
     parameter_ranges,
@@ -90,9 +89,7 @@ from fusion.analysis.drift_model.search import (
     score_effects,
     search,
     settled,
-    verdict,
     withdraw,
-    withheld_for,
 )
 from fusion.analysis.effects.effect import Candidate, Effect
 from fusion.analysis.effects.events import cycle_starts
@@ -101,14 +98,9 @@ from fusion.analysis.effects.library import library
 from fusion.analysis.levels import SEARCH_LEVEL, SECOND_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
-from fusion.results.parts import Number
 from interferometry.common import one_thread
-from interferometry.drift.gls import DriftFit
 from interferometry.drift.kalman import DriftModelError
 from thermography.large_arrays import empty_array, fill_array, in_pieces
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # Detection limits: how large an effect must be to be found in a campaign, and which effects look alike in it.
 
@@ -250,51 +242,16 @@ class LoopError(FusionError):
 
 
 @one_thread
-def close_loop(
-    fused: xr.Dataset | Readings,
+def close_axis(
+    readings: Readings,
     declared: Sequence[str],
     *,
     seed: int = 1,
     set_aside: Collection[tuple[int, str]] = (),
     effects: Mapping[str, Effect] | None = None,
     progress: Progress = no_progress,
-) -> LoopResult:
-    """Close the loop on a positioning campaign.
-
-    Parameters
-    ----------
-    fused : Dataset or Readings
-        What `align` returns: readings in um, and the rises and logs beside them. Or its readings in the order of time, as `read_fused`
-        returns them.
-    declared : sequence of str
-        Names of the effects the user believes to act, such as ``["axis_expansion", "table_offset"]``.
-    seed : int
-        Of the simulated campaigns behind the p-values, so that a run can be repeated.
-    set_aside : collection of (int, str)
-        Sites (target, direction) whose anomaly has its own diagnosis.
-    effects : mapping of str to Effect, optional
-        The library by name; None: the built-in one with the user's own.
-    progress : callable
-        Called with steps done, steps in total, and what is done.
-
-    Returns
-    -------
-    LoopResult
-        Steps with their errors on the hold-out set in um, verdict, what remains, and both models. It prints a summary, and `plot` draws
-        the errors.
-
-    Raises
-    ------
-    LoopError
-        If fewer than 10 cycles are there, or a declared effect cannot be computed from these readings.
-    ReadingsError
-        If fewer than three cycles or targets have readings within the frames' time.
-
-    Notes
-    -----
-    Procedure, assumptions and error rates: docs/method/closed-loop.md.
-    """
-    readings = fused if isinstance(fused, Readings) else read_fused(fused)
+) -> AxisResult:
+    """Close the loop on a positioning campaign, as `close_loop` does."""
     effects = library() if effects is None else effects
     used, description = hold_out(readings)
     terms = declare(readings, declared, effects)
@@ -308,35 +265,33 @@ def close_loop(
     state = replace(before, model=size_camera_errors(fit_model(readings, before.model.terms), effects))
     progress(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
     state = reject_inconsistent_patterns(problem, second_search(problem, state))
-    left = examine_remainder(state.model, seed, set_aside)
     wrong = inconsistent_patterns(state.model, state.added, effects)
     steps = report_steps(state, wrong, problem.ask_hold_out(before, state))
     away = left_out_of_forecast(problem, before, contradicted_places(steps))
     forecast = before.kept(away)
-    final, plain = problem.hold_out_errors(forecast), plain_errors(readings, used)
-    held = {name: missed[~used] for name, missed in plain.items()}
-    errors = {"declared": problem.hold_out_errors(terms), "final": final, **held}
-    result = LoopResult(
-        declared=list(declared),
-        declared_coefficients=coefficients_beside(problem, state, steps),
+    plain = plain_errors(readings, used)
+    errors = {
+        "declared": problem.hold_out_errors(terms),
+        "final": problem.hold_out_errors(forecast),
+        **{name: missed[~used] for name, missed in plain.items()},
+    }
+    late = any(step.is_from_second_search for step in state.steps)
+    result = AxisResult(
+        state=state,
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
-        rmse_declared_um=state.errors_um[0],
-        rmse_final_um=rmse(final),
-        away=frozenset(away),
+        hold_out_errors=errors,
         hold_out={
             name: error_interval(missed, readings.cycle[~used], np.random.default_rng(seed))
             for name, missed in errors.items()
         },
-        hold_out_errors=errors,
-        skill=problem.has_skill(state, held),
-        tracking=track(problem.fitted(forecast), plain["ridge"]),
+        skill_um=problem.hold_out_error(state.model.terms) if late else state.errors_um[-1],
+        tracking=track_cycles(problem.fitted(forecast), plain["ridge"]),
         steps=steps,
-        unnamed=state.unnamed(SECOND_LEVEL),
-        remainder=left,
-        residual_drift=residual_drift_size(state.model),
+        away=frozenset(away),
+        remainder=examine_remainder(state.model, seed, set_aside),
         wandering_um=wandering_um(state.model.fit),
-        state=state,
+        declared_coefficients=coefficients_beside(problem, state, steps),
         before=start.model,
         after=state.model,
     )
@@ -409,10 +364,6 @@ class AxisProblem(Problem[ModelFit]):
         """Log-likelihood lost without a term, the drift's variances kept."""
         return loss_without(model, term)
 
-    def hold_out_error(self, terms: Sequence[Term]) -> float:
-        """Open-loop error on the hold-out cycles, root mean square, um."""
-        return rmse(self.hold_out_errors(terms))
-
     def hold_out_errors(self, terms: Sequence[Term]) -> Array:
         """Open-loop errors on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
         if not any(self.is_late(term) for term in terms):
@@ -460,13 +411,6 @@ class AxisProblem(Problem[ModelFit]):
         first = self.readings.seconds[~self.used].min()
         cycle_s = float(np.median(np.diff(cycle_starts(self.readings))))
         return term.candidate.event_s is not None and term.candidate.event_s >= first - cycle_s
-
-    def has_skill(self, state: AxisState, plain: Mapping[str, Array]) -> bool:
-        """Whether the final model predicts the hold-out cycles better than last values and means, of errors ``plain``."""
-        late = any(step.is_from_second_search for step in state.steps)
-        error_um = self.hold_out_error(state.model.terms) if late else state.errors_um[-1]
-        last_um, mean_um = rmse(plain["last_value"]), rmse(plain["mean"])
-        return has_skill(error_um, last_um, mean_um, state.model.fit.sigma, remainder.DRIFT_SHARE)
 
     def offer(self, name: str, model: ModelFit, near: Candidate | None) -> list[Candidate]:
         """Candidates of an effect whose event, if they have one, has enough cycles on both sides and is not in the model."""
@@ -610,19 +554,19 @@ def examine_remainder(model: ModelFit, seed: int, set_aside: Collection[tuple[in
     return left if left.shape else remainder.with_drift(left, model.fit)
 
 
-def set_aside_sites(result: LoopResult, sites: Collection[tuple[int, str]], *, seed: int = 1) -> LoopResult:
+def set_aside_sites(result: AxisResult, sites: Collection[tuple[int, str]], *, seed: int = 1) -> AxisResult:
     """Count sites whose anomaly has its own diagnosis no longer as a remainder."""
     return replace(result, remainder=examine_remainder(result.after, seed, sites))
 
 
 def on_corrected_fields(
-    result: LoopResult,
+    result: AxisResult,
     readings: Readings,
     errors: Collection[str],
     *,
     effects: Mapping[str, Effect] | None = None,
     seed: int = 1,
-) -> LoopResult:
+) -> AxisResult:
     """Fit the model again on fields from which the camera's errors have been taken out."""
     effects = library() if effects is None else effects
     found, coefficients = result.state, result.after.coefficients()
@@ -644,11 +588,9 @@ def on_corrected_fields(
         result,
         declared_coefficients=coefficients_beside(problem, state, [result.steps[place] for place in kept]),
         noise_floor_um=model.fit.sigma,
-        rmse_final_um=interval.rmse_um,
         hold_out={**result.hold_out, "final": interval},
         hold_out_errors={**result.hold_out_errors, "final": errors_um},
         remainder=examine_remainder(model, seed, ()),
-        residual_drift=residual_drift_size(model),
         wandering_um=wandering_um(model.fit),
         after=model,
     )
@@ -679,7 +621,7 @@ class FieldFault(schema.FieldCorrection):
     """(y, x) where it is to be added, and which share of it."""
 
 
-def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldFault]:
+def find_field_errors(result: AxisResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldFault]:
     """Return every error of the camera that entered the model, with the correction of the frames."""
     errors = []
     time = fields["time"].values.astype("datetime64[ns]")
@@ -789,106 +731,7 @@ def _cycle_of(frame_time: Array, fused: xr.Dataset) -> Array:
     return np.asarray(fused["cycle"].values[place])
 
 
-# What is reported: errors of plain predictions and of left-out blocks, and the result.
-
-#: Parts of the training cycles; those of the later half choose the penalty, each predicted from the parts before it.
-_PARTS = 4
-
-
-def plain_errors(readings: Readings, used: NDArray[np.bool_]) -> dict[str, Array]:
-    """Errors of plain predictions of all readings from those that were used, um, (n,) each."""
-    static = _by_site(readings.site, readings.response, used)
-    now, late = _standardised(readings, used, ()), _standardised(readings, used, BASELINE_LAGS_MIN)
-    predicted: Mapping[str, Array] = {
-        "last_value": static["last"],
-        "mean": static["mean"],
-        "least_squares": _regressed(readings, used, static["mean"], now, [0.0]),
-        "ridge": _regressed(readings, used, static["mean"], now, PENALTIES.tolist()),
-        "ridge_with_lags": _regressed(readings, used, static["mean"], late, PENALTIES.tolist()),
-    }
-    return {name: readings.response - values for name, values in predicted.items()}
-
-
-#: Cycles of the hold-out set that a prediction which tracks is given: often enough for an interval.
-_MEASURED_AGAIN = 10
-
-
-def track(model: ModelFit, ridge: Array) -> schema.Tracking:
-    """Predict the hold-out cycles with one of them measured from time to time, from which the drift is carried on; ``ridge`` are the errors
-    (n,) of ridge regression.
-    """
-    readings, used = model.readings, model.used
-    held = np.unique(readings.cycle[~used])
-    every = max(1, held.size // _MEASURED_AGAIN)
-    columns = np.column_stack([readings.response, model.whole_design()])
-    known = np.isin(readings.site, readings.site[used])
-    missed = {name: np.full(used.size, np.nan) for name in ("model", "last_reading", "ridge")}
-    for start in range(0, held.size, every):
-        # Every cycle is predicted from those measured before it, none from its own readings.
-        here = np.isin(readings.cycle, held[start : start + every])
-        measured = used | np.isin(readings.cycle, held[every - 1 : start : every])
-        errors, _ = replace(model.whole_system(), observed=measured).innovations(columns)
-        own = np.where(known, errors[:, 0] - errors[:, 1:] @ model.fit.coefficients, np.nan)
-        last = readings.response - _by_site(readings.site, readings.response, measured)["last"]
-        started = ridge - _by_site(readings.site, ridge, measured)["last"]
-        for name, values in zip(missed, (own, last, started), strict=True):
-            missed[name][here] = values[here]
-    cycle, rng = readings.cycle[~used], np.random.default_rng(1)
-    intervals = {name: error_interval(values[~used], cycle, rng) for name, values in missed.items()}
-    cycle_s = float(np.median(np.diff(cycle_starts(readings))))
-    return schema.Tracking(every_min=every * cycle_s / 60.0, **intervals)
-
-
-def _by_site(site: NDArray[np.int64], values: Array, used: NDArray[np.bool_]) -> dict[str, Array]:
-    """Last and mean of every site's used values, at every reading (n,); NaN at a site without any."""
-    last, mean = (np.full(site.max() + 1, np.nan) for _ in range(2))
-    for number in np.unique(site[used]):
-        own = values[used & (site == number)]
-        last[number], mean[number] = own[-1], own.mean()
-    return {"last": last[site], "mean": mean[site]}
-
-
-def _standardised(readings: Readings, used: NDArray[np.bool_], lags_min: tuple[float, ...]) -> Array:
-    """Every series and its lagged copies, common and along the axis, freed of each site's mean, of unit variance in training (n, k)."""
-    columns = []
-    for series in readings.series.values():
-        for minutes in (0.0, *lags_min):
-            column = readings.at(series.lagged(60.0 * minutes))
-            columns += [column] if series.values.ndim == 2 else [column, column * readings.share]
-    if not columns:
-        return np.empty((readings.seconds.size, 0))
-    site = readings.site
-    laid = np.column_stack(columns)
-    for number in np.unique(site):
-        here = site == number
-        laid[here] -= laid[here & used].mean(axis=0) if (here & used).any() else np.nan
-    scale = laid[used].std(axis=0)
-    moves = scale > 1e-12
-    return laid[:, moves] / scale[moves]
-
-
-def _regressed(
-    readings: Readings, used: NDArray[np.bool_], mean: Array, columns: Array, penalties: Sequence[float]
-) -> Array:
-    """Prediction by a regression beside every site's mean, (n,), under the penalty that chained best."""
-    y = readings.response - mean
-    if len(penalties) == 1:
-        return np.asarray(mean + columns @ _ridge(columns[used], y[used], penalties[0]))
-    cycles = np.unique(readings.cycle[used])
-    part = np.searchsorted(cycles, readings.cycle) * _PARTS // cycles.size
-    errors = np.zeros(len(penalties))
-    for number in range(_PARTS // 2, _PARTS):
-        before, asked = used & (part < number), used & (part == number)
-        for k, penalty in enumerate(penalties):
-            predicted = columns[asked] @ _ridge(columns[before], y[before], penalty)
-            errors[k] += float(((y[asked] - predicted) ** 2).mean())
-    return np.asarray(mean + columns @ _ridge(columns[used], y[used], penalties[int(np.argmin(errors))]))
-
-
-def _ridge(x: Array, y: Array, penalty: float) -> Array:
-    """Coefficients of a ridge regression; without a penalty those of smallest norm."""
-    normal = x.T @ x / max(1, y.size) + penalty * np.eye(x.shape[1])
-    return np.asarray(np.linalg.lstsq(normal, x.T @ y / max(1, y.size), rcond=None)[0])
+# What is reported: errors of left-out blocks, and the result.
 
 
 #: Blocks of cycles, each as long as the hold-out set; all but the first are left out in turn. The first alone knows in which state the
@@ -952,140 +795,26 @@ class AddedEffect(schema.AxisStep):
 
 
 @dataclass(frozen=True, repr=False)
-class LoopResult:
-    """Result of the closed loop; it prints a summary, and `plot` draws its errors.
+class AxisResult(LoopResult):
+    """Result of the closed loop along an axis: what `LoopResult` holds, and
 
     Attributes
     ----------
-    declared : list of str
-        Names of the declared effects.
     declared_coefficients : list of DeclaredCoefficient
-        Their coefficients beside the effects that are confirmed.
-    held_out : str
-        Which cycles were held out, in words.
-    noise_floor_um : float, um
-        Standard deviation of one reading about the final model.
-    rmse_declared_um, rmse_final_um : float, um
-        Hold-out error of the declared model, and with the effects that were decided on the training part.
-    hold_out : mapping of str to ErrorInterval
-        The same errors with their intervals, as ``declared`` and ``final``, and those of plain predictions.
-    hold_out_errors : mapping of str to (n_held_out,) ndarray, um
-        The errors of single readings behind them, by the same names.
-    tracking : Tracking
-        Errors on the hold-out set where a cycle is measured from time to time.
-    skill : bool
-        Whether the model predicts the hold-out cycles better than their last values and means.
-    steps : list of AddedEffect
-        Effects that were added.
-    unnamed : mapping of str to float
-        Effects that are significant and have no name, with their p-value.
-    remainder : Remainder
-        Structure that the final model leaves.
-    residual_drift : ResidualDrift
-        Size of the unexplained drift.
-    away : frozenset of int
-        Places of the added effects without which the final error is predicted.
-    wandering_um : float, um
-        Root mean square of the unexplained drift, common part and stretch together.
-    state : LoopState
-        The last state of the loop: every round and every decision.
+        Coefficients of the declared effects beside those that are confirmed.
     before, after : ModelFit
         The declared model on the training part, and the final model on all cycles.
     """
 
-    declared: list[str]
-    declared_coefficients: list[schema.DeclaredCoefficient]
-    held_out: str
-    noise_floor_um: float
-    rmse_declared_um: Number
-    rmse_final_um: Number
-    hold_out: Mapping[str, schema.ErrorInterval]
-    hold_out_errors: Mapping[str, Array]
-    tracking: schema.Tracking
-    skill: bool
-    steps: list[AddedEffect]
-    unnamed: Mapping[str, float]
+    noise_share = remainder.DRIFT_SHARE
+    level = SECOND_LEVEL
+
+    state: AxisState
+    steps: Sequence[AddedEffect]
     remainder: Remainder
-    residual_drift: schema.ResidualDrift
-    away: frozenset[int]
-    wandering_um: float
-    state: LoopState[ModelFit]
+    declared_coefficients: list[schema.DeclaredCoefficient]
     before: ModelFit
     after: ModelFit
-
-    def __repr__(self) -> str:
-        added = ", ".join(f"{step.effect} (p = {step.p_value:.2g})" for step in self.steps) or "nothing"
-        return (
-            f"LoopResult: {self.verdict}; declared {', '.join(self.declared) or 'nothing'}; added {added}; "
-            f"held-out error {self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} um"
-        )
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {text}" for name, text in self._summary())
-
-    def _repr_html_(self) -> str:
-        rows = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in self._summary())
-        return f"<table>{''.join(rows)}</table>"
-
-    def _summary(self) -> list[tuple[str, str]]:
-        """Names and texts of what was found."""
-        added = [
-            (
-                "added",
-                f"{step.effect} ({', '.join(map(_words_of, step.parameters.items()))}), p = {step.p_value:.2g}, "
-                f"{step.doubt or 'borne out'}",
-            )
-            for step in self.steps
-        ]
-        return [
-            ("verdict", self.verdict.replace("_", " ")),
-            ("declared", ", ".join(self.declared) or "nothing"),
-            *(added or [("added", "nothing")]),
-            ("held out", self.held_out),
-            ("held-out error", f"{self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} µm"),
-            ("last value repeated", f"{self.rmse_persistence_um:.3g} µm"),
-            ("noise floor", f"{self.noise_floor_um:.3g} µm"),
-            ("what remains", self.remainder.shape or "nothing that these data show"),
-        ]
-
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the errors on the hold-out set with their 95 % intervals; see `fusion.results.plots.plot_loop`."""
-        from fusion.results.plots import plot_loop
-
-        return plot_loop(self, ax)
-
-    @property
-    def rmse_persistence_um(self) -> Number:
-        """Hold-out error of repeating every site's last reading of the training part, um."""
-        return self.hold_out["last_value"].rmse_um
-
-    @property
-    def verdict(self) -> schema.Verdict:
-        """Word for the outcome."""
-        kept = [step.keeps_name and not step.withheld for step in self.steps]
-        return verdict(
-            named=any(kept),
-            left=bool(self.remainder.shape) or not all(kept) or self._falls_short,
-            tested=bool(self.unnamed) or self.remainder.is_tested,
-            skill=self.skill,
-            separable=self.separable,
-        )
-
-    @property
-    def separable(self) -> bool:
-        """Whether a cause can be named: ridge regression with lagged copies does not predict better by a quarter."""
-        return is_separable(self._error("final"), self._error("ridge_with_lags"))
-
-    def _error(self, name: str) -> float:
-        """Error of a prediction of the hold-out set, um."""
-        return float(self.hold_out[name].rmse_um or 0.0)
-
-    @property
-    def _falls_short(self) -> bool:
-        """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
-        final, plain = self._error("final"), min(map(self._error, self.hold_out.keys() - {"declared", "final"}))
-        exceeds = exceeds_noise(final, self.noise_floor_um, remainder.DRIFT_SHARE)
-        return any(step.keeps_name for step in self.steps) and exceeds and final > plain
 
     def described(
         self,
@@ -1096,28 +825,12 @@ class LoopResult:
     ) -> schema.AxisLoop:
         """Return the part ``loop`` of results.json, with what was found beside the loop."""
         return schema.AxisLoop(
-            declared=self.declared,
+            **self._described(),
             declared_coefficients=self.declared_coefficients,
-            held_out=self.held_out,
-            noise_floor_um=self.noise_floor_um,
-            rmse_persistence_um=self.rmse_persistence_um,
-            rmse_declared_um=self.rmse_declared_um,
-            rmse_final_um=self.rmse_final_um,
-            **errors_of_predictions(self.hold_out),
-            steps=self.steps,
-            verdict=self.verdict,
-            unconfirmed_effects=self.unnamed,
-            separable=self.separable,
-            wandering_um=self.wandering_um,
-            tracking=self.tracking,
-            left_out_of_forecast=tuple(self.steps[place].effect for place in sorted(self.away)),
-            unexplained=self.unexplained,
-            residual_drift=self.residual_drift,
+            residual_drift=residual_drift_size(self.after),
             noise=_noise_of(self.after),
             search=[[_score_of(score) for score in scored.scores] for scored in self.state.rounds],
             identifiability=[limit for scored in self.state.rounds for limit in scored.detection_limits],
-            not_tried=self.state.not_tried(),
-            not_admitted=self.state.blocked(),
             field_corrections=field_corrections,
             residual_tests=residual_tests,
             axis_line=axis_line,
@@ -1144,20 +857,7 @@ class LoopResult:
                 "closest_effect_p": others[best].family_wise_p,
                 "closest_effect_share": shares[best],
             }
-        left = self.remainder
-        shape = left.shape or (BEYOND_PLAIN if self._falls_short else "")
-        # The held-out error of a drift that is carried on at its rate says nothing of the size of what drifts.
-        size = max(left.rms_um or excess_um(self._error("final"), self.noise_floor_um), self.wandering_um)
-        # What a step without a name describes is not explained either, whether a shape is left beside it or not.
-        nameless = [step.rms_um or 0.0 for step in self.steps if step.withheld or not step.keeps_name]
-        size = float(np.linalg.norm([size if shape else 0.0, *nameless]))
-        return schema.AxisUnexplained(shape=shape, rms_um=size, p_value=left.p_value, **nearest)
-
-
-def _words_of(parameter: tuple[str, Any]) -> str:
-    """Name and value of a parameter, numbers to three digits."""
-    name, value = parameter
-    return f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        return schema.AxisUnexplained(**self._left(), **nearest)
 
 
 def _score_of(score: Score) -> schema.AxisScore:
@@ -1174,107 +874,55 @@ def report_steps(
     state: LoopState[ModelFit], wrong: Mapping[int, Decision], held_out: Sequence[Answer | None]
 ) -> list[AddedEffect]:
     """Describe the steps of a loop whose hold-out set has been opened, with what that set says of them."""
-    averaged = average_over_drifts(state.model) if held_out else state.model
-    steps: list[AddedEffect] = []
-    for place, asked in enumerate(held_out):
-        steps.append(_added_effect(state, place, wrong.get(place), asked, averaged, steps))
-    return steps
-
-
-def _added_effect(
-    state: LoopState[ModelFit],
-    place: int,
-    wrong: Decision | None,
-    asked: Answer | None,
-    averaged: ModelFit,
-    earlier: Sequence[AddedEffect],
-) -> AddedEffect:
-    model, term, step = state.model, state.added[place], state.steps[place]
-    event_s = term.candidate.event_s
-    before_um, after_um, without_um = (np.nan,) * 3
-    if not step.is_from_second_search:
-        before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
-    without = fit_model(model.readings, state.kept([place]), used=model.used)
-    cross_before_um, cross_after_um = (cross_errors(one, event_s) for one in (without, model))
-    event_cycle = None
-    if event_s is not None:
-        # The cycle of the first reading at or after the event.
-        later = np.flatnonzero(model.readings.seconds >= event_s)
-        event_cycle = int(model.readings.cycle[later[0] if later.size else -1])
-    # The drift that is carried into the hold-out set has learnt an early step by then.
-    where = "on the hold-out set" if asked else "in blocks that are left out"
-    answer = asked or _ask_blocks(model, cross_before_um, cross_after_um)
-    if wrong is not None:
-        answer = replace(answer, against=wrong.sentence)
-    size_um, is_smooth = _size(model, term), model.fit.system.order == 2
-    beside = next((one.effect for one in earlier if one.withheld), "")
-    reasons = (
-        withheld_for(step, size_um=size_um, drift_um=wandering_um(model.fit), is_smooth=is_smooth, beside=beside),
-        _withheld_as_misfit(state, place, size_um, earlier),
-        _withheld_as_counterbalance(model, size_um),
-        answer.other_size(where) if answer.is_of_other_size else "",
-        _withheld_as_superfluous(model, term),
+    model = state.model
+    averaged = average_over_drifts(model) if held_out else model
+    crossed, told = [], []
+    for place, (term, asked) in enumerate(zip(state.added, held_out, strict=True)):
+        without = fit_model(model.readings, state.kept([place]), used=model.used)
+        crossed.append([cross_errors(one, term.candidate.event_s) for one in (without, model)])
+        # The drift that is carried into the hold-out set has learnt an early step by then.
+        answer = asked or _ask_blocks(model, *crossed[-1])
+        told.append(replace(answer, against=wrong[place].sentence) if place in wrong else answer)
+    contributions = [_contribution(model, term) for term in state.added]
+    beside = Surroundings(
+        drift_um=wandering_um(model.fit),
+        is_smooth=model.fit.system.order == 2,
+        total_um=_rms_about_sites(model.readings, model.readings.response),
     )
-    withheld = next(filter(None, reasons), "")
-    return AddedEffect(
-        **step.described(term.candidate, answer, where, size=model.size(term), withheld=withheld),
-        coefficients=coefficients_of(averaged, term),
-        held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
-        rmse_before_um=before_um,
-        rmse_after_um=after_um,
-        rmse_without_um=without_um,
-        cross_errors_before_um=cross_before_um,
-        cross_errors_after_um=cross_after_um,
-        cross_rmse_before_um=rmse(cross_before_um),
-        cross_rmse_after_um=rmse(cross_after_um),
-        rms_um=size_um,
-        event_cycle=event_cycle,
-    )
+    withheld = withhold_names(state, told, contributions, beside)
+    return [
+        AddedEffect(
+            **describe_step(
+                state,
+                place,
+                told[place],
+                withheld[place],
+                size=model.size(term),
+                rms_um=contributions[place].rms_um,
+                cross_um=(rmse(crossed[place][0]), rmse(crossed[place][1])),
+            ),
+            coefficients=coefficients_of(averaged, term),
+            held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
+            cross_errors_before_um=crossed[place][0],
+            cross_errors_after_um=crossed[place][1],
+            event_cycle=_cycle_at(model.readings, term.candidate.event_s),
+        )
+        for place, (step, term) in enumerate(zip(state.steps, state.added, strict=True))
+    ]
 
 
-#: Share of a slow effect that may pass for another of the same pattern: the best single body misses up to 22 % of a bar that conducts
-#: heat (95 % of 200 bars; docs/method/closed-loop.md), and the size of what is small is not known to better than a third.
-_MISFIT_SHARE = 0.3
-#: Cosine of two patterns over the sites from which on they are one.
-_ONE_PATTERN = 0.9
+def _contribution(model: ModelFit, term: Term) -> Contribution:
+    series, _ = model.series(term)
+    _, _, laid = model.readings.by_site(series)
+    return Contribution(_rms_about_sites(model.readings, series), leading_pattern(laid), loss_without(model, term))
 
 
-def _withheld_as_misfit(state: LoopState[ModelFit], place: int, size_um: float, earlier: Sequence[AddedEffect]) -> str:
-    """Why an effect has no name: it is what the shape of a larger slow effect of the same pattern may miss, at most a share where that one
-    has a name.
-    """
-    model, own = state.model, _pattern(state.model, state.added[place])
-    for term, step in zip(state.added[:place], earlier, strict=True):
-        is_slow = "time_constant_min" in term.candidate.parameters
-        other_um = _size(model, term) if is_slow else 0.0
-        share = 1.0 if step.withheld else _MISFIT_SHARE
-        if size_um < share * other_um and abs(own @ _pattern(model, term)) > _ONE_PATTERN:
-            larger = term.effect.replace("_", " ")
-            return f"its {size_um:.2g} µm may be what the course of {larger} ({other_um:.2g} µm, of the same pattern) misses"
-    return ""
-
-
-def _withheld_as_counterbalance(model: ModelFit, size_um: float) -> str:
-    """Why an effect that is larger than the drift itself has no name."""
-    total_um = _rms_about_sites(model.readings, model.readings.response)
-    if size_um <= total_um:
-        return ""
-    return f"its {size_um:.2g} µm exceed the whole drift of {total_um:.2g} µm: it counterbalances another effect"
-
-
-def _withheld_as_superfluous(model: ModelFit, term: Term) -> str:
-    """Why an effect has no name without which all cycles, the hold-out set included, lose little log-likelihood."""
-    loss = loss_without(model, term)
-    if loss >= SUPERFLUOUS_GAIN:
-        return ""
-    return f"all cycles together are described as well without it (log-likelihood lost: {loss:.2g})"
-
-
-def _pattern(model: ModelFit, term: Term) -> Array:
-    """Leading pattern over the sites of a term's contribution, of unit length."""
-    _, _, series = model.readings.by_site(model.series(term)[0])
-    about = np.nan_to_num(series - np.nanmean(series, axis=0))
-    return np.asarray(np.linalg.svd(about, full_matrices=False)[2][0])
+def _cycle_at(readings: Readings, event_s: float | None) -> int | None:
+    """Cycle of the first reading at or after an event, None for an effect that lasts."""
+    if event_s is None:
+        return None
+    later = np.flatnonzero(readings.seconds >= event_s)
+    return int(readings.cycle[later[0] if later.size else -1])
 
 
 def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
@@ -1282,7 +930,8 @@ def _ask_blocks(model: ModelFit, before_um: Array, after_um: Array) -> Answer:
     here = np.isfinite(before_um) & np.isfinite(after_um)
     readings = model.readings.subset(model.used).subset(here)
     rows, loadings, share = np.arange(int(here.sum())), readings.loadings, (before_um - after_um)[here, None]
-    return answers([Unseen(rows, readings.seconds, loadings, before_um[here], loadings[:, 1:], share)])[0]
+    (answer,) = answers([Unseen(rows, readings.seconds, loadings, before_um[here], loadings[:, 1:], share)])
+    return replace(answer, where="in blocks that are left out")
 
 
 #: Courses of a smooth drift, as powers of the time since the first reading: settling, trend, slow rhythm.
@@ -1411,11 +1060,6 @@ def coefficients_of(model: ModelFit, term: Term) -> list[schema.Coefficient]:
     ]
 
 
-def _size(model: ModelFit, term: Term) -> float:
-    """Root mean square of a term's contribution after its mean at every site is removed, um."""
-    return _rms_about_sites(model.readings, model.series(term)[0])
-
-
 def _rms_about_sites(readings: Readings, values: Array) -> float:
     """Root mean square of values after their mean at every site is removed."""
     return float(np.sqrt(np.mean(_about_sites(readings.site, values) ** 2)))
@@ -1424,11 +1068,6 @@ def _rms_about_sites(readings: Readings, values: Array) -> float:
 def _about_sites(site: NDArray[np.int64], values: Array) -> Array:
     """Values less their mean at every site, (n,)."""
     return np.asarray(values - (np.bincount(site, values) / np.maximum(np.bincount(site), 1))[site])
-
-
-def rmse(errors: Array) -> float:
-    """Root mean square of errors, those of sites without a prediction left out."""
-    return float(np.sqrt(np.nanmean(errors**2)))
 
 
 def _noise_of(model: ModelFit) -> schema.NoisePart:
@@ -1440,12 +1079,6 @@ def _noise_of(model: ModelFit) -> schema.NoisePart:
         correlation_time_s=within.time_s if within else None,
         cycle_correlation=float(model.memory.weights.sum()),
     )
-
-
-def wandering_um(fit: DriftFit) -> float:
-    """Root mean square of the random drift beside everything that the model names, um."""
-    drift, _ = unexplained_drift(fit)
-    return float(np.sqrt(np.mean(drift.sum(axis=1) ** 2)))
 
 
 def residual_drift_size(model: ModelFit) -> schema.ResidualDrift:

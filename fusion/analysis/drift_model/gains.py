@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.analysis.drift_model.fit import Moments, PriorRows
+from fusion.analysis.drift_model.model import Moments, PriorRows
 from fusion.analysis.effects.effect import Candidate, Separable, Wave
 from fusion.common import Array
 from interferometry.drift.kalman import DriftSystem

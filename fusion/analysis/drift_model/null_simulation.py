@@ -8,7 +8,7 @@ from copy import deepcopy
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.analysis.drift_model.fit import plausible_ratios
+from fusion.analysis.drift_model.model import plausible_ratios
 from fusion.common import Array
 from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
 from interferometry.drift.kalman import DriftSystem

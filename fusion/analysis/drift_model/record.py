@@ -18,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.alignment.sensor_health import (
@@ -30,46 +29,62 @@ from fusion.analysis.alignment.sensor_health import (
 )
 from fusion.analysis.diagnosis.residual import PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
-from fusion.analysis.drift_model.fit import SINGLE, Term, place_of, plausible_ratios, scaled_systems, unexplained_drift
-from fusion.analysis.drift_model.gains import by_width, profile_gains
+from fusion.analysis.drift_model.evaluation import (
+    Answer,
+    Contribution,
+    LoopResult,
+    Surroundings,
+    Unseen,
+    answers,
+    describe_step,
+    exceeds_noise,
+    leading_pattern,
+    left_out_of_forecast,
+    withhold_names,
+)
+from fusion.analysis.drift_model.gains import Gains, by_width, profile_gains
+from fusion.analysis.drift_model.model import (
+    SINGLE,
+    Term,
+    place_of,
+    plausible_ratios,
+    scaled_systems,
+    wandering_um,
+)
 from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk, rank_p_value
+from fusion.analysis.drift_model.predictions import (
+    Prediction,
+    channel_rmse,
+    error_interval,
+    folds,
+    last_values,
+    plain_predictions,
+    predict,
+    predict_left_out,
+    rmse,
+    track_record,
+)
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
 from fusion.analysis.drift_model.search import (
-    BASELINE_LAGS_MIN,
-    BEYOND_PLAIN,
     BUILT_IN,
     HOLD_OUT_SHARE,
     MOST_EFFECTS,
-    PENALTIES,
-    Answer,
     Confirmation,
     Confirmed,
     Decision,
-    Gains,
     LoopState,
     Problem,
     Progress,
     Reason,
     Round,
     Score,
-    Unseen,
-    answers,
-    error_interval,
-    errors_of_predictions,
-    exceeds_noise,
-    excess_um,
-    has_skill,
-    is_separable,
-    left_out_of_forecast,
     no_progress,
     not_confirmed,
     open_hold_out,
     refine,
     score_effects,
     search,
-    verdict,
     withdraw,
-    withheld_for,
 )
 from fusion.analysis.effects.effect import LAGS_MIN, Candidate, Effect
 from fusion.analysis.effects.events import periods_min
@@ -78,118 +93,10 @@ from fusion.analysis.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.analysis.levels import RECORD_ENTRY_LEVEL, REMAINDER_LEVEL
 from fusion.common import Array
 from fusion.results import loop as schema
+from interferometry.common import one_thread
 from interferometry.deviations import ROUNDING
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
-from interferometry.drift.kalman import DriftModelError, drift_system
-
-# Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training
-# part.
-
-#: Times that runs are left out at most; of more runs several are left out together.
-MOST_LEFT_OUT = 8
-#: Share of the training blocks that must lie before a part for its prediction to be counted.
-_LATER = 0.5
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A prediction of all blocks of a record from some of them.
-
-    Attributes
-    ----------
-    predicted : (blocks, channels) um
-    coefficients : (p, channels) of the columns, um per unit of each
-    penalty : the shrinkage that forward chaining chose
-    chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN where there is none
-    """
-
-    predicted: Array
-    coefficients: Array
-    penalty: float
-    chained_rmse: float
-
-
-def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Prediction:
-    """Predict every block of a record from the training blocks alone."""
-    asked = folds(record, train)
-    errors = np.full((len(asked), PENALTIES.size), np.nan)
-    for place, (before, part) in enumerate(asked):
-        for k, (predicted, _) in enumerate(_paths(record, columns, before)):
-            errors[place, k] = rmse(record, predicted, part)
-    mean = known_mean(errors, axis=0)
-    best = int(np.argmin(mean)) if np.isfinite(mean).all() else PENALTIES.size // 2
-    return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
-
-
-def folds(record: Record, train: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Blocks that are predicted for the choice of the penalty, and those that they are predicted from."""
-    runs = np.unique(record.run[train])
-    if runs.size > 1:
-        left_out = [np.isin(record.run, some) for some in np.array_split(runs, min(runs.size, MOST_LEFT_OUT))]
-        return [(train & ~some, train & some) for some in left_out]
-    return [(train & (record.chained < one), train & (record.chained == one)) for one in chained_parts(record, train)]
-
-
-def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
-    """Last training value of every channel in every run; in a run without any, its zero."""
-    last = np.zeros(record.displacement.shape)
-    for run in range(len(record.first)):
-        here = record.run == run
-        for channel, column in enumerate(record.displacement.T):
-            values = column[train & here & np.isfinite(column)]
-            last[here, channel] = values[-1] if values.size else 0.0
-    return last
-
-
-def predict_left_out(record: Record, columns: Array, penalty: float) -> Array:
-    """Predict every part of a record, or every run of several, from all others, earlier and later ones."""
-    predicted = np.full(record.displacement.shape, np.nan)
-    place = int(np.flatnonzero(penalty == PENALTIES)[0])
-    numbers = record.run if record.runs else record.chained
-    for number in np.unique(numbers):
-        part = numbers == number
-        predicted[part] = _paths(record, columns, ~part)[place][0][part]
-    return predicted
-
-
-def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
-    """Parts of the training blocks that are predicted from those before them: those of the later half."""
-    numbers, counts = np.unique(record.chained[train], return_counts=True)
-    before = np.cumsum(counts) - counts
-    return [int(number) for number, rows in zip(numbers, before, strict=True) if rows >= _LATER * counts.sum()]
-
-
-def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
-    """Root mean square error over some blocks, mean over the channels that were measured there."""
-    return float(known_mean(channel_rmse(record, predicted, where)))
-
-
-def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
-    """Root mean square error of every channel over some blocks."""
-    return np.asarray(np.sqrt(known_mean((record.displacement - predicted)[where] ** 2, axis=0)))
-
-
-def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array]]:
-    """Predictions (blocks, channels) and coefficients (p, channels) under every penalty."""
-    centre, scale = columns[train].mean(axis=0), columns[train].std(axis=0)
-    scale = np.where(scale > 0.0, scale, np.inf)
-    standard = (columns - centre) / scale
-    coefficients = np.zeros((PENALTIES.size, columns.shape[1], len(record.channels)))
-    levels = np.zeros((PENALTIES.size, len(record.channels)))
-    for channel in range(len(record.channels)):
-        here = train & np.isfinite(record.displacement[:, channel])
-        if not here.any():
-            levels[:, channel] = np.nan
-            continue
-        x, y = standard[here], record.displacement[here, channel]
-        # A channel that misses blocks has its mean where the columns of the others have theirs.
-        offset, middle = x.mean(axis=0), float(y.mean())
-        values, vectors = np.linalg.eigh((x - offset).T @ (x - offset) / here.sum())
-        projected = vectors.T @ ((x - offset).T @ (y - middle) / here.sum())
-        coefficients[:, :, channel] = (projected / (np.maximum(values, 0.0) + PENALTIES[:, None])) @ vectors.T
-        levels[:, channel] = middle - coefficients[:, :, channel] @ offset
-    return [(standard @ one + levels[k], one / scale[:, None]) for k, one in enumerate(coefficients)]
-
+from interferometry.drift.kalman import DriftModelError
 
 # Digits of the readings: nothing is stated that rounding may look like.
 
@@ -204,79 +111,6 @@ def rounding_steps(record: Record, terms: Sequence[Term], coefficients: Array) -
 def together(steps: Array) -> Array:
     """Step of every displacement that rounds as much as its independent steps (number, channels) do."""
     return np.asarray(np.linalg.norm(steps, axis=0))
-
-
-# Plain predictions of a record's hold-out set, which the model has to beat: last value, mean, and regressions on all
-# that was logged.
-
-
-def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Array]:
-    """Predict every block of a record without a model of the machine."""
-    now = np.column_stack([record.rise, *(values for powers in record.drivers.values() for values in powers.values())])
-    late = [record.series(now, "1").lagged(60.0 * minutes).values for minutes in BASELINE_LAGS_MIN]
-    design = np.column_stack([np.ones(train.size), now])
-    least_squares = np.empty(record.displacement.shape)
-    for channel, response in enumerate(record.displacement.T):
-        here = train & np.isfinite(response)
-        # The solution of smallest norm where columns depend on each other.
-        least_squares[:, channel] = design @ np.linalg.lstsq(design[here], response[here], rcond=None)[0]
-    of_runs = {"mean_run": mean_course(record, train)} if record.runs else {}
-    return {
-        **of_runs,
-        "last_value": last_values(record, train),
-        "mean": np.broadcast_to(known_mean(record.displacement[train], axis=0), record.displacement.shape),
-        "least_squares": least_squares,
-        "ridge": predict(record, now, train).predicted,
-        "ridge_with_lags": predict(record, np.column_stack([now, *late]), train).predicted,
-    }
-
-
-#: Readings of the hold-out set that a prediction which tracks is given: often enough for an interval, seldom enough to need a model.
-_READINGS = 10
-
-
-def track(record: Record, train: NDArray[np.bool_], forecast: Array, ridge: Array) -> schema.Tracking:
-    """Predict the hold-out set with a reading of all channels from time to time, weighed by the drift of what the forecast misses."""
-    held = np.flatnonzero(~train)
-    every = max(1, held.size // _READINGS)
-    read = train.copy()
-    read[held[every - 1 :: every]] = True
-    # The last block that was read before each one.
-    before = np.maximum.accumulate(np.where(read, np.arange(read.size), 0))[held - 1]
-    carried = np.full(record.displacement.shape, np.nan)
-    for k in range(len(record.channels)):
-        rows = np.flatnonzero(np.isfinite(record.displacement[:, k]))
-        seconds, one = record.seconds[rows], np.ones((rows.size, 1))
-        off = (record.displacement - forecast)[rows, k]
-        # A random walk is carried on at its level: a rate would be carried on as well, and hours ahead it leads astray.
-        before_it = train[rows]
-        fit = estimate(seconds[before_it], one[before_it], off[before_it], one[before_it], order=1, robust=True)
-        told = drift_system(seconds, one, order=1, ratios=fit.system.ratios, observed=read[rows])
-        missed, _ = told.innovations(np.column_stack([off, one]))
-        carried[rows, k] = missed[:, 0] - missed[:, 1] * fit.coefficients[0]
-    last = record.displacement[held] - record.displacement[before]
-    errors = {"model": carried[held], "last_reading": last, "ridge": last - (ridge[held] - ridge[before])}
-    intervals = {name: error_interval(one, held, np.random.default_rng(1)) for name, one in errors.items()}
-    return schema.Tracking(every_min=every * record.block_s / 60.0, **intervals)
-
-
-def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:
-    """Predict every block by the mean of the other training runs at the same time since their start, um (blocks, channels).
-
-    Beyond the end of all others their last mean is kept.
-    """
-    place = np.arange(record.seconds.size) - np.asarray(record.first)[record.run]
-    predicted = np.zeros(record.displacement.shape)
-    for run in range(len(record.runs)):
-        others = np.flatnonzero(train & (record.run != run))
-        course: Array = np.full((int(place.max()) + 1, len(record.channels)), np.nan)
-        for at in np.unique(place[others]):
-            course[at] = known_mean(record.displacement[others[place[others] == at]], axis=0)
-        for k in range(len(record.channels)):
-            known = np.flatnonzero(np.isfinite(course[:, k]))
-            course[:, k] = np.interp(np.arange(len(course)), known, course[known, k]) if known.size else 0.0
-        predicted[record.run == run] = course[place[record.run == run]]
-    return predicted
 
 
 # Hold-out set and declared model of a record.
@@ -843,9 +677,9 @@ class RecordProblem(Problem[RecordFit]):
         gains = channel_gains(without, [term.candidate])
         return float(gains.gain[0, 0]) if gains.separable[0] else 0.0
 
-    def hold_out_error(self, terms: Sequence[Term]) -> float:
-        """Error of predicting the blocks that may not be used, mean over the channels, um."""
-        return float(known_mean(channel_rmse(self.record, self.predict(terms).predicted, ~self.train)))
+    def hold_out_errors(self, terms: Sequence[Term]) -> Array:
+        """Errors of predicting the blocks that may not be used (n_held_out, channels), um."""
+        return (self.record.displacement - self.predict(terms).predicted)[~self.train]
 
     def predict(self, terms: Sequence[Term]) -> Prediction:
         """Predict all blocks from the training part."""
@@ -864,7 +698,7 @@ class ChainedResult(schema.ChainedPart):
     """(channels,) errors of the final model."""
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def search_record(
     record: Record,
     train: NDArray[np.bool_],
@@ -895,7 +729,11 @@ def chain_forward(
         progress(done, len(asked), "predicting part after part")
         problem, state = search_record(record, before, declared, seed=seed, effects=effects)
         hours = record.seconds[part] / 3600.0
-        final_um = channel_rmse(record, problem.predict(state.model.terms).predicted, part)
+        predicted = (
+            last_values(record, before),
+            *(problem.predict(terms).predicted for terms in (state.declared, state.model.terms)),
+        )
+        last_um, declared_um, final_um = (channel_rmse((record.displacement - one)[part]) for one in predicted)
         runs: dict[str, Any] = (
             {"runs": tuple(record.runs[run].name for run in np.unique(record.run[part]))} if record.runs else {}
         )
@@ -906,8 +744,8 @@ def chain_forward(
                 in_training=bool(train[part].all()),
                 effects=tuple(step.effect for step in state.steps),
                 **runs,
-                rmse_persistence_um=known_mean(channel_rmse(record, last_values(record, before), part)),
-                rmse_declared_um=known_mean(channel_rmse(record, problem.predict(state.declared).predicted, part)),
+                rmse_persistence_um=known_mean(last_um),
+                rmse_declared_um=known_mean(declared_um),
                 rmse_final_um=known_mean(final_um),
                 channel_rmse_final_um=final_um,
             )
@@ -985,9 +823,7 @@ def examine(model: RecordFit, hold_out_rmse: Array, step: Array, rng: np.random.
             f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
         )
     shape = " and ".join(words)
-    return RecordRemainder(
-        test.p_value, test.p_values, shape, float(known_mean(hold_out_rmse)) if words else 0.0, share
-    )
+    return RecordRemainder(test.p_value, test.p_values, shape, 0.0, share)
 
 
 def _test(innovations: Array, switched: NDArray[np.bool_], rng: np.random.Generator) -> PermutationTest:
@@ -1083,117 +919,49 @@ def _largest(record: Record, rmse: Array) -> str:
     return "all channels alike" if 1 < len(strong) == len(record.channels) else ", ".join(strong)
 
 
-@dataclass(frozen=True)
-class RecordResult:
-    """Result of the closed loop on a record.
+@dataclass(frozen=True, repr=False)
+class RecordResult(LoopResult):
+    """Result of the closed loop on a record: what `LoopResult` holds, with errors as means over the channels, and
 
     Attributes
     ----------
-    state : what the search on the training part found, effects that were withdrawn left out
-    record : the record on its blocks
-    hold_out : (blocks,) True for the hold-out set
-    held_out : which part that is, in words
-    predictions : of the declared model and after every added effect, from the training part
-    errors : (1 + effects, channels) their errors on the hold-out set, um
-    plain : (blocks, channels) each, plain predictions from the training part, by name
-    left_out : (blocks, channels) each, predictions of every part from all others, um: by the final model, then without each of its effects
-    whole : the final model fitted to all blocks, for its residual
-    remainder : structure that the final model leaves
-    chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
-    answers : what blocks that the coefficients were not fitted to say of every added effect
-    away : places of the effects that left the forecast
-    forecast : prediction with the others, from the training part
-    steps : (1 + sensors, channels) of its displacements, um, as `rounding_steps` gives them
-    tracking : errors with a reading from time to time, None for several runs
-    wandering_um : root mean square of the random drift beside the final model, mean over the channels, um
+    record : Record
+        The record on its blocks.
+    is_held_out : (blocks,) ndarray of bool
+        True for the hold-out set.
+    predicted : mapping of str to (blocks, channels) ndarray, um
+        Predictions of all blocks from the training part, by the names of their errors.
+    contributions : list of (blocks, channels) ndarray, um
+        What every term of the final model contributes, about its mean.
+    left_out : list of (blocks, channels) ndarray, um
+        Predictions of every part from all others: by the final model, then without each of its effects.
+    whole : RecordFit
+        The final model fitted to all blocks, for its residual.
+    chained : list of ChainedResult
+        Every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs.
+    rounding : (1 + sensors, channels) ndarray, um
+        Steps of the displacements, as `rounding_steps` gives them.
     """
 
+    noise_share = RESIDUAL_SHARE
+    level = RECORD_ENTRY_LEVEL
+
     state: RecordState
+    steps: Sequence[schema.RecordStep]
+    remainder: RecordRemainder
     record: Record
-    hold_out: NDArray[np.bool_]
-    held_out: str
-    predictions: list[Prediction]
-    errors: Array
-    plain: Mapping[str, Array]
+    is_held_out: NDArray[np.bool_]
+    predicted: Mapping[str, Array]
+    contributions: list[Array]
     left_out: list[Array]
     whole: RecordFit
-    remainder: RecordRemainder
     chained: list[ChainedResult]
-    answers: list[Answer]
-    away: set[int]
-    forecast: Prediction
-    steps: Array
-    tracking: schema.Tracking | None
-    wandering_um: float
+    rounding: Array
 
     @property
     def noise(self) -> Array:
         """Noise of a block mean (channels,), um."""
-        return noise_floor(self.whole.sigma, together(self.steps))
-
-    @property
-    def noise_um(self) -> float:
-        """Noise of a block mean, mean over the channels, um."""
-        return float(np.mean(self.noise))
-
-    @property
-    def cross_um(self) -> list[float]:
-        """Error of predicting every part from all others, um: of the final model, then without each of its effects."""
-        everywhere = np.ones(self.hold_out.size, bool)
-        return [rmse(self.record, predicted, everywhere) for predicted in self.left_out]
-
-    @property
-    def hold_out_intervals(self) -> dict[str, schema.ErrorInterval]:
-        """Errors on the hold-out set with their intervals: of the declared and the final model, and of plain predictions."""
-        final = self.forecast.predicted
-        predicted = {"declared": self.predictions[0].predicted, "final": final, **self.plain}
-        rows = np.flatnonzero(self.hold_out)
-        errors = {name: (self.record.displacement - values)[rows] for name, values in predicted.items()}
-        return {name: error_interval(one, rows, np.random.default_rng(1)) for name, one in errors.items()}
-
-    @property
-    def final_um(self) -> Array:
-        """Error of the forecast on the hold-out set (channels,), um."""
-        return channel_rmse(self.record, self.forecast.predicted, self.hold_out)
-
-    def _plain_errors(self, here: NDArray[np.bool_]) -> tuple[float, float]:
-        """Errors of repeating the last value, and of the better mean: of all values, or of the other runs' courses, um."""
-        errors = {name: rmse(self.record, predicted, here) for name, predicted in self.plain.items()}
-        return errors["last_value"], min(errors["mean"], errors.get("mean_run", np.inf))
-
-    @property
-    def falls_short(self) -> bool:
-        """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
-        final = float(known_mean(self.final_um))
-        exceeds = exceeds_noise(final, self.noise_um, RESIDUAL_SHARE)
-        plain = min(rmse(self.record, one, self.hold_out) for one in self.plain.values())
-        return any(self._kept) and exceeds and final > plain
-
-    @property
-    def _kept(self) -> list[bool]:
-        """For every step whether its name stands."""
-        steps = zip(self.answers, self.state.steps, strict=True)
-        return [one.word != "no" and not withheld_for(step) for one, step in steps]
-
-    @property
-    def verdict(self) -> schema.Verdict:
-        """Word for the outcome."""
-        return self._verdict(self.hold_out, remains=bool(self.remainder.shape) or self.falls_short)
-
-    def separable(self, here: NDArray[np.bool_]) -> bool:
-        """Whether a cause can be named: ridge regression with lagged copies does not predict these blocks better by a quarter."""
-        compared = (self.forecast.predicted, self.plain["ridge_with_lags"])
-        return is_separable(*(rmse(self.record, one, here) for one in compared))
-
-    def _verdict(self, here: NDArray[np.bool_], *, remains: bool) -> schema.Verdict:
-        final, plain = rmse(self.record, self.forecast.predicted, here), self._plain_errors(here)
-        return verdict(
-            named=any(self._kept),
-            left=remains or not all(self._kept),
-            tested=bool(self.state.unnamed(RECORD_ENTRY_LEVEL)) or self.remainder.is_tested,
-            skill=has_skill(final, *plain, self.noise_um, RESIDUAL_SHARE),
-            separable=self.separable(here),
-        )
+        return noise_floor(self.whole.sigma, together(self.rounding))
 
     def _run(self, number: int) -> schema.RunPart:
         """One run, judged by its own errors where it is held out."""
@@ -1202,10 +970,9 @@ class RecordResult:
         last = declared = final = np.nan
         word: schema.Verdict | Literal[""] = ""
         if described.held_out:
-            last, _ = self._plain_errors(here)
-            predicted = (self.predictions[0].predicted, self.forecast.predicted)
-            declared, final = (rmse(self.record, one, here) for one in predicted)
-            word = self._verdict(here, remains=exceeds_noise(final, self.noise_um, RESIDUAL_SHARE))
+            own = {name: rmse(errors[here[self.is_held_out]]) for name, errors in self.hold_out_errors.items()}
+            last, declared, final = own["last_value"], own["declared"], own["final"]
+            word = self.judge(own, skill_um=final, remains=exceeds_noise(final, self.noise_floor_um, self.noise_share))
         return schema.RunPart(
             file=described.name,
             held_out=described.held_out,
@@ -1219,40 +986,18 @@ class RecordResult:
 
     def described(self, sensor_faults: Sequence[schema.SensorFaultPart]) -> schema.RecordLoop:
         """Return the part ``loop`` of results.json; errors are means over the channels."""
-        mean, final_um = known_mean(self.errors, axis=1), self.final_um
-        shape = self.remainder.shape or (BEYOND_PLAIN if self.falls_short else "")
-        size = max(self.remainder.rms_um or excess_um(float(known_mean(final_um)), self.noise_um), self.wandering_um)
-        persistence_um = channel_rmse(self.record, self.plain["last_value"], self.hold_out)
-        last = self.state.rounds[-1].scores
+        last_um, declared_um, final_um = (
+            channel_rmse(self.hold_out_errors[name]) for name in ("last_value", "declared", "final")
+        )
         runs: dict[str, Any] = (
             {"runs": [self._run(number) for number in range(len(self.record.runs))]} if self.record.runs else {}
         )
         return schema.RecordLoop(
-            declared=[term.effect for term in self.state.declared],
-            held_out=self.held_out,
-            noise_floor_um=self.noise_um,
-            rmse_persistence_um=known_mean(persistence_um),
-            rmse_declared_um=mean[0],
-            rmse_final_um=known_mean(final_um),
-            steps=[self._step(place) for place in range(len(self.state.steps))],
-            **errors_of_predictions(self.hold_out_intervals),
-            verdict=self.verdict,
-            separable=self.separable(self.hold_out),
-            wandering_um=self.wandering_um,
-            left_out_of_forecast=tuple(self.state.steps[place].effect for place in sorted(self.away)),
-            unconfirmed_effects=self.state.unnamed(RECORD_ENTRY_LEVEL),
-            unexplained=schema.RecordUnexplained(
-                shape=shape,
-                rms_um=size if shape else 0.0,
-                p_value=self.remainder.p_value,
-                p_values=self.remainder.p_values,
-                variance_share=known_mean(self.remainder.variance_share),
-                closest_effect=last[0].name if shape and last else "",
-            ),
+            **self._described(),
             channels={
                 name: schema.ChannelErrors(
-                    rmse_persistence_um=persistence_um[k],
-                    rmse_declared_um=self.errors[0, k],
+                    rmse_persistence_um=last_um[k],
+                    rmse_declared_um=declared_um[k],
                     rmse_final_um=final_um[k],
                     noise_um=self.noise[k],
                     variance_share=self.remainder.variance_share[k],
@@ -1260,40 +1005,54 @@ class RecordResult:
                 for k, name in enumerate(self.record.channels)
             },
             chained=self.chained,
-            tracking=self.tracking,
             **runs,
             search=[_round_scores(scored) for scored in self.state.rounds],
-            not_tried=self.state.not_tried(),
-            not_admitted=self.state.blocked(),
             sensor_faults=sensor_faults,
         )
 
-    def _step(self, place: int) -> schema.RecordStep:
-        step, term = self.state.steps[place], self.state.added[place]
-        squares = self.contribution(term) ** 2
-        where = "on the hold-out set" if term.candidate.event_s is None else "in parts that are left out"
-        return schema.RecordStep(
-            **step.described(
-                term.candidate, self.answers[place], where, size=step.score.gain, withheld=withheld_for(step)
+    @property
+    def unexplained(self) -> schema.RecordUnexplained:
+        """What is left, and the effect of the last round that comes closest to it."""
+        left, last = self._left(), self.state.rounds[-1].scores
+        return schema.RecordUnexplained(
+            **left,
+            p_values=self.remainder.p_values,
+            variance_share=known_mean(self.remainder.variance_share),
+            closest_effect=last[0].name if left["shape"] and last else "",
+        )
+
+
+def report_steps(
+    record: Record,
+    state: RecordState,
+    answers: Sequence[Answer],
+    contributed: Sequence[Array],
+    withheld: Sequence[str],
+    left_out: Sequence[Array],
+) -> list[schema.RecordStep]:
+    """Describe the steps of a loop whose hold-out set has been opened, with what unseen blocks say of them."""
+    cross_um = [rmse(record.displacement - predicted) for predicted in left_out]
+    return [
+        schema.RecordStep(
+            **describe_step(
+                state,
+                place,
+                answers[place],
+                withheld[place],
+                size=step.score.gain,
+                rms_um=np.sqrt(np.mean(squares)),
+                cross_um=(cross_um[1 + place], cross_um[0]),
             ),
-            rmse_before_um=known_mean(self.errors[place]),
-            rmse_after_um=known_mean(self.errors[place + 1]),
-            rmse_without_um=self.state.errors_without_um[place],
-            cross_rmse_before_um=self.cross_um[1 + place],
-            cross_rmse_after_um=self.cross_um[0],
-            rms_um=np.sqrt(np.mean(squares)),
-            rms_by_channel_um={name: np.sqrt(np.mean(squares[:, k])) for k, name in enumerate(self.record.channels)},
+            rms_by_channel_um={name: np.sqrt(np.mean(squares[:, k])) for k, name in enumerate(record.channels)},
             chained_rmse_before_um=step.round.start_error_um,
             chained_rmse_after_um=step.score.error_um,
             rejected=_rejected(step.round),
             event_s=_happened_s(term.candidate),
         )
-
-    def contribution(self, term: Term) -> Array:
-        """Contribution of a term to the prediction by the final model, about its mean."""
-        place = place_of(self.state.model.terms, term)
-        series = term.candidate.columns @ self.predictions[-1].coefficients[place]
-        return np.asarray(series - series.mean(axis=0))
+        for place, (step, term, squares) in enumerate(
+            zip(state.steps, state.added, [series**2 for series in contributed], strict=True)
+        )
+    ]
 
 
 def _rejected(scored: Round) -> dict[str, str]:
@@ -1330,7 +1089,7 @@ def close_record(
     effects: Mapping[str, Effect] | None = None,
     progress: Progress = no_progress,
 ) -> RecordResult:
-    """Close the loop on a record."""
+    """Close the loop on a record, as `close_loop` does."""
     terms = declare(declared, record)
     train, description = hold_out(record)
     problem, state = search_record(record, train, terms, seed=seed, effects=effects, progress=progress)
@@ -1338,40 +1097,67 @@ def close_record(
     state = open_hold_out(problem, withdraw_unreplicated(problem, state, chained))
     progress(MOST_EFFECTS, MOST_EFFECTS, "examining the residual")
     whole = fit_record(record, state.model.terms, np.ones_like(train))
-    predictions = [problem.predict(some) for some in state.chain]
-    errors = np.array([channel_rmse(record, one.predicted, ~train) for one in predictions])
+    model = problem.predict(state.model.terms)
     left_out = [
         # The penalty is that from the training part.
         predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
         for terms in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
     ]
-    told = ask_unseen(record, ~train, state, predictions[-1], left_out)
-    away = left_out_of_forecast(problem, state, {place for place, one in enumerate(told) if one.word == "no"})
+    told = ask_unseen(record, ~train, state, model, left_out)
+    series = [
+        term.candidate.columns @ model.coefficients[place_of(state.model.terms, term)] for term in state.model.terms
+    ]
+    contributions = [one - one.mean(axis=0) for one in series]
+    contributed = contributions[len(state.declared) :]
+    drift_um = float(np.mean([wandering_um(fit) for fit in whole.channels]))
+    withheld = withhold_names(
+        state,
+        told,
+        [
+            Contribution(float(np.sqrt(np.mean(one**2))), leading_pattern(one), problem.loss_without(whole, term))
+            for one, term in zip(contributed, state.added, strict=True)
+        ],
+        Surroundings(
+            drift_um=drift_um,
+            is_smooth=any(fit.system.order == 2 for fit in whole.channels),
+            total_um=float(np.sqrt(np.nanmean((record.displacement - np.nanmean(record.displacement, axis=0)) ** 2))),
+            of_own_law={"unseen_heat_source"},
+        ),
+    )
+    steps = report_steps(record, state, told, contributed, withheld, left_out)
+    away = left_out_of_forecast(problem, state, [place for place, step in enumerate(steps) if not step.keeps_name])
     kept = state.kept(away)
     forecast = problem.predict(kept)
-    steps = rounding_steps(record, kept, forecast.coefficients)
-    final_um = channel_rmse(record, forecast.predicted, ~train)
-    plain, tracking = plain_predictions(record, train), None
-    if not record.runs:
-        tracking = track(record, train, forecast.predicted, plain["ridge"])
+    predicted = {
+        "declared": problem.predict(state.declared).predicted,
+        "final": forecast.predicted,
+        **plain_predictions(record, train),
+    }
+    errors = {name: (record.displacement - values)[~train] for name, values in predicted.items()}
+    rounding = rounding_steps(record, kept, forecast.coefficients)
+    step = together(rounding)
     return RecordResult(
         state=state,
-        record=record,
-        hold_out=~train,
         held_out=description,
-        predictions=predictions,
-        errors=errors,
-        plain=plain,
+        noise_floor_um=float(np.mean(noise_floor(whole.sigma, step))),
+        hold_out_errors=errors,
+        hold_out={
+            name: error_interval(one, np.flatnonzero(~train), np.random.default_rng(1)) for name, one in errors.items()
+        },
+        skill_um=rmse(errors["final"]),
+        tracking=None if record.runs else track_record(record, train, forecast.predicted, predicted["ridge"]),
+        steps=steps,
+        away=frozenset(away),
+        remainder=examine(whole, channel_rmse(errors["final"]), step, np.random.default_rng(seed)),
+        wandering_um=drift_um,
+        record=record,
+        is_held_out=~train,
+        predicted=predicted,
+        contributions=contributions,
         left_out=left_out,
         whole=whole,
-        remainder=examine(whole, final_um, together(steps), np.random.default_rng(seed)),
         chained=chained,
-        answers=told,
-        away=away,
-        forecast=forecast,
-        steps=steps,
-        tracking=tracking,
-        wandering_um=float(np.mean([np.sqrt(np.mean(unexplained_drift(fit)[0] ** 2)) for fit in whole.channels])),
+        rounding=rounding,
     )
 
 
@@ -1399,6 +1185,7 @@ def ask_unseen(
         without = left_out[1 + place]
         parts = _unseen(record, everywhere, record.displacement - without, [], [left_out[0] - without])
         (told[place],) = answers(parts, family=len(added))
+        told[place] = replace(told[place], where="in parts that are left out")
     return [told[place] for place in range(len(added))]
 
 
@@ -1579,7 +1366,7 @@ def _declared_errors(table: xr.Dataset, declared: Sequence[str], *, left_out: bo
         return {}
     columns = columns_of(record, declare(declared, record))
     predicted, asked = predict(record, columns, train), ~train
-    errors = channel_rmse(record, predicted.predicted, asked)
+    errors = channel_rmse((record.displacement - predicted.predicted)[asked])
     if left_out:
-        errors = channel_rmse(record, predict_left_out(record, columns, predicted.penalty), np.ones_like(train))
+        errors = channel_rmse(record.displacement - predict_left_out(record, columns, predicted.penalty))
     return dict(zip(record.channels, errors.tolist(), strict=True))

@@ -253,7 +253,31 @@ class _Blocks:
 
 
 def reduce_record(table: xr.Dataset) -> Record:
-    """Average a record over blocks; blocks without any sample (a pause) are left out."""
+    """Average a record over blocks; blocks without any sample (a pause) are left out.
+
+    Parameters
+    ----------
+    table : Dataset
+        What `read_record` returns: temperatures in degC, displacements in um and drivers over time.
+
+    Returns
+    -------
+    Record
+        Means over blocks of equal length, displacements and rises counted from the first block of each run.
+
+    Raises
+    ------
+    RecordError
+        If no displacement or no temperature can be modelled.
+
+    Notes
+    -----
+    Blocks, digits and runs: docs/method/records.md.
+
+    Examples
+    --------
+    >>> record = reduce_record(read_record(load_campaign("record/campaign.toml")))  # doctest: +SKIP
+    """
     time = table["time"].values.astype("datetime64[ns]")
     elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
     table, impossible = _without_impossible(table)

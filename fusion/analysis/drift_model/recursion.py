@@ -17,9 +17,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import known_mean
-from fusion.analysis.drift_model.record import channel_rmse, last_values
+from fusion.analysis.drift_model.predictions import BASELINE_LAGS_MIN, channel_rmse, last_values
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record
-from fusion.analysis.drift_model.search import BASELINE_LAGS_MIN
 from fusion.common import Array
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import (
@@ -342,7 +341,7 @@ def make_recursion(
         errors = errors_of(record, values, events, respond(record, values, events, used), used)
         return np.where(asked[:, None], errors, np.nan)
 
-    before = channel_rmse(record, last_values(record, train), ~train)
+    before = channel_rmse((record.displacement - last_values(record, train))[~train])
     held_out = np.sqrt(known_mean(missed(train, ~train) ** 2, axis=0))
     parts = [missed(everything & ~part, part) for part in _parts(record, everything)]
     u = np.fmax(held_out, np.sqrt(known_mean(np.concatenate(parts) ** 2, axis=0)))

@@ -16,19 +16,17 @@ from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
 
-from fusion.analysis.drift_model.fit import Term
 from fusion.analysis.drift_model.gains import Gains
+from fusion.analysis.drift_model.model import Term
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
-from fusion.analysis.drift_model.record_data import independent
+from fusion.analysis.drift_model.predictions import rmse
 from fusion.analysis.effects.effect import Candidate, Effect, Separable, Wave
-from fusion.analysis.effects.library import LIBRARY, describe_effect
+from fusion.analysis.effects.library import LIBRARY
+from fusion.analysis.levels import RIVAL_LEVEL
 from fusion.common import Array, FusionError
 from fusion.results import loop as schema
-from interferometry.drift.gls import estimate
-from interferometry.drift.kalman import DriftModelError
+from thermofuse.resources import vocabulary
 from thermography.large_arrays import IN_MEMORY_BYTES, copy_to_disk, one_by_one
 
 # Decisions of the search: which effect entered, was refused or was withdrawn, for which reason and on what evidence.
@@ -78,73 +76,13 @@ WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS}
 #: Reasons for which a significant effect has no name: it shows that something is missing all the same.
 WITHHELD = (BLOCKING - {Reason.COLLINEAR, Reason.WITHIN_DIGITS}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
 
-_SENTENCES: Mapping[Reason, str] = {
-    Reason.ENTERED: "added to the model",
-    Reason.NOT_AVAILABLE: "{because}",
-    Reason.NOT_COMPUTABLE: "its columns cannot be computed: {because}",
-    Reason.COLLINEAR: (
-        "no part of it is independent of the model: its columns are constant, or collinear with the static profile, the declared effects "
-        "and the effects added before"
-    ),
-    Reason.SINGLE_WARM_UP: (
-        "the machine was excited by a single warm-up ({share_percent:.1f} % of the candidate is a plain warm-up), and beside free "
-        "warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to separate it"
-    ),
-    Reason.SINGLE_SWITCHING: (
-        "{driver} was switched only once (a single step explains {share_percent:.1f} % of its course), and all single warm-ups are alike; "
-        "switch the load on purpose to separate it"
-    ),
-    Reason.AT_SWITCHING: "a driver was switched at {hours:.2f} h: a shift there is a response to the load, not an event of its own",
-    Reason.HETEROSCEDASTIC_DRIFT: (
-        "drift that moved {times:.2g} times as much between {start_h:.2f} h and {end_h:.2f} h as in the rest of the test, as in a warm-up "
-        "or after a change of the load, would gain {drift_gain:.1f} in log-likelihood; the event gains {event_gain:.1f}, and its name "
-        "needs {needed:.0f} more than such drift"
-    ),
-    Reason.TEMPERATURE_NOISE: (
-        "the noise of {series} is {noise_percent:.2g} % of its range; above {limit_percent:.1g} % a lagged copy, which is smoother, fits "
-        "better by its smoothness alone"
-    ),
-    Reason.FOLLOWS_RATE: (
-        "beside the delayed copy the direct coefficient of {series} takes the opposite sign or nearly cancels it: the readings follow the "
-        "rate of change, which is the power of a source nearby or a late sensor, not a lag"
-    ),
-    Reason.SMOOTHING: (
-        "a copy of {series} that is smoothed but not delayed fits as well (log-likelihood {advantage:+.1f}): the gain comes from "
-        "denoising, not from a lag"
-    ),
-    Reason.UNLOGGED_HEAT: (
-        "nothing that makes heat was logged: the delayed response to a source that is not logged cannot be told from a lag, nor from a "
-        "drift; log duty, speed or load"
-    ),
-    Reason.WITHIN_DIGITS: (
-        "it moves no displacement by more than the digits of the readings, so that rounding may look like it (largest: {range_um:.3g} µm, "
-        "digits: {step_um:.3g} µm)"
-    ),
-    Reason.NOT_CONFIRMED: "significant (p = {p_value:.2g}), but not confirmed on readings that its coefficients were not fitted to",
-    Reason.NOT_PREDICTED: (
-        "significant (p = {p_value:.2g}), but the later parts of the training time are predicted no better with it ({before_um:.3g} to "
-        "{after_um:.3g} µm)"
-    ),
-    Reason.WEAKER_THAN_UNCONFIRMED: (
-        "significant (p = {p_value:.2g}; with {stronger} in the model {beside_p:.2g}), but much weaker than {stronger}, which is not "
-        "confirmed: it may explain a part of the same"
-    ),
-    Reason.SUPERFLUOUS: "removed: an effect added later explains the same (log-likelihood lost without it: {loss:.1f})",
-    Reason.TOO_MANY_EVENTS: "more than {most} events would be needed: that is a switching, for which the library has no name",
-    Reason.INCONSISTENT_PATTERN: (
-        "its course in time is present, but the pattern along the axis and by direction is not that of this effect "
-        "(p = {p_value:.1g})"
-    ),
-    Reason.SHARED_PATTERN: (
-        "{first} and {second} fit no better than one course in time with a free pattern: together they are one pattern that "
-        "the library does not hold"
-    ),
-    Reason.DEPENDS_ON_WITHDRAWN: "withdrawn: it was found beside {beside}, whose name was withdrawn afterwards",
-    Reason.NOT_REPEATED: (
-        "withdrawn: it was found in the training part (p = {p_value:.2g}), but the {parts} earlier part(s) of the record on which the same "
-        "procedure added it were predicted no better ({without_um:.3g} to {with_um:.3g} µm)"
-    ),
-}
+#: Decisions, names withheld and answers in words, with fields for their evidence.
+_SENTENCES = vocabulary("decisions")
+
+
+def say(table: str, code: str, **evidence: float | str) -> str:
+    """A sentence with the numbers and names behind it."""
+    return str(_SENTENCES[table][code].format_map(evidence))
 
 
 @dataclass(frozen=True)
@@ -169,7 +107,7 @@ class Decision:
     @property
     def sentence(self) -> str:
         """The decision in words."""
-        return _SENTENCES[self.reason].format_map(dict(self.evidence))
+        return say("decision", self.reason, **self.evidence)
 
 
 # Values of the nonlinear parameters of an effect that fit as well as the best: profile likelihood intervals.
@@ -230,8 +168,6 @@ TIE_GAIN = 3.0
 #: heat leave of the best response of one or two lumped bodies (docs/method/closed-loop.md). A difference of this size between two effects
 #: is worth no more than a tie, however little noise there is.
 DISCREPANCY = 0.066
-#: An effect that is not significant by itself is no rival.
-_RIVAL_LEVEL = 0.05
 
 
 class SearchError(FusionError):
@@ -354,7 +290,7 @@ def rivals(
         ahead = score.gain - other.gain
         # What a search among more candidates gains by chance is not blurred.
         chance = (other.gain - other.excess) - (score.gain - score.excess)
-        return other.p_value < _RIVAL_LEVEL and (ahead / blurred if ahead > 0.0 else ahead) + chance < TIE_GAIN
+        return other.p_value < RIVAL_LEVEL and (ahead / blurred if ahead > 0.0 else ahead) + chance < TIE_GAIN
 
     tied = [other.name for other in others if is_rival(other)]
     if not others:
@@ -398,58 +334,6 @@ class Step:
     def is_from_second_search(self) -> bool:
         """Whether it entered after the hold-out set had been opened."""
         return self.confirmed is Confirmed.SECOND_SEARCH
-
-    def described(
-        self, candidate: Candidate, answer: Answer, where: str, *, size: float, withheld: str
-    ) -> dict[str, Any]:
-        """What results.json holds of every step, on a record and along an axis.
-
-        `where` says which readings gave the answer, ``size`` is as in :func:`rivals`.
-        """
-        tied, runner_up = rivals(self.score, self.round.scores, size)
-        return {
-            "effect": self.effect,
-            "parameters": candidate.parameters,
-            "parameter_ranges": self.score.ranges,
-            "p_value": self.score.family_wise_p,
-            "tied": tied,
-            "withheld": withheld,
-            "runner_up": runner_up,
-            **answer.described(where),
-            "confirmed_by": str(self.confirmed),
-        }
-
-
-#: A slow effect may be a part of a smooth drift without a name that is left beside it and has this share of its size.
-_SMOOTH_SHARE = 0.5
-
-
-def withheld_for(
-    step: Step, *, size_um: float = np.inf, drift_um: float = 0.0, is_smooth: bool = False, beside: str = ""
-) -> str:
-    """Why a step that is told by its course in time alone has no name: a time constant or period that these data leave open on a side, one
-    that is longer than physics allows, a drift of which it may be a part, or an effect without a name ``beside`` which it was found.
-    """
-    effect, parameters = describe_effect(step.effect), step.score.best.parameters
-    # What follows nothing that was logged is a trend since the first reading.
-    is_trend = parameters.get("follows", "warm_up") == "warm_up"
-    for name, words in (("time_constant_min", "time constant"), ("period_min", "period")):
-        # A value of which no other was tried is as open as one of which all fit.
-        low, high = step.score.ranges.get(name, [None, None] if name in parameters else [0.0, 0.0])
-        by_course = name == "period_min" or is_trend or (effect is not None and effect.excited_by)
-        if by_course and (low is None or high is None):
-            known = f"{low:.3g} min and more" if low else f"{high:.3g} min and less" if high else "any"
-            return f"its {words} is not determined ({known} fits)"
-    longest_min, minutes = effect.longest_min if effect else np.inf, float(parameters.get("time_constant_min", 0.0))
-    if minutes > longest_min:
-        return f"its time constant of {minutes:.3g} min is longer than its physics allows ({longest_min:g} min)"
-    # A walk may be mistaken for a trend as well, and only a smooth drift for what follows a load.
-    if "time_constant_min" in parameters and (is_smooth or is_trend) and drift_um >= _SMOOTH_SHARE * size_um:
-        kind = "smooth drift" if is_smooth else "drift"
-        return f"a {kind} of {drift_um:.2g} µm is left beside its {size_um:.2g} µm, of which it may be a part"
-    if beside and step.score.best.event_s is None and "period_min" not in parameters:
-        return f"it was found beside {beside.replace('_', ' ')}, which has no name itself"
-    return ""
 
 
 class Model(Protocol):
@@ -622,8 +506,12 @@ class Problem(ABC, Generic[M]):
         """Log-likelihood that is lost without one of the model's terms."""
 
     @abstractmethod
+    def hold_out_errors(self, terms: Sequence[Term]) -> Array:
+        """Errors of predicting the hold-out set from the training part, um, (n_held_out,) or (n_held_out, channels)."""
+
     def hold_out_error(self, terms: Sequence[Term]) -> float:
-        """Error of predicting the hold-out set from the training part, root mean square, um."""
+        """Root mean square of these errors, mean over the channels, um."""
+        return rmse(self.hold_out_errors(terms))
 
     def families(self, state: LoopState[M], rows: int) -> tuple[Families, list[Decision]]:
         """Candidates of every effect that can be tried beside the model, those without any left out."""
@@ -904,280 +792,3 @@ def _best_near(score: Score, near: Sequence[Candidate], gains: Callable[[Sequenc
 def of_same_kind(candidate: Candidate, chosen: Candidate) -> bool:
     """Whether two candidates differ in numbers only, or in words that a closer look may change."""
     return _words(chosen.parameters, _OPEN_WORDS).items() <= candidate.parameters.items()
-
-
-# What the evidence allows to say: intervals of errors, whether a name is confirmed, whether the model has skill, and the verdict.
-
-#: Penalties of a ridge regression, as shares of a standardised column's variance.
-PENALTIES = 10.0 ** np.arange(-5.0, 1.6, 0.5)
-#: Time constants of the lagged copies of a series, min: a factor of four apart.
-BASELINE_LAGS_MIN = (5.0, 20.0, 80.0)
-_RESAMPLES = 1000
-_PERCENT = (2.5, 97.5)
-
-
-def error_interval(errors: Array, unit: NDArray[np.int64], rng: np.random.Generator) -> schema.ErrorInterval:
-    """Root mean square error, mean over channels, and its interval from a circular block bootstrap."""
-    errors = errors[:, None] if errors.ndim == 1 else errors
-    place = np.unique(unit, return_inverse=True)[1]
-    known = np.isfinite(errors)
-    squares, number = (
-        np.column_stack([np.bincount(place, column) for column in values.T])
-        for values in (np.where(known, errors, 0.0) ** 2, known.astype(float))
-    )
-    units = squares.shape[0]
-    length = max(1, round(units**0.5))
-    starts = rng.integers(0, units, (_RESAMPLES, -(-units // length)))
-    rows = (starts[:, :, None] + np.arange(length)).reshape(_RESAMPLES, -1)[:, :units] % units
-    resampled = _rmse(squares[rows].sum(axis=1), number[rows].sum(axis=1))
-    low, high = np.nanpercentile(resampled, _PERCENT)
-    return schema.ErrorInterval(rmse_um=_rmse(squares.sum(axis=0), number.sum(axis=0)), low_um=low, high_um=high)
-
-
-def _rmse(squares: Array, number: Array) -> Array:
-    """Root mean square over the last axis' channels, mean over those with a value."""
-    known = number > 0.0
-    each = np.sqrt(np.where(known, squares / np.maximum(number, 1.0), 0.0))
-    channels = known.sum(axis=-1)
-    return np.asarray(np.where(channels > 0, each.sum(axis=-1) / np.maximum(channels, 1), np.nan))
-
-
-# What readings that an effect was not fitted to say of it: regression of these readings on its predicted share.
-
-#: Probability of bearing out any effect that is not there, and of contradicting any that is, over all effects of a model.
-ANSWER_LEVEL = 0.05
-#: Chance at which a right effect is denied its name because unseen readings follow it by another size than that predicted.
-_SIZE_LEVEL = 1e-3
-#: Sizes, over that predicted, between which an effect predicts better than none and than twice as much of it.
-_HALF, _TWICE = 0.5, 2.0
-#: Readings per column below which an interval says nothing.
-_READINGS_PER_COLUMN = 2
-#: Share of its length that a column keeps by rounding where the others contain it.
-_ROUNDING = 1e-6
-#: A size is not told where a right effect would hardly be borne out more often than one that is not there.
-_LEAST_POWER = 2.0 * ANSWER_LEVEL
-
-
-@dataclass(frozen=True)
-class Unseen:
-    """Readings of one channel that effects were not fitted to, and what is predicted of them, um.
-
-    Attributes
-    ----------
-    rows : (n,) number of each reading, by which channels share an instant
-    seconds, loadings : (n,) and (n, components) of the drift that acts there
-    response : (n,) the readings
-    beside : (n, q) what may be of any size there beside a level, such as the share of the declared effects
-    shares : (n, effects) the predicted share of every effect
-    uncertain : (n, r) errors of what was taken from the response beforehand, one column for each of unit variance; None for none
-    """
-
-    rows: NDArray[np.intp]
-    seconds: Array
-    loadings: Array
-    response: Array
-    beside: Array
-    shares: Array
-    uncertain: Array | None = None
-
-    def whitened(self) -> tuple[Array, Array, Array, int] | None:
-        """Response, shares and uncertain columns freed of `beside` and whitened by the drift and noise of these very readings, and the
-        degrees of freedom; None where they cannot be estimated.
-        """
-        if not self.rows.size:  # A displacement that ended before.
-            return None
-        level, number = np.ones((self.rows.size, 1)), self.shares.shape[1]
-        varying = np.column_stack([self.beside, self.shares])
-        design = np.column_stack([level, varying[:, independent(varying)]])
-        freedom = self.rows.size - design.shape[1]
-        if freedom < _READINGS_PER_COLUMN * design.shape[1]:
-            return None
-        try:
-            fit = estimate(self.seconds, self.loadings, self.response, design, memory=True)
-        except DriftModelError:
-            return None
-        if fit.sigma <= 0.0:
-            return None
-        rates = fit.design[:, design.shape[1] :]
-        asked = np.column_stack(
-            [self.response, self.shares, level[:, :0] if self.uncertain is None else self.uncertain]
-        )
-        laid = fit.system.whiten(np.column_stack([asked, level, self.beside, rates]))[0] / fit.sigma
-        asked, beside = laid[:, : asked.shape[1]], laid[:, asked.shape[1] :]
-        left = asked - beside @ np.linalg.lstsq(beside, asked, rcond=None)[0]
-        # What is of no size beside the others is rounding.
-        left[:, np.linalg.norm(left, axis=0) < _ROUNDING * np.linalg.norm(asked, axis=0)] = 0.0
-        return left[:, 0], left[:, 1 : 1 + number], left[:, 1 + number :], freedom
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Whether readings that an effect was not fitted to bear it out.
-
-    Attributes
-    ----------
-    slope, u : size with which it acts there over that predicted, 1 where it is right and 0 where it is not there, and its standard
-        uncertainty; infinite where these readings do not determine it
-    freedom : degrees of freedom of the uncertainty
-    level : probability of each false statement
-    against : what contradicts the effect without regard to its size, in words
-    """
-
-    slope: float = np.nan
-    u: float = np.inf
-    freedom: int = 1
-    level: float = ANSWER_LEVEL
-    against: str = ""
-
-    @property
-    def word(self) -> schema.BorneOut:
-        """Borne out where its size is more than zero and may be that predicted, contradicted where it is less and may be zero."""
-        reach = special.stdtrit(self.freedom, 1.0 - self.level) * self.u
-        if self.against:
-            return "no"
-        if not np.isfinite(reach):
-            return "cannot tell"
-        there, less, more = self.slope > reach, self.slope + reach < 1.0, self.slope - reach > 1.0
-        if there and (self.slope >= _HALF if less else self.slope <= _TWICE or not more):
-            return "yes"
-        return "no" if less and (not there or self.slope < _HALF) else "cannot tell"
-
-    @property
-    def p_value(self) -> float:
-        """Probability of a size as large where the effect is not there."""
-        return float(special.stdtr(self.freedom, -self.slope / self.u)) if np.isfinite(self.u) else 1.0
-
-    @property
-    def power(self) -> float:
-        """Probability that such readings bear a right effect out."""
-        return float(special.stdtr(self.freedom, 1.0 / self.u - special.stdtrit(self.freedom, 1.0 - self.level)))
-
-    @property
-    def is_of_other_size(self) -> bool:
-        """Whether its size differs from that predicted by more than chance and the discrepancy of a library's shape explain."""
-        wide = np.hypot(self.u, DISCREPANCY)
-        return bool(abs(self.slope - 1.0) > special.stdtrit(self.freedom, 1.0 - 0.5 * _SIZE_LEVEL) * wide)
-
-    def other_size(self, where: str) -> str:
-        """Why an effect whose size is another than that predicted has no name."""
-        return f"{self._size(where)}: what acts has another course"
-
-    def _size(self, where: str) -> str:
-        return f"{where} its size is {self.slope:.2f} ± {2.0 * self.u:.2f} (k = 2) of that predicted"
-
-    def described(self, where: str) -> dict[str, Any]:
-        """What results.json holds of it; `where` says which readings were asked."""
-        known, size = self.power >= _LEAST_POWER, self._size(where)
-        doubts = {
-            "yes": "",
-            "no": self.against or f"contradicted: {size}",
-            "cannot tell": f"not yet borne out: {size}" if known else f"not yet borne out: it hardly changes {where}",
-        }
-        return {
-            "confirmed": self.word == "yes",
-            "doubt": doubts[self.word],
-            "borne_out": self.word,
-            "borne_out_p": self.p_value,
-            "borne_out_size": self.slope if known else None,
-            "borne_out_size_u": self.u if known else None,
-            "borne_out_power": self.power,
-        }
-
-
-def answers(channels: Sequence[Unseen], *, family: int = 1) -> list[Answer]:
-    """Ask readings for the size of every effect, all effects together, over that predicted; channels share the sizes.
-
-    ``family`` is the number of effects of the model: with Bonferroni's level none of them is told falsely with the stated probability.
-    """
-    effects = channels[0].shares.shape[1]
-    asked = [(one.rows, *found) for one in channels if (found := one.whitened()) is not None]
-    if not asked or not effects:
-        return [Answer()] * effects
-    known = independent(np.vstack([shares for _, _, shares, _, _ in asked]))
-    parts = [(rows, response, shares[:, known], uncertain) for rows, response, shares, uncertain, _ in asked]
-    inverse = np.linalg.inv(np.sum([x.T @ x for _, _, x, _ in parts], axis=0))
-    slopes = inverse @ np.sum([x.T @ y for _, y, x, _ in parts], axis=0)
-    # The drifts of the channels of one machine are alike, so that many channels say little more than one, whenever each was read.
-    instants = np.unique(np.concatenate([rows for rows, *_ in parts]))
-    left = np.array([_at_nearest(y - x @ slopes, rows, instants) for rows, y, x, _ in parts])
-    laid = np.array([_at_nearest(x, rows, instants) for rows, _, x, _ in parts])
-    alike = left @ left.T
-    # A channel that is predicted exactly has no drift to share.
-    size = np.sqrt(np.maximum(np.diag(alike), np.finfo(float).tiny))
-    products = np.einsum("kni,lnj->klij", laid, laid)
-    covariance = inverse @ np.einsum("kl,klij->ij", alike / np.outer(size, size), products) @ inverse
-    for _, _, x, uncertain in parts:
-        through = inverse @ x.T @ uncertain
-        covariance = covariance + through @ through.T
-    freedom = min(found[-1] for found in asked)
-    told = {
-        k: Answer(float(a), float(u), freedom, ANSWER_LEVEL / family)
-        for k, a, u in zip(known, slopes, np.sqrt(np.diag(covariance)), strict=True)
-    }
-    return [told.get(k, Answer()) for k in range(effects)]
-
-
-def _at_nearest(values: Array, rows: NDArray[np.intp], instants: NDArray[np.intp]) -> Array:
-    """Values (n,) or (n, q) at all instants, each that of the nearest reading; their sum of squares, column by column, is kept."""
-    after = np.clip(np.searchsorted(rows, instants), 1, rows.size - 1)
-    nearest = after - (instants - rows[after - 1] <= rows[after] - instants)
-    laid = values[nearest]
-    length = np.linalg.norm(laid, axis=0)
-    return np.asarray(
-        laid * np.divide(np.linalg.norm(values, axis=0), length, out=np.ones_like(length), where=length > 0.0)
-    )
-
-
-def left_out_of_forecast(problem: Problem[M], state: LoopState[M], contradicted: Collection[int]) -> set[int]:
-    """Places of the steps that leave the forecast: contradicted ones, and those with which the hold-out set is predicted worse."""
-    steps = range(len(state.errors_without_um))
-    left = set(contradicted) & set(steps)
-    while left != set(steps) and problem.hold_out_error(state.kept(left)) > schema.ERROR_BY_CHANCE * state.errors_um[0]:
-        left.add(min(set(steps) - left, key=lambda place: problem.hold_out_error(state.kept(left | {place}))))
-    return left
-
-
-def exceeds_noise(error_um: float, noise_um: float, share: float) -> bool:
-    """Whether an error holds more than noise."""
-    return error_um**2 > (1.0 + share**2) * noise_um**2
-
-
-def excess_um(error_um: float, noise_um: float) -> float:
-    """What an error holds beside the noise, um."""
-    return float(np.sqrt(max(0.0, error_um**2 - noise_um**2)))
-
-
-def has_skill(error_um: float, last_value_um: float, mean_um: float, noise_um: float, share: float) -> bool:
-    """Whether a model predicts the hold-out set better than the last value and the mean of the training part do."""
-    return error_um < min(last_value_um, mean_um) or not exceeds_noise(error_um, noise_um, share)
-
-
-#: What is left where a model with a name predicts neither to within the noise nor as well as the best plain prediction.
-BEYOND_PLAIN = "an error of predicting the hold-out beyond the noise, larger than that of the best plain prediction"
-#: A plain regression whose error is this share of the model's or less knows something that the model lacks.
-_BETTER = 0.75
-
-
-def is_separable(error_um: float, ridge_with_lags_um: float) -> bool:
-    """Whether a cause can be named: a plain regression with lagged copies does not predict better by a quarter."""
-    return not ridge_with_lags_um <= _BETTER * error_um
-
-
-def verdict(*, named: bool, left: bool, skill: bool, separable: bool, tested: bool) -> schema.Verdict:
-    """Word for the outcome."""
-    if not skill and not tested and separable:
-        return "no_skill"
-    left = left or tested or not separable
-    if named and separable:
-        return "partial" if left else "explained"
-    return "unexplained" if left else "complete"
-
-
-def errors_of_predictions(hold_out: Mapping[str, schema.ErrorInterval]) -> dict[str, Any]:
-    """Errors on the hold-out set with their intervals, as ``errors``, ``baselines`` and ``best_baseline`` of a `Loop`."""
-    plain = {name: one for name, one in hold_out.items() if name not in schema.ModelErrors.model_fields}
-    return {
-        "errors": schema.ModelErrors(declared=hold_out["declared"], final=hold_out["final"]),
-        "baselines": schema.RunBaselines(**plain) if "mean_run" in plain else schema.Baselines(**plain),
-        "best_baseline": min(plain, key=lambda name: plain[name].rmse_um),  # type: ignore[arg-type, return-value]
-    }

@@ -6,7 +6,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.attribution.correlate import correlate
-from fusion.analysis.drift_model.fit import fit_model
+from fusion.analysis.drift_model.model import fit_model
 from fusion.analysis.drift_model.record import close_record
 from fusion.analysis.drift_model.record_data import reduce_record
 from tests.fusion import field_simulator as simulator

@@ -11,8 +11,9 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.consistency.checks import Inputs
-from fusion.analysis.drift_model.axis import FieldFault, rmse
-from fusion.analysis.drift_model.fit import fit_model
+from fusion.analysis.drift_model.axis import FieldFault
+from fusion.analysis.drift_model.model import fit_model
+from fusion.analysis.drift_model.predictions import rmse
 from fusion.analysis.effects.effect import Prior
 from fusion.analysis.effects.library import library
 from fusion.pipeline import drift_model

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fusion.analysis.drift_model.fit import Term
+from fusion.analysis.drift_model.model import Term
 from fusion.analysis.drift_model.record import SensorHealth
 from fusion.analysis.drift_model.record_data import Record
 from fusion.analysis.effects.effect import Candidate
@@ -102,18 +102,16 @@ def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[flo
     """As much of a result as the product asks for."""
     candidate = Candidate(np.zeros((50, 1)), {}, ("um",))
     terms = tuple(Term(name, candidate) for name in names)
-    predictions = [SimpleNamespace(predicted=np.full((50, 2), float(k))) for k in range(3)]
-    places = {id(term): k for k, term in enumerate(terms)}
     return SimpleNamespace(
         state=SimpleNamespace(model=SimpleNamespace(terms=terms)),
-        predictions=predictions,
-        final_um=np.array([1.0, 2.0]),
-        forecast=predictions[-1],
+        predicted={
+            name: np.full((50, 2), value) for name, value in {"declared": 0.0, "final": 2.0, "last_value": 7.0}.items()
+        },
+        hold_out_errors={"final": np.array([[1.0, 2.0]])},
         chained=[SimpleNamespace(channel_rmse_final_um=errors) for errors in chained],
-        contribution=lambda term: np.full((50, 2), 10.0 + places[id(term)]),
+        contributions=[np.full((50, 2), 10.0 + k) for k in range(len(terms))],
         noise=np.array([0.1, 0.2]),
-        hold_out=np.arange(50) >= 40,
-        plain={"last_value": np.full((50, 2), 7.0)},
+        is_held_out=np.arange(50) >= 40,
         left_out=[np.full((50, 2), 4.0), np.full((50, 2), 6.0)],
     )
 
@@ -159,7 +157,11 @@ def test_columns_whose_digits_hide_the_noise_are_named():
     steps = np.array([[1.0, 0.1], *np.zeros((len(record.sensors), 2))])
     steps[1, 1] = 1.0
     fine, coarse = (
-        list(digit_notices(SimpleNamespace(record=record, steps=steps, whole=SimpleNamespace(sigma=np.full(2, sigma)))))
+        list(
+            digit_notices(
+                SimpleNamespace(record=record, rounding=steps, whole=SimpleNamespace(sigma=np.full(2, sigma)))
+            )
+        )
         for sigma in (0.6, 0.4)
     )
     assert fine == [] and [one.code for one in coarse] == ["coarse_digits"]

@@ -14,7 +14,7 @@ from fusion.analysis.alignment.readings import read_fused
 from fusion.analysis.consistency.checks import Inputs
 from fusion.analysis.consistency.model import _interpolate, compare_lines, with_line, withhold_names
 from fusion.analysis.drift_model.axis import declare
-from fusion.analysis.drift_model.fit import Term, fit_model
+from fusion.analysis.drift_model.model import Term, fit_model
 from fusion.analysis.effects.library import library
 from fusion.pipeline.consistency import Check, run_checks
 from fusion.results.loop import AxisLine

@@ -10,7 +10,7 @@ import pytest
 
 from fusion.analysis.diagnosis import residual as module
 from fusion.analysis.diagnosis.residual import Remainder, ResidualTests, examine, examine_residual
-from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
+from fusion.analysis.drift_model.model import ModelFit, Term, fit_model
 from fusion.analysis.effects.library import library
 from fusion.analysis.levels import REMAINDER_LEVEL
 from fusion.twin.recipe import EffectRecipe

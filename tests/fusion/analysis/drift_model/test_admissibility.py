@@ -10,7 +10,6 @@ from scipy import stats
 
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.drift_model.admissibility import (
-    LEVEL,
     AxisGrounds,
     CandidateScorer,
     _centred_mean,
@@ -23,10 +22,11 @@ from fusion.analysis.drift_model.admissibility import (
     warm_up_share,
 )
 from fusion.analysis.drift_model.axis import AxisProblem, detection_limits, hold_out
-from fusion.analysis.drift_model.fit import ModelFit, fit_model
+from fusion.analysis.drift_model.model import ModelFit, fit_model
 from fusion.analysis.drift_model.search import TIE_GAIN, Decision, Reason, Score
 from fusion.analysis.effects.effect import Candidate, Effect, warm_up
 from fusion.analysis.effects.library import library
+from fusion.analysis.levels import DENIAL_LEVEL
 from fusion.results.loop import DetectionLimit
 from tests.fusion.long_tests import long_test
 from tests.fusion.small_campaign import campaign, logged, model_of, term
@@ -320,7 +320,7 @@ def test_the_right_pattern_has_uniform_p_values():
         for model in (fitted(BENDING, ("angular_growth", BENDING), seed=seed) for seed in range(60))
     ]
     # The one target that deviates most is left out, which makes the test careful.
-    assert min(p_values) > LEVEL
+    assert min(p_values) > DENIAL_LEVEL
     assert (np.array(p_values) < 0.05).mean() <= 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 60)
 
 
@@ -330,7 +330,7 @@ def test_a_stretch_that_differs_by_direction_is_no_reversal():
     model = fitted(seen, ("reversal_drift", REVERSAL))
     ((place, decision),) = inconsistent_patterns(model, model.terms, library()).items()
     assert (place, decision.effect, decision.reason) == (0, "reversal_drift", Reason.INCONSISTENT_PATTERN)
-    assert decision.evidence["p_value"] == pattern_p_value(model, model.terms[0]) < LEVEL
+    assert decision.evidence["p_value"] == pattern_p_value(model, model.terms[0]) < DENIAL_LEVEL
 
 
 def free_statistic(model: ModelFit) -> float:
@@ -350,7 +350,7 @@ def test_one_target_of_its_own_does_not_make_a_pattern_wrong(seed):
     odd = np.where(BARE.target == 3, 0.2 * COURSE, 0.0)
     model = fitted(BENDING + odd, ("angular_growth", BENDING), seed=seed)
     # Thirteen sizes beside the term's own: with that target the pattern would be wrong.
-    assert stats.chi2.sf(free_statistic(model), 13) < LEVEL
+    assert stats.chi2.sf(free_statistic(model), 13) < DENIAL_LEVEL
     assert inconsistent_patterns(model, model.terms, library()) == {}
     assert 0.01 < pattern_p_value(model, model.terms[0]) < 0.99
 
@@ -371,7 +371,7 @@ def test_a_course_that_is_uneven_between_visits_hides_no_wrong_pattern(seed):
     bending = course * BARE.share**2
     odd = course * np.select([BARE.target == 3, BARE.target == 6], [0.2, -0.2], 0.0)
     right, wrong = (fitted(seen, ("angular_growth", bending), seed=seed) for seen in (bending, bending + odd))
-    assert pattern_p_value(wrong, wrong.terms[0]) < LEVEL < pattern_p_value(right, right.terms[0])
+    assert pattern_p_value(wrong, wrong.terms[0]) < DENIAL_LEVEL < pattern_p_value(right, right.terms[0])
 
 
 def test_an_event_has_no_pattern_to_be_tested():
@@ -442,7 +442,7 @@ def test_the_course_is_that_of_the_column_that_moves_most_with_its_coefficient()
     columns = np.column_stack([COURSE * BARE.share, 100.0 * OTHER_COURSE * BARE.share])
     model = fitted(3.0 * COURSE * BARE.share**3, ("angular_growth", columns))
     assert abs(model.fit.coefficients[-1]) < 1e-2
-    assert pattern_p_value(model, model.terms[0]) < LEVEL
+    assert pattern_p_value(model, model.terms[0]) < DENIAL_LEVEL
 
 
 # Detection limits: they scale with the noise, follow from the critical gain, and say what looks alike.

@@ -22,7 +22,7 @@ from fusion.analysis.drift_model.axis import (
     second_search,
     simplify_rhythms,
 )
-from fusion.analysis.drift_model.fit import ModelFit, Term, fit_model
+from fusion.analysis.drift_model.model import ModelFit, Term, fit_model
 from fusion.analysis.drift_model.search import (
     Confirmation,
     Confirmed,
@@ -182,7 +182,7 @@ def test_an_effect_that_is_contradicted_moves_no_declared_coefficient_and_no_for
 
     monkeypatch.setattr(axis, "report_steps", doubted)
     readings = problem_of(WAVE, other).readings
-    found = axis.close_loop(readings, ["own"], effects=effects)
+    found = axis.close_axis(readings, ["own"], effects=effects)
     assert [step.effect for step in found.steps] == ["other"]
     alone = axis.fit_model(readings, axis.declare(readings, ["own"], effects))
     told = axis.average_over_drifts(alone).coefficients()["own"]
@@ -205,7 +205,7 @@ def test_on_fields_of_which_nothing_is_corrected_the_same_is_found_again(monkeyp
     report = axis.report_steps
     monkeypatch.setattr(axis, "report_steps", lambda *found: [one.model_copy(update=told) for one in report(*found)])
     problem = problem_of(WAVE, *waves.values())
-    found = axis.close_loop(problem.readings, ["own"], effects=effects)
+    found = axis.close_axis(problem.readings, ["own"], effects=effects)
     again = axis.on_corrected_fields(found, problem.readings, (), effects=effects)
     assert again.declared_coefficients == found.declared_coefficients
     assert again.rmse_final_um == pytest.approx(found.rmse_final_um, rel=1e-9)

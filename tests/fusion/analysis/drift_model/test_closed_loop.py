@@ -12,7 +12,6 @@ from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, ReadingsError, read_fused
 from fusion.analysis.drift_model.axis import (
     LoopError,
-    close_loop,
     correct_fields,
     corrected_variables,
     declare,
@@ -20,6 +19,7 @@ from fusion.analysis.drift_model.axis import (
     on_corrected_fields,
     set_aside_sites,
 )
+from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.analysis.drift_model.search import Confirmed
 from fusion.analysis.effects.effect import Candidate, Effect, Prior
 from fusion.analysis.effects.library import library

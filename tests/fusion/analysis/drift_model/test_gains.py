@@ -10,7 +10,6 @@ import pytest
 
 from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.drift_model.admissibility import CandidateScorer, _judged, prior_rows
-from fusion.analysis.drift_model.fit import SHIFT_AND_STRETCH, PriorRows, moments_of
 from fusion.analysis.drift_model.gains import (
     by_width,
     orthogonalise,
@@ -20,10 +19,11 @@ from fusion.analysis.drift_model.gains import (
     sum_products,
     sum_products_apart,
 )
+from fusion.analysis.drift_model.model import SHIFT_AND_STRETCH, PriorRows, moments_of
 from fusion.analysis.drift_model.search import Confirmed, Score
 from fusion.analysis.effects.effect import Candidate, Prior, Separable
 from interferometry.drift.gls import DriftSystem, drift_system
-from tests.fusion.analysis.drift_model.test_fit import squares_beside
+from tests.fusion.analysis.drift_model.test_model import squares_beside
 from tests.fusion.small_campaign import campaign, model_of, term
 
 BARE = campaign(cycles=20)

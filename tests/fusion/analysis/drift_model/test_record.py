@@ -11,10 +11,10 @@ import pytest
 
 from fusion.analysis.alignment.readings import Series
 from fusion.analysis.drift_model import record as module
-from fusion.analysis.drift_model.fit import Term
+from fusion.analysis.drift_model.model import Term
+from fusion.analysis.drift_model.predictions import Prediction, channel_rmse, last_values, predict
 from fusion.analysis.drift_model.record import (
     MEAN,
-    Prediction,
     RecordFit,
     RecordGrounds,
     RecordProblem,
@@ -22,14 +22,11 @@ from fusion.analysis.drift_model.record import (
     candidates_of,
     chain_forward,
     channel_gains,
-    channel_rmse,
     declare,
     fit_record,
     hold_out,
-    last_values,
     needs_of,
     one_switching_share,
-    predict,
     record_library,
     search_record,
 )
@@ -289,7 +286,9 @@ def test_every_part_from_the_third_on_is_predicted_from_the_time_before(monkeypa
     assert (first.first_h, first.last_h) == (pytest.approx(40.5 / 12.0), pytest.approx(59.5 / 12.0))
     assert first.effects == ("rhythm",)
     before, part = record.chained < 2, record.chained == 2
-    assert first.rmse_persistence_um == pytest.approx(channel_rmse(record, last_values(record, before), part).mean())
+    assert first.rmse_persistence_um == pytest.approx(
+        channel_rmse((record.displacement - last_values(record, before))[part]).mean()
+    )
     for columns, errors in (
         (record.rise, first.rmse_declared_um),
         (np.column_stack([record.rise, WAVE]), first.rmse_final_um),

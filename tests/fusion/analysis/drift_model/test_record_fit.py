@@ -7,23 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusion.analysis.drift_model.fit import SINGLE, Term, scaled_systems
 from fusion.analysis.drift_model.gains import by_width, profile_gains
-from fusion.analysis.drift_model.record import (
+from fusion.analysis.drift_model.model import SINGLE, Term, scaled_systems
+from fusion.analysis.drift_model.predictions import (
+    PENALTIES,
     chained_parts,
-    channel_gains,
     channel_rmse,
-    declare,
-    fit_record,
-    hold_out,
     last_values,
     plain_predictions,
     predict,
     rmse,
-    simulate_channels,
 )
+from fusion.analysis.drift_model.record import channel_gains, declare, fit_record, hold_out, simulate_channels
 from fusion.analysis.drift_model.record_data import Record, RecordedRun, RecordError, reduce_record
-from fusion.analysis.drift_model.search import PENALTIES
 from fusion.analysis.effects.effect import Candidate
 from tests.fusion.record_tables import record_of, runs_table, table_of, twin_table
 
@@ -247,10 +243,10 @@ def test_errors_are_those_of_the_blocks_that_were_measured():
     record = record_of(np.array([[1.0, 5.0], [np.nan, 5.0], [3.0, np.nan], [7.0, np.nan]]), np.zeros((4, 1)))
     predicted = np.zeros((4, 2))
     where = np.array([True, True, True, False])
-    np.testing.assert_allclose(channel_rmse(record, predicted, where), [np.sqrt(5.0), 5.0])
-    assert rmse(record, predicted, where) == pytest.approx(0.5 * (np.sqrt(5.0) + 5.0))
-    np.testing.assert_array_equal(channel_rmse(record, predicted, ~where), [7.0, np.nan])
-    assert rmse(record, predicted, ~where) == 7.0
+    np.testing.assert_allclose(channel_rmse((record.displacement - predicted)[where]), [np.sqrt(5.0), 5.0])
+    assert rmse((record.displacement - predicted)[where]) == pytest.approx(0.5 * (np.sqrt(5.0) + 5.0))
+    np.testing.assert_array_equal(channel_rmse((record.displacement - predicted)[~where]), [7.0, np.nan])
+    assert rmse((record.displacement - predicted)[~where]) == 7.0
 
 
 def test_persistence_repeats_the_last_value_that_was_measured():
@@ -258,7 +254,8 @@ def test_persistence_repeats_the_last_value_that_was_measured():
     train = np.array([True, True, False, False])
     # Channel 1 stays at 2, channel 2 at 5.
     np.testing.assert_allclose(
-        channel_rmse(record, last_values(record, train), ~train), [np.sqrt((16.0 + 4.0) / 2), np.sqrt((16.0 + 4.0) / 2)]
+        channel_rmse((record.displacement - last_values(record, train))[~train]),
+        [np.sqrt((16.0 + 4.0) / 2), np.sqrt((16.0 + 4.0) / 2)],
     )
 
 

@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 import fusion
 import fusion.analysis.drift_model.search as scoring_module
 import thermography.large_arrays as spool_module
-from fusion.analysis.drift_model.fit import Term
+from fusion.analysis.drift_model.gains import Gains
+from fusion.analysis.drift_model.model import Term
 from fusion.analysis.drift_model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
 from fusion.analysis.drift_model.search import (
     _SENTENCES,
     Confirmation,
     Confirmed,
     Decision,
-    Gains,
     LoopState,
     Reason,
     Round,
@@ -328,7 +328,7 @@ def test_every_reason_is_decided_with_the_fields_of_its_sentence():
     for path in Path(fusion.__file__).parent.rglob("*.py"):
         for reason, names in decided(ast.parse(path.read_text(encoding="utf-8"))):
             raised[reason] += 1
-            asked = {name for _, name, _, _ in Formatter().parse(_SENTENCES[reason]) if name}
+            asked = {name for _, name, _, _ in Formatter().parse(_SENTENCES["decision"][reason]) if name}
             assert names >= asked, f"{path.name}: {reason}"
     assert all(raised.values()), raised
 

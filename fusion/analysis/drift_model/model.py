@@ -249,6 +249,12 @@ def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
     return np.asarray(drift - q @ (q.T @ drift)), np.asarray(q)
 
 
+def wandering_um(fit: DriftFit) -> float:
+    """Root mean square of the random drift beside everything that the model names, um."""
+    drift, _ = unexplained_drift(fit)
+    return float(np.sqrt(np.mean(drift.sum(axis=1) ** 2)))
+
+
 def condition(fit: DriftFit, combination: Array, prior: Prior) -> DriftFit:
     """Observe one combination (p,) of coefficients once more, as its prior says; the variances are kept."""
     along = fit.covariance @ combination

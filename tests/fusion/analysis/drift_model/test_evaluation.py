@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,25 +10,30 @@ import pytest
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.diagnosis.residual import Remainder
 from fusion.analysis.drift_model.axis import (
-    LoopResult,
-    _size,
-    _withheld_as_misfit,
+    AxisResult,
+    _contribution,
     average_over_drifts,
     coefficients_of,
     cross_errors,
     declared_coefficients,
-    error_interval,
-    has_skill,
-    plain_errors,
     report_steps,
     residual_drift_size,
-    rmse,
-    track,
+)
+from fusion.analysis.drift_model.evaluation import (
+    Answer,
+    Contribution,
+    Surroundings,
+    Unseen,
+    answers,
+    exceeds_noise,
+    has_skill,
+    is_separable,
+    reasons_against,
     verdict,
 )
-from fusion.analysis.drift_model.fit import ModelFit, coefficient_spread, fit_model, unexplained_drift
+from fusion.analysis.drift_model.model import ModelFit, coefficient_spread, fit_model, unexplained_drift
+from fusion.analysis.drift_model.predictions import error_interval, plain_errors, rmse, track_cycles
 from fusion.analysis.drift_model.search import (
-    Answer,
     Confirmation,
     Confirmed,
     Decision,
@@ -38,11 +42,6 @@ from fusion.analysis.drift_model.search import (
     Round,
     Score,
     Step,
-    Unseen,
-    answers,
-    exceeds_noise,
-    is_separable,
-    withheld_for,
 )
 from fusion.analysis.effects.effect import Candidate, Prior
 from fusion.analysis.effects.events import cycle_starts
@@ -134,30 +133,34 @@ HOLD_OUT = {
 UNTESTED = ResidualTestsPart.model_construct()
 
 
-def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
+def result(looped: LoopState[ModelFit], left: Remainder) -> AxisResult:
     model = looped.model
     interval = ErrorInterval(rmse_um=0.2, low_um=0.1, high_um=0.3)
-    return LoopResult(
-        tracking=Tracking(every_min=20.0, model=interval, last_reading=interval, ridge=interval),
-        declared=["axis_expansion"],
-        declared_coefficients=declared_coefficients(model, 1),
+    return AxisResult(
+        state=looped,
         held_out="cycles 11 to 12 held out",
         noise_floor_um=0.1,
-        rmse_declared_um=0.8,
-        rmse_final_um=0.3,
+        hold_out_errors={"final": np.array([0.3, -0.3])},
         hold_out=HOLD_OUT,
-        hold_out_errors={},
-        skill=True,
+        skill_um=0.3,
+        tracking=Tracking(every_min=20.0, model=interval, last_reading=interval, ridge=interval),
         steps=report_steps(looped, {}, [None]),
         away=frozenset(),
-        wandering_um=0.05,
-        unnamed={},
         remainder=left,
-        residual_drift=residual_drift_size(model),
-        state=looped,
+        wandering_um=0.05,
+        declared_coefficients=declared_coefficients(model, 1),
         before=model,
         after=model,
     )
+
+
+def why_nameless(step: Step, *, before=(), **changes) -> str:
+    """The first reason against the name of a step, in surroundings that give none."""
+    own = {"rms_um": np.inf, "pattern": np.ones(1), "loss": np.inf}
+    beside = {"drift_um": 0.0, "is_smooth": False, "total_um": np.inf}
+    contribution = Contribution(**{name: changes.get(name, value) for name, value in own.items()})
+    surroundings = Surroundings(**{name: changes.get(name, value) for name, value in beside.items()})
+    return next(reasons_against(step, changes.get("answer", Answer()), contribution, before, surroundings), "")
 
 
 def test_the_rmse_leaves_sites_without_a_prediction_out():
@@ -272,7 +275,7 @@ def test_nothing_is_explained_where_the_final_error_is_beyond_the_noise_and_a_pl
 def test_what_all_cycles_describe_as_well_without_it_has_no_name():
     without = replace(measured(), response=measured().response - 0.5 * LATE)
     (step,) = report_steps(state(model_of(without, [term(WAVE), term(LATE, "a")])), {}, [Answer(0.9, 0.2, 100)])
-    assert step.withheld.startswith("all cycles together are described as well without it")
+    assert step.withheld.startswith("all readings together are described as well without it")
     (step,) = report_steps(state(model_of(measured(), [term(WAVE), term(LATE, "a")])), {}, [Answer(0.9, 0.2, 100)])
     assert not step.withheld
 
@@ -286,7 +289,7 @@ def test_no_laser_settles_for_longer_than_minutes(effect, minutes, withheld):
         score(effect, ranges={"time_constant_min": [20.0, 30.0]}),
         candidate=Candidate(WAVE[:, None], parameters, ("ppm",)),
     )
-    said = withheld_for(Step(tried, Round(()), Confirmed.LATER_CYCLES))
+    said = why_nameless(Step(tried, Round(()), Confirmed.LATER_CYCLES))
     assert bool(said) == withheld and ("than its physics allows (24 min)" in said) == withheld
 
 
@@ -314,9 +317,11 @@ def test_significant_effects_without_a_name_keep_the_verdict_from_being_complete
     found = replace(result(state(fitted()), remainder()), steps=[])
     assert found.verdict == "complete"
     assert repr(found) == "LoopResult: complete; declared axis_expansion; added nothing; held-out error 0.8 -> 0.3 um"
-    assert replace(found, unnamed={"thermal_lag": 1e-34}).verdict == "unexplained"
-    assert replace(found, skill=False).verdict == "no_skill"
-    assert replace(found, skill=False, unnamed={"thermal_lag": 1e-34}).verdict == "unexplained"
+    lag = Decision("thermal_lag", Reason.INCONSISTENT_PATTERN, {"search_p": 1e-34})
+    nameless = replace(found, state=found.state.decide(lag.on_evidence(p_value=1e-5)))
+    assert nameless.verdict == "unexplained"
+    assert replace(found, skill_um=0.95).verdict == "no_skill"
+    assert replace(nameless, skill_um=0.95).verdict == "unexplained"
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -473,7 +478,7 @@ def test_a_cycle_measured_from_time_to_time_corrects_the_prediction():
     wander = 0.5 * rng.standard_normal(61).cumsum()
     moved = replace(bare, series={}, response=wander[bare.cycle] + 0.4 * rng.standard_normal(bare.seconds.size))
     used = moved.cycle <= 48
-    told = track(fit_model(moved, [], used=used), plain_errors(moved, used)["ridge"])
+    told = track_cycles(fit_model(moved, [], used=used), plain_errors(moved, used)["ridge"])
     assert told.every_min == pytest.approx(np.median(np.diff(np.unique(cycle_starts(moved)))) / 60.0)
     # Repeating a reading repeats its noise: a step of the walk and two noises, here by the very readings.
     cycle, response = moved.cycle, moved.response
@@ -590,7 +595,7 @@ def test_the_size_on_unseen_readings_has_three_answers(slope, u, word):
     """The one-sided 95 % point of Student's t with 100 degrees of freedom is 1.66."""
     answer = Answer(slope, u, 100)
     assert answer.word == word
-    told = answer.described("on the hold-out set")
+    told = answer.described()
     assert told["confirmed"] is (word == "yes") and (told["doubt"] == "") is (word == "yes")
 
 
@@ -666,7 +671,7 @@ def test_channels_that_drift_alike_count_as_one(rng):
 def test_what_does_not_change_on_unseen_readings_is_not_told(rng):
     (one,) = unseen(rng, 1.0, channels=1)
     (answer,) = answers([replace(one, shares=np.full((100, 1), 2.0))])
-    assert answer.word == "cannot tell" and answer.described("there")["borne_out_size"] is None
+    assert answer.word == "cannot tell" and answer.described()["borne_out_size"] is None
 
 
 def test_what_was_taken_off_beforehand_adds_its_uncertainty(rng):
@@ -750,7 +755,7 @@ def test_no_cause_is_separable_where_a_plain_regression_is_better_by_a_quarter()
 def test_what_is_told_by_its_course_alone_needs_a_time_that_is_determined(effect, parameter, interval, why):
     follows = {} if effect == "laser_warm_up" else {"follows": "duty"}
     tried = replace(score(effect, ranges={parameter: interval}), candidate=Candidate(WAVE[:, None], follows, ("um",)))
-    assert withheld_for(Step(tried, Round(()), Confirmed.LATER_CYCLES)) == why
+    assert why_nameless(Step(tried, Round(()), Confirmed.LATER_CYCLES)) == why
 
 
 @pytest.mark.parametrize(
@@ -777,7 +782,7 @@ def test_what_is_told_by_its_course_alone_needs_a_time_that_is_determined(effect
 def test_a_trend_or_a_part_of_a_smooth_drift_has_no_name(effect, parameters, ranges, why):
     chosen = replace(score(effect, ranges=ranges), candidate=Candidate(WAVE[:, None], parameters, ("um",)))
     step = Step(chosen, Round(()), Confirmed.LATER_CYCLES)
-    assert withheld_for(step, size_um=0.4, drift_um=0.2, is_smooth=True) == why
+    assert why_nameless(step, rms_um=0.4, drift_um=0.2, is_smooth=True) == why
 
 
 def test_a_trend_may_be_a_part_of_a_walk_and_what_follows_a_load_may_not():
@@ -789,10 +794,10 @@ def test_a_trend_may_be_a_part_of_a_walk_and_what_follows_a_load_may_not():
         return Step(chosen, Round(()), Confirmed.LATER_CYCLES)
 
     trend, following = step({"time_constant_min": 8.0}), step({"time_constant_min": 8.0, "follows": "duty"})
-    assert withheld_for(trend, size_um=0.4, drift_um=0.2) == (
+    assert why_nameless(trend, rms_um=0.4, drift_um=0.2) == (
         "a drift of 0.2 µm is left beside its 0.4 µm, of which it may be a part"
     )
-    assert withheld_for(trend, size_um=0.4, drift_um=0.19) == withheld_for(following, size_um=0.4, drift_um=0.2) == ""
+    assert why_nameless(trend, rms_um=0.4, drift_um=0.19) == why_nameless(following, rms_um=0.4, drift_um=0.2) == ""
 
 
 @pytest.mark.parametrize(
@@ -806,17 +811,12 @@ def test_what_the_course_of_a_larger_effect_of_the_same_pattern_may_miss_has_no_
     noise = 0.01 * np.random.default_rng(4).standard_normal(BARE.seconds.size)
     response = 2.0 * slow / slow.std() + 2.0 * size * other / other.std() + noise
     model = model_of(replace(BARE, response=response), [lag, term(other / other.std(), "b")])
-    confirmation = Confirmation(True, Confirmed.LATER_CYCLES, 4.0, 0.02)
-    steps = tuple(
-        Step(
-            replace(score(one.effect, confirmation=confirmation), candidate=one.candidate),
-            Round(()),
-            Confirmed.LATER_CYCLES,
-        )
-        for one in model.terms
+    larger, own = (_contribution(model, one) for one in model.terms)
+    # An instant, so that no reason but the course is left.
+    event = Step(
+        replace(score("b"), candidate=Candidate(WAVE[:, None], {}, ("um",), 9.0)), Round(()), Confirmed.LATER_CYCLES
     )
-    larger = [SimpleNamespace(withheld=of_larger)]
-    said = _withheld_as_misfit(LoopState(model, steps=steps), 1, _size(model, model.terms[1]), larger)
+    said = why_nameless(event, before=[(model.terms[0], larger, of_larger)], rms_um=own.rms_um, pattern=own.pattern)
     assert bool(said) == withheld and ("the course of a" in said) == withheld
 
 
@@ -825,8 +825,15 @@ def test_what_was_found_beside_an_effect_without_a_name_has_none_unless_it_has_a
         candidate = Candidate(WAVE[:, None], parameters, ("um",), event_s)
         return Step(replace(score("a"), candidate=candidate), Round(()), Confirmed.LATER_CYCLES)
 
-    assert (
-        withheld_for(step({}), beside="angular_growth")
-        == "it was found beside angular growth, which has no name itself"
-    )
-    assert withheld_for(step({}, event_s=9.0), beside="angular_growth") == ""
+    nameless = term(WAVE, "angular_growth")
+    before = [(nameless, Contribution(0.1, np.ones(1), 9.0), "its time constant is not determined")]
+    assert why_nameless(step({}), before=before) == "it was found beside angular growth, which has no name itself"
+    assert why_nameless(step({}, event_s=9.0), before=before) == ""
+
+
+def test_unseen_readings_that_follow_by_another_size_leave_no_name_unless_the_law_of_the_load_is_open():
+    step, other = Step(score("a"), Round(()), Confirmed.LATER_CYCLES), Answer(0.65, 0.05, 100)
+    own, beside = Contribution(1.0, np.ones(1), 9.0), Surroundings(0.0, False, 2.0)
+    (said,) = reasons_against(step, other, own, [], beside)
+    assert said == "on the hold-out set its size is 0.65 ± 0.10 (k = 2) of that predicted: what acts has another course"
+    assert not list(reasons_against(step, other, own, [], replace(beside, of_own_law={"a"})))

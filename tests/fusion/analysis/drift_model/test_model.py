@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from fusion.analysis.alignment.readings import Readings
-from fusion.analysis.drift_model.fit import (
+from fusion.analysis.drift_model.model import (
     PARTS,
     SINGLE,
     ModelFit,
