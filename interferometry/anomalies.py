@@ -61,7 +61,8 @@ class Anomaly:
     p_value : family-wise: corrected for all positions, directions and kinds
     scatter_um : random standard deviation of the position and direction, um
     extra_um : standard deviation beyond that of the other positions, um; the height of a step, the amplitude of a period
-    stands_out : whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme
+    stands_out
+        Whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme
         Studentized deviate test at `ESD_LEVELS`)
     at_cycle : number of the first cycle after a step
     period_s : period of a periodic motion, s

@@ -69,8 +69,9 @@ class FlirInspection:
     ----------
     frames : usable frames in order of time
     rejected : frames that cannot be used, and why
-    evaluation : maximum, minimum and mean of every frame and of the regions that it stores, see
-        `thermography.evaluation.evaluate_regions`; None where the parameters give no temperature
+    evaluation
+        Maximum, minimum and mean of every frame and of the regions that it stores, see `thermography.evaluation.evaluate_regions`;
+        None where the parameters give no temperature
     warnings : everything that is implausible or damaged
     """
 

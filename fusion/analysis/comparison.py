@@ -45,8 +45,9 @@ class ProfileChange:
     position_mm : (n,) positions that both tests have, mm
     left_out : positions that one test has alone
     remaining_um, remaining_u_um : its standard uncertainty
-    shapes : family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and
-        blocks; last the rest of the profile, with its largest value and the p-value of all of it
+    shapes
+        Family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and blocks;
+        last the rest of the profile, with its largest value and the p-value of all of it
     tests : how many tests were made
     """
 

@@ -449,8 +449,9 @@ class FinishedCycle:
     start, end : first instant of the cycle and of the next one, on the laser's clock; NaT where the readings have no times
     field : (y, x), mean temperature of the table in the cycle, degC; None where no frame of it can be used
     rise_K : mean rise of the table since the first cycle that has a field, K; NaN where it is not known
-    drift_um : (target,), change of the deviation at every target since the first cycle, mean of the directions, um; NaN where a
-        reading is missing. Empty without a laser.
+    drift_um
+        (target,), change of the deviation at every target since the first cycle, mean of the directions, um; NaN where a reading is
+        missing. Empty without a laser.
     """
 
     number: int

@@ -59,8 +59,9 @@ class RecordTruth:
     Attributes
     ----------
     recipe : the recipe asked for
-    table : as logged: `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min. And every part
-        of the displacements (time, channel), um.
+    table
+        As logged: `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min. And every part of
+        the displacements (time, channel), um.
     parts : names of the parts that the displacement is the sum of
     """
 

@@ -54,8 +54,9 @@ class Truth:
     schedule : when and where each reading is taken
     session : the states behind the readings
     plate : the true temperature field, at any point and time
-    readings : (cycle, direction, target): `deviation` as measured, um (NaN where lost), `time`, one variable in um for every part of
-        the deviation, `mean_profile` and `scatter`
+    readings
+        (cycle, direction, target): `deviation` as measured, um (NaN where lost), `time`, one variable in um for every part of the
+        deviation, `mean_profile` and `scatter`
     frames : xarray.Dataset
         (frame,): true time `time_s`, offset `camera_offset_K`, `reflected_K`, `housing` temperature, `table_position` and `knocked`.
     parts : names of the parts that the deviation is the sum of

@@ -399,7 +399,8 @@ class Smoothed(NamedTuple):
     ----------
     levels : (n, components, p), smoothed drift levels, in the units of the columns
     level_covariance : (n, components, components), covariance of the levels, the columns' coefficients being known
-    u : (n, p), smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is each reading's own estimated noise, ``u /
+    u
+        (n, p), smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``independent * u`` is each reading's own estimated noise, ``u /
         D`` its deletion residual, the reading minus its prediction from all others.
     D : (n,), variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.
     """

@@ -179,8 +179,9 @@ class FrameHeader:
     camera : camera and lens
     limits : range in which the camera is calibrated
     settings : focus, frame rate and display settings
-    housekeeping : temperatures measured inside the camera by sensor name, K (lens, shutter, aperture, capsule, detector); "sensor 1"
-        to "sensor 4" in files that do not name them
+    housekeeping
+        Temperatures measured inside the camera by sensor name, K (lens, shutter, aperture, capsule, detector); "sensor 1" to "sensor
+        4" in files that do not name them
     notes : corrections and assumptions that the reader made
     """
 

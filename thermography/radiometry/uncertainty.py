@@ -65,8 +65,9 @@ class InputUncertainty:
     camera_offset_K : standard uncertainty of the camera's reading of a black body that is the same at all temperatures, K
     camera_scale : float
         Standard uncertainty of that reading as a share of the reading in degC ("2 % of reading" of a data sheet), without unit.
-    camera_drift_K : standard uncertainty of the change of the camera's zero between two cycles, K; it enters rises only, because the
-        accuracy of the camera holds at all times. No data sheet states it: 0 by default.
+    camera_drift_K
+        Standard uncertainty of the change of the camera's zero between two cycles, K; it enters rises only, because the accuracy of
+        the camera holds at all times. No data sheet states it: 0 by default.
     netd_K : noise equivalent temperature difference: standard deviation of one pixel in one frame on a black body, K
     netd_temperature_degC : temperature of this black body, degC
 

@@ -602,19 +602,22 @@ class Registration:
     projection : plan to sensor
     fiducials : fiducials used, by name, as listed in the plan
     located : their centroids on the sensor with contrast and uncertainty
-    residual_mm, leave_one_out_mm : mm, registration residual: distance on the plan between the observed and the listed position of
-        each fiducial, with the fiducial in the fit and without it (NaN where the others do not determine the fit)
+    residual_mm, leave_one_out_mm
+        Registration residual, mm: distance on the plan between the observed and the listed position of each fiducial, with the
+        fiducial in the fit and without it (NaN where the others do not determine the fit)
     rms_mm : mm, root mean square of `residual_mm`; NaN where four fiducials determine the plan exactly, which tells nothing
-    scatter_mm, scatter_px : mm and px, standard deviation of the places along either coordinate, on the plan and on the sensor, from
-        the residuals and their degrees of freedom; not below the uncertainty of the centroids
+    scatter_mm, scatter_px
+        Standard deviation of the places along either coordinate, on the plan in mm and on the sensor in px, from the residuals and
+        their degrees of freedom; not below the uncertainty of the centroids
     area_ratio : median ratio of the imaged to the listed area of the discs; NaN for points
     unchecked : fiducials whose place the others predict too badly to notice if it were wrong by a disc's diameter; all of four
     left_out : reason, by name, for every listed fiducial that was not used
     masked : every fiducial on the table, used or not: their pixels do not show the table's temperature
     shape : (rows, columns) of the frames
     lens : the calibrated lens that was given
-    covariance : (p, p), of the homography and of the distortion, p = 8 with a calibrated lens, else 12: coefficients that were not
-        fitted are not known to be zero. See `thermography.registration.projection.parameter_covariance`.
+    covariance
+        (p, p), of the homography and of the distortion, p = 8 with a calibrated lens, else 12: coefficients that were not fitted are
+        not known to be zero. See `thermography.registration.projection.parameter_covariance`.
     """
 
     homography: Array
