@@ -71,7 +71,7 @@ speeds: $(VENV)/.test
 
 # Share of small changes to a module (signs, limits, comparisons) that its tests notice, on a copy of what is staged or committed; fails
 # below 90 %. A sample takes some minutes: make mutants MODULE=fusion/analysis/attribution/two_sessions.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
-MODULE ?= fusion/analysis/drift_model/result.py
+MODULE ?= fusion/analysis/drift_model/evaluation.py
 SAMPLE ?= 60
 SEED ?= 1
 mutants: $(VENV)/.test

@@ -50,7 +50,7 @@ _ALSO = {
     # The memory of the noise is held where profiles and anomalies meet it.
     "interferometry/drift/gls.py": ("tests/interferometry/drift/test_estimate.py",),
     # The end of the search, and the scorer of candidates.
-    "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_result.py",),
+    "fusion/analysis/drift_model/search.py": ("tests/fusion/analysis/drift_model/test_evaluation.py",),
     "fusion/analysis/drift_model/admissibility.py": ("tests/fusion/analysis/drift_model/test_gains.py",),
 }
 #: Decorators that change no value, only speed and form.
