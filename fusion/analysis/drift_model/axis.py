@@ -41,6 +41,7 @@ from fusion.analysis.drift_model.evaluation import (
     Surroundings,
     Unseen,
     answers,
+    contradicted_places,
     describe_step,
     leading_pattern,
     left_out_of_forecast,
@@ -62,7 +63,7 @@ from fusion.analysis.drift_model.model import (
     unexplained_drift,
     wandering_um,
 )
-from fusion.analysis.drift_model.predictions import error_interval, plain_errors, rmse, track_cycles
+from fusion.analysis.drift_model.predictions import error_interval, error_intervals, plain_errors, rmse, track_cycles
 from fusion.analysis.drift_model.search import (
     FINAL,
     HOLD_OUT_SHARE,
@@ -281,10 +282,7 @@ def close_axis(
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
         hold_out_errors=errors,
-        hold_out={
-            name: error_interval(missed, readings.cycle[~used], np.random.default_rng(seed))
-            for name, missed in errors.items()
-        },
+        hold_out=error_intervals(errors, readings.cycle[~used], seed=seed),
         skill_um=problem.hold_out_error(state.model.terms) if late else state.errors_um[-1],
         tracking=track_cycles(problem.fitted(forecast), plain["ridge"]),
         steps=steps,
@@ -983,11 +981,6 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
     about = values - mean
     covariance = np.tensordot(weight, np.array([one[2] for one in found]), 1) + (about.T * weight) @ about
     return replace(model, fit=replace(fit, coefficients=mean, covariance=covariance))
-
-
-def contradicted_places(steps: Sequence[AddedEffect]) -> list[int]:
-    """Return the places of the added effects that the hold-out set contradicts."""
-    return [place for place, step in enumerate(steps) if not step.keeps_name]
 
 
 def coefficients_beside(

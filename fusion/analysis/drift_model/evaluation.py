@@ -369,6 +369,11 @@ def describe_step(
 # What follows from it: whether the model has skill, and the verdict.
 
 
+def contradicted_places(steps: Sequence[schema.StepPart]) -> list[int]:
+    """Return the places of the added effects that readings which they were not fitted to contradict."""
+    return [place for place, step in enumerate(steps) if not step.keeps_name]
+
+
 def left_out_of_forecast(problem: Problem[M], state: LoopState[M], contradicted: Collection[int]) -> set[int]:
     """Places of the steps that leave the forecast: contradicted ones, and those with which the hold-out set is predicted worse."""
     steps = range(len(state.errors_without_um))

@@ -53,6 +53,13 @@ def error_interval(errors: Array, unit: NDArray[np.int64], rng: np.random.Genera
     return schema.ErrorInterval(rmse_um=_rmse(squares.sum(axis=0), number.sum(axis=0)), low_um=low, high_um=high)
 
 
+def error_intervals(
+    errors: Mapping[str, Array], unit: NDArray[np.int64], *, seed: int = 1
+) -> dict[str, schema.ErrorInterval]:
+    """Intervals of the errors of several predictions, each from the same resamples."""
+    return {name: error_interval(missed, unit, np.random.default_rng(seed)) for name, missed in errors.items()}
+
+
 def _rmse(squares: Array, number: Array) -> Array:
     """Root mean square over the last axis' channels, mean over those with a value."""
     known = number > 0.0
@@ -211,8 +218,7 @@ def track_record(record: Record, train: NDArray[np.bool_], forecast: Array, ridg
         carried[rows, k] = missed[:, 0] - missed[:, 1] * fit.coefficients[0]
     last = record.displacement[held] - record.displacement[before]
     errors = {"model": carried[held], "last_reading": last, "ridge": last - (ridge[held] - ridge[before])}
-    intervals = {name: error_interval(one, held, np.random.default_rng(1)) for name, one in errors.items()}
-    return schema.Tracking(every_min=every * record.block_s / 60.0, **intervals)
+    return schema.Tracking(every_min=every * record.block_s / 60.0, **error_intervals(errors, held))
 
 
 def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:

@@ -36,6 +36,7 @@ from fusion.analysis.drift_model.evaluation import (
     Surroundings,
     Unseen,
     answers,
+    contradicted_places,
     describe_step,
     exceeds_noise,
     leading_pattern,
@@ -55,7 +56,7 @@ from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk, rank
 from fusion.analysis.drift_model.predictions import (
     Prediction,
     channel_rmse,
-    error_interval,
+    error_intervals,
     folds,
     last_values,
     plain_predictions,
@@ -1125,7 +1126,7 @@ def close_record(
         ),
     )
     steps = report_steps(record, state, told, contributed, withheld, left_out)
-    away = left_out_of_forecast(problem, state, [place for place, step in enumerate(steps) if not step.keeps_name])
+    away = left_out_of_forecast(problem, state, contradicted_places(steps))
     kept = state.kept(away)
     forecast = problem.predict(kept)
     predicted = {
@@ -1141,9 +1142,7 @@ def close_record(
         held_out=description,
         noise_floor_um=float(np.mean(noise_floor(whole.sigma, step))),
         hold_out_errors=errors,
-        hold_out={
-            name: error_interval(one, np.flatnonzero(~train), np.random.default_rng(1)) for name, one in errors.items()
-        },
+        hold_out=error_intervals(errors, np.flatnonzero(~train)),
         skill_um=rmse(errors["final"]),
         tracking=None if record.runs else track_record(record, train, forecast.predicted, predicted["ridge"]),
         steps=steps,
