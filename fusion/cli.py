@@ -261,7 +261,7 @@ def _read_whole(campaign: Path | str, folder: Path) -> Results | None:
     if isinstance(campaign, str):
         return None
     from fusion.campaign.config import load_campaign
-    from fusion.pipeline.stages import kept_results
+    from fusion.pipeline.resume import kept_results
 
     return kept_results(load_campaign(campaign), folder)
 

@@ -134,7 +134,7 @@ _AXIS, _RECORD, _TEST = ("interferometry",), ("record",), ("interferometry", "re
 
 
 def key(default: Any, *labels: str, example: Any = "", about: str = "", rows: int | None = None, **parts: Any) -> Any:
-    """Declare a key for file, draft, form, sheet and reference; `fusion.campaign.keys.Key` describes its parts."""
+    """Declare a key for file, draft, form, sheet and reference; `fusion.campaign.schema.Key` describes its parts."""
     limits = {name: parts.pop(name) for name in ("ge", "gt", "min_length", "max_length") if name in parts}
     parts |= {"labels": labels} if len(labels) > 1 else {}
     parts |= {} if rows is None else {"rows": rows}

@@ -15,7 +15,7 @@ import numpy as np
 
 from fusion.campaign.columns import ROLES, ColumnsError, TableProposal, propose_runs
 from fusion.campaign.inspect import FolderContent, Kind, Recognised, scan_folder
-from fusion.campaign.keys import Key, keys_of, known_keys
+from fusion.campaign.schema import Key, keys_of, known_keys
 from fusion.campaign.values import column_conversion, role_of_unit
 from fusion.common import FusionError
 from fusion.results.progress import counted

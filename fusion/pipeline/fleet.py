@@ -17,7 +17,7 @@ import psutil
 from fusion.campaign.config import load_campaign
 from fusion.campaign.values import in_order
 from fusion.common import FusionError
-from fusion.pipeline.stages import kept_results
+from fusion.pipeline.resume import kept_results
 from fusion.pipeline.workers import start_run
 from fusion.report.fleet import SUMMARY, Row, as_csv, as_json, read_rows, render_fleet, with_findings, write_book
 from fusion.results.folder import MANIFEST, claim, open_folder

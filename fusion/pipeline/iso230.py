@@ -22,8 +22,8 @@ from fusion.campaign.config import (
     load_campaign,
 )
 from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
-from fusion.campaign.keys import Key, keys_of
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
+from fusion.campaign.schema import Key, keys_of
 from fusion.campaign.time_zones import is_dated, shown_zone
 from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window
 from fusion.results.numbers import exact, moment

@@ -13,7 +13,7 @@ import xarray as xr
 
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
-from fusion.campaign.keys import keys_of
+from fusion.campaign.schema import keys_of
 from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
 from fusion.pipeline.iso230 import date_of, files_of_run, hashed, state_conditions

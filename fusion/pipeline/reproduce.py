@@ -12,8 +12,8 @@ from typing import Any
 from fusion.campaign.config import load_campaign
 from fusion.campaign.remote import fetched_campaign, is_address
 from fusion.common import versions
+from fusion.pipeline.resume import hash_files, noted_campaign
 from fusion.pipeline.run import run_campaign
-from fusion.pipeline.stages import hash_files, noted_campaign
 from fusion.results.progress import Report, silent
 from fusion.results.results import ResultsError, in_this_schema
 from fusion.results.store import is_file_list

@@ -45,7 +45,7 @@ from fusion.pipeline.consistency import (
 from fusion.pipeline.iso230 import complete_sheet
 from fusion.pipeline.iso230_3 import thermal_tests
 from fusion.pipeline.record import RecordSource, model_record, read_record_source
-from fusion.pipeline.stages import (
+from fusion.pipeline.resume import (
     STAGES,
     Run,
     describe_run,

@@ -13,7 +13,7 @@ from fusion.campaign.config import load_campaign
 from fusion.common import versions
 from fusion.pipeline import reproduce as module
 from fusion.pipeline.reproduce import reproduce
-from fusion.pipeline.stages import hash_files
+from fusion.pipeline.resume import hash_files
 from fusion.results.results import ResultsError
 from tests.fusion.campaign_parts import change
 

@@ -13,7 +13,7 @@ import panel as pn
 from fusion.app.parts import Parts, column, heading
 from fusion.app.setup.campaign import CampaignText
 from fusion.campaign.draft import DIRECTIONS, TO_FILL
-from fusion.campaign.keys import Key, known_keys
+from fusion.campaign.schema import Key, known_keys
 from fusion.common import FusionError
 from fusion.results.progress import counted
 

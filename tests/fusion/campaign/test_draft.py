@@ -10,7 +10,7 @@ import pytest
 from fusion.campaign.config import load_campaign
 from fusion.campaign.draft import Asker, DraftError, draft_lines, unused_files, write_campaign, write_campaigns
 from fusion.campaign.inspect import scan_folder
-from fusion.campaign.keys import known_keys
+from fusion.campaign.schema import known_keys
 from fusion.campaign.values import QuantityError
 from fusion.pipeline.check import check_campaign
 from fusion.pipeline.fleet import find_members

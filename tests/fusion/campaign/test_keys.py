@@ -14,7 +14,7 @@ from fusion.app.setup.campaign import CampaignText
 from fusion.app.setup.form import form_fields, read_fields, write_fields
 from fusion.campaign.config import ReportTable, campaign_schema
 from fusion.campaign.draft import Asker, write_campaign
-from fusion.campaign.keys import Key, keys_of, known_keys
+from fusion.campaign.schema import Key, keys_of, known_keys
 from fusion.campaign.values import QuantityError, split_uncertainty
 from fusion.pipeline.iso230 import state_conditions
 from fusion.report.sheet import Stated

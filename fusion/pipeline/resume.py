@@ -1,4 +1,4 @@
-"""The stages of a run: what each depends on, where its product is, and whether it must be computed or is kept."""
+"""What of an earlier run is kept: on what each stage depends, where its product is, and whether it must be computed again."""
 
 from __future__ import annotations
 

@@ -15,8 +15,7 @@ import xarray as xr
 
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.iso230 import files_of_run
-from fusion.pipeline.run import RUN, run_stages
-from fusion.pipeline.stages import (
+from fusion.pipeline.resume import (
     FileState,
     Run,
     dependencies,
@@ -28,6 +27,7 @@ from fusion.pipeline.stages import (
     refuse_other_campaign,
     stamp_run,
 )
+from fusion.pipeline.run import RUN, run_stages
 from fusion.pipeline.workers import Worker
 from fusion.report.charts.embedded import Drawn
 from fusion.results.axis import AlignmentPart
@@ -314,7 +314,7 @@ def test_a_run_of_another_version_or_none_is_not_whole(results_folder, campaign_
     campaign = load_campaign(campaign_folder / "campaign.toml")
     assert kept_results(campaign, results_folder) is not None
     assert kept_results(campaign, tmp_path / "absent") is None
-    monkeypatch.setattr("fusion.pipeline.stages.versions", lambda: {"thermofuse": "0.0.1"})
+    monkeypatch.setattr("fusion.pipeline.resume.versions", lambda: {"thermofuse": "0.0.1"})
     assert kept_results(campaign, results_folder) is None
 
 
