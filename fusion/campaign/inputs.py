@@ -801,9 +801,9 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     TableError
         If a table cannot be read, or runs do not fit together.
 
-    Examples
-    --------
-    >>> read_record(load_campaign("record/campaign.toml"))  # doctest: +SKIP
+    Notes
+    -----
+    Tables, runs and their times: docs/method/records.md.
     """
     paths = campaign.record_paths()
     if len(paths) == 1:

@@ -60,11 +60,6 @@ def close_loop(
     Notes
     -----
     Procedure, assumptions and error rates: docs/method/closed-loop.md, docs/method/records.md.
-
-    Examples
-    --------
-    >>> record = reduce_record(read_record(load_campaign("record/campaign.toml")))  # doctest: +SKIP
-    >>> print(close_loop(record, ["quasi_static"]))  # doctest: +SKIP
     """
     if isinstance(measured, Record):
         return close_record(measured, declared, seed=seed, effects=effects, progress=progress)

@@ -273,10 +273,6 @@ def reduce_record(table: xr.Dataset) -> Record:
     Notes
     -----
     Blocks, digits and runs: docs/method/records.md.
-
-    Examples
-    --------
-    >>> record = reduce_record(read_record(load_campaign("record/campaign.toml")))  # doctest: +SKIP
     """
     time = table["time"].values.astype("datetime64[ns]")
     elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
