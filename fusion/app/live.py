@@ -136,7 +136,7 @@ def _since_first(
         line = np.array(values, float)
         if np.isfinite(line).any():
             looks = {"seen": span_words(line, unit), "colour": colour, "marker": marker}
-            courses.add(cycle, line, name, heading=f"{quantity}, {name} / {unit}", **looks)
+            courses.add(cycle, line, name, column=f"{quantity}, {name} / {unit}", **looks)
     told = f"{counted(cycle.size, 'cycle')}, {quantity}"
     return courses.chart(told) if len(courses.columns) > 1 else None
 
