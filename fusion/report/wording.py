@@ -15,7 +15,7 @@ import numpy as np
 import rich.table
 from markupsafe import Markup
 
-from fusion.analysis.diagnosis.diagnose import CAUSES
+from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.messages import cell, printable
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window

@@ -15,7 +15,7 @@ from typer.main import get_command
 
 import thermofuse
 from fusion import cli
-from fusion.analysis.diagnosis.diagnose import CAUSES
+from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.effect import Effect
 from fusion.analysis.effects.library import LIBRARY
 from fusion.analysis.effects.thermal import QUASI_STATIC

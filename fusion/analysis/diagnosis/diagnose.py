@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import xarray as xr
 
+from fusion.analysis.diagnosis.causes import CAUSES, undetermined_check
 from fusion.analysis.diagnosis.explanations import (
     LAGS_S,
     ProfileFit,
@@ -34,48 +35,6 @@ from fusion.analysis.diagnosis.explanations import (
 from fusion.analysis.levels import CAUSE_LEVELS, SERIAL_LEVEL
 from fusion.results.axis import Cause
 from interferometry.common import one_thread
-
-
-@dataclass(frozen=True)
-class CauseRecord:
-    """A cause as a reader meets it.
-
-    Attributes
-    ----------
-    words : name in words
-    check : what to inspect on the machine, or how to repeat the test; one sentence
-    """
-
-    words: str
-    check: str
-
-
-CAUSES: dict[Cause, CauseRecord] = {
-    "structural": CauseRecord(
-        "mechanical scatter",
-        "Inspect guideway, scale, screw and nut at this position for preload, wear, contamination and looseness; repeat the "
-        "test with small steps around it.",
-    ),
-    "local_temperature": CauseRecord(
-        "local temperature",
-        "Find what heats the table near this position (drive, pipe, chips, sun) and whether the fixture bends with it; repeat "
-        "the test with that source switched on and off.",
-    ),
-    "stick_slip": CauseRecord(
-        "stick-slip",
-        "Inspect lubrication, seals, wipers and the drive's gain at low speed around this position; repeat the test at another "
-        "feed rate and after lubrication.",
-    ),
-    "step": CauseRecord(
-        "sudden step",
-        "Inspect fixture, optics, clamps and the coupling of the scale, and look for an event at that time in the machine's log.",
-    ),
-    "undetermined": CauseRecord(
-        "undetermined",
-        "These data do not decide: repeat the test with more cycles in both directions, a varied duty cycle and a temperature "
-        "sensor at this position.",
-    ),
-}
 
 #: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
@@ -284,15 +243,6 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
         against_it=tuple(against),
         check=undetermined_check(leading) if cause == "undetermined" else CAUSES[cause].check,
     )
-
-
-def undetermined_check(leading: str) -> str:
-    """Return what to do where no cause is named, and what to inspect if the leading explanation, unless it is none, holds after all."""
-    generic = CAUSES["undetermined"].check
-    candidate = None if leading == "undetermined" else CAUSES.get(leading)  # type: ignore[call-overload]
-    if candidate is None:
-        return generic
-    return f"{generic} If the cause is {candidate.words}: {candidate.check[0].lower()}{candidate.check[1:]}"
 
 
 def _in_words(explanation: str) -> str:

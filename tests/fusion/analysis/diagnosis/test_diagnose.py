@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from fusion.analysis.diagnosis import diagnose as module
+from fusion.analysis.diagnosis.causes import undetermined_check
 from fusion.analysis.diagnosis.diagnose import (
     THRESHOLDS,
     _directions_sentence,
     _objections,
     _probabilities,
     diagnose,
-    undetermined_check,
 )
 from fusion.analysis.diagnosis.explanations import DiagnosisError
 from tests.fusion import field_simulator as simulator

@@ -135,7 +135,7 @@ def test_the_loop_and_the_positions_say_what_was_found(page):
 def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page, app):
     name_folder(page, app[1] / "laser_alone")
     page.get_by_text("<img src=x onerror=alert(1)>").wait_for()
-    page.get_by_text("Deviation along the axis").wait_for()
+    page.get_by_text("Profile and drift", exact=True).wait_for()
     assert page.get_by_text("Map", exact=True).count() == 0
 
 
