@@ -44,10 +44,11 @@ class ProfileChange:
     ----------
     position_mm : (n,) positions that both tests have, mm
     left_out : positions that one test has alone
-    remaining_um, remaining_u_um : its standard uncertainty
-    shapes
-        Family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and blocks;
-        last the rest of the profile, with its largest value and the p-value of all of it
+    remaining_um, remaining_u_um : (n,) difference of the profiles (mean of the approaches) beyond the shapes of a thermal state, um, and
+        its standard uncertainty
+    shapes : slope (over the whole travel), bow (height of a parabola over the travel) and mean reversal, then what changed beyond the
+        family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and blocks; last
+        the rest of the profile, with its largest value and the p-value of all of it
     tests : how many tests were made
     """
 

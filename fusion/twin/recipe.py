@@ -33,14 +33,10 @@ class Campaign(_TomlTable):
 
     Attributes
     ----------
-    title, axis : str
-        Title of the report, name of the measured axis.
-    start : str
-        Start of the test, UTC, ISO 8601.
-    seed : int
-        Seed of every random series; the same recipe with the same seed writes the same files.
-    further : str
-        Tables that are added to the campaign file as they are: what a laboratory states of a test.
+    title, axis : title of the report, name of the measured axis
+    start : start of the test, UTC, ISO 8601
+    seed : seed of every random series; the same recipe with the same seed writes the same files
+    further : tables that are added to the campaign file as they are: what a laboratory states of a test
     """
 
     title: str = "Twin"
@@ -56,18 +52,13 @@ class Test(_TomlTable):
 
     Attributes
     ----------
-    cycles : int
-        Number of cycles; in each, every target is approached from both directions.
+    cycles : number of cycles; in each, every target is approached from both directions
     targets, spacing_mm, jitter_mm : int, float, float
         Evenly spaced targets from position 0, all but the first and the last offset at random by up to `jitter_mm`.
-    positions_mm : tuple of floats
-        Target positions, increasing; they replace `targets`, `spacing_mm` and `jitter_mm`.
-    feed_mm_per_min, dwell_s, reversal_s : float
-        Feed, dwell before a reading, time between the last forward and the first backward reading.
-    period_s : float
-        Time from the start of one cycle to that of the next.
-    missing_fraction : float
-        Probability that a reading is lost, 0..1.
+    positions_mm : target positions, increasing; they replace `targets`, `spacing_mm` and `jitter_mm`
+    feed_mm_per_min, dwell_s, reversal_s : feed, dwell before a reading, time between the last forward and the first backward reading
+    period_s : time from the start of one cycle to that of the next
+    missing_fraction : probability that a reading is lost, 0..1
     """
 
     cycles: PositiveInt = 60
@@ -91,12 +82,9 @@ class Duty(_TomlTable):
     kind : str
         "random": levels between `low` and `high` held for random times; "constant": always `high`; "switched": `low` and `high`
         alternate; "randomised": they alternate by the law that the campaign file states.
-    low, high : float
-        Range of the load.
-    mean_hold_min : float
-        Mean time for which a level is held.
-    least_hold_min : float
-        Of "randomised": minimum hold; the remainder is exponentially distributed.
+    low, high : range of the load
+    mean_hold_min : mean time for which a level is held
+    least_hold_min : of "randomised": minimum hold; the remainder is exponentially distributed
     """
 
     kind: Literal["random", "constant", "switched", "randomised"] = "random"
@@ -112,16 +100,12 @@ class Plan(_TomlTable):
 
     Attributes
     ----------
-    width_mm, height_mm : float
-        Size of the table.
+    width_mm, height_mm : size of the table
     origin_mm, direction : tuple of two floats
         Plan point under the spindle at axis position 0, and unit vector in which that point moves as the axis position grows.
-    fiducial_diameter_mm : float
-        Diameter of the discs.
-    fiducials_x_mm, fiducials_y_mm : tuple of floats
-        Coordinates of the discs' centres, one each per disc.
-    hint_error_px : float
-        Standard deviation of the rough pixel positions that are written with the fiducials.
+    fiducial_diameter_mm : diameter of the discs
+    fiducials_x_mm, fiducials_y_mm : coordinates of the discs' centres, one each per disc
+    hint_error_px : standard deviation of the rough pixel positions that are written with the fiducials
     """
 
     width_mm: PositiveFloat = 700.0
@@ -140,14 +124,10 @@ class Table(_TomlTable):
 
     Attributes
     ----------
-    thickness_mm, conductivity_W_per_mK, density_kg_per_m3, heat_capacity_J_per_kgK : float
-        Thickness and material.
-    convection_W_per_m2K : float
-        Heat transfer to the air, sum over both faces.
-    initial_temperature_degC : float
-        Uniform temperature at the start of the pre-heat.
-    preheat_min : float
-        Time for which the machine runs before the test.
+    thickness_mm, conductivity_W_per_mK, density_kg_per_m3, heat_capacity_J_per_kgK : thickness and material
+    convection_W_per_m2K : heat transfer to the air, sum over both faces
+    initial_temperature_degC : uniform temperature at the start of the pre-heat
+    preheat_min : time for which the machine runs before the test
     """
 
     thickness_mm: PositiveFloat = 40.0
@@ -166,14 +146,10 @@ class Source(_TomlTable):
     Attributes
     ----------
     name : str
-    x_mm, y_mm, spread_x_mm, spread_y_mm : float
-        Centre of the footprint on the plan and its standard deviations.
-    power_W : float
-        Power into the table at full load.
-    time_constant_min : float
-        First-order lag between the load and the power.
-    follows : str
-        "duty": the logged load; "constant": full load from the start; "own": a switched load that is not logged.
+    x_mm, y_mm, spread_x_mm, spread_y_mm : centre of the footprint on the plan and its standard deviations
+    power_W : power into the table at full load
+    time_constant_min : first-order lag between the load and the power
+    follows : "duty": the logged load; "constant": full load from the start; "own": a switched load that is not logged
     """
 
     name: str
@@ -194,12 +170,9 @@ class Room(_TomlTable):
     ----------
     temperature_degC, trend_K_per_h, swing_K, swing_period_min : float
         Temperature at the start, its linear trend, and amplitude and period of its swing.
-    pressure_hPa, pressure_walk_hPa_per_sqrt_h : float
-        Pressure at the start, and standard deviation of its random walk after one hour.
-    humidity_percent : float
-        Relative humidity at the start.
-    probe_lag_min : float
-        Time constant of the material temperature sensor.
+    pressure_hPa, pressure_walk_hPa_per_sqrt_h : pressure at the start, and standard deviation of its random walk after one hour
+    humidity_percent : relative humidity at the start
+    probe_lag_min : time constant of the material temperature sensor
     """
 
     temperature_degC: float = 23.5
@@ -218,10 +191,8 @@ class Drift(_TomlTable):
 
     Attributes
     ----------
-    expansion_ppm_per_K, offset_um_per_K : float
-        Coefficients of `axis_expansion` and `table_offset`.
-    walk : str
-        Kind of the drift without a cause: "none", "random_walk", "integrated" (random walk) or "ou" (Ornstein-Uhlenbeck).
+    expansion_ppm_per_K, offset_um_per_K : coefficients of `axis_expansion` and `table_offset`
+    walk : kind of the drift without a cause: "none", "random_walk", "integrated" (random walk) or "ou" (Ornstein-Uhlenbeck)
     walk_common_um_per_sqrt_h, walk_slope_um_per_sqrt_h : float
         Its standard deviation after one hour ("ou": in the long run), common to all positions, and at the far end of the travel.
     """
@@ -239,14 +210,10 @@ class Profile(_TomlTable):
 
     Attributes
     ----------
-    slope_um, bow_um : float
-        Error at the far end of the travel, and height of a parabola over the travel.
-    rough_um : float
-        Standard deviation of an independent error of every target.
-    pitch_um, lead_mm : float
-        Amplitude and period of the cyclic error of the screw.
-    reversal_um : float
-        Mean reversal error; it varies by 15 % between targets.
+    slope_um, bow_um : error at the far end of the travel, and height of a parabola over the travel
+    rough_um : standard deviation of an independent error of every target
+    pitch_um, lead_mm : amplitude and period of the cyclic error of the screw
+    reversal_um : mean reversal error; it varies by 15 % between targets
     """
 
     slope_um: float = 3.0
@@ -265,12 +232,9 @@ class Laser(_TomlTable):
     ----------
     noise_um, noise_spread : float
         Standard deviation of a reading's random error, and of the logarithm of that standard deviation over the targets.
-    tails : str
-        "normal", or "t4": Student's t with 4 degrees of freedom, scaled to the same standard deviation.
-    file : str
-        Format of the laser file: "csv" or "rtl".
-    stated_expansion_ppm_per_K : float
-        Expansion coefficient that the campaign file states.
+    tails : "normal", or "t4": Student's t with 4 degrees of freedom, scaled to the same standard deviation
+    file : format of the laser file: "csv" or "rtl"
+    stated_expansion_ppm_per_K : expansion coefficient that the campaign file states
     """
 
     noise_um: float = 0.4
@@ -289,30 +253,21 @@ class Camera(_TomlTable):
     table : str
         "still": `frames_per_cycle` frames, `burst_interval_s` apart, from `frame_after_s` after a cycle's last reading on, with the
         table at axis position 0. "moving": a frame every `frame_interval_s` throughout the test.
-    file : str
-        Format of the frames: "jpg" or "seq".
-    columns, rows, focal_px, k1 : int, int, float, float
-        Size of the detector, focal length, coefficient of the radial distortion 1 + k1 r^2.
+    file : format of the frames: "jpg" or "seq"
+    columns, rows, focal_px, k1 : size of the detector, focal length, coefficient of the radial distortion 1 + k1 r^2
     distance_mm, centre_mm, tilt_deg, pan_deg, roll_deg : float, tuple of two floats, float, float, float
         Distance to the plan point in the centre of the view, that point, and rotations about x, y and the optical axis.
-    blur_px : float
-        Standard deviation of the optical blur.
-    emissivity, disc_emissivity : float
-        Emissivity of the painted table and of the discs.
+    blur_px : standard deviation of the optical blur
+    emissivity, disc_emissivity : emissivity of the painted table and of the discs
     reflected_temperature_degC, atmospheric_temperature_degC, relative_humidity : float
         Reflected apparent temperature, and state of the air in the optical path (humidity 0..1).
-    netd_K, fixed_pattern_K : float
-        Standard deviations of the temporal noise (NETD at 25 degC) and of the fixed pattern.
+    netd_K, fixed_pattern_K : standard deviations of the temporal noise (NETD at 25 degC) and of the fixed pattern
     ffc_step_K, ffc_interval_min : float
         Standard deviation of the offset after a flat-field correction (FFC), and the interval of those corrections.
-    drift_K_per_K : float
-        Offset of all pixels per K of warming of the camera's housing.
-    bad_pixels : int
-        Number of pixels that always show the same value.
-    knock_cycle, knock_px : int, tuple of two floats
-        Cycle from which on the view is displaced (0: never), and the displacement in columns and rows.
-    clock_offset_s, state_clock_offset : float, bool
-        Camera clock minus laser clock, and whether the campaign file states it.
+    drift_K_per_K : offset of all pixels per K of warming of the camera's housing
+    bad_pixels : number of pixels that always show the same value
+    knock_cycle, knock_px : cycle from which on the view is displaced (0: never), and the displacement in columns and rows
+    clock_offset_s, state_clock_offset : camera clock minus laser clock, and whether the campaign file states it
     """
 
     table: Literal["still", "moving"] = "still"
@@ -357,10 +312,8 @@ class EffectRecipe(_TomlTable):
     name : str
     amplitude_um : float or None
         Rms about the mean of every target and direction, over those that move; None keeps the size that the parameters give.
-    amplitude_K : float or None
-        Of `camera_offset` and `reflected_source`: size in K instead of an rms in um.
-    parameters : dict
-        The effect's own parameters; in RECIPE.toml they follow `name`.
+    amplitude_K : of `camera_offset` and `reflected_source`: size in K instead of an rms in um
+    parameters : the effect's own parameters; in RECIPE.toml they follow `name`
     """
 
     name: str
@@ -375,16 +328,11 @@ class AnomalyRecipe(_TomlTable):
 
     Attributes
     ----------
-    target : int
-        Target number, from 1.
-    kind : str
-        Cause; "wander" is a slow random motion that no measured quantity explains.
-    direction : str
-        Approaches that it affects.
-    amplitude_um : float
-        Rms about the mean of each affected direction.
-    at_cycle : int
-        Of "step": first cycle after the step; 0: half-way through the test.
+    target : target number, from 1
+    kind : cause; "wander" is a slow random motion that no measured quantity explains
+    direction : approaches that it affects
+    amplitude_um : rms about the mean of each affected direction
+    at_cycle : of "step": first cycle after the step; 0: half-way through the test
     """
 
     target: int
@@ -451,14 +399,10 @@ class Recipe(_TomlTable):
     ----------
     campaign, test, duty, plan, table, room, drift, profile, laser, camera
         See their classes.
-    source : tuple of Source
-        Heat sources under the table.
-    effect : tuple of EffectRecipe
-        Effects that the campaign file does not declare.
-    anomaly : tuple of AnomalyRecipe
-        Anomalous targets.
-    record : Record or None
-        A record instead of a positioning test.
+    source : heat sources under the table
+    effect : effects that the campaign file does not declare
+    anomaly : anomalous targets
+    record : A record instead of a positioning test
     """
 
     campaign: Campaign = field(default_factory=Campaign)

@@ -129,7 +129,8 @@ class ProfileFit:
     best : index of the best candidate (lag or step)
     coefficient, coefficient_u : its coefficient, with standard uncertainty, for the average of the directions, um/K or um
     by_direction : its coefficient in each direction alone, NaN where one was not read, um/K or um
-    hold_out_gain : NaN where only one direction was read
+    hold_out_gain : log-likelihood gained in each direction by the candidate and the coefficient fitted to the other, sum of both, nats;
+        NaN where only one direction was read
     """
 
     log_likelihood: float
@@ -353,7 +354,8 @@ class ScatterFit:
     ----------
     both : excess scatter equal in both directions, Gaussian or with rare large values
     one_direction : excess scatter in one direction only
-    along_approach : that sticks) or beyond it
+    along_approach : one-sided, exponentially distributed amounts along the direction of motion, short of the target (as of a carriage
+        that sticks) or beyond it
     """
 
     both: float

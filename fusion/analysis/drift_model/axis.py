@@ -798,10 +798,8 @@ class AxisResult(LoopResult):
 
     Attributes
     ----------
-    declared_coefficients : list of DeclaredCoefficient
-        Coefficients of the declared effects beside those that are confirmed.
-    before, after : ModelFit
-        The declared model on the training part, and the final model on all cycles.
+    declared_coefficients : coefficients of the declared effects beside those that are confirmed
+    before, after : the declared model on the training part, and the final model on all cycles
     """
 
     noise_share = remainder.DRIFT_SHARE

@@ -926,22 +926,14 @@ class RecordResult(LoopResult):
 
     Attributes
     ----------
-    record : Record
-        The record on its blocks.
-    is_held_out : (blocks,) ndarray of bool
-        True for the hold-out set.
-    predicted : mapping of str to (blocks, channels) ndarray, um
-        Predictions of all blocks from the training part, by the names of their errors.
-    contributions : list of (blocks, channels) ndarray, um
-        What every term of the final model contributes, about its mean.
-    left_out : list of (blocks, channels) ndarray, um
-        Predictions of every part from all others: by the final model, then without each of its effects.
-    whole : RecordFit
-        The final model fitted to all blocks, for its residual.
-    chained : list of ChainedResult
-        Every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs.
-    rounding : (1 + sensors, channels) ndarray, um
-        Steps of the displacements, as `rounding_steps` gives them.
+    record : the record on its blocks
+    is_held_out : (blocks,), true for the hold-out set
+    predicted : um, predictions of all blocks from the training part, by the names of their errors
+    contributions : um, what every term of the final model contributes, about its mean
+    left_out : um, predictions of every part from all others: by the final model, then without each of its effects
+    whole : the final model fitted to all blocks, for its residual
+    chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
+    rounding : (1 + sensors, channels), um, steps of the displacements, as `rounding_steps` gives them
     """
 
     noise_share = RESIDUAL_SHARE
