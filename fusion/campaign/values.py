@@ -142,20 +142,8 @@ def read_option(option: str, text: str, target: str) -> float:
 
 
 def split_uncertainty(text: str) -> tuple[str, str | None]:
-    """Return value and standard uncertainty of a text such as ``"22 +- 1 degC"``, each with its unit.
+    """Return value and standard uncertainty of a text such as ``"22 +- 1 degC"``, each with its unit; one at the end belongs to both.
 
-    Parameters
-    ----------
-    text : str
-        Value, ``+-`` or ``±``, and standard uncertainty; a unit at the end belongs to both.
-
-    Returns
-    -------
-    value, uncertainty : str
-        ``"22 degC"`` and ``"1 degC"``; the uncertainty is None where none is given.
-
-    Examples
-    --------
     >>> split_uncertainty("1.2 m +- 5 cm"), split_uncertainty("0.97 ± 0.01"), split_uncertainty("22 degC")
     (('1.2 m', '5 cm'), ('0.97', '0.01'), ('22 degC', None))
     """

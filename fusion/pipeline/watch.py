@@ -522,13 +522,6 @@ class LiveState:
 def live_line(state: LiveState) -> str:
     """Return a finished cycle and what is known after it as one line.
 
-    Parameters
-    ----------
-    state : LiveState
-        With a finished cycle.
-
-    Examples
-    --------
     >>> nat = np.datetime64("NaT", "ns")
     >>> cycle = FinishedCycle(7, nat, nat, 3, None, (23.1, 25.64), 0.8, np.array([1.0, 1.5]))
     >>> live_line(LiveState(21, 140, 7, cycle, {"A": 4.21}, "cycles 3 to 7", Enough(7, 0.31, 68, ""), ()))

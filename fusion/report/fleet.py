@@ -46,15 +46,12 @@ class Row:
     ----------
     state : "finished" now, "kept" from an earlier fleet, "failed", "stopped" in the middle, or "waiting" to be run
     verdict, headline : of the closed loop, and as a sentence; empty where there is none
-    drift_um, drift_u_um : float or None, um
-        Largest range of the drift over the targets, of a record over its displacements, and its standard uncertainty.
+    drift_um, drift_u_um : largest range of the drift over the targets or displacements, and its standard uncertainty
     axis : as the campaign file names it
-    A_um, A_u_um and so on : float or None, um
-        Values by ISO 230-2 of the quoted window, each with its standard uncertainty.
+    A_um, A_u_um and so on : values by ISO 230-2 of the quoted window, each with its standard uncertainty
     machine, serial, date : as the campaign file names them, and the day of the first reading
     decision : the least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated
-    maximum_degC, maximum_u_degC : float or None, degC
-        Highest temperature that a camera measured in a picture, a region or a field, and its standard uncertainty.
+    maximum_degC, maximum_u_degC : highest temperature that a camera measured in a picture, a region or a field, and its uncertainty
     above_range : whether it is the end of the calibrated range, which pixels are above
     held_out_um : um, root mean square error of the final model on what was held out
     anomalies, warnings : positions that stand out, and warnings

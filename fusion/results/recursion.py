@@ -213,23 +213,7 @@ def run_recursion(
 
 
 def read_recursion(path: str | Path) -> Recursion:
-    """Read a model description that `export --format model-json` wrote.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    Recursion
-        The model.
-
-    Raises
-    ------
-    RecursionError
-        If the file is no such description.
-    """
+    """Read a model description that `export --format model-json` wrote; a RecursionError where the file is none."""
     try:
         return Recursion.model_validate(json.loads(Path(path).read_text(encoding="utf-8")))
     except (OSError, ValueError, ValidationError) as error:

@@ -425,19 +425,8 @@ class Recipe(_TomlTable):
     record: Record | None = None
 
     def vary(self, **tables: Any) -> Recipe:
-        """Return a copy with some values changed.
+        """Return a copy with some values changed: for each table a dict of the keys to change, or its new value.
 
-        Parameters
-        ----------
-        **tables : dict or table
-            For each table a dict of the keys to change, or its new value.
-
-        Returns
-        -------
-        Recipe
-
-        Examples
-        --------
         >>> Recipe().vary(campaign={"seed": 7}, effect=(EffectRecipe("dead_path"),)).campaign.seed
         7
         """

@@ -86,24 +86,11 @@ class Truth:
 
 
 def simulate(recipe: Recipe) -> Truth:
-    """Simulate a positioning campaign without rendering a frame.
+    """Simulate a positioning campaign without rendering a frame; the same recipe gives the same numbers.
 
-    Parameters
-    ----------
-    recipe : Recipe
-        Machine, test and effects; the same recipe gives the same numbers.
+    Raises a RecipeError where the recipe asks for a record, a value is impossible, the cycle does not fit into its period, or an effect
+    moves no reading.
 
-    Returns
-    -------
-    Truth
-
-    Raises
-    ------
-    RecipeError
-        The recipe asks for a record, a value is impossible, the cycle does not fit into its period, or an effect moves no reading.
-
-    Examples
-    --------
     >>> truth = simulate(Recipe().vary(test={"cycles": 3}))
     >>> dict(truth.readings["deviation"].sizes)
     {'cycle': 3, 'direction': 2, 'target': 16}

@@ -289,32 +289,11 @@ def make_recursion(
     reduced: bool = False,
     remarks: Sequence[str] = (),
 ) -> Recursion:
-    """Make the recursion of a record.
+    """Make the recursion of a record from ``fusion.nc`` and what the closed loop found, with steps of `sampling_s`.
 
-    Parameters
-    ----------
-    product : Dataset
-        ``fusion.nc`` of the run.
-    loop : RecordLoop
-        What the closed loop found.
-    campaign, results_sha256 : str
-        Where it comes from.
-    sampling_s : float
-        Time from step to step, s.
-    reduced : bool
-        Keep the fewest sensors that lose at most 5 % beside all (`sensor_curve`); the hold-out set decides nothing.
-    remarks : sequence of str
-        What to add to its remarks.
-
-    Returns
-    -------
-    Recursion
-        Coefficients from the whole record, uncertainties from parts of it that those of the other parts had not seen.
-
-    Raises
-    ------
-    RecursionError
-        If nothing is left that predicts.
+    Coefficients are from the whole record, uncertainties from parts of it that those of the other parts had not seen. `reduced` keeps the
+    fewest sensors that lose at most 5 % beside all (`sensor_curve`); the hold-out set decides nothing. Raises a RecursionError if nothing
+    is left that predicts.
     """
     record = record_of_product(product)
     train = ~product["sealed"].values.astype(bool)

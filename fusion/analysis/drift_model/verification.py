@@ -78,23 +78,10 @@ class ChannelVerdict:
 def verify(
     product: xr.Dataset, loop: RecordLoop, after: Record, applied: Recursion, *, faulty_sensors: Mapping[str, str]
 ) -> list[ChannelVerdict]:
-    """Compare a test with an active compensation with what the test before it predicts.
+    """Compare a test with an active compensation with what the test before it predicts, displacement by displacement.
 
-    Parameters
-    ----------
-    product, loop : Dataset and RecordLoop
-        ``fusion.nc`` of the test before it, and what the closed loop found there.
-    after : Record
-        The test with the compensation, on its blocks.
-    applied : Recursion
-        The model that is said to run in the control.
-    faulty_sensors : mapping of str to str
-        Sensors that do not measure in this test, with what they do.
-
-    Returns
-    -------
-    list of ChannelVerdict
-        One per displacement that the model corrects.
+    `product` and `loop` are of the test before it, `after` is the test with the compensation, `applied` the model that is said to run in
+    the control; `faulty_sensors` do not measure in this test, with what they do.
     """
     missing = [one.name for one in applied.inputs if one.name not in (*after.sensors, *after.drivers, *faulty_sensors)]
     if missing:
