@@ -54,15 +54,9 @@ CHANNELS = ("X", "Y", "Z", "A", "B", "C")
 
 @dataclass(frozen=True)
 class RecordTruth:
-    """A simulated record.
+    """A simulated record: what was logged, every part of the displacements (time, channel), um, and the names of these parts.
 
-    Attributes
-    ----------
-    recipe : the recipe asked for
-    table
-        As logged: `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min. And every part of
-        the displacements (time, channel), um.
-    parts : names of the parts that the displacement is the sum of
+    `table` holds `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min.
     """
 
     recipe: Recipe

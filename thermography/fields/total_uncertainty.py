@@ -297,16 +297,10 @@ def evaluate_uncertainty(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Cells of a surface in the cycles that were calibrated with one set of parameters, and what they share, tabulated.
+    """Cells of a surface in the cycles that were calibrated with one set of parameters, and what they share at temperatures `grid`, degC.
 
-    Attributes
-    ----------
-    cells, cycles : (y, x) and (cycle,) ndarray of bool
-    grid : (n,), degC, temperatures of the table
-    u : (n,), K, common standard uncertainty of temperatures
-    scale : (n,), common standard uncertainty of rises about a temperature, as a share of the rise
-    sensitivity : (n,), error of a temperature per error of what the camera reads
-    shares : sum and number of the shares `scale` of the cells, piece by piece
+    `u` is the common standard uncertainty of temperatures, K, `scale` that of rises as a share of the rise, `sensitivity` the error of a
+    temperature per error of what the camera reads, (n,) each; `shares` are sum and number of the shares of the cells, piece by piece.
     """
 
     cells: NDArray[np.bool_]
