@@ -97,6 +97,9 @@ ResultsFolder = Annotated[Path, Argument(metavar="RESULTS", help="Results folder
 
 def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
     """End a command as `fusion.messages` says; `folders` are those of its results."""
+    if folders:
+        # What `_kept` needs is loaded while a signal still ends the process at once: numpy cannot be loaded again where one broke it off.
+        import fusion.results.store  # noqa: F401
     return answering(errors, kept=lambda: _kept(folders))
 
 
