@@ -652,7 +652,7 @@ class StillReduction:
         """Register the plan again from the frame of a knock on."""
         span = self.displacement.span_after(knock)
         if self.checkpoint is not None:
-            self.checkpoint.save(f"knock_{knock.frame:08d}", **vars(knock))
+            self.checkpoint.save(f"knock_{knock.frame:08d}_{knock.span:04d}", **vars(knock))
         self.registrations.insert(knock.span + 1, span)
 
     @property
