@@ -70,7 +70,7 @@ speeds: $(VENV)/.test
 	$(BIN)/python tests/benchmarks/beside_earlier.py build/before
 
 # Share of small changes to a module (signs, limits, comparisons) that its tests notice, on a copy of what is staged or committed; fails
-# below 90 %. A sample takes some minutes: make mutants MODULE=fusion/analysis/attribution/two_sessions.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
+# below 90 %. A sample takes some minutes: make mutants MODULE=fusion/analysis/attribution/places.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
 MODULE ?= fusion/analysis/drift_model/evaluation.py
 SAMPLE ?= 60
 SEED ?= 1

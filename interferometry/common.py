@@ -35,16 +35,10 @@ def one_thread(function: Callable[_P, _T]) -> Callable[_P, _T]:
 
 DIRECTIONS = ("positive", "negative")
 
-#: Name of a variable -> (dims, units, kind), kind being a NumPy dtype kind.
-Contract = dict[str, tuple[tuple[str, ...], str, str]]
-
-DEVIATIONS: Contract
-ENVIRONMENT: Contract
-ESTIMATE: Contract
 #: Contract and attributes of deviations and of logged conditions, and what the search for anomalies takes from the joint estimate.
 DEVIATIONS, DEVIATION_ATTRIBUTES = variables("deviations")
 ENVIRONMENT, ENVIRONMENT_ATTRIBUTES = variables("environment")
-ESTIMATE, _ = variables("estimate")
+ESTIMATE = variables("estimate")[0]
 
 #: Name of a contracted argument -> its contract, and what returns such a Dataset.
 _ARGUMENTS = {

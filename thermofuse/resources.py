@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+#: Name of a variable -> (dims, units, kind), kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
+Contract = dict[str, tuple[tuple[str, ...], str, str]]
 
 
 def resource(name: str) -> Path:
@@ -23,15 +25,18 @@ def vocabulary(name: str) -> dict[str, Any]:
     return tomllib.loads(resource(f"vocabulary/{name}.toml").read_text(encoding="utf-8"))
 
 
-def variables(product: str) -> tuple[dict[str, tuple[tuple[str, ...], str, str]], dict[str, dict[str, str]]]:
-    """Return the contract of a product, (dims, units, kind) of the variables that others rely on, and the attributes of all of them."""
-    described = deepcopy(vocabulary("variables")[product])
+def variables(product: str) -> tuple[Contract, dict[str, dict[str, str]]]:
+    """Return the contract of a product, of the variables that others rely on, and the attributes of all of them."""
+    described = vocabulary("variables")[product]
     contract = {
-        name: (tuple(one.pop("dims")), one.get("units", ""), one.pop("kind"))
+        name: (tuple(one["dims"]), one.get("units", ""), one["kind"])
         for name, one in described.items()
         if "kind" in one
     }
-    return contract, described
+    attributes = {
+        name: {key: text for key, text in one.items() if key not in ("dims", "kind")} for name, one in described.items()
+    }
+    return contract, attributes
 
 
 def by_word(meanings: Mapping[str, Sequence[str]]) -> dict[str, str]:

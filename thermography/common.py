@@ -71,11 +71,8 @@ def write_csv(frame: pd.DataFrame, path: Path | None = None, **options: Any) -> 
     return shown.to_csv(path, index=False, date_format="%Y-%m-%dT%H:%M:%S.%fZ", **options)
 
 
-#: Contract of the products, on which other packages rely: name of a variable -> (dims, units, kind), kind being a NumPy dtype kind
-#: (``f``, ``i``, ``u``, ``M``).
-Contract = dict[str, tuple[tuple[str, ...], str, str]]
-FIELDS: Contract
-#: Fields on the table plan, and the attributes of their variables; ``x`` and ``y`` are in mm, ``cycle`` counts from 1.
+#: Contract of fields on the table plan, on which other packages rely, and the attributes of their variables; ``x`` and ``y`` are in mm,
+#: ``cycle`` counts from 1.
 FIELDS, FIELD_ATTRIBUTES = variables("fields")
 
 

@@ -119,7 +119,7 @@ def in_pieces(array: Array | xr.DataArray) -> Iterator[tuple[slice, Array]]:
 
 
 def one_by_one(arrays: Iterable[Item]) -> Iterator[Item]:
-    """Go through arrays, or along the first dimension of one, to read or to fill them; after each see `give_back`."""
+    """Go through arrays, or along the first dimension of one, to read or to fill them; each is given back (`give_back`) before the next."""
     for array in arrays:
         yield array
         give_back(array)

@@ -349,7 +349,7 @@ class ComparedCampaign:
     sha256 : SHA-256 of its results.json
     axis : name of the measured axis; empty where the run does not tell
     drift : joint estimate with ``position`` (target; mm); None where there are no readings with times
-    maps : which part of the field the drift follows, as `fusion.analysis.attribution.correlate` returns it; None where that was not tested
+    maps : which part of the field the drift follows, as `tf.correlate` returns it; None where that was not tested
     """
 
     results: Results

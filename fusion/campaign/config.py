@@ -521,13 +521,18 @@ class ThermographyTable(_Measured, title="Camera"):
     window_temperature_degC: Celsius | None = key(None, "Temperature of that window")
     window_temperature_u_K: KelvinU | None = None
     camera_offset_u_K: KelvinU | None = key(
-        None, "Standard uncertainty of the camera, as an offset", about="cancels in a rise", absent="uncooled camera"
+        None,
+        "Standard uncertainty of the camera, as an offset",
+        about="cancels in a rise",
+        absent="that of an uncooled camera",
     )
     camera_scale_u: FractionU | None = key(
         None, "Standard uncertainty of the camera, share of the reading", example="1.2 %", about="does not cancel"
     )
     camera_drift_u_K: KelvinU | None = key(
-        None, "Standard uncertainty of the change of its zero", about="between cycles; at least what the frames leave"
+        None,
+        "Standard uncertainty of the change of the camera's zero between cycles",
+        about="at least what the frames leave",
     )
     region: tuple[RegionTable, ...] = ()
     clock_offset_s: Seconds | None = key(
@@ -573,7 +578,11 @@ class AxisTable(Table, title="Axis on the plan"):
         ..., *(f"Spindle at axis position 0, {one}" for one in "xy"), example=("500 mm", "90 mm"), needed=True
     )
     direction: tuple[float, float] = key(
-        ..., "It moves, as the position grows", example="left", about="[-1, 0] left, [0, 1] down", needed=True
+        ...,
+        "How that point moves as the position grows",
+        example="left",
+        about="[-1, 0] left, [0, 1] down",
+        needed=True,
     )
 
     @model_validator(mode="after")
@@ -671,7 +680,9 @@ class InterferometryTable(_Measured, title="Laser"):
         11.7, example="11.7 +- 0.3 ppm/K", about="of scale or workpiece", absent="11.7 +- 2 ppm/K", ask=True
     )
     expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = None
-    feed_mm_per_min: Feed | None = key(None, "Feed between the targets", about="with dwell: times of a .rtl")
+    feed_mm_per_min: Feed | None = key(
+        None, "Feed between the targets", about="with dwell, it places the readings of a .rtl more closely in time"
+    )
     dwell_s: PositiveSeconds | None = key(None, "Dwell at a target")
     compensation: Literal["as recorded", "redo"] = key(
         "as recorded", "Compensation of the readings", choices={"redo": "again, with the logged conditions"}
@@ -683,7 +694,7 @@ class InterferometryTable(_Measured, title="Laser"):
         None,
         *(f"Material sensor, {one}" for one in "xy"),
         example=("350 mm", "90 mm"),
-        about="on the plan, against the camera",
+        about="its place on the plan, where the camera's rise is compared with it",
     )
     environment_factor_mm: tuple[Millimetres, Millimetres] | None = key(
         None, *(f"Environment factor at the {one}" for one in ("start", "end")), example=("0.316382 um", "0.316385 um")
@@ -896,7 +907,12 @@ class ThermalTestTable(Table, title="Test of thermal effects (ISO 230-3)"):
     )
     tilts: dict[str, TiltTable] = key({}, "Tilt", rows=0, of=_RECORD)
     sensor_calibration: FractionU | None = key(
-        None, "Standard uncertainty of the displacement sensors", example="0.5 %", absent="1 %", show=True, of=_RECORD
+        None,
+        "Standard uncertainty of the sensitivity of the displacement sensors",
+        example="0.5 %",
+        absent="1 %",
+        show=True,
+        of=_RECORD,
     )
     mounting_length_mm: PositiveMillimetres | None = key(
         None, "Length of the mounting of the sensors", example="100 mm", absent="not budgeted", show=True, of=_RECORD

@@ -61,7 +61,7 @@ class Asker:
         """Return the answer to a key of the campaign file, empty where nothing is stated."""
         absent = "to be filled in" if key.needed else key.absent or "not stated"
         example = f", such as {key.example}" if key.example else ""
-        question = (key.told or key.label) + ("" if default else f"{example}; empty: {absent}")
+        question = "; ".join(filter(None, (key.label, key.about))) + ("" if default else f"{example}; empty: {absent}")
         return self.checked(question, default, lambda answer: answer and key.check(answer))
 
     def unit(self, question: str, target: str, default: str) -> str:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
+from datetime import date
 from functools import cache
 from typing import Any, NamedTuple
 
 from fusion.campaign.config import campaign_schema
 from fusion.campaign.values import QuantityError, canonical_unit, read_quantity
 from fusion.results.numbers import print_unit
-
-_DAY = re.compile(r"\d{4}-\d\d-\d\d")
 
 
 class Key(NamedTuple):
@@ -61,8 +59,11 @@ class Key(NamedTuple):
         """Return a text that is a quantity of its unit, or a day, where it has to be."""
         if self.kind == "quantity":
             read_quantity(text, canonical_unit(self.unit))
-        elif self.kind == "date" and not _DAY.fullmatch(text):
-            raise QuantityError(f'"{text}" is no day; write year-month-day, for example {self.example}')
+        elif self.kind == "date":
+            try:
+                return date.fromisoformat(text).isoformat()
+            except ValueError:
+                raise QuantityError(f'"{text}" is no day; write year-month-day, for example {self.example}') from None
         return text
 
     @property

@@ -72,6 +72,7 @@ from fusion.results.progress import counted
 from fusion.results.results import Results
 from fusion.results.store import by_approach, group, has
 from interferometry.deviations import REGISTRY
+from interferometry.io.tables import DATED
 from interferometry.plots import time_span
 
 if TYPE_CHECKING:
@@ -657,7 +658,7 @@ def _record(results: Results, record: xr.Dataset) -> dict[str, Any]:
     first, last = record["time"].values[[0, -1]]
     block_s = float(record.attrs["block_s"])
     span = duration(float((last - first) / np.timedelta64(1, "s")) + block_s)
-    start = first if first >= np.datetime64("1971-01-01") else None
+    start = first if first >= DATED else None
     begun = "start not stated" if start is None else moment(start, results.time.zone if results.time else None)
     channels, drivers = (join([str(name) for name in record[dim].values]) for dim in ("channel", "driver_name"))
     shown = shown_channels(record)

@@ -51,9 +51,10 @@ class Row:
     A_um, A_u_um and so on : values by ISO 230-2 of the quoted window, each with its standard uncertainty
     machine, serial, date : as the campaign file names them, and the day of the first reading
     decision : the least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated
-    maximum_degC, maximum_u_degC : highest temperature that a camera measured in a picture, a region or a field, and its uncertainty
+    maximum_degC, maximum_u_degC
+        Highest temperature that a camera measured in a picture, a region or a field, and its standard uncertainty.
     above_range : whether it is the end of the calibrated range, which pixels are above
-    held_out_um : um, root mean square error of the final model on what was held out
+    held_out_um : root mean square error of the final model on what was held out
     anomalies, warnings : positions that stand out, and warnings
     seconds, peak_MB : wall time of its run, s, and largest memory of its process; 0 where it was not measured
     log : file with everything that its run said, as seen from the summary
@@ -118,7 +119,8 @@ def with_findings(row: Row, folder: Path) -> Row:
         maps = read_product(folder, "fields") if (folder / "fields.nc").is_file() else None
     except (FusionError, OSError) as error:
         return replace(row, state="failed", message=str(error))
-    loop, conditions = results.loop, {one.key: one.text for one in conditions_of(results)}
+    loop, listed = results.loop, conditions_of(results)
+    conditions = {one.key: one.text for one in listed}
     stated = read_json_object(folder / "provenance.json").get("parameters", {}).get("report", {})
     decided = [one.decision for one in results.iso230.tolerances] if results.iso230 else []
     maxima = {one.maximum_degC: one.overrange_pictures > 0 for one in results.regions or ()}
@@ -143,7 +145,7 @@ def with_findings(row: Row, folder: Path) -> Row:
         anomalies=None if results.anomalies is None else len(results.anomalies),
         warnings=len(results.warnings),
         inputs="" if results.inputs is None else results.inputs.state,
-        conditions={one.name: one.text for one in conditions_of(results)},
+        conditions={one.name: one.text for one in listed},
         # Of an axis in another unit than the columns have there is none.
         **{name: number for name, number in numbers.items() if name in _COLUMNS},
     )

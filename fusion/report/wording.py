@@ -342,7 +342,7 @@ def _without_control(value: object) -> object:
 def sentences(name: str, *facts: Any, template: str = "sentences.j2") -> list[str]:
     """Return the lines of a statement as plain text."""
     macro = getattr(environment(html=False).get_template(template).module, name)
-    return [" ".join(line.split()) for line in macro(*facts).splitlines() if line.strip()]
+    return [" ".join(line.split()) for line in macro(*facts).split("\n") if line.strip()]
 
 
 def say(name: str, *facts: Any) -> str:

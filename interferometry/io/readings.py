@@ -538,7 +538,7 @@ class Run:
 
 @dataclass
 class WideTable:
-    """A table of position by run whose headings, beside or below the positions' line, were understood: line and text of each position,
+    """A table of position by run whose headings were understood: line of the row that names the positions, line and text of each position,
     units (keys of `UNITS`), runs, and headings of columns that are none.
     """
 
@@ -797,13 +797,13 @@ _AVERAGES = b"Bidirectional Avg Error"
 _HEADER_WITHIN = 40
 #: Heading of a further column of the environment file, ``"name [unit]"``; a name begins with a letter, as a variable of NetCDF does.
 _WITH_UNIT = re.compile(r"\s*([^\W\d_][^/\[\]()]{0,99}?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*")
-#: Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value. Below 1 % of humidity lies a
+#: Column of the environment file, variable, kind of quantity, smallest and largest plausible value. Below 1 % of humidity lies a
 #: fraction of 1, and no workshop.
 ENVIRONMENT_COLUMNS = (
-    ("air_temperature_degC", "air_temperature", "degC", "temperature", -9.0, 60.0),
-    ("air_pressure_hPa", "air_pressure", "hPa", "pressure", 500.0, 1200.0),
-    ("relative_humidity_percent", "relative_humidity", "percent", "humidity", 1.0, 100.0),
-    ("material_temperature_degC", "material_temperature", "degC", "temperature", -9.0, 80.0),
+    ("air_temperature_degC", "air_temperature", "temperature", -9.0, 60.0),
+    ("air_pressure_hPa", "air_pressure", "pressure", 500.0, 1200.0),
+    ("relative_humidity_percent", "relative_humidity", "humidity", 1.0, 100.0),
+    ("material_temperature_degC", "material_temperature", "temperature", -9.0, 80.0),
 )
 AIR_AND_MATERIAL = tuple(name for _, name, *_ in ENVIRONMENT_COLUMNS)
 
@@ -838,9 +838,9 @@ def read_deviations(
     Returns
     -------
     xarray.Dataset
-        Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
-        (mm; target). ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason), ``attrs["notes"]`` one of
-        what the reader assumed;
+        Keeps `interferometry.common.DEVIATIONS`: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target),
+        ``position`` (mm; target). ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason),
+        ``attrs["notes"]`` one of what the reader assumed;
         ``time.attrs["origin"]`` is "recorded", "reconstructed" or "none"; ``time_u`` is the standard uncertainty of reconstructed
         times, s.
 
@@ -868,9 +868,10 @@ def read_deviations(
     [[0.12, 1.48]]
     """
     path = Path(path)
-    if (program := _of_a_program(path)) is not None:
+    start = _start_of(path)
+    if (program := _of_a_program(start)) is not None:
         return program.read(path, feed_mm_per_min, dwell_s)
-    if _AVERAGES in path.read_bytes()[:START_BYTES]:
+    if _AVERAGES in start:
         raise LaserFormatError(
             f"{path}: a report of averages over runs holds no single reading; export the readings of every run"
         )
@@ -883,10 +884,14 @@ def read_deviations(
     return deviations
 
 
-def _of_a_program(path: Path) -> Layout | None:
-    """Return the layout of a laser program that a file begins with."""
+def _start_of(path: Path) -> bytes:
+    """Return the beginning of a file, by which the files of laser programs are known."""
     with path.open("rb") as stream:
-        start = stream.read(START_BYTES)
+        return stream.read(START_BYTES)
+
+
+def _of_a_program(start: bytes) -> Layout | None:
+    """Return the layout of the laser program whose files begin so."""
     return next((one for one in FILES if one.find(start)), None)
 
 
@@ -914,12 +919,14 @@ def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
 
 def holds_deviations(path: Path) -> bool:
     """Return whether a file has a layout of deviations, whatever is in it."""
-    return _of_a_program(path) is not None or any(one.find(grid) for grid in read_grids(path) for one in TABLES)
+    return _of_a_program(_start_of(path)) is not None or any(
+        one.find(grid) for grid in read_grids(path) for one in TABLES
+    )
 
 
 def is_environment_log(path: Path) -> bool:
     """Return whether a file is a table of air and material conditions, and not one of deviations."""
-    if _of_a_program(path) is not None:
+    if _of_a_program(_start_of(path)) is not None:
         return False
     roles = [
         {read_heading(text).role for text in fields}
@@ -975,7 +982,7 @@ def read_environment(path: str | Path) -> xr.Dataset:
 
     def parse(fields: dict[str, str]) -> list[float]:
         values = []
-        for (column, _, _, _, low, high), (text, unit) in zip(ENVIRONMENT_COLUMNS, columns.values(), strict=True):
+        for (column, _, _, low, high), (text, unit) in zip(ENVIRONMENT_COLUMNS, columns.values(), strict=True):
             value = table.numerals.reading(fields[text]) * UNITS[unit].factor + UNITS[unit].offset
             if not low <= value <= high:
                 raise BadReading(fields[text], f"is outside {low:g} .. {high:g}, the range of {column} in its unit")
@@ -1019,7 +1026,7 @@ def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple
                 found = f"line {line} lacks {', '.join(lacking)}"
                 best = max(best, (-len(lacking), found), key=lambda each: each[0])
                 continue
-            for _, name, _, kind, *_ in ENVIRONMENT_COLUMNS:
+            for _, name, kind, *_ in ENVIRONMENT_COLUMNS:
                 if UNITS[columns[name].unit or ""].kind != kind:
                     raise LaserFormatError(
                         f"{path}, line {line}: the unit of {columns[name].text!r} is none of a {kind}; correct the heading"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from hashlib import sha256
@@ -45,10 +46,10 @@ _SOURCES = ("thermofuse", "thermography", "interferometry", "fusion", "data", "t
 @pytest.fixture(scope="session")
 def kept(pytestconfig: pytest.Config) -> Callable[[str, Callable[[Path], object]], Path]:
     """Return a function that fills a folder once for all workers, and for later calls of a day while no source changes."""
-    digest = sha256()
+    digest = sha256((sys.version + (pytestconfig.rootpath / "constraints.txt").read_text(encoding="utf-8")).encode())
     for path in sorted(each for source in _SOURCES for each in (pytestconfig.rootpath / source).rglob("*.*")):
         if path.is_file() and "__pycache__" not in path.parts:
-            digest.update(path.read_bytes())
+            digest.update(str(path.relative_to(pytestconfig.rootpath)).encode() + path.read_bytes())
     base = pytestconfig.rootpath / "build" / "kept"
     root = base / digest.hexdigest()
 
@@ -58,7 +59,7 @@ def kept(pytestconfig: pytest.Config) -> Callable[[str, Callable[[Path], object]
         with FileLock(root / f"{name}.lock"):
             if not whole.exists():
                 for earlier in base.iterdir():
-                    if earlier.stat().st_mtime < time.time() - 86400.0:
+                    if earlier != root and earlier.stat().st_mtime < time.time() - 86400.0:
                         shutil.rmtree(earlier, ignore_errors=True)
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusion.analysis.drift_model.record import ask_unseen, declare, hold_out, search_record
+from fusion.analysis.drift_model.record import ask_unseen, declare, hold_out, search_record, series_of
 from fusion.analysis.drift_model.record_data import reduce_record
 from fusion.analysis.drift_model.search import open_hold_out
 from fusion.twin.recipe import EffectRecipe
@@ -70,7 +70,8 @@ def test_a_hold_out_that_wanders_at_random_bears_no_effect_out(kind: str, capsys
         record = reduce_record(twin_table(KINDS[kind], seed=seed))
         train, _ = hold_out(record)
         problem, state = search_record(record, train, declare(["quasi_static"], record))
-        final, scale = problem.predict(state.model.terms), record.displacement[train].std(axis=0)
+        share = series_of(state.model.terms, problem.predict(state.model.terms))
+        scale = record.displacement[train].std(axis=0)
         for size in WALKS:
             steps = rng.standard_normal(((~train).sum(), scale.size)) + rng.standard_normal(((~train).sum(), 1))
             displacement = record.displacement.copy()
@@ -79,7 +80,7 @@ def test_a_hold_out_that_wanders_at_random_bears_no_effect_out(kind: str, capsys
             wandering = replace(record, displacement=displacement)
             lasting = [term.candidate.event_s is None for term in state.added]
             left_out = [displacement] * (1 + len(lasting))
-            asked = ask_unseen(wandering, ~train, state, final, left_out)
+            asked = ask_unseen(wandering, ~train, state, share, left_out)
             told.update(one.word for one, lasts in zip(asked, lasting, strict=True) if lasts)
     with capsys.disabled():
         print(f"\n{kind}: borne out by a random walk {rate(told['yes'], told.total())}, {dict(told)}")

@@ -196,7 +196,7 @@ class ShownRange:
     ----------
     lowest_degC, highest_degC : (cycle,), NaN for a cycle that does not show it
     start_degC : mean of temperature minus rise
-    lowest_rise_K, highest_rise_K : A cell that the first cycle does not show counts as one without rise
+    lowest_rise_K, highest_rise_K : a cell that the first cycle does not show counts as one without rise
     """
 
     lowest_degC: Array

@@ -150,8 +150,8 @@ def _sums(frames: int, first: Array, deviations: Array, squares: Array, far_squa
 
 @dataclass(frozen=True)
 class MeanTemperature:
-    """Mean of the temperature of each pixel over the frames in which it had one, degC, mean squared deviation from it, K2, and bound on the
-    error of the mean, K, beyond `AVERAGING_LIMIT_K` of which the frames are calibrated one by one.
+    """Mean of the temperature of each pixel over the frames in which it had one, degC (NaN: in none), mean squared deviation from it, K2,
+    and bound on the error of the mean, K, beyond `AVERAGING_LIMIT_K` of which the frames are calibrated one by one.
     """
 
     frames: int

@@ -49,8 +49,8 @@ class Lens:
     Attributes
     ----------
     focal_length_px : px, unit of the normalised image coordinates
-    principal_point_px : px, centre of the distortion
-    distortion : of the normalised image coordinates
+    principal_point_px : (column, row), px, centre of the distortion
+    distortion : (k1, k2, p1, p2), of the normalised image coordinates
     size_px : (columns, rows) of the frames that the calibration was made with; None where it is not stated
     """
 

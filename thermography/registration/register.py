@@ -617,7 +617,7 @@ class Registration:
     lens : the calibrated lens that was given
     covariance
         (p, p), of the homography and of the distortion, p = 8 with a calibrated lens, else 12: coefficients that were not fitted are
-        not known to be zero. See `thermography.registration.projection.parameter_covariance`.
+        not known to be zero. See `thermography.registration.projection.DiscFit.covariance`.
     """
 
     homography: Array

@@ -331,15 +331,17 @@ def _integral_from_zero(line: Array, places_mm: Array) -> Array:
     return np.asarray(integral - integral[:, [int(np.argmin(np.abs(places_mm)))]])
 
 
+def both_ends(series: NDArray[np.datetime64], readings: NDArray[np.datetime64]) -> list[str]:
+    """First and last time of a series, then of the readings, in UTC."""
+    return [f"{np.datetime_as_string(at, unit='s')}Z" for at in (*series[[0, -1]], readings.min(), readings.max())]
+
+
 def _check_overlap(reading_time: NDArray[np.datetime64], frame_time: NDArray[np.datetime64]) -> None:
     timed = reading_time[~np.isnat(reading_time)]
     if timed.size == 0:
         raise AlignmentError("no reading has a time; readings and frames cannot be synchronised")
     if frame_time.size < 2 or frame_time[-1] < timed.min() or frame_time[0] > timed.max():
-        start, end, first, last = (
-            f"{np.datetime_as_string(time, unit='s')}Z"
-            for time in (frame_time[0], frame_time[-1], timed.min(), timed.max())
-        )
+        start, end, first, last = both_ends(frame_time, timed)
         raise AlignmentError(
             f"frames ({start} .. {end}) and readings ({first} .. {last}) do not overlap in time; check the time zone of both clocks and "
             "[thermography] clock_offset (camera clock minus laser clock)"

@@ -206,7 +206,7 @@ def _statistics(series: Sequence[DriftSeries], banks: Sequence[NullBank], respon
     total = np.zeros(flat.shape[1])
     for channel, bank in zip(series, banks, strict=True):
         regressors = np.ascontiguousarray(channel.sampling @ flat, np.float32)
-        total += likelihood_ratios(bank, whiten_series(bank, channel.values[None, :]), regressors)[0]
+        total += likelihood_ratios(whiten_series(bank, channel.values[None, :]), regressors)[0]
     return total.reshape(responses.shape[1:])
 
 

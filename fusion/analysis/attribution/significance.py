@@ -252,7 +252,7 @@ def _log_ratio(null_score: Array32, best: Array32, freedom: float) -> None:
             best[b, j] = freedom * np.log(whole / max(best[b, j], np.float32(1e-6) * whole))
 
 
-def likelihood_ratios(bank: NullBank, whitened: Whitened, regressors: Array32) -> Array32:
+def likelihood_ratios(whitened: Whitened, regressors: Array32) -> Array32:
     """Return the profile likelihood ratio of every regressor for every series."""
     draws = whitened.series.shape[1]
     best = np.empty((draws, regressors.shape[1]), np.float32)
@@ -511,7 +511,7 @@ def _test_tile(
     count = field.shape[1]
     regressors = [_respond_tile(source.response, field) for source in sources]
     ratios = [
-        likelihood_ratios(source.bank, source.whitened, columns).reshape(-1, count, lags)
+        likelihood_ratios(source.whitened, columns).reshape(-1, count, lags)
         for source, columns in zip(sources, regressors, strict=True)
     ]
     summed = [[k] for k in range(len(sources))]

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.analysis.alignment.align import covered_share, likely_zone_shift
+from fusion.analysis.alignment.align import both_ends, covered_share, likely_zone_shift
 from fusion.analysis.consistency.checks import CAMERA, CLOCK, Found, check, judge
 from fusion.analysis.consistency.clocks import QUARTER_S, QUARTERS, TIMES, Evidence
 from fusion.common import Array
@@ -162,11 +162,12 @@ def frames_coverage(frame_time: NDArray[np.datetime64], deviations: xr.Dataset, 
     readings = deviations["time"].values
     readings = readings[~np.isnat(readings)]
     covered, shift_s = covered_share(readings, frame_time), likely_zone_shift(readings, frame_time)
-    ends = [
-        f"{np.datetime_as_string(time, unit='s')}Z" for time in (*frame_time[[0, -1]], readings.min(), readings.max())
-    ]
     zones = covered < _COVERED_NOW and shift_s is not None
-    facts = {"ends": ends, "laser": deviations.attrs.get("source", "the laser"), "offset_s": offset_s}
+    facts = {
+        "ends": both_ends(frame_time, readings),
+        "laser": deviations.attrs.get("source", "the laser"),
+        "offset_s": offset_s,
+    }
     passed = covered > 0.0 and not zones
     return judge(covered, _COVERED_NOW, passed=passed, contradicts=True, shift_s=shift_s if zones else None, **facts)
 

@@ -18,7 +18,7 @@ from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.readings import Readings, Series
 from fusion.analysis.consistency.checks import LOG, Found, check, judge
 from fusion.analysis.consistency.clocks import COURSES, QUARTER_S, QUARTERS, Evidence
-from fusion.analysis.consistency.field_series import FieldSeries
+from fusion.analysis.consistency.field_series import LEAST_FRAMES, FieldSeries
 from fusion.analysis.consistency.logs import SOURCE_S, even_times, loads_of
 from fusion.analysis.consistency.material import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_LAGS_S, compare_course
 from fusion.analysis.drift_model.gains import by_width, profile_gains
@@ -86,7 +86,7 @@ def compare_material(near: FieldSeries | None, log: xr.Dataset | None) -> list[E
     share = np.full(_LOG_SHIFTS_S.size, np.inf)
     for k, shift in enumerate(_LOG_SHIFTS_S):
         inside = (near.seconds + shift >= at[0]) & (near.seconds + shift <= at[-1])
-        if inside.sum() < max(12, _LEAST_COMMON * near.seconds.size):
+        if inside.sum() < max(LEAST_FRAMES, _LEAST_COMMON * near.seconds.size):
             continue
         target = np.interp(near.seconds[inside] + shift, at, logged)
         compared = [compare_course(cells[inside], target) for cells in courses]

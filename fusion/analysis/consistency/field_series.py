@@ -18,7 +18,7 @@ _COARSE_MM = 20.0
 #: Frames nearer to each other than this say the same, s.
 _LEAST_STEP_S = 60.0
 #: Fewest frames from which a course can be distinguished from another one.
-_LEAST_FRAMES = 12
+LEAST_FRAMES = 12
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries |
     """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it that every frame shows."""
     frames = _thinned(fields)
     seen = seen_throughout(frames).ravel()
-    if len(frames) < _LEAST_FRAMES or not seen.any():
+    if len(frames) < LEAST_FRAMES or not seen.any():
         return None
     y_mm, x_mm = (at.ravel()[seen] for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
     away = np.array([x_mm - place_mm[0], y_mm - place_mm[1]])
@@ -96,7 +96,7 @@ def _series(frames: xr.DataArray) -> FieldSeries | None:
     """Cells that all frames show, as series; None where there are too few frames or no such cell."""
     values = frames.values.reshape(len(frames), -1).astype(float)
     seen = np.isfinite(values).all(axis=0)
-    if len(frames) < _LEAST_FRAMES or not seen.any():
+    if len(frames) < LEAST_FRAMES or not seen.any():
         return None
     y, x = np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij")
     return FieldSeries(*_clock(frames), values[:, seen], x.ravel()[seen], y.ravel()[seen])

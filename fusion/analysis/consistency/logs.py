@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.analysis.alignment.align import covered_share, likely_zone_shift
+from fusion.analysis.alignment.align import both_ends, covered_share, likely_zone_shift
 from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.sensor_health import Kind, examine_sensors
 from fusion.analysis.consistency.checks import CLOCK, LOG, Found, check, judge
@@ -48,7 +48,7 @@ def environment_coverage(environment: xr.Dataset, reading_time: xr.DataArray) ->
 
 @check("source", LOG, waits=True)
 def drivers_coverage(drivers: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
-    """The same of the drivers' log."""
+    """The same for the drivers' log."""
     return _coverage(drivers, reading_time)
 
 
@@ -73,7 +73,7 @@ def drivers_kind(drivers: xr.Dataset) -> Found | None:
 
 @check("source", CLOCK, waits=True)
 def sensors_coverage(sensors: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
-    """The same as of the environment log, of the contact sensors' log where it stands for the camera."""
+    """The same as for the environment log, for the contact sensors' log where it stands for the camera."""
     return _coverage(sensors, reading_time)
 
 
@@ -91,7 +91,7 @@ def _coverage(log: xr.Dataset, reading_time: xr.DataArray) -> Found | None:
     late_s = None if passed or gaps else likely_zone_shift(readings, logged)
     clear = late_s is not None and covered < _COVERED_NOW and _same_ends(logged, readings, late_s)
     apart_s = max(readings.min() - logged[-1], logged[0] - readings.max()) / np.timedelta64(1, "s")
-    ends = [f"{np.datetime_as_string(at, unit='s')}Z" for at in (*logged[[0, -1]], readings.min(), readings.max())]
+    ends = both_ends(logged, readings)
     contradicts = bool(apart_s > _APART_S or clear)
     return judge(covered, _LEAST_COVERED, passed=passed, contradicts=contradicts, ends=ends, gaps=gaps, late_s=late_s)
 

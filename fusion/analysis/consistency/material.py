@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.analysis.consistency.checks import CAMERA, LOG, Found, check, judge
-from fusion.analysis.consistency.field_series import FieldSeries, field_at
+from fusion.analysis.consistency.field_series import LEAST_FRAMES, FieldSeries, field_at
 from fusion.common import Array
 
 #: Largest difference between camera and sensors in standard uncertainties.
@@ -27,8 +27,8 @@ LEAST_FOLLOWED = 0.3
 #: Resolution of a logged temperature, K: smaller differences mean nothing.
 RESOLUTION_K = 0.01
 #: Share by which the rise under a surface probe may differ from that of the surface: contact and stem conduction, 2 standard
-#: uncertainties of 2 %.
-_CONTACT_SHARE = 0.04
+#: uncertainties.
+_CONTACT_SHARE = 2.0 * _CONTACT
 #: The same where the sensor's place is not stated: several cells follow alike, and their rises differ by some per cent.
 _UNKNOWN_PLACE = 0.07
 #: Drift of the camera's zero within a test that its correction leaves, K.
@@ -39,8 +39,6 @@ _LEAST_CHANGE_K = 1.0
 _LARGEST_LEFT = 0.7
 #: Share of the change of the least changing cell that the log has at least: a sensor on the table, also one in poor contact, shows more.
 _LEAST_SHARE = 0.5
-#: Fewest frames from which a course can be distinguished from another one.
-_LEAST_FRAMES = 12
 #: Differences over this time show the slope without a slow drift of the camera, s.
 _SHORT_TERM_S = 1200.0
 #: A cell is as good as the best one where the misfit is no larger by this many units of log-likelihood.
@@ -88,7 +86,7 @@ class Logged:
     @property
     def tells(self) -> bool:
         """Whether it changes enough, over enough frames, to be compared."""
-        return self.change_K >= _LEAST_CHANGE_K and bool(self.inside.sum() >= _LEAST_FRAMES)
+        return self.change_K >= _LEAST_CHANGE_K and bool(self.inside.sum() >= LEAST_FRAMES)
 
 
 def log_with_camera(near: FieldSeries | None, log: xr.Dataset | None) -> Logged | None:
@@ -132,7 +130,7 @@ def material_still(logged: Logged) -> Found:
     stated), where that is 1 K at least: at least `_LEAST_SHARE`.
     """
     least_K = float(np.ptp(logged.near.lagged(SENSOR_LAGS_S[-1])[logged.inside], axis=0).min())
-    testable = least_K >= _LEAST_CHANGE_K and logged.inside.sum() >= _LEAST_FRAMES
+    testable = least_K >= _LEAST_CHANGE_K and logged.inside.sum() >= LEAST_FRAMES
     share = logged.change_K / least_K if testable else 1.0
     facts = {"change_K": logged.change_K, "least_K": least_K, "testable": testable, "level": logged.material[0]}
     return judge(share, _LEAST_SHARE, passed=share >= _LEAST_SHARE, **facts)
@@ -236,7 +234,7 @@ def _off(slopes: tuple[float, float]) -> float:
 def _slopes(logged: Logged, temperature: Array, *, stated: bool) -> tuple[float, float] | None:
     """Smallest and largest slope of the camera over the log that the data allow; None where it changes little or no cell follows it."""
     near, inside = logged.near, logged.inside
-    if float(np.ptp(temperature)) < _LEAST_CHANGE_K or inside.sum() < _LEAST_FRAMES:
+    if float(np.ptp(temperature)) < _LEAST_CHANGE_K or inside.sum() < LEAST_FRAMES:
         return None
     step = max(1, round(_SHORT_TERM_S / float(np.median(np.diff(near.seconds[inside])))))
     courses = []

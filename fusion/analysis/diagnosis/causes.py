@@ -1,4 +1,4 @@
-"""Causes of an anomaly: each with its name in words and what to inspect on the machine; read without the libraries of the diagnosis."""
+"""Causes of an anomaly: each with its name in words and what to inspect on the machine; imports none of the libraries of the diagnosis."""
 
 from __future__ import annotations
 

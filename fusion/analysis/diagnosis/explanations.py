@@ -284,7 +284,7 @@ def fit_profile(residual: Residual, columns: Array, rng: np.random.Generator) ->
     # Gaussian draws need no orders of the residuals, but their number.
     orders = np.empty((_DRAWS, parts.mean.size), np.int64)
     series = np.vstack([parts.mean, resample(bank, orders, rng=rng, gaussian=True)])
-    ratios = likelihood_ratios(bank, whiten_series(bank, series), regressors)
+    ratios = likelihood_ratios(whiten_series(bank, series), regressors)
     largest = ratios.max(axis=1)
     best = int(ratios[0].argmax())
     estimate = estimate_effects(bank, regressors[:, [best]])
@@ -311,7 +311,7 @@ def _across_directions(
     positive, negative = (float(estimate_effects(bank, regressors[:, [best]]).coefficient[0]) for bank in banks)
     gain = 0.0
     for train, test in (banks, banks[::-1]):
-        ratios = likelihood_ratios(train, whiten_series(train, train.values[None, :]), regressors)
+        ratios = likelihood_ratios(whiten_series(train, train.values[None, :]), regressors)
         chosen = regressors[:, [int(ratios[0].argmax())]]
         prediction = chosen[:, 0] * estimate_effects(train, chosen).coefficient[0]
         # The drift beside a candidate is that of the readings less its prediction: what it explains is no random walk.

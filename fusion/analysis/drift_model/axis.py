@@ -45,7 +45,7 @@ from fusion.analysis.drift_model.evaluation import (
     describe_step,
     leading_pattern,
     left_out_of_forecast,
-    withhold_names,
+    withheld_for,
 )
 from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
 from fusion.analysis.drift_model.model import (
@@ -164,7 +164,7 @@ def _median(values: Array) -> float | None:
 
 
 def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Array, Array]:
-    """Size of every candidate's first column, (candidates,) each."""
+    """Of every candidate's first column the size about the sites, what the model leaves of it, and its spread, (candidates,) each."""
     site = model.readings.subset(model.used).site
     q, _ = np.linalg.qr(model.fit.design)
     own, left, spread = np.empty((3, len(candidates)))
@@ -885,7 +885,7 @@ def report_steps(
         is_smooth=model.fit.system.order == 2,
         total_um=_rms_about_sites(model.readings, model.readings.response),
     )
-    withheld = withhold_names(state, told, contributions, beside)
+    withheld = withheld_for(state, told, contributions, beside)
     return [
         AddedEffect(
             **describe_step(

@@ -274,7 +274,7 @@ class Surroundings:
     of_own_law: Collection[str] = ()
 
 
-def withhold_names(
+def withheld_for(
     state: LoopState[M], answers: Sequence[Answer], contributions: Sequence[Contribution], beside: Surroundings
 ) -> list[str]:
     """Say why added effects have no name, in turn; empty for those that have one."""
@@ -399,7 +399,7 @@ def has_skill(error_um: float, last_value_um: float, mean_um: float, noise_um: f
 
 
 #: What is left where a model with a name predicts neither to within the noise nor as well as the best plain prediction.
-BEYOND_PLAIN = say("unseen", "beyond_plain")
+BEYOND_PLAIN = say("remainder", "beyond_plain")
 #: A plain regression whose error is this share of the model's or less knows something that the model lacks.
 _BETTER = 0.75
 
@@ -583,11 +583,8 @@ class LoopResult:
     @property
     def _falls_short(self) -> bool:
         """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
-        errors_um = self._errors_um
-        final_um, plain_um = (
-            errors_um["final"],
-            min(map(errors_um.__getitem__, errors_um.keys() - {"declared", "final"})),
-        )
+        final_um = self._errors_um["final"]
+        plain_um = min(um for name, um in self._errors_um.items() if name not in schema.ModelErrors.model_fields)
         exceeds = exceeds_noise(final_um, self.noise_floor_um, self.noise_share)
         return any(self._kept) and exceeds and final_um > plain_um
 

@@ -106,7 +106,7 @@ def propose_tests(product: xr.Dataset, loop: RecordLoop, *, seed: int = 0) -> It
 
 
 def covariance_after(one: Response, seconds: Array, values: Array, *, steps: float) -> Array:
-    """Return the covariance of a response after a test (n, p) as well, of which so many steps are as long as a block of the record."""
+    """Return the covariance of a response after a test (n, p), too, so many steps of which are as long as a block of the record."""
     # The noise of a block mean is that of so many steps.
     noise_um, ratio = one.noise_um * np.sqrt(steps), one.ratio / steps
     marginal = Marginal.of(seconds, np.zeros(seconds.size), np.ones((seconds.size, 1)), values, ratio=ratio)

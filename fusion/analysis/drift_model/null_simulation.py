@@ -12,7 +12,7 @@ from fusion.analysis.drift_model.model import plausible_ratios
 from fusion.common import Array
 from interferometry.drift.gls import NO_MEMORY, Autoregression, DriftFit
 from interferometry.drift.kalman import DriftSystem
-from thermography.large_arrays import empty_array, one_by_one
+from thermography.large_arrays import empty_array, give_back, one_by_one
 
 DRAWS = 200
 #: Readings that are simulated together, 0.4 MB of random numbers, which stay in the cache of a processor.
@@ -45,6 +45,7 @@ def simulate_null(
     if memory.weights.size and site is not None:
         for number in np.unique(site):
             drawn[site == number] = memory.with_memory(drawn[site == number])
+            give_back(drawn)
     if system.memory is not None:
         kept = np.exp(-np.diff(system.seconds, prepend=-np.inf) / system.memory.time_s)[:, None]
         shared = np.zeros((1, draws))

@@ -41,7 +41,7 @@ from fusion.analysis.drift_model.evaluation import (
     exceeds_noise,
     leading_pattern,
     left_out_of_forecast,
-    withhold_names,
+    withheld_for,
 )
 from fusion.analysis.drift_model.gains import Gains, by_width, profile_gains
 from fusion.analysis.drift_model.model import (
@@ -1096,14 +1096,12 @@ def close_record(
         predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
         for terms in (state.model.terms, *(state.kept([place]) for place in range(len(state.steps))))
     ]
-    told = ask_unseen(record, ~train, state, model, left_out)
-    series = [
-        term.candidate.columns @ model.coefficients[place_of(state.model.terms, term)] for term in state.model.terms
-    ]
+    series = series_of(state.model.terms, model)
+    told = ask_unseen(record, ~train, state, series, left_out)
     contributions = [one - one.mean(axis=0) for one in series]
     contributed = contributions[len(state.declared) :]
     drift_um = float(np.mean([wandering_um(fit) for fit in whole.channels]))
-    withheld = withhold_names(
+    withheld = withheld_for(
         state,
         told,
         [
@@ -1152,16 +1150,18 @@ def close_record(
     )
 
 
+def series_of(terms: Sequence[Term], predicted: Prediction) -> list[Array]:
+    """What every term contributes to a prediction, (blocks, channels) each, um."""
+    return [term.candidate.columns @ predicted.coefficients[place_of(terms, term)] for term in terms]
+
+
 def ask_unseen(
-    record: Record, held_out: NDArray[np.bool_], state: RecordState, final: Prediction, left_out: Sequence[Array]
+    record: Record, held_out: NDArray[np.bool_], state: RecordState, share: Sequence[Array], left_out: Sequence[Array]
 ) -> list[Answer]:
     """What blocks that the coefficients were not fitted to say of every added effect: the hold-out set; of an event parts left out.
 
-    An event before the hold-out set is a constant there.
+    ``share`` is what every term of the final model contributes. An event before the hold-out set is a constant there.
     """
-    share = [
-        term.candidate.columns @ final.coefficients[place_of(state.model.terms, term)] for term in state.model.terms
-    ]
     declared = np.sum([np.zeros(record.displacement.shape), *share[: len(state.declared)]], axis=0)
     added = share[len(state.declared) :]
     events = [place for place, term in enumerate(state.added) if term.candidate.event_s is not None]

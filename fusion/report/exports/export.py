@@ -164,7 +164,7 @@ class Exported:
 
     Attributes
     ----------
-    files : the files
+    files : the files that were written
     remarks : what to know of them, one sentence each
     """
 

@@ -27,6 +27,7 @@ from fusion.results.numbers import print_unit
 from fusion.results.parts import Iso230Condition
 from fusion.results.results import Results
 from fusion.results.store import group, has, opened, read_product, require_kind
+from interferometry.io.tables import DATED
 from thermography.common import ACTING
 
 #: Bytes of a row of fields.csv, measured on the demo.
@@ -236,7 +237,7 @@ def record_readings_table(record: xr.Dataset) -> pd.DataFrame:
     elapsed = record["elapsed"].values / 3600.0 if "elapsed" in record else (time - time[0]) / np.timedelta64(1, "h")
     columns: dict[str, Any] = {"time [h]": elapsed}
     # The times of a record whose start nobody states count from zero.
-    columns |= {"time_utc": time} if time[0] >= np.datetime64("1971-01-01") else {}
+    columns |= {"time_utc": time} if time[0] >= DATED else {}
 
     def add(name: str, unit: str, values: np.ndarray) -> None:
         columns[own_name(f"{name} [{unit}]", columns)] = values

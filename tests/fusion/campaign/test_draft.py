@@ -25,7 +25,7 @@ ANSWERS = {
     "Title of the report": 'The "small" one',
     "Spindle at axis position 0, x": "500 mm",
     "Spindle at axis position 0, y": "90 mm",
-    "It moves, as the position grows": "left",
+    "How that point moves as the position grows": "left",
     "Material sensor, x": "640 mm",
     "Material sensor, y": "30 mm",
     "Size of a cell of the field": "20 mm",

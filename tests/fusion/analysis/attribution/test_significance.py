@@ -239,7 +239,7 @@ def problem(rng):
 def test_likelihood_ratio_is_that_of_dense_gaussian_algebra(problem):
     seconds, values, nuisance, regressors = problem
     bank = null_bank(values, seconds, np.ones(40), nuisance)
-    found = likelihood_ratios(bank, whiten_series(bank, values[None, :]), regressors)[0]
+    found = likelihood_ratios(whiten_series(bank, values[None, :]), regressors)[0]
     matrices = list(covariances(seconds, bank))
     null = max(dense_log_likelihood(values, nuisance, c) for c in matrices)
     expected = [
@@ -271,7 +271,7 @@ def test_a_regressor_without_information_gives_nothing(problem):
     seconds, values, nuisance, _ = problem
     bank = null_bank(values, seconds, np.ones(40), nuisance)
     dead = np.column_stack([np.zeros(40), np.ones(40), seconds / 3600.0]).astype(np.float32)
-    assert likelihood_ratios(bank, whiten_series(bank, values[None, :]), dead) == pytest.approx(0.0, abs=1e-6)
+    assert likelihood_ratios(whiten_series(bank, values[None, :]), dead) == pytest.approx(0.0, abs=1e-6)
     assert np.isinf(estimate_effects(bank, dead).coefficient_u).all()
 
 
@@ -350,8 +350,8 @@ def test_whitenings_in_a_temporary_file_give_the_same_bits(problem, monkeypatch)
     monkeypatch.setattr(spool_module, "IN_MEMORY_BYTES", 100)
     in_file = whiten_series(bank, draws)
     assert isinstance(in_file.projects.base, np.memmap) and isinstance(in_file.series.base, np.memmap)
-    found = likelihood_ratios(bank, in_file, regressors)
-    assert (found == likelihood_ratios(bank, at_hand, regressors)).all()
+    found = likelihood_ratios(in_file, regressors)
+    assert (found == likelihood_ratios(at_hand, regressors)).all()
     alone, beside = estimate_effects(bank, regressors), estimate_effects(bank, regressors, whitened=in_file)
     assert (alone.coefficient == beside.coefficient).all() and (alone.coefficient_u == beside.coefficient_u).all()
     assert (alone.null_u == beside.null_u).all()

@@ -161,7 +161,7 @@ def test_an_explanation_gains_half_its_likelihood_ratio_over_the_walk_that_it_st
     column = step_columns(CYCLES)[:, [25]]
     parts = residual.parts
     bank = module.fit_null(parts.grid, parts.mean)
-    ratio = module.likelihood_ratios(bank, module.whiten_series(bank, parts.mean[None]), column.astype(np.float32))
+    ratio = module.likelihood_ratios(module.whiten_series(bank, parts.mean[None]), column.astype(np.float32))
     fit = fit_profile(residual, column, rng)
     assert fit.log_likelihood == pytest.approx(walk.shared + 0.5 * float(ratio[0, 0]), abs=1e-3)
     assert fit.log_likelihood > walk.shared + 5.0

@@ -98,7 +98,7 @@ def test_fields_are_read_back_and_every_fault_is_named_with_its_field(copied):
     names = ("campaign.title", "plan.size.0", "plan.axis.direction", "thermography.table")
     assert [texts[name] for name in names] == ["Small campaign", "700 mm", "left", "still"]
     assert texts["report.machine"] == "", "a table that can be added is shown"
-    told = r"(?s)Width of the plan, x \(mm\): .*K.*It moves, as the position grows: .* no direction"
+    told = r"(?s)Width of the plan, x \(mm\): .*K.*How that point moves as the position grows: .* no direction"
     with pytest.raises(FieldError, match=told):
         write_fields(open_campaign(copied), {"plan.size.0": "700 K", "plan.axis.direction": "0, 0"})
 

@@ -131,7 +131,7 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(app, new_folder, n
     for label, text in (
         ("Spindle at axis position 0, x (mm)", "500"),
         ("Spindle at axis position 0, y (mm)", "90 mm"),
-        ("It moves, as the position grows", "left"),
+        ("How that point moves as the position grows", "left"),
         ("Machine", "<b>Mill</b>"),
     ):
         page.get_by_label(label, exact=True).fill(text)
