@@ -1,0 +1,263 @@
+"""A machine of known truth and its measured campaign, by numpy: nothing of the twin, and of the analysis only the names of its variables.
+
+A table of two heat capacities (a hot zone and the whole) is heated by a load and by the room; an axis of 16 targets expands with it, shifts with
+its mean, and drifts in ways that nobody declares. The camera's fields and the logs are as ideal instruments would hand them over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+START = np.datetime64("2026-03-09T06:30", "ns")
+#: Where the axis lies on the plan of the table (mm), and the size of that plan and of its cells.
+ORIGIN_MM, DIRECTION, PLAN_MM, CELL_MM = (40.0, 90.0), (1.0, 0.0), (400.0, 180.0), 20.0
+#: Time constants of the hot zone and of the whole table, min, and how far they warm at full load, K.
+ZONE_MIN, TABLE_MIN, ZONE_K, TABLE_K = 15.0, 60.0, 3.0, 4.0
+
+
+def first_order(seconds: Array, source: Array, minutes: float) -> Array:
+    """Response (n,) of a heat capacity with a time constant to a source (n,) that is constant between two times."""
+    state = np.zeros(source.shape)
+    kept = np.exp(-np.diff(seconds) / (60.0 * minutes))
+    for number, share in enumerate(kept):
+        state[number + 1] = share * state[number] + (1.0 - share) * source[number]
+    return state
+
+
+def constant_load(rng: np.random.Generator, seconds: Array) -> Array:
+    return np.ones(seconds.size)
+
+
+def switched_load(rng: np.random.Generator, seconds: Array) -> Array:
+    """Levels between 0 and 1, each held for 25 min on average."""
+    changes = rng.random(seconds.size) < np.gradient(seconds) / 1500.0
+    return rng.random(int(changes.sum()) + 1)[np.cumsum(changes)]
+
+
+def staircase_load(rng: np.random.Generator, seconds: Array) -> Array:
+    """Four levels up and down again."""
+    return np.array([0.25, 0.5, 0.75, 1.0, 0.6, 0.2])[(seconds / seconds[-1] * 5.999).astype(int)]
+
+
+LOADS = {"constant": constant_load, "staircase": staircase_load, "switched": switched_load}
+
+
+def walk(rng: np.random.Generator, seconds: Array, um_per_root_hour: float) -> Array:
+    steps = (
+        rng.standard_normal(seconds.size) * um_per_root_hour * np.sqrt(np.diff(seconds, prepend=seconds[0]) / 3600.0)
+    )
+    return np.cumsum(steps)
+
+
+def room(rng: np.random.Generator, seconds: Array, minutes: float = 36.0) -> Array:
+    """A room whose temperature forgets itself in some minutes (Ornstein and Uhlenbeck), standard deviation 1."""
+    kept = np.exp(-np.diff(seconds) / (60.0 * minutes))
+    state = np.empty(seconds.size)
+    state[0] = rng.standard_normal()
+    for number, share in enumerate(kept):
+        state[number + 1] = share * state[number] + np.sqrt(1.0 - share**2) * rng.standard_normal()
+    return state
+
+
+#: Undeclared drift (um) at times (n,) and shares of the travel (n,): what a test of hours may hold.
+DRIFTS: dict[str, Callable[[np.random.Generator, Array, Array], Array]] = {
+    "none": lambda rng, seconds, share: np.zeros(seconds.size),
+    "warm-up": lambda rng, seconds, share: (5.0 + 8.0 * share) * (1.0 - np.exp(-seconds / 4500.0)),
+    "random walk": lambda rng, seconds, share: walk(rng, seconds, 1.2) + share * walk(rng, seconds, 0.8),
+    "room": lambda rng, seconds, share: 1.0 * room(rng, seconds) + share * room(rng, seconds),
+    "switched": lambda rng, seconds, share: (
+        3.0 * (1.0 + share) * first_order(seconds, switched_load(rng, seconds), 30.0)
+    ),
+    "hot zone": lambda rng, seconds, share: (
+        (2.0 + 6.0 / (1.0 + np.exp(-(share - 0.5) * 300.0 / 24.0))) * (1.0 - np.exp(-seconds / 4500.0))
+    ),
+}
+
+
+def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], axis: int, memory: float) -> Array:
+    """Noise of standard deviation 1 that keeps a share of itself from one place to the next along an axis."""
+    noise = np.moveaxis(rng.standard_normal(shape), axis, 0)
+    for place in range(1, noise.shape[0]):
+        noise[place] = memory * noise[place - 1] + np.sqrt(1.0 - memory**2) * noise[place]
+    return np.moveaxis(noise, 0, axis)
+
+
+#: Reading noise (cycle, approach, order within the pass) of standard deviation 1.
+NOISES: dict[str, Callable[[np.random.Generator, tuple[int, int, int]], Array]] = {
+    "white": lambda rng, shape: rng.standard_normal(shape),
+    "Laplace": lambda rng, shape: rng.laplace(0.0, np.sqrt(0.5), shape),
+    "memory .3": lambda rng, shape: autoregressive(rng, shape, 2, 0.3),
+    "memory .6": lambda rng, shape: autoregressive(rng, shape, 2, 0.6),
+    "memory over cycles": lambda rng, shape: autoregressive(rng, shape, 0, 0.5),
+}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """An axis, what it stands on, and how it is measured.
+
+    Attributes
+    ----------
+    noise, drift, load : names out of `NOISES`, `DRIFTS` and `LOADS`
+    noise_um : standard deviation of a reading
+    unequal : how much the noise differs between sites, as the standard deviation of its logarithm
+    growing : by what share of itself the noise grows from the first cycle to the last
+    expansion_ppm_per_K, shift_um_per_K : what the axis does as its table warms
+    """
+
+    cycles: int = 40
+    targets: int = 16
+    spacing_mm: float = 20.0
+    cycle_s: float = 252.0
+    noise: str = "white"
+    noise_um: float = 0.4
+    unequal: float = 0.0
+    growing: float = 0.0
+    drift: str = "none"
+    load: str = "switched"
+    expansion_ppm_per_K: float = 11.7
+    shift_um_per_K: float = 2.5
+    profile_um: float = 4.0
+    reversal_um: float = 1.5
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A measured campaign beside its truth; arrays (cycle, approach, target) unless said otherwise.
+
+    Attributes
+    ----------
+    profile_um : (approach, target), without any drift
+    drift_um, noise_um : drift (declared effects included) and noise of every reading
+    sigma_um : (approach, target), standard deviation of the noise at the start of the test
+    undeclared_um : the part of the drift that no declared effect holds
+    table_K : (frame,), mean rise of the table, K
+    """
+
+    deviations: xr.Dataset
+    fields: xr.Dataset
+    environment: xr.Dataset
+    drivers: xr.Dataset
+    seconds: Array
+    profile_um: Array
+    drift_um: Array
+    undeclared_um: Array
+    noise_um: Array
+    sigma_um: Array
+    table_K: Array
+
+
+def times_s(machine: Machine) -> Array:
+    """Times of readings (cycle, approach, target), s: a cycle goes forth and back at an even pace."""
+    pace = machine.cycle_s / (2.0 * machine.targets)
+    forth = pace * np.arange(machine.targets)
+    back = pace * (2 * machine.targets - 1 - np.arange(machine.targets))
+    return machine.cycle_s * np.arange(machine.cycles)[:, None, None] + np.stack([forth, back])
+
+
+def readings_noise(machine: Machine, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return the noise of every reading (um) and its standard deviation at every site (um)."""
+    noise = NOISES[machine.noise](rng, (machine.cycles, 2, machine.targets))
+    # The second approach meets the targets in the opposite order.
+    noise[:, 1] = noise[:, 1, ::-1]
+    sigma = machine.noise_um * np.exp(machine.unequal * rng.standard_normal((2, machine.targets)))
+    growth = 1.0 + machine.growing * np.linspace(0.0, 1.0, machine.cycles)
+    return noise * sigma * growth[:, None, None], sigma
+
+
+def measure(machine: Machine, rng: np.random.Generator) -> Campaign:
+    """Measure a machine: random profile, load, drift and noise."""
+    seconds = times_s(machine)
+    position = machine.spacing_mm * np.arange(machine.targets)
+    share = position / position[-1]
+    profile = machine.profile_um * (share + 0.3 * np.sin(2.0 * np.pi * (share + rng.random())))
+    profile = np.stack([profile + machine.reversal_um / 2.0, profile - machine.reversal_um / 2.0])
+
+    frame_s = np.arange(0.0, seconds.max() + machine.cycle_s, machine.cycle_s / 2.0)
+    load = LOADS[machine.load](rng, frame_s)
+    zone, table = (first_order(frame_s, load, minutes) for minutes in (ZONE_MIN, TABLE_MIN))
+    y, x = (np.arange(CELL_MM / 2.0, size, CELL_MM) for size in PLAN_MM[::-1])
+    near = np.exp(-(((x - 260.0) / 80.0) ** 2) - ((y[:, None] - 90.0) / 60.0) ** 2)
+    rise = TABLE_K * table[:, None, None] + ZONE_K * zone[:, None, None] * near
+    temperature = 21.0 + rise + 0.02 * rng.standard_normal(rise.shape)
+
+    order = np.argsort(seconds, axis=None)
+    at, where = seconds.ravel()[order], np.broadcast_to(share, seconds.shape).ravel()[order]
+    undeclared = np.empty(seconds.size)
+    undeclared[order] = DRIFTS[machine.drift](rng, at, where)
+    undeclared = undeclared.reshape(seconds.shape)
+    mean_K, integral = rise.mean(axis=(1, 2)), _integral(rise, x, y, position)
+    shift = machine.shift_um_per_K * np.interp(seconds, frame_s, mean_K)
+    expansion = np.empty(seconds.shape)
+    for target in range(machine.targets):
+        expansion[..., target] = np.interp(seconds[..., target], frame_s, integral[:, target])
+    declared = shift + 1e-3 * machine.expansion_ppm_per_K * expansion
+    noise, sigma = readings_noise(machine, rng)
+    deviation = profile + declared + undeclared + noise
+    return Campaign(
+        deviations_of(seconds, position, deviation),
+        fields_of(frame_s, x, y, temperature),
+        xr.Dataset(
+            {
+                "air_temperature": ("time", np.full(frame_s.size, 21.0), {"units": "degC"}),
+                "material_temperature": ("time", 21.0 + mean_K, {"units": "degC"}),
+            },
+            {"time": clock(frame_s)},
+        ),
+        xr.Dataset({"duty": ("time", load, {"units": "1"})}, {"time": clock(frame_s)}),
+        seconds,
+        profile,
+        declared + undeclared,
+        undeclared,
+        noise,
+        sigma,
+        mean_K,
+    )
+
+
+def _integral(rise: Array, x: Array, y: Array, position: Array) -> Array:
+    """Integral (frame, target), K mm, of the rise along the axis from its position 0, trapezoids of 2 mm between centres of cells."""
+    row = int(np.argmin(abs(y - ORIGIN_MM[1])))
+    fine = np.arange(0.0, position[-1] + 1.0, 2.0)
+    line = np.array([np.interp(ORIGIN_MM[0] + fine, x, one) for one in rise[:, row]])
+    total = np.concatenate([np.zeros((len(rise), 1)), np.cumsum((line[:, 1:] + line[:, :-1]), axis=1)], axis=1)
+    return np.array([np.interp(position, fine, one) for one in total])
+
+
+def clock(seconds: Array) -> NDArray[np.datetime64]:
+    return START + np.round(1e9 * seconds).astype("timedelta64[ns]")
+
+
+def deviations_of(seconds: Array, position_mm: Array, deviation_um: Array) -> xr.Dataset:
+    """Readings (cycle, approach, target) as the laser's reader hands them over; NaN where one is missing."""
+    dims, cycles, _, targets = ("cycle", "direction", "target"), *deviation_um.shape
+    missing = np.isnan(deviation_um)
+    time = np.where(missing, np.datetime64("NaT"), clock(seconds))
+    return xr.Dataset(
+        {
+            "deviation": (dims, deviation_um, {"units": "um"}),
+            "time": (dims, time, {"origin": "recorded"}),
+            "position": ("target", position_mm, {"units": "mm"}),
+            "quality_flag": (dims, missing.astype(np.uint8), {"units": "1"}),
+            "resolution": ((), 0.0, {"units": "um"}),
+        },
+        {
+            "cycle": np.arange(1, cycles + 1),
+            "direction": ["positive", "negative"],
+            "target": np.arange(1, targets + 1),
+        },
+    )
+
+
+def fields_of(frame_s: Array, x: Array, y: Array, temperature: Array) -> xr.Dataset:
+    """Temperature fields (time, y, x), degC, one frame for every time."""
+    return xr.Dataset(
+        {"frame_temperature": (("time", "y", "x"), temperature, {"units": "degC"})},
+        {"time": clock(frame_s), "y": ("y", y, {"units": "mm"}), "x": ("x", x, {"units": "mm"})},
+    )
