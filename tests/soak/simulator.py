@@ -1,7 +1,7 @@
 """A machine of known truth and its measured campaign, by numpy: nothing of the twin, and of the analysis only the names of its variables.
 
-A table of two heat capacities (a hot zone and the whole) is heated by a load and by the room; an axis of 16 targets expands with it, shifts with
-its mean, and drifts in ways that nobody declares. The camera's fields and the logs are as ideal instruments would hand them over.
+A table of two heat capacities (a hot zone and the whole) is heated by a load; an axis of 16 targets expands with it, shifts with its mean,
+and drifts in ways that nobody declares. The camera's fields and the logs are as ideal instruments would hand them over.
 """
 
 from __future__ import annotations
