@@ -143,7 +143,8 @@ def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
         if pair.places is not None:
             found = describe_places(pairs, pair)
             parts += [ui.heading("Places that the drift follows", level=3), ui.paragraph(" ".join(found["said"]))]
-            parts.append(table_of(found["table"], "Sources that either test shows"))
+            if found["table"].rows:
+                parts.append(table_of(found["table"], "Sources that either test shows"))
         if pair.changes:
             every = f"Everything that was compared, {names[0]} before and {name} after"
             parts.append(table_of(changes_table(pairs, pair), every))

@@ -250,7 +250,11 @@ def _read_record(path: Path) -> TableProposal:
 def _read_names(path: Path) -> list[str]:
     from interferometry.io.tables import read_table
 
-    return [fields["name"].strip() for _, fields in read_table(path, ("name",)).records() if fields is not None]
+    return [
+        fields["name"].strip()
+        for _, fields in read_table(path, ("name", "x_mm", "y_mm")).records()
+        if fields is not None
+    ]
 
 
 def _read_regions(path: Path) -> Any:

@@ -16,7 +16,6 @@ from fusion.analysis.drift_model.record_data import reduce_record
 from fusion.analysis.drift_model.verification import ChannelVerdict, verify
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import CampaignError, load_campaign
-from fusion.campaign.inputs import read_record
 from fusion.campaign.values import read_option
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import duration
@@ -114,6 +113,8 @@ class Verification:
 
 def verify_compensation(before: Path, after: Path, applied: Path) -> Verification:
     """Compare a test with an active compensation with what the results before it predicted."""
+    from fusion.campaign.inputs import read_record  # its instruments take half a second, which a plan does not need
+
     if applied.suffix.lower() != ".json":
         raise CampaignError(
             f"{applied}: name the model that the control runs, model.json of export --format model-json; what a table of positions did "

@@ -193,7 +193,10 @@ def collect_garbage_less() -> None:
 def start_run(
     campaign: Path, results: Path, *options: str, resume: bool, usual: Mapping[str, str] | None = None, **process: Any
 ) -> subprocess.Popen[Any]:
-    """Start `thermofuse run` in a process of the same interpreter that finds the same modules; `usual` holds for what nobody has set."""
+    """Start `thermofuse run` in a process of the same interpreter that finds the same modules.
+
+    Variables of `usual` apply where the environment does not set them.
+    """
     command = [sys.executable, "-P", "-m", "fusion.cli", "run", str(campaign), "--out", str(results), *options]
     command += ["--resume"] if resume else []
     environment = {**(usual or {}), **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -1,4 +1,4 @@
-"""What the parts of results.json have in common: their base class, types of values, and quantities with an uncertainty.
+"""What parts of results.json share: their base class, types of values, quantities with an uncertainty, and the prediction of a table.
 
 The analysis makes the parts. A number that the data do not determine is NaN there, ``null`` in the file and None when it is read; a key
 that does not apply is never set, and absent.
@@ -508,7 +508,7 @@ class ContactSensorPart(ResultPart):
 # What a compensation table is predicted to leave, as it is stored beside the table.
 
 #: What the name of the file adds to that of the table.
-ENDING = ".prediction.json"
+PREDICTION_ENDING = ".prediction.json"
 
 
 class TablePredictionError(FusionError):
@@ -534,7 +534,7 @@ class TablePrediction(ResultPart):
 
 def read_table_prediction(path: Path) -> TablePrediction:
     """Read the prediction of a table; either file may be named."""
-    file = path if path.name.endswith(ENDING) else path.with_name(path.name + ENDING)
+    file = path if path.name.endswith(PREDICTION_ENDING) else path.with_name(path.name + PREDICTION_ENDING)
     try:
         return TablePrediction.model_validate(json.loads(file.read_text(encoding="utf-8")))
     except FileNotFoundError:

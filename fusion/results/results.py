@@ -93,8 +93,20 @@ _WITHOUT_BUDGET: dict[str, Any] = {
     "u_without_sampling_um": {},
     "contributions": [],
 }
-#: Keys of conditions whose earlier names are not their words.
-_CONDITIONS = {"Date of the test": "date", "Serial number of the machine": "machine_serial_number"}
+#: Earlier results name a condition by its words alone; keys that differ from those words.
+_CONDITIONS = {
+    "Air temperature before, after": "air_temperature",
+    "Compensation of the machine": "machine_compensation",
+    "Date of the test": "date",
+    "Dwell at a target": "dwell",
+    "Lead of the screw": "screw_lead",
+    "Material temperature before, after": "material_temperature",
+    "Places of the sensors": "sensor_places",
+    "Readings": "compensation",
+    "Serial number of the machine": "machine_serial_number",
+    "Travel of the axis": "axis_travel",
+    "Warm-up": "warm_up",
+}
 #: Objects whose keys are names of a campaign: fiducials and channels.
 _NAMED_BY_THE_CAMPAIGN = ("leave_one_out_mm", "channels", "rms_by_channel_um")
 #: Faults of a file of which the first is named: each one that is written out takes a kilobyte.

@@ -402,7 +402,7 @@ class Recipe(_TomlTable):
     source : heat sources under the table
     effect : effects that the campaign file does not declare
     anomaly : anomalous targets
-    record : A record instead of a positioning test
+    record : a record instead of a positioning test
     """
 
     campaign: Campaign = field(default_factory=Campaign)

@@ -41,7 +41,7 @@ from fusion.report.exports.controls import (
 from fusion.report.wording import sentences
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
-from fusion.results.parts import ENDING, Quantity, TablePrediction
+from fusion.results.parts import PREDICTION_ENDING, Quantity, TablePrediction
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically
 from interferometry.iso230 import STANDARD_CYCLES
@@ -307,7 +307,7 @@ def _table_texts(
     header = header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
     file = control.file_name.format(axis=name) if name else control.file_name.replace("_{axis}", "")
     texts = {file: control.write(table, name, header if control.comment else ())}
-    texts[f"{file}{ENDING}"] = _prediction_text(run, profile, table, control, file)
+    texts[f"{file}{PREDICTION_ENDING}"] = _prediction_text(run, profile, table, control, file)
     if not control.comment:
         texts[f"{file}.README.txt"] = "\n".join(header) + "\n"
     return texts, [*_forced(against), *remarks(run.results)]

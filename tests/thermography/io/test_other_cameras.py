@@ -19,6 +19,7 @@ from thermography.io import flir
 from thermography.io import other_cameras as frame_readers
 from thermography.io.flir import FlirReader, read_frame
 from thermography.io.flir_writer import write_jpeg
+from thermography.io.frame import RejectedFrame
 from thermography.io.other_cameras import (
     FrameReaderError,
     NetcdfReader,
@@ -393,6 +394,31 @@ def test_a_plug_in_that_cannot_be_used_is_no_fault_of_the_files(tmp_path, plug_i
 
 def test_every_reader_keeps_the_protocol():
     assert all(isinstance(reader, frame_readers.FrameReader) for reader in readers())
+
+
+def test_damaged_files_raise_no_foreign_error(tmp_path):
+    np.save(tmp_path / "a.npy", SMALL_IMAGE)
+    tifffile.imwrite(tmp_path / "b.tif", np.stack([SMALL_IMAGE] * 2).astype(np.float32), photometric="minisblack")
+    np.savetxt(tmp_path / "c.csv", SMALL_IMAGE, delimiter=";", fmt="%.2f")
+    rng = np.random.default_rng(7)
+    outcomes = {"read": 0, "refused": 0}
+    for i in range(240):
+        original = sorted(tmp_path.glob("[abc].*"))[i % 3]
+        content = bytearray(original.read_bytes())
+        for _ in range(int(rng.integers(1, 4))):
+            at = int(rng.integers(0, len(content)))
+            content[at : at + int(rng.integers(0, 9))] = rng.bytes(int(rng.integers(0, 9)))
+        path = tmp_path / f"damaged{original.suffix}"
+        path.write_bytes(bytes(content[: int(rng.integers(1, len(content) + 1))] if i % 5 == 0 else content))
+        try:
+            frames, rejected = index_recordings([path], EVERY_10_S)
+            for frame in frames:
+                frame.read_counts()
+            assert all(isinstance(one, RejectedFrame) for one in rejected)
+            outcomes["read" if frames else "refused"] += 1
+        except (ThermographyError, OSError):
+            outcomes["refused"] += 1
+    assert min(outcomes.values()) > 20
 
 
 def test_what_the_options_must_say_is_asked_for(tmp_path):

@@ -18,7 +18,7 @@ from fusion.analysis.consistency.clocks import Recording, compare_clocks
 from fusion.analysis.consistency.field_series import field_at, thin_fields
 from fusion.analysis.consistency.library import RULES
 from fusion.analysis.consistency.material import log_with_camera
-from fusion.pipeline.consistency import Check, _worded
+from fusion.pipeline.consistency import Check, _worded, run_checks
 from fusion.results.axis import RegistrationPart
 from tests.fusion.analysis.consistency import test_camera, test_logs, test_model, test_readings
 from tests.fusion.analysis.consistency.twin_fields import FILES, SENSOR_MM, late, recorded, scaled
@@ -248,6 +248,18 @@ LIES: dict[str, Lie] = {
 }
 
 
+#: What the evidence of a lie must say: its number, place or file.
+SAID = {
+    "travel_order": "In 40 of 40 cycles, first in cycle 1, the readings labelled positive were taken at falling",
+    "fiducials_found": "5 of the 12 fiducials of fiducials.csv",
+    "fiducials_unchecked": "If F1, F3 were elsewhere than fiducials.csv says",
+    "fiducial_hints": "7 of 12 fiducials lie more than 25 px",
+    "fiducial_diameters": "1.060 times the area that diameter_mm of fiducials.csv says",
+    "fiducials_span": "The fiducials in use span 24 % of the plan",
+    "plan_mirrored": "appears mirrored",
+}
+
+
 @pytest.fixture(scope="module")
 def sound(campaign_folder: Path) -> dict[str, Inputs]:
     """Inputs that agree, for every phase; what is compared in one check only need not be of one test."""
@@ -294,3 +306,10 @@ def test_sound_inputs_pass_and_a_lie_is_named_with_its_remedy(code: str, sound: 
     assert not doubted.passed and doubted.remedy.endswith(".") and doubted.evidence.endswith(".")
     assert doubted.evidence != told.evidence and doubted.assumption and doubted.endangers
     assert doubted.conditional == rule.figures and "causes" in rule.figures
+    assert SAID.get(code, "") in doubted.evidence
+    assert "unit" in doubted.remedy or code not in ("deviation_magnitude", "deviation_unit", "travel")
+
+
+@pytest.mark.parametrize("code", [code for code, rule in RULES.items() if rule.phase == "plan"])
+def test_a_fault_of_the_plan_fails_its_own_check_alone(code: str, sound: dict[str, Inputs]) -> None:
+    assert [check.code for check in run_checks("plan", LIES[code](sound["plan"])) if not check.passed] == [code]
