@@ -1,0 +1,75 @@
+"""Coverage of what is printed with ± of profile, reversal, drift and coefficients, by a simulator of its own: docs/method/coverage.md.
+
+Every figure: the share of errors within 2 u (0.954 of normal errors), and the root mean square of the errors over that of u, 1 where u is
+honest.
+THERMOFUSE_RUNS campaigns for each kind of drift, of noise and of length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from interferometry.drift.estimate import estimate_drift
+from tests.soak.rates import campaigns, first_seed
+from tests.soak.simulator import DRIFTS, NOISES, Campaign, Machine, measure
+
+pytestmark = pytest.mark.slow
+RUNS = campaigns(60)
+FIRST_SEED = first_seed(2300)
+#: Drifts whose shape along the axis the joint estimate holds: a shift and a stretch, whatever their course.
+HELD = [name for name in DRIFTS if name != "hot zone"]
+#: A machine without a declared effect.
+ALONE = Machine(expansion_ppm_per_K=0.0, shift_um_per_K=0.0)
+
+
+def errors(campaign: Campaign) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Errors of the joint estimate and their standard uncertainty, um."""
+    found = estimate_drift(campaign.deviations)
+    # The profile is that of the average over the measured cycles, from which the drift is counted as well.
+    state = campaign.drift_um.mean(axis=(0, 1))
+    profile = campaign.profile_um + state
+    return {
+        "profile": (found["profile"].values - profile, found["profile_u"].values),
+        "reversal": (found["reversal"].values - profile[0] + profile[1], found["reversal_u"].values),
+        "drift": (found["drift"].values - campaign.drift_um + state, found["drift_u"].values),
+    }
+
+
+def rows(machine: Machine, number: int) -> dict[str, tuple[float, float]]:
+    """Share within 2 u, and rms of the errors over that of u, of every quantity."""
+    made = [errors(measure(machine, np.random.default_rng([FIRST_SEED, number, run]))) for run in range(RUNS)]
+    found = {}
+    for name in made[0]:
+        error, u = (np.concatenate([one[name][part].ravel() for one in made]) for part in (0, 1))
+        found[name] = float(np.mean(np.abs(error) <= 2.0 * u)), float(np.sqrt(np.mean(error**2) / np.mean(u**2)))
+    return found
+
+
+def show(title: str, found: dict[str, tuple[float, float]], capsys: pytest.CaptureFixture[str]) -> None:
+    with capsys.disabled():
+        print(f"\n{title}: " + ", ".join(f"{name} {share:.3f} (rms {rms:.2f})" for name, (share, rms) in found.items()))
+
+
+@pytest.mark.parametrize("cycles", [8, 15, 40])
+@pytest.mark.parametrize("drift", list(DRIFTS))
+def test_joint_estimate(drift: str, cycles: int, capsys: pytest.CaptureFixture[str]) -> None:
+    found = rows(replace(ALONE, drift=drift, cycles=cycles), 10 * list(DRIFTS).index(drift) + cycles)
+    show(f"{drift}, {cycles} cycles", found, capsys)
+    for name, (share, rms) in found.items():
+        # The band of a drift that is not there cannot be as narrow as its error, nothing.
+        if drift in HELD and (drift, name) != ("none", "drift"):
+            assert 0.92 <= share <= 0.98 and 0.7 <= rms <= 1.3, name
+
+
+@pytest.mark.parametrize("quality", ["equal", "unequal", "growing"])
+@pytest.mark.parametrize("noise", list(NOISES))
+def test_noise(noise: str, quality: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shape = {"equal": {}, "unequal": {"unequal": 0.25}, "growing": {"growing": 1.0}}[quality]
+    number = 1000 + 10 * list(NOISES).index(noise) + ["equal", "unequal", "growing"].index(quality)
+    found = rows(replace(ALONE, drift="random walk", noise=noise, **shape), number)
+    show(f"{noise}, {quality}", found, capsys)
+    for name, (share, rms) in found.items():
+        assert 0.92 <= share <= 0.98 and 0.7 <= rms <= 1.3, name
