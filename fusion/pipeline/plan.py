@@ -113,7 +113,7 @@ class Verification:
 
 def verify_compensation(before: Path, after: Path, applied: Path) -> Verification:
     """Compare a test with an active compensation with what the results before it predicted."""
-    from fusion.campaign.inputs import read_record  # its instruments take half a second, which a plan does not need
+    from fusion.campaign.inputs import read_record  # loads both instruments, which no plan needs
 
     if applied.suffix.lower() != ".json":
         raise CampaignError(
