@@ -25,7 +25,7 @@ from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.campaign.schema import Key, keys_of
 from fusion.campaign.time_zones import is_dated, shown_zone
-from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window
+from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window, Iso230WithTable
 from fusion.results.numbers import exact, moment
 from fusion.results.parts import Iso230Condition, Iso230Tolerance, Quantity, decide, is_determined
 from fusion.results.progress import left_out_notices
@@ -42,6 +42,7 @@ from interferometry.iso230 import (
     SAMPLING,
     STANDARD_CYCLES,
     Iso230Budget,
+    accuracy_with_table,
     evaluate_iso230,
     evaluate_other_standards,
     evaluate_windows,
@@ -121,8 +122,21 @@ def evaluate_standard(
         range_um={
             name: Iso230Range(lowest=of_standard[name].min(), highest=of_standard[name].max()) for name in QUANTITIES
         },
+        with_table=None
+        if drift is None
+        else _with_table(deviations, drift, blocks[: of_standard.sizes["window"]], quoted),
     )
     return windows, settled, part
+
+
+def _with_table(
+    deviations: xr.Dataset, drift: xr.Dataset, windows: list[list[int]], quoted: list[int]
+) -> Iso230WithTable | None:
+    """Return A with a compensation table; None where no cycles are left that it could be made from."""
+    found = accuracy_with_table(deviations, drift["drift"], [quoted, *windows])
+    if not np.isfinite(found).all():
+        return None
+    return Iso230WithTable(quoted_um=found[0], lowest_um=found.min(), highest_um=found.max())
 
 
 def _quantity(result: xr.Dataset, name: str, **where: str) -> Quantity:

@@ -316,6 +316,17 @@ class Iso230Range(ResultPart):
     """Largest value, um."""
 
 
+class Iso230WithTable(ResultPart):
+    """A of the readings of this test had a compensation table corrected them, each window by the profile that all other cycles show."""
+
+    quoted_um: Number
+    """In the quoted window, um."""
+    lowest_um: Number
+    """Smallest value of any window of the standard's number of cycles, um."""
+    highest_um: Number
+    """Largest value: a table is right in one thermal state only, um."""
+
+
 class Iso230Part(Iso230Window):
     """Axis values by ISO 230-2:2014; those at this level are the values to quote, of the window that shows the warmed-up axis."""
 
@@ -325,6 +336,8 @@ class Iso230Part(Iso230Window):
     """The first window, which may be a cold start."""
     range_um: Mapping[str, Iso230Range] = Field(default_factory=dict)
     """Range of A, R, E, M and B over all windows of the standard's number of cycles, um."""
+    with_table: Iso230WithTable | None = None
+    """A with a compensation table in this thermal state and in the others; null where no other cycles tell. New in schema 4."""
     tolerances: tuple[Iso230Tolerance, ...] = ()
     """The quoted window against the tolerances that the campaign states."""
     checks: tuple[Iso230Check, ...] = ()

@@ -9,6 +9,7 @@ Evaluation (:mod:`interferometry.iso230.evaluation`), the inputs of the budget (
 from interferometry.iso230.budget import CONTRIBUTIONS, SAMPLING, Iso230Budget
 from interferometry.iso230.evaluation import (
     STANDARD_CYCLES,
+    accuracy_with_table,
     evaluate_iso230,
     evaluate_other_standards,
     evaluate_windows,
@@ -22,6 +23,7 @@ __all__ = [
     "SAMPLING",
     "STANDARD_CYCLES",
     "Iso230Budget",
+    "accuracy_with_table",
     "evaluate_iso230",
     "evaluate_other_standards",
     "evaluate_windows",

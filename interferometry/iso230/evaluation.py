@@ -194,6 +194,24 @@ def evaluate_windows(
     ).assign_attrs(window="several")
 
 
+def accuracy_with_table(deviations: xr.Dataset, drift: xr.DataArray, windows: Sequence[Sequence[int]]) -> np.ndarray:
+    """Return A of every window (windows,), um, had a table of both approaches corrected the profile that the other cycles show.
+
+    NaN where no other cycle holds what the window does: readings that a table was made from say nothing of a test with it.
+    """
+    x = deviations["deviation"].transpose("cycle", "direction", "target").reindex(direction=list(DIRECTIONS))
+    # What is flagged, as a single gross error, enters no table.
+    profile = (x - drift).where(deviations["quality_flag"] == 0).transpose(*x.dims)
+    found = []
+    for window in windows:
+        inside = x["cycle"].isin(window)
+        left = (x[inside] - profile[~inside].mean("cycle")).values
+        count, read = np.isfinite(left).sum(axis=0), np.isfinite(x[inside].values).sum(axis=0)
+        mean, s = _mean_and_s(left, np.where(count > 1, count, 0))
+        found.append(float(axis_quantities(mean, s)["A"]) if (count == read).all() else np.nan)
+    return np.array(found)
+
+
 def _of_the_axis(result: xr.Dataset) -> xr.Dataset:
     """Return what was found of the axis as a whole, without the values of single targets."""
     return result[[name for name in result.data_vars if "target" not in result[name].dims]]

@@ -119,12 +119,14 @@ def read_profile(deviations: xr.Dataset) -> Profile:
     )
 
 
-def read_scatter(deviations: xr.Dataset) -> Array:
-    """Return the standard deviation of a reading (2, n), um, in the order of `read_profile`."""
-    drift = group(deviations, "drift").sel(direction=list(APPROACHES))
+def read_scatter_and_drift(deviations: xr.Dataset) -> tuple[Array, Array]:
+    """Return the standard deviation of a reading (2, n) and the drift (cycles, 2, n), um, in the order of `read_profile`."""
     order = np.argsort(deviations["position"].values)
-    scatter = drift["scatter"].fillna(drift["scatter_position"])
-    return np.asarray(scatter.isel(target=order).transpose("direction", "target").values, float)
+    drift = group(deviations, "drift").sel(direction=list(APPROACHES)).isel(target=order)
+    scatter = drift["scatter"].fillna(drift["scatter_position"]).transpose("direction", "target")
+    # Where a reading is missing, the drift went on.
+    course = drift["drift"].interpolate_na("cycle", fill_value="extrapolate").transpose("cycle", "direction", "target")
+    return scatter.values.astype(float), course.values.astype(float)
 
 
 def tabulate(profile: Profile, *, spacing_mm: float | None = None, reference_mm: float | None = None) -> ErrorTable:

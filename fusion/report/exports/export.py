@@ -33,7 +33,7 @@ from fusion.report.exports.controls import (
     path_variance,
     read_origin,
     read_profile,
-    read_scatter,
+    read_scatter_and_drift,
     read_thermal_state,
     siemens_temperature,
     tabulate,
@@ -109,18 +109,23 @@ def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Predicti
 
 
 def predict_test(
-    profile: Profile, table: ErrorTable, scatter_um: Array, *, cycles: int, one_table: bool
+    profile: Profile, table: ErrorTable, scatter_um: Array, drift_um: Array, *, cycles: int, one_table: bool
 ) -> dict[str, Quantity]:
     """Predict A, E, M and B of a test of so many cycles with an active table: median over tests, each with its own readings.
 
-    `scatter_um` (2, n) is the standard deviation of a reading. The errors of the profile are those of the table too.
+    `scatter_um` (2, n) is the standard deviation of a reading, `drift_um` (cycles, 2, n) the drift, which no table corrects: every
+    test has that of some successive cycles. The errors of the profile are those of the table too.
     """
     rng, left = np.random.default_rng(_SEED), remainder_um(profile, table, one_table=one_table)
     errors = rng.multivariate_normal(
         np.zeros(left.size), profile.covariance_um2.reshape(left.size, left.size), _DRAWS, method="eigh"
     )
     mean = left - errors.reshape(_DRAWS, *left.shape) + rng.normal(0.0, scatter_um / cycles**0.5, (_DRAWS, *left.shape))
-    spread = 2.0 * scatter_um * np.sqrt(rng.chisquare(cycles - 1, mean.shape) / (cycles - 1))
+    first = rng.integers(0, max(1, len(drift_um) - cycles + 1), _DRAWS)
+    states = [drift_um[start : start + cycles] for start in first]
+    mean = mean + [state.mean(axis=0) for state in states]
+    drifted = np.array([state.var(axis=0, ddof=1 if len(state) > 1 else 0) for state in states])
+    spread = 2.0 * np.sqrt(scatter_um**2 * rng.chisquare(cycles - 1, mean.shape) / (cycles - 1) + drifted)
     drawn = {
         "A": (mean + spread).max(axis=(1, 2)) - (mean - spread).min(axis=(1, 2)),
         "E": np.ptp(mean, axis=(1, 2)),
@@ -303,6 +308,7 @@ def _table_texts(
     name = _axis_name(run, axis, needed=control.names_axis)
     facts: dict[str, Any] = {"words": control.words, "axis": name, "table": table, "sign": control.sign}
     facts["prediction"] = predict(profile, table, one_table=control.one_table)
+    facts["with_table"] = run.results.iso230.with_table if run.results.iso230 else None
     facts["between_um"] = (path_variance(profile) * table.widest_gap_mm / 4.0) ** 0.5
     header = header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
     file = control.file_name.format(axis=name) if name else control.file_name.replace("_{axis}", "")
@@ -323,7 +329,11 @@ def _prediction_text(run: _Run, profile: Profile, table: ErrorTable, control: Co
         results_sha256=run.origin.results_sha256,
         cycles=cycles,
         predicted_um=predict_test(
-            profile, table, read_scatter(run.deviations), cycles=max(cycles, 2), one_table=control.one_table
+            profile,
+            table,
+            *read_scatter_and_drift(run.deviations),
+            cycles=max(cycles, 2),
+            one_table=control.one_table,
         ),
     )
     return json.dumps(prediction.model_dump(mode="json"), indent=2) + "\n"

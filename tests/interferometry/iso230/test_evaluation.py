@@ -12,6 +12,7 @@ import interferometry.iso230.evaluation as evaluation_module
 from interferometry.io.readings import read_deviations
 from interferometry.iso230 import (
     Iso230Budget,
+    accuracy_with_table,
     evaluate_iso230,
     evaluate_other_standards,
     evaluate_windows,
@@ -292,3 +293,20 @@ def test_values_of_other_standards_follow_their_definitions():
     x = np.random.default_rng(9).normal(0, 3, (5, 2, 6))
     x[:, 1] = np.nan
     assert evaluate_other_standards(test_made(x), cycles=range(1, 6)) == []
+
+
+def test_a_table_is_made_from_the_other_cycles_and_leaves_the_drift():
+    """Cycles stretched by -25, -15, 15 and 25 um, one gross error that is flagged: each pair of cycles with the table of the other."""
+    drift_um = np.array([-25.0, -15.0, 15.0, 25.0])[:, None, None] * np.array([[[0.0, 1.0]]]) * np.ones((2, 1))
+    test = test_made(drift_um + np.array([[3.0, 8.0], [1.0, 7.0]]))
+    drift = test["deviation"].copy(data=drift_um)
+    # The end lies 20 um off on average, with a standard deviation of 10 um / sqrt(2); the first position is right.
+    alone = evaluate_iso230(test.assign(deviation=drift), cycles=[1, 2])["A"]
+    assert float(alone) == pytest.approx(20.0 + 2.0 * 50.0**0.5)
+    np.testing.assert_allclose(accuracy_with_table(test, drift, [[1, 2], [3, 4]]), float(alone))
+    gross = test["deviation"].copy()
+    gross[3, 0, 0] += 500.0
+    flags = (gross > 400.0).astype(np.uint8)
+    flagged = test.assign(deviation=gross, quality_flag=flags)
+    assert accuracy_with_table(flagged, drift, [[1, 2]])[0] == pytest.approx(float(alone))
+    assert np.isnan(accuracy_with_table(test, drift, [[1, 2, 3, 4]])).all()

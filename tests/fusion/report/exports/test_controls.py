@@ -215,14 +215,24 @@ def test_the_repeated_test_has_the_range_of_independent_errors():
 def test_a_test_with_a_table_has_the_errors_of_the_table_and_its_own():
     """Means with variance 1 of the table and 2²/4 of four cycles; median ranges of 12 and of 6 normal values: 3.2 and 2.47."""
     profile = Profile(np.arange(6.0), np.zeros((2, 6)), np.eye(12).reshape(2, 6, 2, 6))
-    found = predict_test(profile, tabulate(profile), np.full((2, 6), 2.0), cycles=4, one_table=False)
+    still = np.zeros((8, 2, 6))
+    found = predict_test(profile, tabulate(profile), np.full((2, 6), 2.0), still, cycles=4, one_table=False)
     # Monte Carlo with 400 draws: a median is known within some 3 %.
     assert found["E"].value == pytest.approx(3.2 * 2**0.5, rel=0.06)
     assert found["M"].value == pytest.approx(2.47, rel=0.08)
     assert found["B"].value == pytest.approx(2.0 * 1.6, rel=0.08)  # largest of six |normal|: 1.6
     exact = Profile(np.arange(6.0), np.zeros((2, 6)), 1e-12 * np.eye(12).reshape(2, 6, 2, 6))
-    many = predict_test(exact, tabulate(exact), np.full((2, 6), 2.0), cycles=10**6, one_table=False)
+    many = predict_test(exact, tabulate(exact), np.full((2, 6), 2.0), still, cycles=10**6, one_table=False)
     assert many["A"].value == pytest.approx(4 * 2.0, rel=0.01)
+
+
+def test_a_test_with_a_table_drifts_as_the_one_that_it_was_made_from():
+    """An axis without scatter that stretches by 1 um a cycle: seven windows of two cycles, 3, 2, 1, 0, 1, 2 and 3 um from its profile."""
+    profile = Profile(np.arange(6.0), np.zeros((2, 6)), np.zeros((2, 6, 2, 6)))
+    stretch = (np.arange(8.0)[:, None, None] - 3.5) * np.linspace(0.0, 1.0, 6) * np.ones((2, 1))
+    found = predict_test(profile, tabulate(profile), np.zeros((2, 6)), stretch, cycles=2, one_table=False)
+    assert found["M"].value == pytest.approx(2.0, abs=0.01) and found["M"].u == pytest.approx(1.0, abs=0.1)
+    assert found["A"].value == pytest.approx(2.0 + 2.0 * 0.5**0.5, abs=0.01)
 
 
 def test_one_table_leaves_the_part_of_the_reversal_that_is_not_constant(small_run):

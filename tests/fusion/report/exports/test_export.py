@@ -125,7 +125,7 @@ def test_the_axis_is_a_name(unexplained, tmp_path):
 
 
 def test_what_a_table_is_predicted_to_leave_is_stored_beside_it(small_run, tmp_path):
-    """Readings of 0.05 um: E of a repeated test is far below the profile's, A holds four times the scatter."""
+    """The table leaves the drift with the material, which stretches the axis by up to 3 um."""
     table = export_results(small_run, "linuxcnc", tmp_path).files[0]
     prediction = read_table_prediction(table)
     assert prediction == read_table_prediction(tmp_path / f"{table.name}.prediction.json")
@@ -133,9 +133,9 @@ def test_what_a_table_is_predicted_to_leave_is_stored_beside_it(small_run, tmp_p
     assert prediction.results_sha256 == hashlib.sha256((small_run / "results.json").read_bytes()).hexdigest()
     values = {symbol: found.value for symbol, found in prediction.predicted_um.items()}
     assert set(values) == set("AEMB")
-    assert 0.05 < values["E"] < 0.3 and values["M"] < values["E"]
-    assert values["A"] == pytest.approx(values["E"] + 4 * 0.05, abs=0.1)
-    assert all(0.0 < found.u < 0.2 for found in prediction.predicted_um.values())
+    assert 0.3 < values["E"] < 3.0 and values["M"] < values["E"] and values["B"] < 0.2
+    assert values["A"] > values["E"] + 4 * 0.05
+    assert 0.2 < prediction.predicted_um["E"].u < 2.0
 
 
 def test_a_prediction_that_is_missing_or_damaged_says_what_to_do(tmp_path):

@@ -1,0 +1,36 @@
+"""A with a compensation table in other thermal states, and the held-out error that a model expects; figures in docs/measured.md."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusion.pipeline.iso230 import estimate_joint
+from interferometry.iso230 import accuracy_with_table
+from interferometry.iso230.quantities import axis_quantities
+from tests.soak.simulator import Machine, measure
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("drift", ["none", "warm-up", "random walk", "room"])
+def test_accuracy_with_a_table_is_that_of_new_tests_in_these_thermal_states(drift):
+    """The machine with the table of all its cycles is tested anew in every window: the same drift, other noise, no estimate."""
+    told, true = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        campaign = measure(Machine(drift=drift), rng)
+        joint, _ = estimate_joint(campaign.deviations)
+        blocks = [list(range(first, first + 5)) for first in range(1, 41, 5)]
+        told.append(accuracy_with_table(campaign.deviations, joint["drift"], blocks))
+        left = (campaign.profile_um + campaign.drift_um - joint["profile"].values).reshape(8, 5, 2, 16)
+        tests = left + 0.4 * rng.standard_normal((200, *left.shape))
+        true.append(axis_quantities(tests.mean(axis=2), tests.std(axis=2, ddof=1))["A"].mean(axis=0))
+    told, true = np.array(told), np.array(true)
+    ratio, lowest, highest = told / true, told.min(axis=1) / true.min(axis=1), told.max(axis=1) / true.max(axis=1)
+    print(
+        f"\n{drift}: A over true A of each window {ratio.mean():.3f} ({ratio.std():.3f}), smallest {lowest.mean():.3f}, largest "
+        f"{highest.mean():.3f}; true A {true.min(axis=1).mean():.2f} to {true.max(axis=1).mean():.2f} um"
+    )
+    # The smallest of eight values that scatter by a twentieth is too small by a tenth of them at most.
+    assert abs(ratio.mean() - 1.0) < 0.02 and 0.88 < lowest.mean() < 1.02 and 0.98 < highest.mean() < 1.12
