@@ -842,7 +842,8 @@ def plan(
     """Propose a random duty schedule for a new test.
 
     It separates what is collinear when it is switched together: heat sources that are named, or what the results of a record left open,
-    with the uncertainty of a prediction that is expected after it.
+    with the uncertainty of a prediction that is expected after it. A mat or a fan
+    at a single place is a source, too: it tests the place itself.
     """
     from fusion.pipeline.plan import duty_lines, next_test_lines
 

@@ -43,12 +43,14 @@ def duty_lines(
     proposed = plan_duty(machine, power=power, seed=seed)
     reached = float(proposed["power"].sel(hours=float(proposed["test_hours"])).max())
     longest = f"; no test of up to {float(proposed['hours'].max()):g} h reaches {power:.0%}"
-    lines = [
+    return [
         f"test of {float(proposed['test_hours']):g} h, mean dwell {duration(float(proposed['mean_dwell']))}: "
         f"chance to name the weakest source {reached:.0%}{'' if proposed.attrs['enough'] else longest}",
+        "What passes is a load that moves the axis; it need not act where it warms the table. To test a place, add a source that heats or "
+        "cools it alone (a mat, a fan), or loads that warm it and the rest of the machine in different ratios.",
         "minute  source  state",
+        *(f"{minute:6.0f}  {name}  {state}" for minute, name, state in switchings(proposed)),
     ]
-    return lines + [f"{minute:6.0f}  {name}  {state}" for minute, name, state in switchings(proposed)]
 
 
 def next_test_lines(folder: Path, *, seed: int) -> list[str]:

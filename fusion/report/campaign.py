@@ -98,7 +98,7 @@ def describe_correlation(
         "headline": conditional(say("place_sentence", correlation), results.inputs, "attribution"),
         "attributable": attributable,
         "causes": randomised_causes(correlation),
-        "joint_causes": None if joint is None else joint["causes"],
+        "repeated": None if joint is None else joint["repeated"],
         "adding": adding,
         "collinear": collinear,
         "figure": {"mode": f"mode_{source.name}", "cell": "sensitivity"}.get(source.kind, "") if attributable else "",

@@ -215,9 +215,9 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
 
 
 def describe_places(pairs: Sequence[PairComparison], pair: PairComparison) -> dict[str, Any]:
-    """Return what two tests agree on: in sentences, the places of causes, a table of the sources, and every part of the drift.
+    """Return what two tests agree on: in sentences, the places that repeat, a table of the sources, and every part of the drift.
 
-    A row of the table is a source that either shows: its name, where it is, what either test shows there, and whether it is a cause.
+    A row of the table is a source that either shows: its name, where it is, what either test shows there, and whether it repeats.
     """
     if pair.places is None:
         return {}
@@ -236,7 +236,7 @@ def describe_places(pairs: Sequence[PairComparison], pair: PairComparison) -> di
     titles = [Words(title) for title in ("Place", "Where, and part of the drift", *tests, "Verdict")]
     return {
         "said": sentences("joint_outcome", pair.places, found, tests),
-        "causes": [row[1] for source, row in found if source.cause],
+        "repeated": [row[1] for source, row in found if source.repeats],
         "table": table(titles, rows, stacked=True),
         "rows": [
             (CHANNELS.get(one.channel, one.channel), say("channel_agreement", one, ATTRIBUTION_LEVEL))
@@ -251,7 +251,7 @@ def places_json(pairs: Sequence[PairComparison], pair: PairComparison) -> dict[s
         return {"sources": [], "agreement": []}
     rows = [row.cells for row in describe_places(pairs, pair)["table"].rows]
     agreement = [
-        {**asdict(source), "cause": source.cause, "name": cells[0], "verdict": cells[-1]}
+        {**asdict(source), "repeats": source.repeats, "name": cells[0], "verdict": cells[-1]}
         for source, cells in zip(pair.places.sources, rows, strict=True)
     ]
     sources = [{**asdict(one), "reason": say("channel_reason", one, ATTRIBUTION_LEVEL)} for one in pair.places.channels]

@@ -19,7 +19,6 @@ from fusion.report.wording import (
     drift_extremes,
     quantity,
     quoted_values,
-    randomised_causes,
     say,
     sentences,
 )
@@ -205,7 +204,7 @@ def next_steps(results: Results) -> list[str]:
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
     steps += [say("position_action", anomaly) for anomaly in results.anomalies or ()]
-    if correlation is not None and correlation.verdict == "attributable" and not randomised_causes(correlation):
+    if correlation is not None and correlation.verdict == "attributable":
         steps.append(say("test_place", correlation.source))
     steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))

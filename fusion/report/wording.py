@@ -463,7 +463,7 @@ def figures_of(results: Results) -> list[Figures]:
 
 
 def randomised_causes(correlation: CorrelationPart) -> list[str]:
-    """Return the loads that randomisation shows to cause drift."""
+    """Return the loads that randomisation shows to move the axis."""
     return [load.name for load in correlation.randomised_duty or () if load.cause]
 
 

@@ -112,7 +112,7 @@ class DutyPart(ResultPart):
     name: str
     """Column of the drivers' log."""
     cause: bool
-    """Whether randomisation shows that it causes drift."""
+    """Whether randomisation shows that it moves the axis, at whatever place its heat acts."""
     p_value: Number
     """Share of schedules drawn from the same law that the drift follows as closely, family-wise over the loads."""
     drift_at_full_duty_um: Quantity

@@ -1,4 +1,4 @@
-"""Test which part of the temperature field drives the drift, so that two series that merely both rise are not taken for cause and effect.
+"""Test which part of the temperature field the drift follows, so that two series that merely both rise are not taken for a finding.
 
 Plan cells, localised thermal modes and regions are tested against the drift channels (common, proportional to position, reversal; on
 request every target and direction). Each temperature passes through a bank of first-order lags. The drift that the field does not explain

@@ -2,7 +2,8 @@
 
 Where the duty of every source was drawn from a known random law, other schedules drawn from that law are as likely as the one that was
 run. A statistic that is larger for the real schedule than for 95 % of the others therefore rejects the null hypothesis exactly, whatever
-the drift does by itself, warm-up included; the drift model behind the statistic only adds power. A significant source is a cause.
+the drift does by itself, warm-up included; the drift model behind the statistic only adds power. A significant source
+moves the axis; at which place its heat acts follows only where it warms one place alone.
 
 Sources: Fisher (1935), *The design of experiments*; for slow series Harris (2020), bioRxiv 2020.11.29.402719 ("pseudosession method").
 """

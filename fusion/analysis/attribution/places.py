@@ -1,7 +1,8 @@
-"""Places of the drift in two tests of one machine: a source is called a cause only where both agree.
+"""Places of the drift in two tests of one machine: which of them repeat.
 
 Within one test independent drifts can go with a temperature by chance. Two independent tests do so at the same place, with the same
-sign and size, far more rarely (a hundredth of the cases instead of a tenth; for two warm-ups nearly never).
+sign and size, far more rarely. Repetition rules out chance, not a common cause: a load that warms the place and a part that no camera
+sees does so in every test.
 
 Source: conjunction of two tests, Nichols et al. (2005), NeuroImage 25, 653 (the larger of both p-values); docs/method/attribution.md.
 """
@@ -72,7 +73,7 @@ class SourceAgreement:
     agreed_near_mm: tuple[float, float, float] | None = None
 
     @property
-    def cause(self) -> bool:
+    def repeats(self) -> bool:
         """Whether both tests agree on it, and it is distinguished from the other sources."""
         return self.agrees and self.separate
 

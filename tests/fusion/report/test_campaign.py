@@ -125,14 +125,14 @@ def test_a_further_mode_is_named_with_the_part_of_the_drift_that_it_explains(par
     assert "for the drift of the reversal, p = 0.004)" in page and "significant conditional on the leading mode" in page
 
 
-def test_two_tests_decide_what_is_a_cause(parts):
+def test_a_place_that_two_tests_show_repeats_and_is_no_cause(parts):
     fused, results = parts
     attributable = correlation_of(results).model_copy(update={"verdict": "attributable"})
     leading = results.model_copy(update={"correlation": attributable})
-    joint = {"other": "Tuesday", "causes": ["x 1 mm, y 2 mm"], "rows": [], "table": table([], [])}
-    assert "a cause where the test Tuesday agrees: x 1 mm, y 2 mm (below)" in page_of(fused, leading, joint)
-    assert "the test Tuesday does not show the same" in page_of(fused, leading, {**joint, "causes": []})
-    assert "Causation is not shown yet: in one session" in page_of(fused, leading)
+    joint = {"other": "Tuesday", "repeated": ["x 1 mm, y 2 mm"], "rows": [], "table": table([], [])}
+    page = page_of(fused, leading, joint)
+    assert "The test Tuesday shows the same: x 1 mm, y 2 mm (below)" in page and "a cause" not in page
+    assert "The test Tuesday does not show the same" in page_of(fused, leading, {**joint, "repeated": []})
 
 
 def test_sensors_that_lose_more_than_fewer_are_named(parts):

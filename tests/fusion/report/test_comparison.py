@@ -285,9 +285,9 @@ def test_a_neighbouring_place_is_told_apart_and_reconciled(pairs):
     assert first[-1].startswith(f"shown by the test {FOUND} only; ") and "a different one: 3.8 and 7.8" in first[-1]
     assert "75 mm both agree (place 2)" in first[-1]
     assert second[-1].startswith("both tests agree here, but it is not a separate source")
-    assert found["said"][0] == "The two tests show no cause in common."
+    assert found["said"][0] == "The drift follows no place in both tests."
     assert found["said"][1].startswith("Both agree in place 2 (x 330 mm, y 90 mm")
-    assert found["said"][2] == f"Only the test {FOUND} shows place 1." and found["causes"] == []
+    assert found["said"][2] == f"Only the test {FOUND} shows place 1." and found["repeated"] == []
 
 
 def test_what_one_test_shows_alone_has_the_chance_of_the_other(pairs):
@@ -297,10 +297,11 @@ def test_what_one_test_shows_alone_has_the_chance_of_the_other(pairs):
     assert shown == "p 0.6, 7.8 ± 1.7 µm/K, lag 10 min"
 
 
-def test_a_cause_is_what_both_tests_show(pairs):
+def test_a_place_that_both_tests_show_repeats(pairs):
     found, ((*_, verdict),) = described(pairs, replace(AGREED, separate=True))
-    assert verdict.startswith("a cause: both tests agree") and len(found["causes"]) == 1
-    assert found["said"][0].startswith("Both tests show the same cause: place 1")
+    assert verdict.startswith("repeats: both tests agree") and len(found["repeated"]) == 1
+    assert found["said"][0].startswith("The drift follows the same place in both tests: place 1")
+    assert "a part that no camera sees" in " ".join(found["said"])
     assert found["rows"][0][1].endswith("larger p of both 0.004, 4.0 and 5.8 µm/K")
     nothing, rows = described(pairs)
     assert rows == [] and nothing["said"][0].startswith("Neither test shows a source")
@@ -332,4 +333,4 @@ def test_the_page_escapes_titles_and_links_both_reports(pairs):
     page = render_comparison([pair], reports=["monday/report.html", "tuesday/report.html"])
     assert "Monday &lt;1&gt;" in page and "<1>" not in page
     assert 'href="monday/report.html"' in page and 'href="tuesday/report.html"' in page
-    assert "The two tests show no cause in common." in page
+    assert "The drift follows no place in both tests." in page

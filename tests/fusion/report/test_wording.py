@@ -560,13 +560,13 @@ def test_no_cause_is_to_be_looked_for_where_none_is_separable():
     assert effect_words("dead_path").remedy not in nothing
 
 
-def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
+def test_a_place_is_to_be_tested_by_itself_whatever_load_moves_the_axis():
     source = SourcePart.model_construct(x_mm=355.0, y_mm=95.0, area=None)
     seen = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
     (step,) = next_steps(results(loop("complete"), correlation=seen))
-    assert step.startswith("Repeat the test") and "whether the place around x 355 mm, y 95 mm is a cause" in step
+    assert "whether the place around x 355 mm, y 95 mm itself moves the axis: heat or cool this place alone" in step
     shown = seen.model_copy(update={"randomised_duty": (DutyPart.model_construct(name="spindle", cause=True),)})
-    assert "Nothing has to be done" in next_steps(results(loop("complete"), correlation=shown))[0]
+    assert next_steps(results(loop("complete"), correlation=shown)) == [step]
 
 
 @pytest.mark.parametrize(
@@ -575,7 +575,7 @@ def test_a_place_is_to_be_tested_unless_a_load_is_shown_to_be_the_cause():
         ("not separable", (), "Switch the heat sources at random times"),
         ("not attributable", (), "From 0.12 µm/K on, a source at the best place"),
         ("attributable", ((1.0, 2.0),), "Other places explain the drift equally well (x 1 mm, y 2 mm): switch"),
-        ("attributable", (), "A second session that finds the same place"),
+        ("attributable", (), "To tell this place from the load that warms it, heat or cool it alone"),
     ],
 )
 def test_the_next_test_is_recommended_with_its_noise_and_drift(verdict, places, told):

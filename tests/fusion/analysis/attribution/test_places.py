@@ -1,4 +1,4 @@
-"""Two campaigns of one machine: only what both show is a cause."""
+"""Two campaigns of one machine: what both show repeats."""
 
 from types import SimpleNamespace
 
@@ -43,7 +43,7 @@ def far_from_source(place):
     return simulator.distance_cells(place.y_mm / 10 - 0.5, place.x_mm / 10 - 0.5, 0)
 
 
-def test_a_source_that_both_sessions_show_is_a_cause(both):
+def test_a_source_that_both_sessions_show_repeats(both):
     joint = joint_of(both)
     assert joint.verdict == "attributable" and joint.p_value <= 0.05
     # 99 simulated series each.
@@ -53,15 +53,15 @@ def test_a_source_that_both_sessions_show_is_a_cause(both):
 
 
 def test_each_source_is_listed_once_with_what_both_sessions_show(both):
-    (cause,) = [one for one in both.sources if one.cause]
-    assert cause.shown_by == (0, 1) and cause.power is None
-    assert far_from_source(cause) <= 5 and max(cause.p_value) <= 0.05
+    (repeated,) = [one for one in both.sources if one.repeats]
+    assert repeated.shown_by == (0, 1) and repeated.power is None
+    assert far_from_source(repeated) <= 5 and max(repeated.p_value) <= 0.05
     # 3 um per 3 K at the source, common and stretch together at the far end: 2 um/K.
-    for value, u in zip(cause.sensitivity_um_per_K, cause.sensitivity_u_um_per_K, strict=True):
+    for value, u in zip(repeated.sensitivity_um_per_K, repeated.sensitivity_u_um_per_K, strict=True):
         assert value == pytest.approx(2.0, abs=4 * u)
 
 
-def test_a_source_of_one_session_is_listed_as_its_own_and_is_no_cause(alone):
+def test_a_source_of_one_session_is_listed_as_its_own_and_does_not_repeat(alone):
     assert {agreement.verdict for agreement in alone.channels} == {"not attributable"}
     assert joint_of(alone).p_value > 0.05
     sources = alone.sources
@@ -136,12 +136,12 @@ def test_a_place_on_which_both_agree_is_told_apart_from_its_neighbour():
     alone = module._source_at(pairs, plan, "joint", (405.0, 75.0), (0,), True)
     agreed = module.ChannelAgreement("joint", "attributable", 345.0, 155.0, 0.004, (4.0, 5.8), (0.0, 0.0))
     first, second = module._with_agreed_places([alone], [agreed], plan, pairs)
-    assert (second.x_mm, second.agrees, second.cause, second.shown_by) == (345.0, True, False, (0, 1))
+    assert (second.x_mm, second.agrees, second.repeats, second.shown_by) == (345.0, True, False, (0, 1))
     assert first.agreed_near_mm == (345.0, 155.0, 100.0) and not first.agrees
-    # A cause at that place already, be it in another part of the drift, is not listed a second time.
-    cause = module._source_at(pairs, plan, "common", (345.0, 105.0), (0, 1), True)
-    assert module._with_agreed_places([cause], [agreed], plan, pairs) == [cause]
-    # A cause elsewhere hides nothing.
+    # A place that repeats already, be it in another part of the drift, is not listed a second time.
+    repeated = module._source_at(pairs, plan, "common", (345.0, 105.0), (0, 1), True)
+    assert module._with_agreed_places([repeated], [agreed], plan, pairs) == [repeated]
+    # One elsewhere hides nothing.
     far = module._source_at(pairs, plan, "common", (290.0, 155.0), (0, 1), True)
     assert [one.x_mm for one in module._with_agreed_places([far], [agreed], plan, pairs)] == [290.0, 345.0]
 
