@@ -218,8 +218,9 @@ def test_json_is_json_in_any_encoding(tmp_path: Path, encoding: str) -> None:
 def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
     result = invoke("plan", "--source", "spindle=40 min", "--source", "drive=15 min", "--effect", "3 um")
     assert result.exit_code == 0, result.output
-    head, _, *rows = result.output.splitlines()
+    head, told, _, *rows = result.output.splitlines()
     assert re.match(r"test of [\d.]+ h, mean dwell \d+ min: chance to name the weakest source \d+%", head)
+    assert "heats or cools it alone" in told
     assert {row.split()[1] for row in rows} == {"spindle", "drive"}
     assert {row.split()[2] for row in rows} == {"on", "off"}
     for bad, message in (
