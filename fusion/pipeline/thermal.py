@@ -76,7 +76,13 @@ from thermography.radiometry.camera import (
     room_temperatures,
 )
 from thermography.radiometry.planck import Overrides, calibrate, override, signal_slope
-from thermography.radiometry.uncertainty import InputUncertainty, common_contributions, rise_scale_contributions
+from thermography.radiometry.uncertainty import (
+    KNOWN_PAINT_U,
+    LEAST_OF_PAINTS,
+    InputUncertainty,
+    common_contributions,
+    rise_scale_contributions,
+)
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.plan import Polygon
 from thermography.registration.register import Registration, RegistrationError, register
@@ -368,18 +374,23 @@ _STATED = {
 def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:
     """Return the uncertainties of the radiometric inputs: those that the campaign states, defaults for the others."""
     given = {name: getattr(table, key) for name, key in _STATED.items()}
+    if table.emissivity is not None and table.emissivity >= LEAST_OF_PAINTS and table.emissivity_u is None:
+        given["emissivity"] = KNOWN_PAINT_U
     return InputUncertainty(**{name: u for name, u in given.items() if u is not None})
 
 
-def _by_material_sensor(source: CameraInputs, fields: xr.Dataset, emissivity: float) -> float | None:
+def _by_material_sensor(source: CameraInputs, fields: xr.Dataset, emissivity: float, assumed_u: float) -> float | None:
     """Standard uncertainty of an emissivity that the material sensor leaves; None where it is stated, or the sensor tells nothing."""
     if not isinstance(source, Source) or source.thermography.emissivity_u is not None:
         return None
     place_mm = source.interferometry.material_sensor_mm
     near = thin_fields(fields) if place_mm is None else field_at(fields, place_mm)
     share = rise_share_u(near, source.environment, stated=place_mm is not None)
+    if share is None:
+        return None
     # Beyond a third of it an emissivity has no upper end.
-    return None if share is None else emissivity * min(share, 1.0 / 3.0)
+    u = emissivity * min(share, 1.0 / 3.0)
+    return u if place_mm is not None else max(u, assumed_u)
 
 
 def complete_fields(
@@ -391,7 +402,7 @@ def complete_fields(
     cameras = {name: _parameters_at(source, parameters, fields[time].values) for name, time in along.items()}
     camera = cameras["cycle"][reference_cycle(fields["temperature"])]
     on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
-    if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity)) is not None:
+    if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity, inputs.emissivity)) is not None:
         inputs = replace(inputs, emissivity=measured_u)
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)

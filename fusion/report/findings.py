@@ -71,7 +71,7 @@ def first_screen(results: Results, report: Mapping[str, Any], axis: str, begun: 
     if alone and inputs is not None:
         inputs = inputs.model_copy(update={"accepted": (*inputs.accepted, "camera_range")})
     serial = report.get("machine_serial_number", "")
-    still_open = "" if inputs is None else say("open_inputs", inputs)
+    still_open = "" if inputs is None else say("open_inputs", inputs, results.radiometry)
     decision = "" if alone else "Not an acceptance test: no tolerance applies."
     if iso is not None:
         decision = _if_so(conditional(say("decision", iso), inputs, "positions"))

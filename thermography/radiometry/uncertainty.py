@@ -39,6 +39,10 @@ _RANGES = {
     "window_transmission": (1e-3, 1.0),
     "window_temperature_K": (100.0, 3000.0),
 }
+#: Least emissivity of non-metallic paints from 8 to 14 um, and standard uncertainty of one that is known: the entries of a named paint,
+#: such as dull black 0.96 to 0.98 or three colours 0.92 to 0.94, lie within 0.03 (FLIR Systems, user's manual T559880, emissivity tables;
+#: rectangular).
+LEAST_OF_PAINTS, KNOWN_PAINT_U = 0.87, 0.02
 #: Largest relative difference between first order and propagation of distributions that is left as it is: an uncertainty is stated
 #: to two significant digits, so that half a unit of the last one is 5 % of the smallest such number (JCGM 101:2008, 7.9.2 and 8).
 FIRST_ORDER_TOLERANCE = 0.05

@@ -102,13 +102,17 @@ def log_with_camera(near: FieldSeries | None, log: xr.Dataset | None) -> Logged 
 
 
 def rise_share_u(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool) -> float | None:
-    """Standard uncertainty of the camera's rise, as a share of it, that a material sensor leaves; None where it tells nothing."""
+    """Standard uncertainty of the camera's rise, as a share of it, that a material sensor shows: at a stated place by all slopes that fit,
+    else by what no place explains; None where it tells nothing.
+    """
     logged = log_with_camera(near, log)
     slopes = None if logged is None else _slopes(logged, logged.material, stated=stated)
-    # Every scale at which some place of the sensor fits is as likely (rectangular, JCGM 100:2008, 4.3.7).
-    return (
-        None if slopes is None else float(np.hypot(_CONTACT, max(abs(slope - 1.0) for slope in slopes) / np.sqrt(3.0)))
-    )
+    if slopes is None:
+        return None
+    # What is seen and not corrected belongs to the uncertainty (rectangular, JCGM 100:2008, 4.3.7 and F.2.4.5). A place that nobody
+    # stated is no measurement of the scale: that it could lie elsewhere says nothing of the camera.
+    off = max(abs(slope - 1.0) for slope in slopes) if stated else abs(_off(slopes))
+    return float(np.hypot(_CONTACT, off / np.sqrt(3.0))) if stated or off > 0.0 else None
 
 
 @check("fields", CAMERA, waits=True)

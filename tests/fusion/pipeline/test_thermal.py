@@ -276,6 +276,23 @@ def test_stated_uncertainties_replace_the_defaults():
     assert parameters == {"emissivity": 0.9, "reflected_temperature_K": 295.15, "window_transmission": 0.9}
 
 
+@pytest.mark.parametrize(
+    ("emissivity", "u"), [(0.97, 0.02), (0.87, 0.02), (0.35, 0.03), (None, 0.03), ("0.35 +- 0.05", 0.05)]
+)
+def test_an_emissivity_is_as_well_known_as_stated_or_as_its_paint(emissivity, u):
+    assert stated_uncertainty(ThermographyTable(frames=("a.jpg",), emissivity=emissivity)).emissivity == u
+
+
+def test_an_emissivity_is_assumed_where_the_place_of_the_material_sensor_is_not_stated(campaign, results_folder):
+    text = campaign.read_text()
+    place = next(line for line in text.splitlines() if line.startswith("material_sensor"))
+    radiometry = completed(campaign, results_folder, (place + "\n", "")).parts.radiometry
+    entry = radiometry.budget[0]
+    assert (entry.input, entry.source, entry.u) == ("emissivity", "assumed", 0.02)
+    # 0.02 / 0.97 and the scale of the camera, 1.15 %, make 2.36 %; that no emissivity exceeds 1 leaves nine tenths of it.
+    assert radiometry.rise_scale_u == pytest.approx(0.0212, abs=0.001)
+
+
 def test_results_give_both_parts_and_say_what_was_assumed(results_folder):
     part = json.loads((results_folder / "results.json").read_text())["radiometry"]
     temperature, rise = part["temperature_u"], part["rise_u"]
