@@ -677,7 +677,7 @@ class InterferometryTable(_Measured, title="Laser"):
     environment_clock_offset_s: Seconds = key(0.0, f"Log of air and material: {_LATE}")
     dead_path_mm: Millimetres = key(0.0, "Dead path of the laser", example="0 mm", ask=True)
     expansion_coefficient_ppm_per_K: PartsPerMillion = key(
-        11.7, example="11.7 +- 0.3 ppm/K", about="of scale or workpiece", absent="11.7 +- 2 ppm/K", ask=True
+        11.7, example="11.7 +- 0.3 ppm/K", about="of scale or workpiece", absent="11.7 ppm/K, within 2 ppm/K", ask=True
     )
     expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = None
     feed_mm_per_min: Feed | None = key(

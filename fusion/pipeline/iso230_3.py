@@ -10,15 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import uniform_filter1d
 
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
 from fusion.campaign.schema import keys_of
 from fusion.campaign.time_zones import shown_zone
 from fusion.common import Array
-from fusion.pipeline.iso230 import date_of, files_of_run, hashed, state_conditions
+from fusion.pipeline.iso230 import date_of, estimate_joint, files_of_run, hashed, state_conditions
 from fusion.results.parts import Quantity, TestKind, ThermalContribution, ThermalCourse, ThermalDistortion, ThermalTest
 from fusion.results.results import read_results
+from fusion.results.store import group, has
 from interferometry.deviations import ROUNDING, resolution
 from interferometry.iso230.thermal import (
     AVERAGED_S,
@@ -34,6 +36,10 @@ from interferometry.iso230.thermal import (
 #: Standard uncertainty of the sensitivity of a displacement sensor where none is stated: one percent of the reading.
 ASSUMED_CALIBRATION = 0.01
 _NEEDS = "a [record], or readings of a linear axis with their times in two cycles or more"
+#: Name of the row of the budget by which noise widens a range.
+_EXTREMES = "bias of the largest of scattered values"
+#: Courses that are drawn to see by how much, about one that is smoothed over so many values.
+_DRAWS, _SEED, _SMOOTHED = 50, 230, 11
 #: Values of a course that are kept for its chart.
 _KEPT = 120
 DEFINITIONS = (
@@ -56,6 +62,8 @@ class _Course:
     values: Array
     absolute: Mapping[str, tuple[float | None, str]]
     share: tuple[float, str]
+    #: Standard deviation of the independent noise of the values, which widens a range.
+    noise: float = 0.0
 
 
 def evaluate_record_test(table: xr.Dataset, stated: ThermalTestTable) -> list[ThermalTest]:
@@ -91,7 +99,7 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
             "resolution": (digit, "from the digits of the readings"),
             "mounting": _mounting(stated, temperature),
         }
-        courses.append(_Course(channel, "um", displacement[:, k], sources, share))
+        courses.append(_Course(channel, "um", displacement[:, k], sources, share, noise))
     missing = [one for tilted in stated.tilts.values() for one in tilted.channels if one not in channels]
     if missing:
         raise CampaignError(
@@ -103,8 +111,9 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
             'No tilt: write [thermal_test.tilts], for example A = {channels = ["Y1", "Y2"], distance = "150 mm"}.'
         )
     sensors = [
-        _Course(str(one), "K", temperature[:, k], {"noise": (scatter(temperature[:, k]), "")}, (0.0, ""))
-        for k, one in enumerate(table["sensor"].values)
+        _Course(str(name), "K", course, {"noise": (noise, "")}, (0.0, ""), noise)
+        for name, course in zip(table["sensor"].values, temperature.T, strict=True)
+        for noise in [scatter(course)]
     ]
     return _test(stated.kind or "not stated", name, seconds, courses, sensors, remarks)
 
@@ -134,27 +143,45 @@ def _tilts(courses: Sequence[_Course], stated: ThermalTestTable) -> Iterator[_Co
         # What holds both sensors moves both alike.
         sources["mounting"] = (None, "not known, not contained: only the difference of both sensors' mountings tilts")
         values = tilt(first.values, second.values, distance_mm=tilted.distance_mm)
-        yield _Course(f"{name} ({first.name}, {second.name})", "um/m", values, sources, first.share)
+        noise = float(np.hypot(first.noise, second.noise)) * per_um
+        yield _Course(f"{name} ({first.name}, {second.name})", "um/m", values, sources, first.share, noise)
 
 
-def evaluate_axis_test(deviations: xr.Dataset, stated: ThermalTestTable) -> list[ThermalTest]:
-    """Evaluate the drift of zero and scale of a linear axis; none without times, or of fewer than two cycles or targets."""
+def evaluate_axis_test(deviations: xr.Dataset, drift: xr.Dataset | None, stated: ThermalTestTable) -> list[ThermalTest]:
+    """Evaluate the drift of zero and scale of a linear axis, that of the joint estimate where there is one: ranges of readings are those
+    of their scatter, too. None without times, or of fewer than two cycles or targets.
+    """
     timed = ~np.isnat(deviations["time"].values)
     few = deviations.sizes["cycle"] < 2 or np.unique(deviations["position"].values).size < 2
     if not timed.any() or few or deviations["deviation"].attrs["units"] != "um":
         return []
-    seconds, values, u = axis_courses(deviations)
+    seconds, values, line_u = axis_courses(deviations)
+    u = {key: float(np.nanmedian(one)) for key, one in line_u.items()}
+    origin = "scatter of all targets about the straight line"
+    if drift is not None:
+        _, values, _ = axis_courses(deviations.assign(deviation=drift["drift"]))
+        first, last = (
+            drift["drift_u"]
+            .mean("direction")
+            .isel(target=np.argsort(deviations["position"].values)[[0, -1]])
+            .max("cycle")
+            .values
+        )
+        metres = np.ptp(deviations["position"].values) * 1e-3
+        found = {"zero": first, "end": last, "scale": drift["drift_stretch_u"].max() / metres}
+        # No estimate knows the change from one half of the test to the other better than the means of both halves.
+        u = {key: max(float(found[key]), one * np.sqrt(2.0 / len(seconds))) for key, one in u.items()}
+        origin = "of the joint estimate, at the cycle where it is largest"
     known = np.isfinite(seconds)
-    first, last = np.sort(deviations["position"].values)[[0, -1]]
-    names = {"zero": f"zero, at {first:g} mm", "end": f"end, at {last:g} mm", "scale": "scale"}
-    scatter_words = "scatter of all targets about the straight line"
+    first_mm, last_mm = np.sort(deviations["position"].values)[[0, -1]]
+    names = {"zero": f"zero, at {first_mm:g} mm", "end": f"end, at {last_mm:g} mm", "scale": "scale"}
     courses = [
         _Course(
             names[key],
             "um/m" if key == "scale" else "um",
             values[key][known],
             {
-                "noise": (float(np.nanmedian(u[key])), scatter_words),
+                "noise": (u[key], origin),
                 "compensation of the laser": (None, "not contained: drift of its sensors during the test"),
             },
             (0.0, ""),
@@ -162,8 +189,11 @@ def evaluate_axis_test(deviations: xr.Dataset, stated: ThermalTestTable) -> list
         for key in names
     ]
     remarks = [
-        f"Zero and scale are those of a straight line through the drift of all {deviations.sizes['target']} targets, both approaches; the "
-        "standard's test needs the end positions only."
+        f"Zero and scale are those of a straight line through the drift of all {deviations.sizes['target']} targets, mean of both "
+        "approaches; the standard's test needs the end positions only.",
+        "The drift is that of the joint estimate, from which the scatter of the readings is removed."
+        if drift is not None
+        else "No drift could be estimated beside the scatter: the straight lines are those of the readings.",
     ]
     return [_test(stated.kind or "linear axis", "", seconds[known], courses, [], remarks)]
 
@@ -187,7 +217,9 @@ def _test(
         contributions=tuple(
             ThermalContribution(name=one.name, source=source, u=u, origin=origin)
             for one in courses
-            for source, u, origin in _budget(one, evaluate_distortion(seconds, one.values).whole)
+            for source, u, origin in _budget(
+                one, evaluate_distortion(seconds, one.values).whole, _excess_of_ranges(one, seconds).whole
+            )
         ),
         courses=tuple(
             ThermalCourse(
@@ -202,40 +234,67 @@ def _test(
     )
 
 
-def _budget(course: _Course, size: float) -> list[tuple[str, float | None, str]]:
-    """Return the sources of the uncertainty of a range: a difference of two values, and the sensitivity of the sensor."""
-    of_two = [
+def _budget(course: _Course, size: float, excess: float) -> list[tuple[str, float | None, str]]:
+    """Return the sources of the uncertainty of a range: a difference of two values, by how much noise widens it, and the sensitivity of
+    the sensor.
+    """
+    sources: list[tuple[str, float | None, str]] = [
         (source, None if u is None else u * np.sqrt(2.0), origin) for source, (u, origin) in course.absolute.items()
     ]
+    if course.noise > 0.0:
+        sources.append((_EXTREMES, excess, "mean excess of simulated courses like this one"))
     share, origin = course.share
-    return [*of_two, ("calibration", share * abs(size), origin)] if origin else of_two
+    return [*sources, ("calibration", share * abs(size), origin)] if origin else sources
+
+
+def _excess_of_ranges(course: _Course, seconds: Array) -> Distortion:
+    """Return by how much noise widens the ranges of a course on average, in its unit (ISO 230-2 has the same row in its budget)."""
+    rng, known = np.random.default_rng(_SEED), np.isfinite(course.values)
+    if not course.noise > 0.0 or not known.any():
+        return Distortion(0.0, 0.0, 0.0, 0.0, np.nan)
+    smooth = np.full(course.values.shape, np.nan)
+    smooth[known] = uniform_filter1d(course.values[known], _SMOOTHED, mode="nearest")
+    still = evaluate_distortion(seconds, smooth)
+    drawn = [
+        evaluate_distortion(seconds, smooth + course.noise * rng.standard_normal(smooth.size)) for _ in range(_DRAWS)
+    ]
+    first, whole, last = (
+        max(0.0, float(np.mean([getattr(one, name) for one in drawn])) - getattr(still, name))
+        for name in ("first_hour", "whole", "last_hour")
+    )
+    return Distortion(first, whole, last, 0.0, np.nan)
 
 
 def _distortion(course: _Course, seconds: Array) -> ThermalDistortion:
     """Return the ranges of a course with their uncertainties."""
-    found: Distortion = evaluate_distortion(seconds, course.values)
+    found, excess = evaluate_distortion(seconds, course.values), _excess_of_ranges(course, seconds)
 
-    def quantity(value: float) -> Quantity:
+    def quantity(name: str) -> Quantity:
+        value = getattr(found, name)
         if not np.isfinite(value):
             return Quantity(value=None, u=None)
-        known = [u for _, u, _ in _budget(course, value) if u is not None and np.isfinite(u)]
+        known = [u for _, u, _ in _budget(course, value, getattr(excess, name)) if u is not None and np.isfinite(u)]
         return Quantity(value=value, u=float(np.sqrt(np.sum(np.square(known)))))
 
     return ThermalDistortion(
         name=course.name,
         unit=course.unit,
-        first_hour=quantity(found.first_hour),
-        whole=quantity(found.whole),
-        last_hour=quantity(found.last_hour),
-        change=quantity(found.change),
+        first_hour=quantity("first_hour"),
+        whole=quantity("whole"),
+        last_hour=quantity("last_hour"),
+        change=quantity("change"),
         settling_min=None if np.isnan(found.settling_s) else found.settling_s / 60.0,
     )
 
 
 def thermal_tests(campaign: Campaign, table: xr.Dataset) -> tuple[ThermalTest, ...]:
     """Evaluate the tests of a campaign from its record or its readings, with whose they were and the conditions that its file states."""
-    evaluate = evaluate_axis_test if campaign.record is None else evaluate_record_test
-    tests = evaluate(table, campaign.thermal_test)
+    stated_test = campaign.thermal_test
+    if campaign.record is not None:
+        tests = evaluate_record_test(table, stated_test)
+    else:
+        drift = group(table, "drift") if has(table, "drift") else estimate_joint(table)[0]
+        tests = evaluate_axis_test(table, drift, stated_test)
     zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
     date, keys = date_of(table["time"].values, zone), keys_of("report", of="record")
     stated = state_conditions(keys, campaign.report.model_dump(by_alias=True), date, campaign.campaign.axis, {})

@@ -37,15 +37,17 @@ class Iso230Budget:
         Of the temperature that the compensation took for that of the measured length, K: accuracy of the probe and of its place.
         Assumed: 0.3 K.
     expansion_coefficient_ppm_per_K : float
-        Of the expansion coefficient that the compensation used, ppm/K. Assumed: 2 ppm/K, a steel or cast iron of unknown grade.
+        Of the expansion coefficient that the compensation used, ppm/K. Assumed: 1.2 ppm/K, limits of 2 ppm/K on either side with a
+        rectangular distribution, between which steels and cast irons of unknown grade lie (JCGM 100:2008, 4.3.7).
     difference_from_20_degC_K : float
         Difference of the material temperature from 20 degC, K (no uncertainty: it scales that of the coefficient). Assumed: 10 K,
         an axis that has warmed in a workshop of 15 to 25 degC: what is not measured must not make the uncertainty smaller.
     nominal_expansion_ppm_per_K : float
         The coefficient itself, ppm/K (no uncertainty: it scales that of the temperature). Assumed: 11.7 ppm/K, steel.
     environmental_variation_um : float or None
-        Environmental variation error (EVE) during one evaluation, um; that of a drift test of range E is E / sqrt 12. None: the
-        standard deviation of the drift that the joint estimate finds within the window, where there is one.
+        Environmental variation error (EVE) during one evaluation, um; that of a drift test of range E is E / sqrt 12. One number has no
+        course, and counts as independent from one mean deviation to the next. None: what the drift of the joint estimate, where there
+        is one, does to each quantity.
 
     Raises
     ------
@@ -65,7 +67,7 @@ class Iso230Budget:
     device_ppm: float = 0.25
     alignment_ppm: float = 0.3
     material_temperature_K: float = 0.3
-    expansion_coefficient_ppm_per_K: float = 2.0
+    expansion_coefficient_ppm_per_K: float = 1.2
     difference_from_20_degC_K: float = 10.0
     nominal_expansion_ppm_per_K: float = 11.7
     environmental_variation_um: float | None = None

@@ -52,7 +52,7 @@ def evaluate_iso230(
     budget : Iso230Budget, optional
         None: the assumptions of `Iso230Budget`; of a rotary axis the scatter alone, as the budget is one of lengths.
     drift : (cycle, direction, target) DataArray, optional
-        Drift of the joint estimate, um: its standard deviation within the window is the environmental variation where the budget
+        Drift of the joint estimate, um: what it does to each quantity within the window is its environmental variation where the budget
         states none. None: without either, the uncertainty holds no environmental variation.
     material_degC : (cycle) DataArray, optional
         Temperature of the material, degC: its mean over the window replaces the difference from 20 degC of the budget.
@@ -70,7 +70,7 @@ def evaluate_iso230(
           bidirectional systematic positioning error, ``M`` mean bidirectional positioning error, ``A`` bidirectional accuracy.
         - Of the budget: ``contribution`` (quantity, contributor) to the standard uncertainty of each quantity of the axis,
           ``<name>_contribution`` (direction, contributor) to that of each quantity per direction;
-          ``environmental_variation`` that was used, ``drift_variation``, the standard deviation of the drift at the position where it is
+          ``environmental_variation``, as stated, else ``drift_variation``, the standard deviation of the drift at the position where it is
           largest (NaN where not known), and ``temperature_difference`` (K), that of the material from 20 degC.
 
         The uncertainties of mean deviations are relative to the first position. Quantities that need both directions are NaN where
@@ -113,23 +113,27 @@ def evaluate_iso230(
     x, numbers = _select(deviations, cycles)
     count = np.isfinite(x).sum(axis=0)
     x, count, left_out = _leave_out_single_readings(deviations, x, count)
-    result = xr.Dataset(
-        _quantities(x, count),
-        coords={"direction": deviations["direction"].values, "target": deviations["target"].values},
-    )
-    varied = np.nan if drift is None else _drift_variation(drift.reindex_like(deviations["deviation"]), numbers)
-    used = _budget_of_window(
-        budget or (SCATTER_ALONE if unit == "arcsec" else Iso230Budget()), varied, material_degC, numbers
-    )
+    coords = {"direction": deviations["direction"].values, "target": deviations["target"].values}
+    result = without_drift = xr.Dataset(_quantities(x, count), coords)
+    used = _budget_of_window(budget or (SCATTER_ALONE if unit == "arcsec" else Iso230Budget()), material_degC, numbers)
+    varied, stated, changes = np.nan, used.environmental_variation_um, {}
+    if drift is not None:
+        within = drift.reindex_like(deviations["deviation"]).sel(cycle=numbers)
+        varied = _drift_variation(within.values)
+        if stated is None:
+            course = _drift_within(within)
+            without_drift = xr.Dataset(_quantities(x - course, count), coords)
+            changes = _changes_within(without_drift, course)
     # Without a standard deviation no uncertainty is known either.
-    scattered = result if len(numbers) > 1 else result * np.nan
+    known = 1.0 if len(numbers) > 1 else np.nan
     # Its library loads for a tenth of a second, and most commands state no uncertainty.
     from interferometry.iso230.uncertainty import UncertainTest
 
-    uncertain = UncertainTest(scattered, deviations["position"].values, used)
-    stated = np.nan if used.environmental_variation_um is None else used.environmental_variation_um
+    uncertain = UncertainTest(result * known, without_drift * known, changes, deviations["position"].values, used)
     result = result.assign(uncertain.uncertainties()).assign(
-        environmental_variation=stated, drift_variation=varied, temperature_difference=used.difference_from_20_degC_K
+        environmental_variation=varied if stated is None else stated,
+        drift_variation=varied,
+        temperature_difference=used.difference_from_20_degC_K,
     )
     result = result.assign_coords(quantity=list(AXIS), contributor=list(CONTRIBUTIONS))
     for name in result.data_vars:
@@ -138,19 +142,31 @@ def evaluate_iso230(
     return result
 
 
-def _drift_variation(drift: xr.DataArray, cycles: np.ndarray) -> float:
+def _drift_variation(within: np.ndarray) -> float:
     """Return the standard deviation of the drift over the cycles of a window, at the position and approach where it is largest, um."""
-    within = drift.sel(cycle=cycles).values
     known = np.isfinite(within).sum(axis=0) >= 2
     return float(np.nanstd(within[:, known], axis=0, ddof=1).max()) if known.any() else np.nan
 
 
-def _budget_of_window(
-    budget: Iso230Budget, drift_variation: float, material_degC: xr.DataArray | None, cycles: np.ndarray
-) -> Iso230Budget:
-    """Return the budget with what was measured during a window: the variation of the drift, and the temperature of the material."""
-    if budget.environmental_variation_um is None and np.isfinite(drift_variation):
-        budget = replace(budget, environmental_variation_um=drift_variation)
+def _drift_within(drift: xr.DataArray) -> np.ndarray:
+    """Return the drift of a window from its mean at every target, um; where a reading has none, that of its cycle."""
+    drift = drift - drift.mean(("cycle", "direction"))
+    return (
+        drift.fillna(drift.mean(("direction", "target"))).fillna(0.0).transpose("cycle", "direction", "target").values
+    )
+
+
+def _changes_within(axis: xr.Dataset, drift: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the standard deviations of the axis's quantities, um, over the thermal states of the cycles of a window."""
+    if len(drift) < 2:
+        return {}
+    states = axis["mean_unidirectional"].values + drift.mean(axis=1, keepdims=True)
+    found = axis_quantities(states, np.broadcast_to(axis["standard_deviation"].values, states.shape))
+    return {name: values.std(axis=0, ddof=1) for name, values in found.items()}
+
+
+def _budget_of_window(budget: Iso230Budget, material_degC: xr.DataArray | None, cycles: np.ndarray) -> Iso230Budget:
+    """Return the budget with the temperature of the material that was measured during a window."""
     if material_degC is not None:
         mean = float(material_degC.sel(cycle=cycles).mean())
         if np.isfinite(mean):

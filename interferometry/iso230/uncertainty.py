@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import GTC
 import numpy as np
 import xarray as xr
+from scipy import special
 
+from interferometry.common import Array
 from interferometry.iso230.budget import CONTRIBUTIONS, Iso230Budget
 from interferometry.iso230.quantities import AXIS, ONE_WAY, axis_quantities
 
@@ -15,24 +17,38 @@ from interferometry.iso230.quantities import AXIS, ONE_WAY, axis_quantities
 _UNKNOWN = [np.nan] * len(CONTRIBUTIONS)
 #: Tests that are drawn to see by how much the largest of noisy values is too large: enough to know it to a tenth of itself.
 _DRAWS, _SEED = 400, 230
+#: A position's own scatter replaces that of all where it exceeds it at this level.
+_EXCESS_LEVEL = 1e-3
 
 
 class UncertainTest:
     """The quantities of one evaluation as GTC numbers.
 
-    A mean deviation is that of its readings, plus the environmental variation during them, plus the errors that grow with position and are
-    the same in every cycle and direction, which cancel in the reversal error and in repeatability. Every quantity but the mean reversal
-    error is the largest of noisy values, which is too large on average: that excess is not corrected and enters the uncertainty (JCGM
-    100:2008, F.2.4.5; parametric bootstrap after Efron and Tibshirani 1993, *An introduction to the bootstrap*, chapters 6 and 10).
+    A mean deviation is that of its readings, plus the errors that grow with position and are the same in every cycle and direction, which
+    cancel in the reversal error and in repeatability. The scatter of a reading is that of all cells together, or a cell's own where that
+    is clearly larger. A quantity by the definition of the standard holds two things that are known, not corrected, and enter its
+    uncertainty (JCGM 100:2008, F.2.4.5): what the drift within the window has added, which is the quantity less that of the same
+    readings without drift; and, of all but the mean reversal error, that the largest of noisy values is too large (parametric bootstrap
+    after Efron and Tibshirani 1993, *An introduction to the bootstrap*, chapters 6 and 10). The axis also changes within the window: how
+    far a quantity of its cycles scatters by the drift alone is a definitional uncertainty. A variation that is stated as one number has
+    no course: it is taken as independent from one mean deviation to the next.
     """
 
-    def __init__(self, result: xr.Dataset, position_mm: np.ndarray, budget: Iso230Budget) -> None:
-        self._result = result
+    def __init__(
+        self,
+        result: xr.Dataset,
+        without_drift: xr.Dataset,
+        changes: Mapping[str, Array],
+        position_mm: Array,
+        budget: Iso230Budget,
+    ) -> None:
+        self._result, self._without_drift, self._changes = result, without_drift, changes
         self._variation = budget.environmental_variation_um or 0.0
         self._mean, self._s = result["mean_unidirectional"].values, result["standard_deviation"].values
         self._count, self._distance_mm = result["count"].values, position_mm - position_mm.min()
+        self._scatter = _typical(without_drift["standard_deviation"].values, self._count - 1)
         along = np.argsort(position_mm, kind="stable")
-        self._excess = _excess_of_extremes(self._mean[:, along], self._s[:, along], self._count[:, along])
+        self._excess = _excess_of_extremes(self._mean[:, along], self._scatter[:, along], self._count[:, along])
         self._scale = 1e-3 * (
             GTC.ureal(0, budget.device_ppm, label="device")
             + GTC.ureal(0, budget.alignment_ppm, label="alignment")
@@ -48,7 +64,7 @@ class UncertainTest:
 
     def _deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
         readings = int(self._count[direction, target])
-        scatter = GTC.ureal(0, self._s[direction, target] / readings**0.5, readings - 1, label="sampling")
+        scatter = GTC.ureal(0, self._scatter[direction, target] / readings**0.5, readings - 1, label="sampling")
         environment = GTC.ureal(0, self._variation / readings**0.5, label="environmental_variation")
         return (
             float(self._mean[direction, target])
@@ -58,11 +74,22 @@ class UncertainTest:
         )
 
     def _sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
-        """Return s with the scatter of an estimate, and with what the environmental variation has added to it."""
+        """Return s with the scatter of an estimate, and with what a stated environmental variation has added to it."""
         readings, s = int(self._count[direction, target]), float(self._s[direction, target])
         added = s - np.sqrt(max(s**2 - self._variation**2, 0.0))
-        scatter = GTC.ureal(s, s / (2 * (readings - 1)) ** 0.5, readings - 1, label="sampling")
-        return scatter + GTC.ureal(0, added, label="environmental_variation")
+        u = self._scatter[direction, target] / (2 * (readings - 1)) ** 0.5
+        return GTC.ureal(s, u, readings - 1, label="sampling") + GTC.ureal(0, added, label="environmental_variation")
+
+    def _whole(self, name: str, value: GTC.lib.UncertainReal, *place: int) -> GTC.lib.UncertainReal:
+        """Return a quantity with the excess of the largest of noisy values, and with the drift within the window."""
+        excess = float(self._excess[name][place]) if name in self._excess else 0.0
+        added = float(self._result[name].values[place] - self._without_drift[name].values[place])
+        change = float(self._changes[name][place]) if name in self._changes else 0.0
+        # Both excesses are known and add up, while the rows of a budget add as squares.
+        environment = np.sqrt(max((excess + added) ** 2 - excess**2, 0.0) + change**2)
+        return (
+            value + GTC.ureal(0, excess, label="extremes") + GTC.ureal(0, environment, label="environmental_variation")
+        )
 
     def reversal(self, target: int) -> GTC.lib.UncertainReal:
         """Reversal error B_i, signed."""
@@ -97,9 +124,7 @@ class UncertainTest:
             "A": self._accuracy(range(2)),
         }
         mean_reversal = sum(self.reversal(int(target)) for target in both) / both.size
-        return {name: value + _bias(float(self._excess[name])) for name, value in extremes.items()} | {
-            "mean_reversal": mean_reversal
-        }
+        return {name: self._whole(name, value) for name, value in {**extremes, "mean_reversal": mean_reversal}.items()}
 
     def of_direction(self, direction: int) -> dict[str, GTC.lib.UncertainReal]:
         """E, R and A of one direction by name; empty where it was not measured."""
@@ -112,7 +137,7 @@ class UncertainTest:
             "E_unidirectional": self.deviations[direction, top] - self.deviations[direction, bottom],
             "A_unidirectional": self._accuracy([direction]),
         }
-        return {name: value + _bias(float(self._excess[name][direction])) for name, value in extremes.items()}
+        return {name: self._whole(name, value, direction) for name, value in extremes.items()}
 
     def _accuracy(self, directions: Iterable[int]) -> GTC.lib.UncertainReal:
         rows = list(directions)
@@ -127,24 +152,28 @@ class UncertainTest:
         measured = np.isfinite(self._mean)
         both = measured.all(axis=0)
 
-        def per_cell(values: dict[tuple[int, int], GTC.lib.UncertainReal]) -> np.ndarray:
+        def per_cell(name: str, values: dict[tuple[int, int], GTC.lib.UncertainReal]) -> np.ndarray:
             u = np.full(self._mean.shape, np.nan)
             for cell, value in values.items():
-                u[cell] = GTC.uncertainty(value)
+                u[cell] = GTC.uncertainty(self._whole(name, value, *cell))
             return u
 
-        def per_target(quantity: Callable[[int], GTC.lib.UncertainReal]) -> np.ndarray:
-            u = [GTC.uncertainty(quantity(int(target))) if both[target] else np.nan for target in range(targets)]
-            return np.array(u, dtype=float)
+        def per_target(
+            name: str, quantity: Callable[[int], GTC.lib.UncertainReal]
+        ) -> tuple[tuple[str, ...], np.ndarray]:
+            u = np.full(targets, np.nan)
+            for target in np.flatnonzero(both):
+                u[target] = GTC.uncertainty(self._whole(name, quantity(int(target)), int(target)))
+            return ("target",), u
 
-        s_u = per_cell(self.sigmas)
+        s_u = per_cell("standard_deviation", self.sigmas)
         variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {
-            "mean_unidirectional_u": (("direction", "target"), per_cell(self.deviations)),
+            "mean_unidirectional_u": (("direction", "target"), per_cell("mean_unidirectional", self.deviations)),
             "standard_deviation_u": (("direction", "target"), s_u),
             "repeatability_u": (("direction", "target"), 4 * s_u),
-            "mean_bidirectional_u": (("target",), per_target(self.bidirectional_mean)),
-            "reversal_u": (("target",), per_target(self.reversal)),
-            "repeatability_bidirectional_u": (("target",), per_target(self.repeatability)),
+            "mean_bidirectional_u": per_target("mean_bidirectional", self.bidirectional_mean),
+            "reversal_u": per_target("reversal", self.reversal),
+            "repeatability_bidirectional_u": per_target("repeatability_bidirectional", self.repeatability),
         }
         by_direction = [self.of_direction(direction) for direction in range(directions)]
         for name in ONE_WAY:
@@ -166,6 +195,17 @@ def _contributions(value: GTC.lib.UncertainReal) -> list[float]:
     for part in GTC.reporting.budget(value, trim=0):
         squares[part.label] += float(part.u) ** 2
     return [float(np.sqrt(squares[name])) for name in CONTRIBUTIONS]
+
+
+def _typical(s: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of all cells together, and a cell's own where it is larger at `_EXCESS_LEVEL`; NaN where it is."""
+    known = np.isfinite(s)
+    if not known.any():
+        return s
+    pooled = np.sqrt(np.average(s[known] ** 2, weights=freedom[known]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = special.chdtrc(freedom, freedom * (s / pooled) ** 2) < _EXCESS_LEVEL
+    return np.where(known & ~own, pooled, s)
 
 
 def _excess_of_extremes(mean: np.ndarray, s: np.ndarray, count: np.ndarray) -> dict[str, np.ndarray]:
@@ -206,17 +246,15 @@ def _without_scatter(mean: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _drawn_together(values: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return values (..., target) drawn towards their mean until the variance that u explains is gone."""
+    """Return values (..., target) drawn towards their mean until the variance that u explains, up to its 95 % limit, is gone."""
     known = np.isfinite(values)
     if known.sum() < 2:
         return values
     centre, spread = values[known].mean(), values[known].var(ddof=1)
-    share = max(1.0 - float((u[known] ** 2).mean()) / spread, 0.0) if spread > 0 else 0.0
+    freedom = known.sum() - 1
+    by_scatter = float((u[known] ** 2).mean() * special.chdtri(freedom, 0.05) / freedom)
+    share = max(1.0 - by_scatter / spread, 0.0) if spread > 0 else 0.0
     return centre + np.sqrt(share) * (values - centre)
-
-
-def _bias(size: float) -> GTC.lib.UncertainReal:
-    return GTC.ureal(0, size, label="extremes")
 
 
 def _magnitude(value: GTC.lib.UncertainReal) -> GTC.lib.UncertainReal:

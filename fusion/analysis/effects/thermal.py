@@ -146,7 +146,7 @@ PITCH_ERROR = Effect(
 )
 
 
-#: Standard uncertainty of an expansion coefficient from a table: steels and cast irons lie between 9 and 14 ppm/K.
+#: Standard uncertainty of what an axis expands by: steels and cast irons lie between 9 and 14 ppm/K, and what holds the axis takes part.
 EXPANSION_U_PPM_PER_K = 2.0
 #: Name of the declared model of a record: every displacement a linear function of the temperatures.
 QUASI_STATIC = "quasi_static"
