@@ -565,8 +565,8 @@ def iso230(
     cycles: Annotated[
         str | None,
         Option(
-            help="Window, for example 1-5; left out: the five cycles with the least drift in the second half of the test, "
-            "in windows laid back from the last whole cycle."
+            help="Window, for example 1-5; left out: the cycles under [acceptance] of the campaign file, without them the last five "
+            "whole cycles."
         ),
     ] = None,
     out: Annotated[Path | None, Option(help="Write the sheet to sign: sheet.html, sheet.pdf, or sheet.docx.")] = None,
@@ -580,6 +580,7 @@ def iso230(
     from fusion.common import versions
     from fusion.pipeline.iso230 import read_test
     from fusion.report.sheet import describe_sheet, iso230_csv, iso230_json, iso230_tables, write_iso230
+    from fusion.report.wording import sentences
 
     if as_json and as_csv:
         _refuse("--json and --csv: what is printed has one format; write one of them")
@@ -592,7 +593,7 @@ def iso230(
         else:
             for table in iso230_tables(found.part, found.dataset, title=found.title, axis_alone=out is not None):
                 _wide().print(table)
-            _print_lines(found.remarks)
+            _print_lines([*sentences("decided_how", found.part), *found.remarks])
         if out is not None:
             sheet = describe_sheet(found.title, found.part, files=found.files, version=versions()["thermofuse"])
             write_iso230(out, sheet, found.part, found.dataset, remarks=found.remarks)

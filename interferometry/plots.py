@@ -268,16 +268,16 @@ def plot_drift(
     return ax
 
 
-def plot_iso230(settled: xr.Dataset, position: xr.DataArray, ax: Axes | None = None) -> Axes:
+def plot_iso230(quoted: xr.Dataset, position: xr.DataArray, ax: Axes | None = None) -> Axes:
     """Plot the chart of ISO 230-2: mean deviation of each approach with its 2 s, um (arcsec), over the positions, mm (deg)."""
     axes, order = new_axes(ax), np.argsort(position.values, kind="stable")
-    for direction in settled["direction"].values:
-        one = settled.sel(direction=direction).isel(target=order)
+    for direction in quoted["direction"].values:
+        one = quoted.sel(direction=direction).isel(target=order)
         mean, spread = one["mean_unidirectional"].values, 2 * one["standard_deviation"].values
         if np.isfinite(mean).any():
             label = f"mean {ARROWS[direction]}{' ± 2 s' if np.isfinite(spread).any() else ''}"
             axes.errorbar(position.values[order], mean, spread, color=COLOURS[direction], capsize=3, label=label)
-    unit = str(settled["A"].attrs.get("units", "um")).replace("um", "µm")
+    unit = str(quoted["A"].attrs.get("units", "um")).replace("um", "µm")
     axes.set(xlabel=f"position / {position.attrs.get('units', 'mm')}", ylabel=f"deviation / {unit}")
     axes.legend(frameon=False)
     return axes

@@ -29,6 +29,7 @@ from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.values import (
     FILE_KEYS,
     Celsius,
+    Cycles,
     Feed,
     Fraction,
     FractionU,
@@ -174,8 +175,8 @@ class UncertaintyTable(Table, title="Standard uncertainties (k = 1)"):
 _Limit = PositiveMicrometres | None
 
 
-class AcceptanceTable(Table, title="Tolerances of the axis (ISO 230-2)"):
-    """``[acceptance]``: tolerances of the axis; a quantity without one is not judged."""
+class AcceptanceTable(Table, title="Tolerances of the axis, and the cycles that are judged (ISO 230-2)"):
+    """``[acceptance]``: tolerances of the axis, of which a quantity without one is not judged, and the cycles whose values are quoted."""
 
     A_um: _Limit = key(None, "A: bidirectional accuracy", example="20 um", ask=True)
     R_um: _Limit = key(None, "R: bidirectional repeatability", example="10 um", ask=True)
@@ -185,10 +186,18 @@ class AcceptanceTable(Table, title="Tolerances of the axis (ISO 230-2)"):
     A_unidirectional_um: _Limit = key(None, "A↑, A↓: unidirectional accuracy", example="15 um", ask=True)
     R_unidirectional_um: _Limit = key(None, "R↑, R↓: unidirectional repeatability", example="8 um", ask=True)
     E_unidirectional_um: _Limit = key(None, "E↑, E↓: unidirectional systematic deviation", example="12 um", ask=True)
+    cycles: Cycles | None = key(
+        None,
+        "Cycles whose values are quoted and judged",
+        example="10-14",
+        about="to be chosen before the values are known",
+        absent="the last five whole cycles",
+        show=True,
+    )
 
     def limits(self) -> dict[str, float]:
         """Return the tolerances that are stated, um, by the symbol of their quantity."""
-        stated = {name.removesuffix("_um"): value for name, value in self}
+        stated = {name.removesuffix("_um"): value for name, value in self if name.endswith("_um")}
         return {symbol: float(value) for symbol, value in stated.items() if value is not None}
 
 

@@ -399,10 +399,9 @@ def _report(asker: Asker, *, linear: bool) -> Iterator[str]:
     """Yield what the sheet to sign prints: machine, people and conditions, of a test along a linear axis its tolerances and motion too."""
     keys = keys_of("report", of="interferometry" if linear else "record")
     if linear:
-        tolerances = {one.key: one for one in keys_of("acceptance")}
-        yield from _section(
-            "acceptance", tolerances.values(), _by_name(asker, "Tolerances of the axis by ISO 230-2", tolerances)
-        )
+        judged = keys_of("acceptance")
+        tolerances = {one.key: one for one in judged if one.ask}
+        yield from _section("acceptance", judged, _by_name(asker, "Tolerances of the axis by ISO 230-2", tolerances))
     motion = {one.key.rpartition("_")[2]: one for one in keys if one.unit and one.ask}
     asked = [one for one in keys if one.ask and one not in motion.values()]
     answers = _by_name(asker, ", ".join(one.label for one in motion.values()), motion) if motion else {}

@@ -228,11 +228,15 @@ class Inputs:
 
 @dataclass(frozen=True, kw_only=True)
 class LaserInputs(Inputs):
-    """Inputs of a campaign with the laser; ``deviations`` keep ``interferometry.common.DEVIATIONS``."""
+    """Inputs of a campaign with the laser; ``deviations`` keep ``interferometry.common.DEVIATIONS``.
+
+    ``iso_cycles`` are those whose values by ISO 230-2 are quoted, None where the campaign file chooses none.
+    """
 
     interferometry: InterferometryTable
     deviations: xr.Dataset
     iso_budget: StatedBudget
+    iso_cycles: list[int] | None
 
     @property
     def is_recompensated(self) -> bool:
@@ -408,6 +412,10 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
         raise SourceError(
             f"{campaign.path}: [acceptance] holds limits of a length, but {interferometry.deviations} is of a rotary axis; remove it"
         )
+    span, chosen = campaign.acceptance.cycles, None
+    if span is not None:
+        stated = f'{campaign.path}: [acceptance] cycles = "{span[0]}-{span[1]}"'
+        chosen = cycles_within(span, deviations, stated=stated, file=interferometry.deviations)
     if _is_timed(deviations):
         cycles_of_readings(deviations)
     environment = None
@@ -425,7 +433,23 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
             'write "logged", or add the frames'
         )
     read = {"interferometry": interferometry, "environment": environment, "deviations": deviations}
-    return {**read, "iso_budget": compensated.budget, "notices": notices}
+    return {**read, "iso_budget": compensated.budget, "iso_cycles": chosen, "notices": notices}
+
+
+def cycles_within(span: tuple[int, int], deviations: xr.Dataset, *, stated: str, file: str) -> list[int]:
+    """Return the cycles of a range, first and last included; each of them has to hold readings."""
+    first, last = span
+    read = deviations["deviation"].notnull().any(("direction", "target")).values
+    measured = deviations["cycle"].values[read].tolist()
+    if measured and not measured[0] <= first <= last <= measured[-1]:
+        raise SourceError(
+            f"{stated}: cycles outside the test; {file} has readings of cycles {measured[0]} to {measured[-1]}"
+        )
+    if unread := sorted({*range(first, last + 1)} - {*measured}):
+        raise SourceError(
+            f"{stated}: {file} has no reading of {listed(f'cycle {number}' for number in unread)}; choose cycles without a gap"
+        )
+    return [*range(first, last + 1)]
 
 
 def _timed_cycles(deviations: xr.Dataset, *, file: str) -> tuple[xr.Dataset, list[Notice]]:

@@ -8,17 +8,17 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from fusion.campaign.config import campaign_schema
-from fusion.campaign.values import QuantityError, canonical_unit, read_quantity
+from fusion.campaign.values import QuantityError, canonical_unit, read_cycles, read_quantity
 from fusion.results.numbers import print_unit
 
 
 class Key(NamedTuple):
     """One value that somebody states: a key of a table, an item of a list of fixed length, or a key of a line of a list of tables.
 
-    `kind` is "text", "number", "quantity" with a `unit`, "date" or "list" of texts; `title` is that of the table. `about` says more than
-    the label, `absent` what holds where it is left out, `choices` what its values mean. `thermofuse init` asks for it (`ask`) or shows it
-    in a comment (`show`). It says something only with one of the tables `of`, and where those of `within` are there; a campaign cannot run
-    without a `needed` one. A table with lines calls one of them `row`, and shows `rows` of them where none is stated.
+    `kind` is "text", "number", "quantity" with a `unit`, "cycles", "date" or "list" of texts; `title` is that of the table. `about` says
+    more than the label, `absent` what holds where it is left out, `choices` what its values mean. `thermofuse init` asks for it (`ask`)
+    or shows it in a comment (`show`). It says something only with one of the tables `of`, and where those of `within` are there; a
+    campaign cannot run without a `needed` one. A table with lines calls one of them `row`, and shows `rows` of them where none is stated.
     """
 
     table: tuple[str, ...]
@@ -56,9 +56,11 @@ class Key(NamedTuple):
         return f"{self.label} ({print_unit(self.unit)})" if self.unit else self.label
 
     def check(self, text: str) -> str:
-        """Return a text that is a quantity of its unit, or a day, where it has to be."""
+        """Return a text that is a quantity of its unit, a range of cycles or a day, where it has to be."""
         if self.kind == "quantity":
             read_quantity(text, canonical_unit(self.unit))
+        elif self.kind == "cycles":
+            read_cycles(text)
         elif self.kind == "date":
             try:
                 return date.fromisoformat(text).isoformat()

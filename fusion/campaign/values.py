@@ -46,6 +46,7 @@ _PLUS_MINUS = re.compile(r"\s*(?:\+/?-|±)\s*")
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")
 
 
+_CYCLES = re.compile(r"\s*(\d{1,99})(?:\s*-\s*(\d{1,99}))?\s*")
 #: Heading of a column with its unit, ``"name [unit]"`` or ``"name(unit)"``.
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
@@ -139,6 +140,17 @@ def read_option(option: str, text: str, target: str) -> float:
         return read_quantity(text, target)
     except QuantityError as error:
         raise QuantityError(f'{option} "{text}": {error}') from None
+
+
+def read_cycles(value: object) -> tuple[int, int]:
+    """Return the first and the last of a range of cycles written as text; a single number is both."""
+    match = _CYCLES.fullmatch(value) if isinstance(value, str) else None
+    if match is None:
+        raise QuantityError('this is not a window of cycles; write for example "1-5"')
+    first, last = int(match[1]), int(match[2] or match[1])
+    if first > last:
+        raise QuantityError(f'this window ends before it begins; write for example "{last}-{first}"')
+    return first, last
 
 
 def split_uncertainty(text: str) -> tuple[str, str | None]:
@@ -243,6 +255,25 @@ def _zone(name: str) -> str:
 
 
 TimeZone = Annotated[str, AfterValidator(_zone)]
+
+
+def _several(cycles: tuple[int, int]) -> tuple[int, int]:
+    """Accept more than one cycle."""
+    if cycles[0] == cycles[1]:
+        raise ValueError(
+            "one cycle has no standard deviation, and with it neither R nor A nor an uncertainty; write the first and the last of "
+            'several, five for a test by ISO 230-2, for example "1-5"'
+        )
+    return cycles
+
+
+#: First and last of several cycles.
+Cycles = Annotated[
+    tuple[int, int],
+    BeforeValidator(read_cycles),
+    AfterValidator(_several),
+    WithJsonSchema({"type": "string", "format": "cycles", "examples": ["10-14"]}),
+]
 
 
 def _patch(values: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

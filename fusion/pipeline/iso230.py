@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,10 +20,11 @@ from fusion.campaign.config import (
     ReportTable,
     load_campaign,
 )
-from fusion.campaign.inputs import is_rotary, lacks_course, read_laser
+from fusion.campaign.inputs import cycles_within, is_rotary, lacks_course, read_laser
 from fusion.campaign.recompensation import ROTARY_BUDGET, StatedBudget, material_by_cycle
 from fusion.campaign.schema import Key, keys_of
 from fusion.campaign.time_zones import is_dated, shown_zone
+from fusion.campaign.values import QuantityError, read_cycles
 from fusion.results.axis import Iso230Contribution, Iso230Part, Iso230Range, Iso230Window, Iso230WithTable
 from fusion.results.numbers import exact, moment
 from fusion.results.parts import Iso230Condition, Iso230Tolerance, Quantity, decide, is_determined
@@ -46,16 +46,12 @@ from interferometry.iso230 import (
     evaluate_iso230,
     evaluate_other_standards,
     evaluate_windows,
-    settled_window,
 )
 from interferometry.iso230.conditions import check_conditions
 
-_RULE = (
-    f"of the windows of {STANDARD_CYCLES} cycles, laid back from the last whole cycle, whose middle is in the second half of the test, the "
-    "one with the least drift by the joint estimate"
-)
-_RULE_WITHOUT_DRIFT = f"the last window of {STANDARD_CYCLES} whole cycles, as no drift could be estimated"
-_RULE_ONE = "the only window of the test"
+_LAST = f"the last {STANDARD_CYCLES} whole cycles of the test"
+_ONLY = "the only window of the test"
+_CHOSEN = "as chosen"
 _AXIS = (*QUANTITIES, "mean_reversal")
 #: Unit of each input, and the field of `interferometry.iso230.Iso230Budget` that holds it.
 _INPUTS = {
@@ -91,7 +87,10 @@ def evaluate_standard(
     environment: xr.Dataset | None = None,
     cycles: list[int] | None = None,
 ) -> tuple[xr.Dataset, xr.Dataset, Iso230Part]:
-    """Evaluate windows of a test by ISO 230-2, and say which of them shows the warmed-up axis."""
+    """Evaluate windows of a test by ISO 230-2, and the cycles to quote: those that were chosen, else the last window.
+
+    Which cycles are quoted follows from nothing that was measured in them: what is chosen by its drift is chosen by its R and A.
+    """
     beside: dict[str, Any] = {
         "budget": budget.budget,
         "drift": None if drift is None else drift["drift"],
@@ -103,30 +102,30 @@ def evaluate_standard(
         numbers[(numbers >= first) & (numbers <= last)].tolist()
         for first, last in zip(windows["first_cycle"].values, windows["last_cycle"].values, strict=True)
     ]
-    quoted = blocks[settled_window(windows)] if cycles is None else cycles
-    first, settled = (evaluate_iso230(deviations, cycles=window, **beside) for window in (blocks[0], quoted))
-    of_standard = windows.isel(window=slice(0, -1)) if windows.sizes["window"] > 1 else windows
-    if cycles is not None:
-        rule = ""
-    elif of_standard.sizes["window"] == 1:
-        rule = _RULE_ONE
-    else:
-        rule = _RULE_WITHOUT_DRIFT if drift is None else _RULE
+    of_standard = _of_standard(windows)
+    chosen = blocks[of_standard.sizes["window"] - 1] if cycles is None else cycles
+    first, quoted = (evaluate_iso230(deviations, cycles=window, **beside) for window in (blocks[0], chosen))
+    rule = _CHOSEN if cycles is not None else _ONLY if of_standard.sizes["window"] == 1 else _LAST
     # What was measured beside the readings tells where two inputs of the budget come from.
     material = beside["material_degC"] is not None
     described = partial(_describe_window, budget=budget, drift=drift is not None, material=material)
     part = Iso230Part(
-        **vars(described(settled, quoted)),
-        settled_rule=rule,
+        **vars(described(quoted, chosen)),
+        window_rule=rule,
         first=described(first, blocks[0]),
         range_um={
             name: Iso230Range(lowest=of_standard[name].min(), highest=of_standard[name].max()) for name in QUANTITIES
         },
         with_table=None
         if drift is None
-        else _with_table(deviations, drift, blocks[: of_standard.sizes["window"]], quoted),
+        else _with_table(deviations, drift, blocks[: of_standard.sizes["window"]], chosen),
     )
-    return windows, settled, part
+    return windows, quoted, part
+
+
+def _of_standard(windows: xr.Dataset) -> xr.Dataset:
+    """Return the windows without the whole test, which is the last of several."""
+    return windows.isel(window=slice(0, max(1, windows.sizes["window"] - 1)))
 
 
 def _with_table(
@@ -225,27 +224,39 @@ def complete_sheet(
     settling = estimate_settling(dataset, group(dataset, "drift")) if has(dataset, "drift") else None
     checks = check_conditions(dataset, cycles=cycles, lead_mm=report.screw_lead_mm, settling=settling)
     others = [] if is_rotary(dataset) else evaluate_other_standards(dataset, cycles=cycles)
+    windows = _of_standard(group(dataset, "iso"))
+    judged = [row for symbol, limit in limits.items() for row in _judge(part, windows, symbol, limit)]
+    met = {check.met for check in checks}
     sheet = {
-        "tolerances": [row for symbol, limit in limits.items() for row in _judge(part, symbol, limit)],
+        "tolerances": [row for row, _ in judged],
+        "windows": windows.sizes["window"],
+        "windows_otherwise": sum(map(any, zip(*(otherwise for _, otherwise in judged), strict=True))),
         "checks": [vars(check) for check in checks],
+        "is_acceptance_test": False if False in met else None if None in met else True,
         "conditions": _conditions(dataset, report, campaign, environment),
         "other_standards": [vars(value) for value in others],
     }
     return Iso230Part.model_validate({**vars(part), **sheet})
 
 
-def _judge(part: Iso230Part, symbol: str, limit: float) -> Iterator[Iso230Tolerance]:
-    """Judge a quantity, each direction by itself where it is unidirectional."""
-    found = {symbol: part}
+def _judge(
+    part: Iso230Part, windows: xr.Dataset, symbol: str, limit: float
+) -> Iterator[tuple[Iso230Tolerance, list[bool]]]:
+    """Judge a quantity, each direction by itself where it is unidirectional, with whether each window is judged otherwise."""
+    found: dict[str, tuple[Any, xr.Dataset]] = {symbol: (part, windows)}
     if symbol.endswith("_unidirectional"):
-        symbol = symbol.removesuffix("_unidirectional")
-        found = {f"{symbol}{arrow}": getattr(part, direction) for direction, arrow in _ARROWS.items()}
-    for name, holder in found.items():
-        quantity: Quantity = getattr(holder, f"{symbol}_um")
+        found = {
+            f"{symbol[0]}{arrow}": (getattr(part, direction), windows.sel(direction=direction))
+            for direction, arrow in _ARROWS.items()
+        }
+    for name, (holder, along) in found.items():
+        quantity: Quantity = getattr(holder, f"{name[0]}_um")
         expanded = 2 * quantity.u if is_determined(quantity.u) else None
         decision = decide(quantity.value, expanded, limit)
+        pairs = zip(along[symbol].values, 2 * along[f"{symbol}_u"].values, strict=True)
+        otherwise = [decide(value, u, limit) != decision for value, u in pairs]
         judged = {"limit_um": limit, "value_um": quantity.value, "expanded_u_um": expanded, "decision": decision}
-        yield Iso230Tolerance(quantity=name, **judged)
+        yield Iso230Tolerance(quantity=name, **judged, windows_otherwise=sum(otherwise)), otherwise
 
 
 def _conditions(
@@ -363,7 +374,7 @@ class StandardTest:
     Attributes
     ----------
     part : values; those that need a standard deviation are null of a test of one cycle
-    dataset : readings; the group ``settled`` holds the quoted window
+    dataset : readings; the group ``quoted`` holds the quoted window
     remarks : what was left out or assumed when the file was read
     files : SHA-256 of the files that it was read from, by name
     """
@@ -386,13 +397,18 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
         if campaign.interferometry is None:
             raise CampaignError(f"{path}: this campaign has no [interferometry]; name one with readings of the axis")
         laser = read_laser(campaign)
-        read = (laser["deviations"], laser["iso_budget"], cycles, campaign, laser["environment"])
+        readings = laser["deviations"]
+        window = (
+            laser["iso_cycles"] if cycles is None else _window_of(cycles, readings, campaign.interferometry.deviations)
+        )
         named = {path.name: path, **campaign.files_of("interferometry")}
+        read = (readings, laser["iso_budget"], window, campaign, laser["environment"])
         return _evaluate(campaign.campaign.title, named, *read)
     deviations = read_deviations(path, rotary=True)
+    window = None if cycles is None else _window_of(cycles, deviations, path.name)
     budget = ROTARY_BUDGET if is_rotary(deviations) else StatedBudget(Iso230Budget(), dict.fromkeys(_INPUTS, "assumed"))
     try:
-        return _evaluate(path.name, {path.name: path}, deviations, budget, cycles)
+        return _evaluate(path.name, {path.name: path}, deviations, budget, window)
     except InterferometryError as error:
         raise CampaignError(f"{path}: {error}") from None
 
@@ -401,18 +417,18 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
     """Return the test of a run as its results hold it."""
     if cycles is not None:
         raise CampaignError(
-            f'--cycles "{cycles}": {folder} holds the windows of its run; name the campaign file or the file of readings instead'
+            f'--cycles "{cycles}": {folder} holds the values of its run; name the campaign file or the file of readings instead, or write '
+            "[acceptance] cycles into the campaign file and run it again"
         )
     results = read_results(folder)
     if results.iso230 is None:
         raise CampaignError(
             f"{folder}: its run had no readings of an axis; name the results of a campaign with [interferometry]"
         )
-    if not results.iso230.cycles:
+    if not results.iso230.cycles or not has(dataset := read_product(folder, "deviations"), "quoted"):
         raise CampaignError(
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )
-    dataset = read_product(folder, "deviations")
     return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset), files_of_run(folder))
 
 
@@ -443,33 +459,25 @@ def _evaluate(
     files: Mapping[str, Path],
     deviations: xr.Dataset,
     budget: StatedBudget,
-    cycles: str | None,
+    cycles: list[int] | None,
     campaign: Campaign | None = None,
     environment: xr.Dataset | None = None,
 ) -> StandardTest:
     """Evaluate readings."""
-    window = None if cycles is None else read_window(cycles, deviations)
     drift, digits = estimate_joint(deviations)
     without = lacks_course(deviations)
     remarks = (*_remarks(deviations), *(notice.message for notice in digits), *([without] if without else []))
-    windows, settled, found = evaluate_standard(deviations, budget, drift=drift, environment=environment, cycles=window)
-    dataset = joined(deviations, iso=windows, settled=settled, **({} if drift is None else {"drift": drift}))
+    windows, quoted, found = evaluate_standard(deviations, budget, drift=drift, environment=environment, cycles=cycles)
+    dataset = joined(deviations, iso=windows, quoted=quoted, **({} if drift is None else {"drift": drift}))
     found = complete_sheet(found, dataset, campaign=campaign, environment=environment)
     return StandardTest(title, Iso230Part.model_validate(plain(found)), dataset, remarks, hashed(files))
 
 
-def read_window(text: str, deviations: xr.Dataset) -> list[int]:
-    """Return the cycle numbers of a window of cycles."""
-    match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", text)
-    if match is None:
-        raise CampaignError(f'--cycles "{text}" is not a window of cycles; write for example 1-5')
-    first, last = int(match.group(1)), int(match.group(2) or match.group(1))
-    cycles = deviations["cycle"].values.tolist()
-    window = [cycle for cycle in cycles if first <= cycle <= last]
-    if first > last:
-        raise CampaignError(f'--cycles "{text}" ends before it begins; write for example {last}-{first}')
-    if len(window) != last - first + 1:
-        raise CampaignError(
-            f'--cycles "{text}" contains cycles that were not measured; there are {cycles[0]} to {cycles[-1]}'
-        )
-    return window
+def _window_of(text: str, deviations: xr.Dataset, file: str) -> list[int]:
+    """Return the cycles of the window that ``--cycles`` names."""
+    stated = f'--cycles "{text}"'
+    try:
+        span = read_cycles(text)
+    except QuantityError as error:
+        raise CampaignError(f"{stated}: {error}") from None
+    return cycles_within(span, deviations, stated=stated, file=file)

@@ -38,10 +38,10 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
     times = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
     drift, digits = estimate_joint(deviations)
     deviations = deviations if drift is None else flag_outliers(deviations, drift)
-    windows, settled, standard = evaluate_standard(
-        deviations, source.iso_budget, drift=drift, environment=source.environment
+    windows, quoted, standard = evaluate_standard(
+        deviations, source.iso_budget, drift=drift, environment=source.environment, cycles=source.iso_cycles
     )
-    groups, parts = {"iso": windows, "settled": settled}, Parts(iso230=standard)
+    groups, parts = {"iso": windows, "quoted": quoted}, Parts(iso230=standard)
     if not lacks_course(deviations):
         comparison = neighbours.compare(deviations, drift)
         groups |= {

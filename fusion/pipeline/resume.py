@@ -290,9 +290,9 @@ class Run:
     worker : takes stages that the next one does not wait for
     depends : what every stage depends on besides campaign and files, as it was at the start
     drawn : each waits for a part of the charts and returns it
-    taken : by stage, what its result depends on of tables that it does not list whole
+    taken : by stage, what its own product alone depends on of tables that it does not list whole
     parts, notices : parts of results.json and notices of the stages so far
-    seconds, keys : wall time (s) and input digest by stage
+    seconds, keys : wall time (s), and digest of the input by stage, without what it takes for its own product alone
     products : what the run wrote or kept
     """
 
@@ -367,7 +367,7 @@ class Run:
             self.stamps.record(name, key, [path], found)
             del computed
         _return_freed_memory()
-        self.keys[name] = key
+        self.keys[name] = self._shared_key(name)
         self.products.append(path)
         self.parts.take(outcome.parts)
         self.notices.extend(outcome.notices)
@@ -375,13 +375,17 @@ class Run:
         return outcome.dataset
 
     def _key(self, name: str) -> str:
-        """Return a digest of everything that the result of a stage depends on."""
+        """Return a digest of everything that the product of a stage depends on."""
+        return digest(self._shared_key(name), self.taken.get(name))
+
+    def _shared_key(self, name: str) -> str:
+        """Return a digest of what the result of a stage depends on as far as later stages use it."""
         stage = STAGES[name]
         settings = self.campaign.model_dump(mode="json", include=set(stage.tables))
         files = {file: self.inputs[file] for table in stage.tables for file in self.campaign.files_of(table)}
         zone = self.campaign.campaign.time_zone if _ZONED & {*stage.tables} else None
         earlier = [self.keys[one] for one in stage.after if one in self.keys]
-        return digest(name, *self.depends, zone, settings, files, self.taken.get(name), earlier)
+        return digest(name, *self.depends, zone, settings, files, earlier)
 
     def checkpoint(self, name: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""

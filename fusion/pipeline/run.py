@@ -183,6 +183,7 @@ def _run_loaded(
             stamps = StageStamps(folder)
             forget_run(stamps)
             run = Run(campaign, folder, report, stamps, inputs, seen, started, address, worker)
+            run.taken["deviations"] = campaign.acceptance.cycles
             run.notices.extend(made["source"].notices if "source" in made else ())
             run_stages(run, RUN, made)
             if "source" in made:

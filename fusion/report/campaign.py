@@ -44,6 +44,7 @@ from fusion.report.wording import (
     quantity,
     randomised_causes,
     say,
+    sentences,
     table,
     untouched,
     with_values,
@@ -229,12 +230,13 @@ _NAMED = 8
 def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None) -> dict[str, Any]:
     """Return the tables of the section on ISO 230-2, as page and terminal show them."""
     unit = print_unit(part.unit)
-    targets = None if dataset is None or not has(dataset, "settled") else group(dataset, "settled")
+    targets = None if dataset is None or not has(dataset, "quoted") else group(dataset, "quoted")
     return {
         "positions": None
         if dataset is None or targets is None
         else _iso230_positions_table(targets, dataset["position"], unit),
         "axis": _values_table(part, unit),
+        "notes": sentences("decided_how", part),
         # Of one cycle nothing is known of the uncertainty.
         "budget": _budget_table(part, unit) if len(part.cycles) > 1 else None,
         "sharper": sharpen(part),
@@ -255,17 +257,17 @@ def _other_first(part: Iso230Part) -> Iso230Window | None:
     return part.first if part.first is not None and part.first.window != part.window else None
 
 
-def _iso230_positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
+def _iso230_positions_table(quoted: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
     """Return the values of every target in the order of the axis; decimals by the uncertainty of a mean deviation."""
-    spread = settled["standard_deviation"].values / np.sqrt(np.where(settled["count"] > 0, settled["count"], np.nan))
+    spread = quoted["standard_deviation"].values / np.sqrt(np.where(quoted["count"] > 0, quoted["count"], np.nan))
     known = spread[np.isfinite(spread)]
     places = decimals_of(float(np.median(known)) if known.size else np.nan)
     along = _along(position)
     of_both = ("mean_bidirectional", "reversal", "repeatability_bidirectional")
     of_each = ("mean_unidirectional", "standard_deviation", "repeatability")
-    one_way = [by_approach(settled[name], target=along) for name in of_each]
-    values = np.hstack([*one_way, *(settled[name].sel(target=along).values[:, None] for name in of_both)])
-    places_mm, counted = position.sel(target=along).values, by_approach(settled["count"], target=along)
+    one_way = [by_approach(quoted[name], target=along) for name in of_each]
+    values = np.hstack([*one_way, *(quoted[name].sel(target=along).values[:, None] for name in of_both)])
+    places_mm, counted = position.sel(target=along).values, by_approach(quoted["count"], target=along)
     rows = [
         [
             str(target),
@@ -315,7 +317,7 @@ def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
 def values_to_sign(part: Iso230Part) -> Table:
     """Return the axis values of the quoted window, and of each direction what has a tolerance, with their decisions."""
     unit = print_unit(part.unit)
-    judged = {one.quantity: [f"{one.limit_um:g}", one.decision] for one in part.tolerances}
+    judged = {one.quantity: one for one in part.tolerances}
     one_way = part.approach is not None
     found: list[tuple[str, str, Iso230Window | Iso230Direction]] = [
         *((term, symbol, part) for symbol, term in ISO230_TERMS.items()),
@@ -330,8 +332,14 @@ def values_to_sign(part: Iso230Part) -> Table:
     for term, symbol, values in found:
         value = getattr(values, f"{symbol[0]}_um")
         if value.value is not None:
-            verdict = judged.get(symbol, ["–", "no tolerance stated"]) if judged else []
-            rows.append(Row([term, quantity(value), *verdict], symbol in judged and verdict[1] != "pass"))
+            stated = judged.get(symbol)
+            verdict = (
+                ["–", "no tolerance stated"]
+                if stated is None
+                else [f"{stated.limit_um:g}", say("judged", stated, part)]
+            )
+            cells = [term, quantity(value), *(verdict if judged else [])]
+            rows.append(Row(cells, stated is not None and stated.decision != "pass"))
     titles = [f"Tolerance / {unit}", Words("Decision (ISO 14253-1)")] if judged else []
     value = "Value ± U (k = 2)" if any("±" in row.cells[1] for row in rows) else "Value"
     return table([Words("Quantity of the axis"), f"{value} / {unit}", *titles], rows)
@@ -340,7 +348,7 @@ def values_to_sign(part: Iso230Part) -> Table:
 def _values_table(part: Iso230Part, unit: str) -> Table:
     """Return the axis values of the quoted window with their decisions, those of the first one and their range over the windows."""
     first = _other_first(part)
-    judged = {one.quantity: (f"{one.limit_um:g}", one.decision) for one in part.tolerances}
+    judged = {one.quantity: (f"{one.limit_um:g}", say("judged", one, part)) for one in part.tolerances}
     rows = []
 
     def add(title: str, symbol: str, *cells: str, marked: bool = False) -> None:

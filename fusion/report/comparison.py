@@ -202,7 +202,7 @@ def _figures(campaign: ComparedCampaign) -> dict[str, str]:
         figures |= {f"{symbol} by ISO 230-2": value for symbol, value in iso230_values(results.iso230).items()}
         for one in results.iso230.tolerances:
             limit = f"at most {one.limit_um:g} {print_unit(results.iso230.unit)}"
-            figures[f"{one.quantity} {limit}"] = one.decision
+            figures[f"{one.quantity} {limit}"] = say("judged", one, results.iso230, True)
     if results.anomalies is not None:
         named = [
             f"{say('position_words', one.target, one.position_mm)}: {anomaly_cause(one)}" for one in results.anomalies
@@ -286,6 +286,7 @@ def describe_pair(pair: PairComparison) -> Sheet:
         ),
         caption="Values by ISO 230-2, expanded uncertainties (k = 2); of the change without what both tests have in common",
         values=_values_as_left(pair),
+        notes=sentences("decision_rule") if any(part is not None and part.tolerances for part in parts) else [],
         requirements=table([], []),
         files=files,
         version=versions()["thermofuse"],
@@ -314,7 +315,11 @@ def _values_as_left(pair: PairComparison) -> Table:
         stated = [one.get(symbol) for one in judged]
         if any_judged:
             limits = dict.fromkeys(f"{one.limit_um:g}" for one in stated if one is not None)
-            cells += [" / ".join(limits) or "–", *("–" if one is None else one.decision for one in stated)]
+            told = [
+                "–" if one is None or part is None else say("judged", one, part, True)
+                for one, part in zip(stated, parts, strict=True)
+            ]
+            cells += [" / ".join(limits) or "–", *told]
         rows.append(Row(cells, marked=change is not None and change.significant))
     unit = print_unit(next((part.unit for part in parts if part is not None), "um"))
     decided = (

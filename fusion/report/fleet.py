@@ -25,7 +25,7 @@ from fusion.report.charts.style import Chart, embed
 from fusion.report.exports.tables import Bars, Bound, Linked, conditions_of, write_workbook
 from fusion.report.findings import findings, headline
 from fusion.report.page import render_page
-from fusion.report.wording import ISO230_TERMS
+from fusion.report.wording import ISO230_TERMS, say
 from fusion.results.numbers import fixed, measured, upper_first
 from fusion.results.parts import Quantity
 from fusion.results.results import Results, read_results
@@ -51,6 +51,8 @@ class Row:
     A_um, A_u_um and so on : values by ISO 230-2 of the quoted window, each with its standard uncertainty
     machine, serial, date : as the campaign file names them, and the day of the first reading
     decision : the least favourable of the decisions by ISO 14253-1 against the stated tolerances; empty where none is stated
+    windows_otherwise : how many windows of five cycles decide otherwise; empty where no tolerance is stated
+    acceptance : whether the test meets what ISO 230-2 asks of an acceptance test; None where the readings do not show it
     maximum_degC, maximum_u_degC
         Highest temperature that a camera measured in a picture, a region or a field, and its standard uncertainty.
     above_range : whether it is the end of the calibrated range, which pixels are above
@@ -83,6 +85,8 @@ class Row:
     machine: str = ""
     date: str = ""
     decision: str = ""
+    windows_otherwise: str = ""
+    acceptance: bool | None = None
     maximum_degC: float | None = None
     maximum_u_degC: float | None = None
     held_out_um: float | None = None
@@ -122,7 +126,8 @@ def with_findings(row: Row, folder: Path) -> Row:
     loop, listed = results.loop, conditions_of(results)
     conditions = {one.key: one.text for one in listed}
     stated = read_json_object(folder / "provenance.json").get("parameters", {}).get("report", {})
-    decided = [one.decision for one in results.iso230.tolerances] if results.iso230 else []
+    iso = results.iso230
+    decided = [one.decision for one in iso.tolerances] if iso else []
     maxima = {one.maximum_degC: one.overrange_pictures > 0 for one in results.regions or ()}
     if maps is not None:
         maxima[_hottest_cell(maps)] = False
@@ -138,6 +143,8 @@ def with_findings(row: Row, folder: Path) -> Row:
         serial=conditions.get("machine_serial_number") or stated.get("machine_serial_number", ""),
         date=_day(results, conditions, maps),
         decision=next((one for one in _DECISIONS if one in decided), ""),
+        windows_otherwise=say("windows_otherwise", iso, iso) if iso and decided else "",
+        acceptance=iso.is_acceptance_test if iso else None,
         above_range=maxima.get(hottest, False),
         verdict="" if loop is None else loop.verdict,
         headline="" if loop is None else headline(results),
@@ -238,7 +245,13 @@ FINDINGS = (
     Column(
         "decision",
         "decision",
-        "Decision: the least favourable of the stated tolerances (ISO 14253-1); not decided where one lies within the uncertainty.",
+        "Decision: the least favourable of the stated tolerances (ISO 14253-1); not decided where one lies within the uncertainty; no "
+        "acceptance where the test does not meet what ISO 230-2 asks for.",
+    ),
+    Column(
+        "decided otherwise",
+        "windows_otherwise",
+        "Decided otherwise: windows of five cycles of the same test that would not keep or fail the same tolerances.",
     ),
     Column(
         "drift / µm",
@@ -276,7 +289,7 @@ def shown(row: Row, column: Column) -> str:
     if value is None or value == "" or (value == 0.0 and column.key in ("seconds", "peak_MB")):
         return "–"
     if column.key == "decision":
-        return _short(value)
+        return _decided(row)
     if column.key == "maximum_degC" and row.above_range:
         return f"> {fixed(value, 0)}"
     if column.key == "peak_MB":
@@ -284,8 +297,9 @@ def shown(row: Row, column: Column) -> str:
     return measured(value, getattr(row, column.u) if column.u else None) if isinstance(value, float) else str(value)
 
 
-def _short(decision: str) -> str:
-    return decision.removesuffix(" within the uncertainty")
+def _decided(row: Row) -> str:
+    """Return the decision in short, with what makes it no acceptance."""
+    return row.decision.removesuffix(" within the uncertainty") + (", no acceptance" if row.acceptance is False else "")
 
 
 def filled(rows: Sequence[Row], columns: Sequence[Column]) -> list[Column]:
@@ -295,9 +309,10 @@ def filled(rows: Sequence[Row], columns: Sequence[Column]) -> list[Column]:
 
 def count_decisions(rows: Sequence[Row]) -> dict[str, int]:
     """Return how many campaigns there are of each decision, the most favourable first, and without one."""
-    counts = Counter(row.decision for row in rows if row.is_whole)
-    named = {_short(decision): counts[decision] for decision in reversed(_DECISIONS) if counts[decision]}
-    return named | ({"without a tolerance": counts[""]} if counts[""] else {})
+    whole = [row for row in rows if row.is_whole]
+    judged = sorted((row for row in whole if row.decision), key=lambda row: -_DECISIONS.index(row.decision))
+    unjudged = len(whole) - len(judged)
+    return {**Counter(map(_decided, judged)), **({"without a tolerance": unjudged} if unjudged else {})}
 
 
 # The workbook of a fleet: a summary, one row per campaign, and what is stated of each test.

@@ -20,7 +20,7 @@ from fusion.report.charts.readings import has_windows, plot_test, plot_windows
 from fusion.report.charts.record import draw_thermal_tests
 from fusion.report.charts.style import Chart, embed, of_rank
 from fusion.report.page import page_format, render_page, write_page
-from fusion.report.wording import Table, Words, print_table, table
+from fusion.report.wording import Table, Words, print_table, sentences, table
 from fusion.results.axis import Iso230Part
 from fusion.results.parts import Iso230Condition, ThermalTest
 from fusion.results.store import group, write_atomically
@@ -63,8 +63,8 @@ class Stated:
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a sheet shows, in words; `values` under their caption, `requirements` without rows where there are none, SHA-256 of files by
-    name.
+    """What a sheet shows, in words; `values` under their caption, before the `notes` on what they mean; `requirements` without rows where
+    there are none, SHA-256 of files by name.
     """
 
     title: str
@@ -72,6 +72,7 @@ class Sheet:
     stated: Stated
     caption: str
     values: Table
+    notes: list[str]
     requirements: Table
     files: Mapping[str, str]
     version: str
@@ -86,6 +87,7 @@ def describe_sheet(title: str, part: Iso230Part, *, files: Mapping[str, str], ve
         stated=Stated.of(part.conditions, _CONVENTION),
         caption=f"Values of {part.window}",
         values=values_to_sign(part),
+        notes=sentences("decided_how", part),
         requirements=table([Words("Requirement of ISO 230-2"), Words("Met"), Words("Found")], requirements),
         files=files,
         version=version,
@@ -101,6 +103,7 @@ def describe_thermal_sheet(title: str, test: ThermalTest, *, files: Mapping[str,
         stated=Stated.of(test.conditions, "not stated"),
         caption="Largest less smallest value, with expanded uncertainty (k = 2)",
         values=described["distortions"],
+        notes=[],
         requirements=table([], []),
         files=files,
         version=version,
@@ -109,7 +112,7 @@ def describe_thermal_sheet(title: str, test: ThermalTest, *, files: Mapping[str,
 
 def draw_iso230(dataset: xr.Dataset) -> dict[str, Chart]:
     """Return the charts of the section on ISO 230-2, by name."""
-    charts = {"iso230": plot_test(group(dataset, "settled"), dataset["position"])}
+    charts = {"iso230": plot_test(group(dataset, "quoted"), dataset["position"])}
     windows = group(dataset, "iso")
     return {**charts, "windows": plot_windows(windows)} if has_windows(windows) else charts
 
@@ -124,7 +127,7 @@ def render_iso230(sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remark
 def write_iso230(path: Path, sheet: Sheet, part: Iso230Part, dataset: xr.Dataset, *, remarks: tuple[str, ...]) -> None:
     """Write the sheet of a test in the format of the file's name; nothing is replaced."""
     if page_format(path, ".html", ".pdf", ".docx") == ".docx":
-        drawn = plot_iso230(group(dataset, "settled"), dataset["position"])
+        drawn = plot_iso230(group(dataset, "quoted"), dataset["position"])
         write_atomically(path, lambda temporary: _write_word(temporary, [(sheet, drawn)]))
     else:
         write_page(path, render_iso230(sheet, part, dataset, remarks=remarks))
@@ -211,6 +214,8 @@ def _write_word(path: Path, sheets: Sequence[tuple[Sheet, Axes]]) -> None:
         # The first column holds names, the others share what is left of the width.
         titles = sheet.values.titles
         put([row.cells for row in sheet.values.rows], (58, *[120 // (len(titles) - 1)] * (len(titles) - 1)), titles)
+        for note in sheet.notes:
+            document.add_paragraph(note)
         if sheet.requirements.rows:
             put([row.cells for row in sheet.requirements.rows], (44, 18, 116), sheet.requirements.titles)
         if sheet.stated.conditions:
@@ -257,12 +262,12 @@ def _of_targets(dataset: xr.Dataset) -> pd.DataFrame:
     """Return the values of each target; headings carry the units of the dataset."""
     unit, place = dataset["deviation"].attrs["units"], dataset["position"].attrs["units"]
     columns = {"target": dataset["target"].values, f"position_{place}": dataset["position"].values}
-    settled = group(dataset, "settled").sel(target=dataset["target"].values)
+    quoted = group(dataset, "quoted").sel(target=dataset["target"].values)
     for direction in dataset["direction"].values:
-        here = settled.sel(direction=direction)
+        here = quoted.sel(direction=direction)
         for symbol, name in (("mean", "mean_unidirectional"), ("s", "standard_deviation"), ("R", "repeatability")):
             columns[f"{symbol}_{direction}_{unit}"] = here[name].values
         columns[f"readings_{direction}"] = here["count"].values.astype(int)
     for symbol, name in (("mean", "mean_bidirectional"), ("B_i", "reversal"), ("R_i", "repeatability_bidirectional")):
-        columns[f"{symbol}_{unit}"] = settled[name].values
+        columns[f"{symbol}_{unit}"] = quoted[name].values
     return pd.DataFrame(columns)

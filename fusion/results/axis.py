@@ -328,10 +328,10 @@ class Iso230WithTable(ResultPart):
 
 
 class Iso230Part(Iso230Window):
-    """Axis values by ISO 230-2:2014; those at this level are the values to quote, of the window that shows the warmed-up axis."""
+    """Axis values by ISO 230-2:2014; those at this level are to quote: of the cycles that were chosen, else of the last window."""
 
-    settled_rule: str = ""
-    """How that window was chosen."""
+    window_rule: str = ""
+    """How that window was chosen. ``settled_rule`` before schema 4."""
     first: Iso230Window | None = None
     """The first window, which may be a cold start."""
     range_um: Mapping[str, Iso230Range] = Field(default_factory=dict)
@@ -340,8 +340,15 @@ class Iso230Part(Iso230Window):
     """A with a compensation table in this thermal state and in the others; null where no other cycles tell. New in schema 4."""
     tolerances: tuple[Iso230Tolerance, ...] = ()
     """The quoted window against the tolerances that the campaign states."""
+    windows: int = 0
+    """How many windows of five cycles, laid back from the last one of the test, are judged beside it. New in schema 4."""
+    windows_otherwise: int = 0
+    """How many of them would be judged otherwise in any of the tolerances. New in schema 4."""
     checks: tuple[Iso230Check, ...] = ()
     """Conditions that the standard asks of a test."""
+    is_acceptance_test: bool | None = None
+    """Whether every one of them is met: where one is not, no decision is an acceptance by ISO 230-2; null where the readings do not show
+    all of them, and in results of versions that did not write it. New in schema 4."""
     conditions: tuple[Iso230Condition, ...] = ()
     """Conditions of the test as they were stated or logged."""
     other_standards: tuple[OtherEvaluation, ...] = ()

@@ -70,6 +70,7 @@ RENAMED_KEYS = {
     "p_beside_leader": "p_given_leading_mode",
     "premise": "assumption",
     "sealed_question": "held_out_test",
+    "settled_rule": "window_rule",
     "share_not_separable": "collinear_share",
     "unnamed": "unconfirmed_effects",
     "within_s": "block_length_s",

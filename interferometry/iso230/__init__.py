@@ -13,7 +13,6 @@ from interferometry.iso230.evaluation import (
     evaluate_iso230,
     evaluate_other_standards,
     evaluate_windows,
-    settled_window,
 )
 from interferometry.iso230.quantities import QUANTITIES
 
@@ -27,5 +26,4 @@ __all__ = [
     "evaluate_iso230",
     "evaluate_other_standards",
     "evaluate_windows",
-    "settled_window",
 ]

@@ -79,7 +79,7 @@ def _travel(position: np.ndarray) -> ConditionCheck:
 
 
 def _spacing(position: np.ndarray, lead_mm: float | None) -> ConditionCheck:
-    name = "non-uniform target spacing"
+    name = "non-uniform spacing"
     spacing = np.diff(position)
     if spacing.size < 2:
         return ConditionCheck(name, None, "Fewer than two spacings.")

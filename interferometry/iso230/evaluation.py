@@ -8,7 +8,7 @@ deviation, B_i reversal error at a position, R_i repeatability at a position; of
 bidirectional repeatability R, bidirectional systematic positioning error E, mean bidirectional positioning error M, bidirectional
 accuracy A.
 
-In this order: the evaluation of one window; windows along a test and which of them is quoted; other standards.
+In this order: the evaluation of one window; windows along a test; other standards.
 """
 
 from __future__ import annotations
@@ -231,21 +231,6 @@ def accuracy_with_table(deviations: xr.Dataset, drift: xr.DataArray, windows: Se
 def _of_the_axis(result: xr.Dataset) -> xr.Dataset:
     """Return what was found of the axis as a whole, without the values of single targets."""
     return result[[name for name in result.data_vars if "target" not in result[name].dims]]
-
-
-def settled_window(windows: xr.Dataset) -> int:
-    """Return which window is quoted: of those whose middle is in the second half of the test, the one in which the drift varied least."""
-    several = windows.sizes["window"] - 1
-    if several < 1:
-        return 0
-    middle = windows["middle_cycle"].values
-    late = np.flatnonzero(middle[:several] >= middle[several])
-    late = late if late.size else np.array([several - 1])
-    varied = windows["drift_variation"].values[late]
-    if not np.isfinite(varied).any():
-        return int(late[-1])
-    least = np.flatnonzero(varied == np.nanmin(varied))
-    return int(late[least[-1]])
 
 
 def _select(deviations: xr.Dataset, cycles: Sequence[int] | None) -> tuple[np.ndarray, np.ndarray]:

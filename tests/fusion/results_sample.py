@@ -112,7 +112,7 @@ PARTS: dict[str, Any] = {
         **WINDOW,
         "window": "cycles 6 to 10",
         "cycles": [6, 7, 8, 9, 10],
-        "settled_rule": "the only window of the test",
+        "window_rule": "the only window of the test",
         "first": {**WINDOW, "window": "cycles 1 to 5", "cycles": [1, 2, 3, 4, 5]},
         "range_um": {name: {"lowest": 0.5, "highest": 1.5} for name in "BREMA"},
         "tolerances": [{"quantity": "A", "limit_um": 10.0, "value_um": 1.0, "expanded_u_um": 0.2, "decision": "pass"}],

@@ -147,8 +147,8 @@ def _standard_charts(read: xr.Dataset, products: Products, linker: Linker) -> ui
         ui.heading("ISO 230-2", level=3),
         ui.paragraph(f"{part.window[:1].upper()}{part.window[1:]}: {values} (k = 2)."),
     ]
-    if has(read, "settled"):
-        chart = readings.plot_test(group(read, "settled"), read["position"])
+    if has(read, "quoted"):
+        chart = readings.plot_test(group(read, "quoted"), read["position"])
         linker.link(chart.figure, x=POSITION)
         parts.append(shown(chart, f"Means ± 2 s of both approaches, {part.window}."))
     windows = group(read, "iso")

@@ -114,7 +114,7 @@ def _reading_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     """The charts that need neither the times of the readings nor their drift; without neighbour differences that of the standard alone."""
     position, sides = deviations["position"], _sides(deviations)
     standard = (
-        {"iso230": readings.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}
+        {"iso230": readings.plot_test(group(deviations, "quoted"), position)} if has(deviations, "quoted") else {}
     )
     if not has(deviations, "comparison"):
         return standard

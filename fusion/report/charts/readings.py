@@ -177,13 +177,13 @@ def edges(middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # Chart of a test by ISO 230-2: means and ±2 s of both approaches over the targets, with A, E and B.
 
 
-def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
+def plot_test(quoted: xr.Dataset, position: xr.DataArray) -> Chart:
     """Draw the chart of the standard: mean deviation and ±2 s of each approach, with the spans of A and E and the place of B."""
     order = np.argsort(position.values, kind="stable")
-    settled, x = settled.isel(target=order), position.values[order].astype(float)
+    quoted, x = quoted.isel(target=order), position.values[order].astype(float)
     room = 0.24 * (np.ptp(x) or 1.0)
     left = x[0] - 0.04 * room
-    unit, along = (print_unit(str(values.attrs.get("units", "um"))) for values in (settled["A"], position))
+    unit, along = (print_unit(str(values.attrs.get("units", "um"))) for values in (quoted["A"], position))
     drawn = new_figure(
         x=f"position / {along}",
         y=f"deviation / {unit}",
@@ -191,9 +191,9 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
         x_range=(left, x[-1] + room),
         zero=True,
     )
-    columns: dict[str, np.ndarray] = {"target": settled["target"].values, f"position / {along}": x}
-    for direction in settled["direction"].values:
-        row = settled.sel(direction=direction)
+    columns: dict[str, np.ndarray] = {"target": quoted["target"].values, f"position / {along}": x}
+    for direction in quoted["direction"].values:
+        row = quoted.sel(direction=direction)
         mean, s = row["mean_unidirectional"].values, row["standard_deviation"].values
         if not np.isfinite(mean).any():
             continue
@@ -214,16 +214,16 @@ def plot_test(settled: xr.Dataset, position: xr.DataArray) -> Chart:
         ]
         add_hover(drawn, tips, [points])
         columns |= {f"mean, {name} / {unit}": mean, f"s, {name} / {unit}": s}
-    if np.isfinite(settled["mean_bidirectional"]).any():
-        drawn.line(x, settled["mean_bidirectional"].values, color=INK, line_dash="dotted", legend_label="mean of both")
-        _mark_reversal(drawn, settled, x)
-    _mark_spans(drawn, settled, x[-1], room)
-    return Chart(drawn, _seen(settled, x, unit, along), columns)
+    if np.isfinite(quoted["mean_bidirectional"]).any():
+        drawn.line(x, quoted["mean_bidirectional"].values, color=INK, line_dash="dotted", legend_label="mean of both")
+        _mark_reversal(drawn, quoted, x)
+    _mark_spans(drawn, quoted, x[-1], room)
+    return Chart(drawn, _seen(quoted, x, unit, along), columns)
 
 
-def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> None:
+def _mark_spans(drawn: figure, quoted: xr.Dataset, end: float, room: float) -> None:
     """Draw the spans of A and E to the right of the data, where both approaches were measured, else those of the one approach."""
-    mean, s = settled["mean_unidirectional"].values, settled["standard_deviation"].values
+    mean, s = quoted["mean_unidirectional"].values, quoted["standard_deviation"].values
     # Labels are at two heights: at one height they would be written over each other.
     spans = (("A", mean - 2 * s, mean + 2 * s, 0.1, 0.3), ("E", mean, mean, 0.9, 0.6))
     for symbol, low, high, share, height in spans:
@@ -238,25 +238,25 @@ def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> 
         add_label(drawn, at, bottom + height * (top - bottom), f"{symbol} {number(top - bottom)}", **looks)
 
 
-def _mark_reversal(drawn: figure, settled: xr.Dataset, x: np.ndarray) -> None:
+def _mark_reversal(drawn: figure, quoted: xr.Dataset, x: np.ndarray) -> None:
     """Draw the reversal error B at the target where it is largest."""
-    reversal = settled["reversal"].values
+    reversal = quoted["reversal"].values
     k = int(np.nanargmax(np.abs(reversal)))
-    ends, s = settled["mean_unidirectional"].values[:, k], settled["standard_deviation"].values[:, k]
+    ends, s = quoted["mean_unidirectional"].values[:, k], quoted["standard_deviation"].values[:, k]
     drawn.segment([x[k]], [ends.min()], [x[k]], [ends.max()], line_color=INK, line_width=3)
     top = float((ends + 2 * s).max())
     at, offset = (top, (-16, 6)) if np.isfinite(top) else (float(ends.mean()), (6, -8))
     add_label(drawn, float(x[k]), at, f"B {number(abs(reversal[k]))}", offset=offset)
 
 
-def _seen(settled: xr.Dataset, x: np.ndarray, unit: str, along: str) -> str:
+def _seen(quoted: xr.Dataset, x: np.ndarray, unit: str, along: str) -> str:
     """Return the text alternative."""
     means = {
-        direction: settled["mean_unidirectional"].sel(direction=direction) for direction in settled["direction"].values
+        direction: quoted["mean_unidirectional"].sel(direction=direction) for direction in quoted["direction"].values
     }
     rows = [f"{ARROWS[side]} {span_words(mean, unit)}" for side, mean in means.items() if np.isfinite(mean).any()]
-    known = [symbol for symbol in "AEB" if np.isfinite(settled[symbol])]
-    values = ", ".join(f"{symbol} {number(float(settled[symbol]))} {unit}" for symbol in known)
+    known = [symbol for symbol in "AEB" if np.isfinite(quoted[symbol])]
+    values = ", ".join(f"{symbol} {number(float(quoted[symbol]))} {unit}" for symbol in known)
     told = f"Mean deviation over {span_words(x, along)} of the axis with ±2 s: {'; '.join(rows)}."
     return f"{told} {values}." if values else told
 

@@ -21,7 +21,7 @@ from openpyxl.utils import get_column_letter
 
 from fusion.common import own_name
 from fusion.report.findings import summary_rows
-from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters
+from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters, say
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import print_unit
 from fusion.results.parts import Iso230Condition
@@ -70,13 +70,16 @@ def _judged_table(results: Results) -> pd.DataFrame:
     """Return the values to quote with the decision on each that has a tolerance."""
     assert results.iso230 is not None
     window, limits = results.iso230, {one.quantity: one for one in results.iso230.tolerances}
-    unit = window.unit
+    unit, accepted = window.unit, {True: "yes", False: "no", None: "open"}[window.is_acceptance_test]
     rows = []
     for name in ISO230_TERMS:
         found, limit = getattr(window, f"{name}_um"), limits.get(name)
-        judged = (None, "no tolerance stated") if limit is None else (limit.limit_um, limit.decision)
-        rows.append((name, found.value, found.u, *judged))
-    return pd.DataFrame(rows, columns=["quantity", f"value_{unit}", f"u_{unit}", f"limit_{unit}", "decision"])
+        judged: tuple[float | None, str, str | None] = (None, "no tolerance stated", None)
+        if limit is not None:
+            judged = (limit.limit_um, limit.decision, say("windows_otherwise", limit, window))
+        rows.append((name, found.value, found.u, *judged, accepted))
+    titles = ["decision", "decided otherwise", "acceptance by ISO 230-2"]
+    return pd.DataFrame(rows, columns=["quantity", f"value_{unit}", f"u_{unit}", f"limit_{unit}", *titles])
 
 
 def readings_table(deviations: xr.Dataset) -> pd.DataFrame:
@@ -123,7 +126,7 @@ def iso230_axis_table(deviations: xr.Dataset) -> pd.DataFrame:
 
 def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFrame:
     """Return mean, standard deviation, reversal and repeatability per target in the window whose values are quoted, um."""
-    evaluated = group(deviations, "settled")
+    evaluated = group(deviations, "quoted")
     columns = {"position_mm": deviations["position"]}
     for direction in ("positive", "negative"):
         chosen = evaluated.sel(direction=direction, drop=True)

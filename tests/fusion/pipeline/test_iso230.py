@@ -1,4 +1,4 @@
-"""ISO 230-2 in the pipeline: settled and first window, budgets, the sheet with tolerances and conditions, and a test from a file alone."""
+"""ISO 230-2 in the pipeline: quoted and first window, budgets, the sheet with tolerances and conditions, and a test from a file alone."""
 
 import os
 from pathlib import Path
@@ -9,13 +9,13 @@ import xarray as xr
 
 from fusion.campaign.config import Campaign, CampaignError
 from fusion.campaign.recompensation import StatedBudget
-from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test, read_window
+from fusion.common import FusionError
+from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test
 from fusion.results.axis import Iso230Part
 from fusion.results.numbers import moment
 from fusion.results.parts import decide
 from fusion.results.results import ResultsError, assemble
 from fusion.results.store import joined, plain, write_json
-from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.io.readings import read_deviations
 from interferometry.iso230 import Iso230Budget, evaluate_iso230
@@ -29,16 +29,15 @@ ASSUMED = StatedBudget(
 )
 
 
-def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
+def test_the_window_that_is_quoted_is_the_last_one_with_the_first_beside_it():
     deviations, _ = simulate(np.random.default_rng(2), kind="warmup", cycles=40)
     drift = estimate_drift(deviations)
-    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=drift)
+    windows, quoted, part = evaluate_standard(deviations, ASSUMED, drift=drift)
     assert part.first.window == "cycles 1 to 5" and part.first.cycles == (1, 2, 3, 4, 5)
-    assert min(part.cycles) > 20 and len(part.cycles) == 5
+    assert part.cycles == (36, 37, 38, 39, 40) and part.window_rule == "the last 5 whole cycles of the test"
     assert part.R_um.value < part.first.R_um.value
     assert part.range_um["R"].highest == float(windows["R"][:-1].max())
-    assert "least drift" in part.settled_rule
-    assert float(settled["A"]) == part.A_um.value
+    assert float(quoted["A"]) == part.A_um.value
     for window in (part.first, part):
         for name in (*"AREMB", "mean_reversal"):
             squares = sum(getattr(entry, f"{name}_um") ** 2 for entry in window.contributions)
@@ -52,7 +51,7 @@ def test_the_settled_window_of_a_warm_up_is_late_and_repeats_better():
 def test_without_times_no_environmental_variation_is_claimed():
     deviations, _ = simulate(np.random.default_rng(2), cycles=4)
     _, _, part = evaluate_standard(deviations, ASSUMED, drift=None)
-    assert part.settled_rule == "the only window of the test"
+    assert part.window_rule == "the only window of the test"
     entry = next(row for row in part.contributions if row.contributor == "environmental_variation")
     assert np.isnan(entry.u) and entry.origin == "not known, not contained"
 
@@ -68,8 +67,8 @@ STATED = {
 def sheet(campaign: Campaign | None, environment: xr.Dataset | None = None, *, moved_mm: float = 0.0) -> Iso230Part:
     deviations, _ = simulate(np.random.default_rng(3), cycles=12)
     deviations = deviations.assign_coords(position=deviations["position"] + moved_mm)
-    _, settled, part = evaluate_standard(deviations, ASSUMED, drift=None)
-    dataset = joined(deviations, settled=settled)
+    windows, quoted, part = evaluate_standard(deviations, ASSUMED, drift=None)
+    dataset = joined(deviations, iso=windows, quoted=quoted)
     return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=campaign, environment=environment)))
 
 
@@ -122,7 +121,7 @@ def test_the_date_of_the_test_is_that_of_its_readings():
 def test_a_file_of_readings(tmp_path):
     file = write_laser(tmp_path / "test", 6, 5).with_name("laser.csv")
     found = read_test(file, "2-6")
-    assert found.part.cycles == (2, 3, 4, 5, 6) and found.part.settled_rule == ""
+    assert found.part.cycles == (2, 3, 4, 5, 6) and found.part.window_rule == "as chosen"
     axis = evaluate_iso230(read_deviations(file), cycles=[2, 3, 4, 5, 6])
     for symbol in "AREMB":
         assert getattr(found.part, f"{symbol}_um").value == pytest.approx(float(axis[symbol]))
@@ -145,26 +144,75 @@ def test_results_without_readings_of_an_axis_say_what_is_lacking(tmp_path):
 
 def test_the_results_of_a_run_hold_their_own_window(results_folder):
     found = read_test(results_folder, None)
-    assert float(found.dataset["settled_A"]) == pytest.approx(found.part.A_um.value)
-    with pytest.raises(CampaignError, match="holds the windows of its run"):
+    assert float(found.dataset["quoted_A"]) == pytest.approx(found.part.A_um.value)
+    with pytest.raises(CampaignError, match=r"write \[acceptance\] cycles into the campaign file"):
         read_test(results_folder, "1-5")
     with pytest.raises(ResultsError, match=r"there is no results\.json"):
         read_test(results_folder / "maps", None)
 
 
-def test_a_window_of_cycles_is_read():
-    x, time = np.zeros((8, 2, 2)), np.full((8, 2, 2), np.datetime64("NaT", "ns"))
-    deviations = build_deviations(range(1, 9), [1, 2], np.array([0.0, 1.0]), x, time)
-    assert read_window(" 2 - 4 ", deviations) == [2, 3, 4]
-    assert read_window("8", deviations) == [8]
-    with pytest.raises(CampaignError, match='--cycles "a" is not a window of cycles; write for example 1-5'):
-        read_window("a", deviations)
-    with pytest.raises(CampaignError, match="ends before it begins; write for example 2-4"):
-        read_window("4-2", deviations)
-    with pytest.raises(CampaignError, match="were not measured; there are 1 to 8"):
-        read_window("7-9", deviations)
-    with pytest.raises(CampaignError, match=r'--cycles "1-1000000000000000000000000000000" contains cycles that were'):
-        read_window(f"1-{10**30}", deviations)
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("a", 'this is not a window of cycles; write for example "1-5"'),
+        ("4-2", 'this window ends before it begins; write for example "2-4"'),
+        ("5-7", r"cycles outside the test; laser\.csv has readings of cycles 1 to 6"),
+        (f"1-{10**30}", "cycles outside the test"),
+    ],
+)
+def test_a_window_that_is_none_is_refused_by_the_option_and_by_the_key(tmp_path, text, fault):
+    path = without(write_laser(tmp_path / "test", 6, 5), added=f'[acceptance]\ncycles = "{text}"\n')
+    with pytest.raises(FusionError, match=f'^--cycles "{text}": {fault}'):
+        read_test(path.with_name("laser.csv"), text)
+    with pytest.raises(FusionError, match=rf"{path.name}.*{fault}") as refused:
+        read_test(path, None)
+    assert "acceptance" in str(refused.value) and "cycles" in str(refused.value) and text in str(refused.value)
+
+
+def test_one_cycle_may_be_looked_at_and_not_be_judged(tmp_path):
+    path = without(write_laser(tmp_path / "test", 6, 5), added='[acceptance]\ncycles = "3"\n')
+    assert read_test(path.with_name("laser.csv"), " 3 ").part.cycles == (3,)
+    with pytest.raises(FusionError, match=r'acceptance\.cycles.*"3".*write the first and the last of several'):
+        read_test(path, None)
+
+
+def test_a_cycle_without_a_reading_is_in_no_window_that_is_chosen(tmp_path):
+    path = without(write_laser(tmp_path / "test", 6, 5), added='[acceptance]\ncycles = "2-4"\n')
+    laser = path.with_name("laser.csv")
+    head, *rows = laser.read_text().splitlines()
+    laser.write_text("\n".join([head, *(row for row in rows if not row.startswith("3,"))]) + "\n")
+    with pytest.raises(
+        FusionError, match=r'\[acceptance\] cycles = "2-4": laser\.csv has no reading of cycle 3; choose'
+    ):
+        read_test(path, None)
+
+
+def test_the_cycles_of_the_campaign_file_are_judged_and_those_of_the_option_before_them(tmp_path):
+    stated = '[acceptance]\nA = "1 m"\ncycles = "1-5"\n'
+    path = without(write_laser(tmp_path / "test", 12, 5), added=stated)
+    found = read_test(path, None).part
+    assert found.cycles == (1, 2, 3, 4, 5) and found.window_rule == "as chosen"
+    assert found.A_um == found.first.A_um
+    assert read_test(path, "2-6").part.cycles == (2, 3, 4, 5, 6)
+
+
+def test_windows_that_decide_otherwise_are_counted():
+    """Cycles 1 to 5 scatter by 10 um, the others by 0.1 um: one of three windows fails R of 5 um."""
+    deviations, _ = simulate(np.random.default_rng(3), kind="none", cycles=15)
+    scatter = np.where(np.arange(15) < 5, 10.0, 0.1)[:, None, None]
+    deviations["deviation"].values[:] = scatter * np.random.default_rng(4).standard_normal(
+        deviations["deviation"].shape
+    )
+    windows, quoted, part = evaluate_standard(deviations, ASSUMED, drift=None)
+    stated = {**STATED, "acceptance": {"R": "5 um", "A": "1 m", "R_unidirectional": "5 um"}}
+    campaign = Campaign.model_validate({**stated, "path": Path("campaign.toml")})
+    part = complete_sheet(part, joined(deviations, iso=windows, quoted=quoted), campaign=campaign, environment=None)
+    assert (part.windows, part.windows_otherwise) == (3, 1)
+    assert {row.quantity: (row.decision, row.windows_otherwise) for row in part.tolerances} == {
+        "A": ("pass", 0), "R": ("pass", 1), "R\u2191": ("pass", 1), "R\u2193": ("pass", 1),
+    }  # fmt: skip
+    # Equal spacings.
+    assert part.is_acceptance_test is False
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path):

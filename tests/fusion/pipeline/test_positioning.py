@@ -78,7 +78,7 @@ def test_parts_agree_with_the_product(campaign_folder):
     outcome = evaluate_interferometry(read_source(load_campaign(campaign_folder / "campaign.toml")))
     standard = outcome.parts.iso230
     assert standard.first.cycles == (1, 2, 3, 4, 5) and standard.cycles[0] > 12
-    for found, name in ((standard.first, "iso_A"), (standard, "settled_A")):
+    for found, name in ((standard.first, "iso_A"), (standard, "quoted_A")):
         assert found.A_um.value == pytest.approx(float(np.atleast_1d(outcome.dataset[name])[0]))
     profile = outcome.dataset["drift_profile"]
     assert by_direction(profile).negative == tuple(profile.sel(direction="negative").values)

@@ -95,6 +95,17 @@ def test_a_stage_is_kept_until_its_table_or_a_file_of_it_or_the_one_before_chang
         assert work.times == times
 
 
+def test_what_a_stage_takes_of_another_table_makes_it_anew_and_keeps_those_after_it(new_run):
+    """Other cycles are quoted by ISO 230-2: the readings are evaluated again, and the drift is not modelled again."""
+    work, later = Counting(), Counting()
+    for cycles, times in (((1, 5), 1), ((1, 5), 1), ((2, 6), 2), (None, 3)):
+        run = new_run()
+        run.taken["deviations"] = cycles
+        run.stage("deviations", work)
+        run.stage("model", later)
+        assert (work.times, later.times) == (times, 1)
+
+
 def test_what_a_stage_found_is_drawn_where_it_was_computed_or_from_what_is_kept(new_run):
     work, seen = Counting(), []
 

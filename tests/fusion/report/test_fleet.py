@@ -166,8 +166,13 @@ def test_a_legend_explains_what_is_shown_alone(whole):
 
 
 def test_decisions_are_counted(whole):
-    rows = [replace(whole, decision=one) for one in ("fail", "pass", "pass", "not decided within the uncertainty", "")]
-    assert count_decisions([*rows, FAILED]) == {"pass": 2, "not decided": 1, "fail": 1, "without a tolerance": 1}
+    open_one, refused = (replace(whole, decision="pass", acceptance=one) for one in (None, False))
+    rows = [
+        replace(open_one, decision=one) for one in ("fail", "pass", "pass", "not decided within the uncertainty", "")
+    ]
+    assert count_decisions([*rows, refused, FAILED]) == {
+        "pass": 2, "pass, no acceptance": 1, "not decided": 1, "fail": 1, "without a tolerance": 1,
+    }  # fmt: skip
 
 
 def test_the_workbook_has_links_dates_and_the_columns_of_the_page(whole, tmp_path):
@@ -187,7 +192,7 @@ def test_the_workbook_has_links_dates_and_the_columns_of_the_page(whole, tmp_pat
     message = sheet.cell(11, 1 + names.index("message"))
     assert (message.data_type, message.value) == ("s", '=HYPERLINK("x")')
     told = {row[0]: row[1:] for row in book["Summary"].iter_rows(min_row=2, values_only=True)}
-    assert (told["campaigns"][0], told["decision: pass"][0], told["failed"][0]) == (10, 9, 1)
+    assert (told["campaigns"][0], told["decision: pass, no acceptance"][0], told["failed"][0]) == (10, 9, 1)
     assert told["largest A / µm"][0] == pytest.approx(5.9) and told["largest A / µm"][2] == "m/9"
     assert told["newest date"][0] == datetime.datetime(2026, 9, 1)
     assert book["Summary"]._charts

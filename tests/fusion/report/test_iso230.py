@@ -61,8 +61,8 @@ def test_sheet():
 def evaluated(x: np.ndarray) -> tuple[Iso230Part, xr.Dataset]:
     """A sheet with its readings."""
     deviations = test_made(x)
-    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=None)
-    dataset = joined(deviations, iso=windows, settled=settled)
+    windows, quoted, part = evaluate_standard(deviations, ASSUMED, drift=None)
+    dataset = joined(deviations, iso=windows, quoted=quoted)
     return Iso230Part.model_validate(plain(complete_sheet(part, dataset, campaign=None, environment=None))), dataset
 
 
@@ -167,8 +167,8 @@ def test_names_from_files_are_escaped_and_no_file_is_replaced(test_sheet, tmp_pa
 def test_a_rotary_axis_keeps_its_units_everywhere():
     deviations = test_made(X)
     deviations["deviation"].attrs["units"], deviations["position"].attrs["units"] = "arcsec", "deg"
-    windows, settled, part = evaluate_standard(deviations, ROTARY_BUDGET, drift=None)
-    dataset = joined(deviations, iso=windows, settled=settled)
+    windows, quoted, part = evaluate_standard(deviations, ROTARY_BUDGET, drift=None)
+    dataset = joined(deviations, iso=windows, quoted=quoted)
     part = complete_sheet(part, dataset, campaign=None, environment=None)
     found = Iso230Part.model_validate(plain(part))
     tables = iso230_tables(found, dataset, title="A")

@@ -47,8 +47,8 @@ def measured(position_mm: np.ndarray = UNEVEN_MM, *, noise_um: float = 0.05, see
 def write_run(folder: Path, deviations: xr.Dataset, *, axis: str = "X", **changes: Any) -> Path:
     """Write deviations.nc, fusion.nc, results.json and provenance.json of a run whose verdict is sound unless `changes` say otherwise."""
     parts = {**PARTS, "inputs": {"state": "sound", "accepted": [], "checks": []}, **changes}
-    settled = evaluate_iso230(deviations, cycles=range(6, 11))  # the window that PARTS quotes
-    content = joined(deviations, drift=estimate_drift(deviations), iso=evaluate_windows(deviations), settled=settled)
+    quoted = evaluate_iso230(deviations, cycles=range(6, 11))  # the window that PARTS quotes
+    content = joined(deviations, drift=estimate_drift(deviations), iso=evaluate_windows(deviations), quoted=quoted)
     write_dataset(folder / "deviations.nc", content)
     dims = ("cycle", "direction", "target")
     degC = np.broadcast_to(material_degC()[:, None, None], deviations["deviation"].shape)

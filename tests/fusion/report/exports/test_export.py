@@ -464,7 +464,8 @@ def test_the_workbook_reads_back(small_run, tmp_path):
     values = list(book["A R E M B"].iter_rows(min_row=2, values_only=True))
     assert "".join(row[0] for row in values) == "AREMB"
     headings = [cell.value for cell in book["A R E M B"][1]]
-    assert headings == ["quantity", "value / µm", "U (k = 2) / µm", "limit / µm", "decision"]
+    judged = ["decision", "decided otherwise", "acceptance by ISO 230-2"]
+    assert headings == ["quantity", "value / µm", "U (k = 2) / µm", "limit / µm", *judged]
     quantity = next(row for row in book["A R E M B"].iter_rows(min_row=2) if row[0].value == "A")
     window = results.iso230
     assert [cell.value for cell in quantity[1:3]] == pytest.approx([window.A_um.value, 2 * window.A_um.u])
