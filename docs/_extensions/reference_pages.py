@@ -257,6 +257,16 @@ def measured_page(text: str, rows: Sequence[Mapping[str, str]]) -> str:
     return "".join(parts)
 
 
+def coverage_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return the measured figures of `measured.csv` on what intervals hold, each with its command."""
+    lines = ["| figure | measured | n | command |", "|---|---|---|---|"]
+    for row in rows:
+        if row["section"] == "Coverage of intervals":
+            interval = f" ({row['interval']})" if row["interval"] else ""
+            lines.append(f"| {row['figure']} | {row['value']}{interval} | {row['n']} | `{row['command']}` |")
+    return "\n".join(lines) + "\n"
+
+
 def measured_rows(path: Path) -> list[dict[str, str]]:
     """Return the measured figures of `measured.csv`, one a row."""
     with path.open(encoding="utf-8", newline="") as file:
@@ -279,9 +289,11 @@ def write_pages(app: Sphinx) -> None:
         stale.unlink()
     pages |= {generated / f"names_{package}.md": table for package, table in public_names()}
     measured = Path(app.srcdir) / "measured.md"
-    pages[measured] = measured_page(measured.read_text(encoding="utf-8"), measured_rows(measured.with_suffix(".csv")))
+    rows = measured_rows(measured.with_suffix(".csv"))
+    pages[measured] = measured_page(measured.read_text(encoding="utf-8"), rows)
     pages |= {
         generated / "checks.md": checks_table(),
+        generated / "coverage.md": coverage_table(rows),
         generated / "command.md": command_page(),
         generated / "campaign.md": campaign_page(campaign_schema()),
         generated / "recipe.md": schema_page(recipe_schema()),
