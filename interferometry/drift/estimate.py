@@ -27,6 +27,7 @@ from interferometry.drift.gls import (
     DriftFit,
     average_drift,
     estimate,
+    memory_of_each,
     typical_memory,
     von_neumann_p_value,
 )
@@ -608,7 +609,9 @@ def _memory_variance(noise: Array, joint: JointFit) -> Array:
     series = series[np.isfinite(series).any(axis=1)]
     centred = np.nan_to_num(series - np.nanmean(series, axis=1, keepdims=True))
     readings = np.bincount(joint.cell, minlength=len(joint.cells))
-    return np.asarray(max(typical_memory(centred).long_run - 1.0, 0.0) * joint.fit.sigma**2 / readings)
+    # Over many cycles the memory of each series is known without the bias that its own mean gives; over few it is not known at all.
+    long_run = max(1.0, memory_of_each(centred).long_run, typical_memory(centred).long_run)
+    return np.asarray((long_run - 1.0) * joint.fit.sigma**2 / readings)
 
 
 def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Array) -> Variables:
