@@ -21,7 +21,7 @@ from fusion.report.comparison import (
     render_comparison,
 )
 from fusion.report.page import report_of
-from fusion.report.wording import effect_words
+from fusion.report.wording import effect_words, say
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import number
 from fusion.results.parts import read_table_prediction
@@ -149,7 +149,7 @@ def _compare_records(pair: PairComparison, out: Path) -> list[tuple[str, str]]:
     for title, loop in loops:
         records.append({"title": title, **{key: getattr(loop, key) for key in _FIGURES}})
         errors = f"{number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"
-        rows.append((title, f"{loop.verdict}, held-out error {errors}"))
+        rows.append((title, f"{say('verdict_word', loop)}, held-out error {errors}"))
     agreement = [{"effect": name, "shown_by": who, "agrees": len(who) == 2} for name, who in shown_by.items()]
     write_json(
         out / "joint.json", {"campaigns": [title for title, _ in loops], "records": records, "agreement": agreement}

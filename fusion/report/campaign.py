@@ -468,7 +468,11 @@ def _runner_up(other: RunnerUp | Nothing) -> str:
 
 def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
     """Return the model in numbers: coefficients, unexplained drift, simplest prediction, and what was not tried."""
-    rows = [(effect_words(one.effect).name, _coefficient(one)) for one in loop.declared_coefficients]
+    on_condition = {name: say("warm_up_condition") for name in loop.warm_up_only}
+    rows = [
+        (effect_words(one.effect).name, _coefficient(one) + on_condition.get(one.effect, ""))
+        for one in loop.declared_coefficients
+    ]
     for step in loop.steps:
         name = effect_words(step.effect).name
         named = zip(coefficient_names(step), step.coefficients, strict=True)

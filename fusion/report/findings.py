@@ -201,6 +201,8 @@ def next_steps(results: Results) -> list[str]:
         shown = loop.steps if loop.separable else ()
         actions = [action(step, results.time, record=results.registration is None) for step in shown]
         steps += [conditional(one, inputs, "causes") for one in actions]
+        if loop.warm_up_only:
+            steps.append(say("vary_load"))
         if loop.verdict in {"partial", "unexplained", "no_skill"} and loop.separable and not _clock_doubted(results):
             steps.append(say("log_more", loop.unexplained.shape))
     steps += [say("position_action", anomaly) for anomaly in results.anomalies or ()]
@@ -290,7 +292,7 @@ def findings(results: Results) -> list[Finding]:
     if drift is not None:
         add("scatter", "scatter per position", text=_scatter_range(drift), rests_on="positions")
     if loop is not None:
-        add("verdict", "verdict", text=f"{loop.verdict.replace('_', ' ')}: {headline(results)}")
+        add("verdict", "verdict", text=f"{say('verdict_word', loop).replace('_', ' ')}: {headline(results)}")
     for code in ("how_much", "where", "how_sure", "which_place", "what_remains"):
         add(code, code.replace("_", " "))
     if loop is not None:

@@ -146,7 +146,7 @@ def with_findings(row: Row, folder: Path) -> Row:
         windows_otherwise=say("windows_otherwise", iso, iso) if iso and decided else "",
         acceptance=iso.is_acceptance_test if iso else None,
         above_range=maxima.get(hottest, False),
-        verdict="" if loop is None else loop.verdict,
+        verdict="" if loop is None else say("verdict_word", loop),
         headline="" if loop is None else headline(results),
         axis=conditions.get("axis", ""),
         anomalies=None if results.anomalies is None else len(results.anomalies),

@@ -307,7 +307,7 @@ def environment(*, html: bool) -> jinja2.Environment:
     formats = (
         anomaly_cause, anomaly_place, caption, condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first,
         measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small, upper_first,
-        variance_left,
+        variance_left, whole_percent,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {
@@ -498,6 +498,11 @@ def better_plain(loop: Loop) -> PlainPrediction | None:
 def variance_left(share: float | None) -> str:
     """Return the share of a variance that a prediction leaves, in per cent; "all" where the mean itself would leave less."""
     return "–" if share is None else "all" if share > 1.0 else f"{number(100 * share, 2)} %"
+
+
+def whole_percent(share: float) -> str:
+    """Return a share of 1 in whole per cent, without one that only rounding makes 0 or 100."""
+    return "less than 1 %" if share < 0.005 else "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
 
 
 def worse_channels(loop: Loop) -> list[tuple[str, ChannelErrors]]:

@@ -124,6 +124,8 @@ class StepPart(ResultPart):
     """Root mean square of its contribution, um."""
     tied: tuple[str, ...]
     """Effects that these data cannot distinguish from it: together with it they are one answer, "one of these"."""
+    lowers_error: bool = True
+    """Whether readings that it was not fitted to, the hold-out or for an event blocks that are left out, are predicted better with it."""
     withheld: str = ""
     """Why its name is not given although the readings follow its columns; empty where it is."""
     runner_up: RunnerUp | Nothing
@@ -133,8 +135,8 @@ class StepPart(ResultPart):
     doubt: str
     """Why it is not borne out; empty where it is."""
     borne_out: BorneOut | None = None
-    """Whether those readings, the hold-out or for an event blocks that are left out, bear it out; no: they contradict it, it leaves the
-    forecast and its name the headline. Either statement is false with a probability of 0.05. Null in results of earlier versions."""
+    """Whether those readings, the hold-out or for an event blocks that are left out, bear it out; no: they contradict it. Either statement
+    is false with a probability of 0.05. Null in results of earlier versions."""
     borne_out_p: Number = None
     """Probability of a size as large there where the effect is not there."""
     borne_out_size: Number = None
@@ -148,8 +150,12 @@ class StepPart(ResultPart):
 
     @property
     def keeps_name(self) -> bool:
-        """Whether readings that it was not fitted to do not contradict it."""
-        return self.confirmed if self.borne_out is None else self.borne_out != "no"
+        """Whether readings that it was not fitted to bear it out, or do not contradict it and are predicted better with it; otherwise it
+        stands in no headline and in no forecast.
+        """
+        if self.borne_out is None or self.confirmed:
+            return self.confirmed
+        return self.borne_out == "cannot tell" and self.lowers_error
 
 
 class AxisStep(StepPart):
@@ -178,8 +184,20 @@ class RecordStep(StepPart):
     """Instant of an event, s from the start; null for an effect that is no event."""
 
 
+class DriftShare(ResultPart):
+    """What a part of the drift follows."""
+
+    effect: str
+    """Name of the effect."""
+    share: Number
+    """Its share of the variance of the drift, 1, together with the others 1 less `unexplained.share`; negative where effects cancel."""
+
+
 class Unexplained(ResultPart):
     """Structure that the final model leaves."""
+
+    share: Number = None
+    """Share of the variance of the drift that follows no effect of the model, 1; null in results of earlier versions."""
 
     shape: str
     """Description; empty where nothing is left."""
@@ -425,6 +443,14 @@ class Loop(HoldOutErrors):
     """Effects that were added, in turn."""
     separable: bool = True
     """Whether a cause can be named: false where ridge regression with lagged copies predicts the hold-out better by a quarter."""
+    warm_up_only: tuple[str, ...] = ()
+    """Declared effects that the readings show by one warm-up alone: their coefficients, with their uncertainty, and the verdict hold on
+    condition that nothing else warmed alike, because whatever did is contained in them."""
+    drift_um: Number = None
+    """Root mean square of the drift, about the mean of every position or channel, um: along an axis without the noise; null in results of
+    earlier versions."""
+    followed: tuple[DriftShare, ...] = ()
+    """What the drift follows: declared effects, then added ones that are not contradicted."""
     wandering_um: Number = None
     """Root mean square of the random drift that the final model allows beside its effects, um; null in results of earlier versions."""
     verdict: Verdict
@@ -435,7 +461,7 @@ class Loop(HoldOutErrors):
     tracking: Tracking | None = None
     """Errors with a reading from time to time; null for several runs, and in results of earlier versions."""
     left_out_of_forecast: tuple[str, ...] = ()
-    """Added effects without which the final error is predicted: the hold-out contradicts them, or is predicted worse with them."""
+    """Added effects without which the final error is predicted: the hold-out contradicts them, or is predicted no better with them."""
     unexplained: Unexplained
     """What is left."""
     not_tried: Mapping[str, str]
@@ -445,7 +471,7 @@ class Loop(HoldOutErrors):
 
     @property
     def named(self) -> tuple[StepPart, ...]:
-        """The added effects that keep their name: not contradicted, and a cause can be separated."""
+        """The added effects that keep their name, where a cause can be separated."""
         return tuple(one for one in self.steps if self.separable and one.keeps_name)
 
 

@@ -166,7 +166,7 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
     where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"
     return replace(
         remainder,
-        shape=f"a slow, {course} drift that no effect of the library follows; {where}, both directions",
+        shape=f"a slow, {course} drift without a name; {where}, both directions",
         rms_um=float(sizes[largest]),
         series=drift[:, largest],
         free=lambda columns: columns - basis @ (basis.T @ columns),

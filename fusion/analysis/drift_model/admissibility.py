@@ -144,10 +144,7 @@ class AxisGrounds:
         share = warm_up_share(self._training, on_training)
         if share <= WARM_UP_SHARE:
             return None
-        # Free warm-ups of several time constants, common and along the axis.
-        curves = [warm_up(self._training, minutes) for minutes in _PROTECTION_MIN]
-        free = np.column_stack([*curves, *(curve * self._training.share for curve in curves)])
-        gain = _gain(self._model, on_training, free)
+        gain = _gain(self._model, on_training, free_warm_ups(self._training))
         if gain >= _PROTECTED_GAIN:
             return None
         return Decision(effect, Reason.SINGLE_WARM_UP, {"share_percent": 100.0 * share, "gain": gain})
@@ -202,6 +199,25 @@ def warm_up_share(readings: Readings, candidate: Candidate) -> float:
     return min(1.0 - min(_residual_share(course, curve) for curve in curves) for course in candidate.columns[far].T)
 
 
+def free_warm_ups(readings: Readings) -> Array:
+    """Warm-ups of several time constants, common and along the axis, (n, columns)."""
+    curves = [warm_up(readings, minutes) for minutes in _PROTECTION_MIN]
+    return np.column_stack([*curves, *(curve * readings.share for curve in curves)])
+
+
+def is_shown_by_one_warm_up(fits: Sequence[DriftFit], own: Sequence[NDArray[np.bool_]], free: Sequence[Array]) -> bool:
+    """Whether readings show an effect by its columns (p,) of each fit's design, but not beside free warm-ups (n, q): then whatever else
+    warmed alike, and was not logged, is in its coefficients.
+    """
+    plain = protected = 0.0
+    for fit, columns, curves in zip(fits, own, free, strict=True):
+        effect, others = fit.design[:, columns], fit.design[:, ~columns]
+        by_chance = effect.shape[1] - 1.0
+        plain += _gain_beside(fit, effect, others) - by_chance
+        protected += _gain_beside(fit, effect, np.column_stack([others, curves])) - by_chance
+    return plain >= _PROTECTED_GAIN > protected
+
+
 def _residual_share(course: Array, curve: Array) -> float:
     """Share of a course's variance that a constant and a curve do not explain."""
     basis = np.column_stack([np.ones(course.size), curve])
@@ -222,13 +238,18 @@ def _centred_mean(series: Series, half_width_s: float) -> Series:
 
 
 def _gain(model: ModelFit, candidate: Candidate, beside: Array | None) -> float:
-    """Log-likelihood that the candidate gains beside the model and further columns, the drift's variances kept."""
+    """Log-likelihood that the candidate gains beside the model and further columns."""
     base = model.fit.design if beside is None else np.column_stack([model.fit.design, beside])
-    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, base, candidate.columns]))
+    return _gain_beside(model.fit, np.asarray(candidate.columns), base)
+
+
+def _gain_beside(fit: DriftFit, columns: Array, base: Array) -> float:
+    """Log-likelihood that columns gain beside others, the drift's variances kept."""
+    whitened, _ = fit.system.whiten(np.column_stack([fit.response, base, columns]))
     y, x = whitened[:, 0], whitened[:, 1:]
     # A copy that is smoothed over the whole campaign is a constant, which the model has already.
-    without, with_candidate = residual_squares(y, x[:, : base.shape[1]]), residual_squares(y, x)
-    return 0.5 * y.size * float(np.log(without / with_candidate))
+    without, with_columns = residual_squares(y, x[:, : base.shape[1]]), residual_squares(y, x)
+    return 0.5 * y.size * float(np.log(without / with_columns))
 
 
 # Does an effect act along the axis as its physics says? If the same course in time fits better with another pattern,

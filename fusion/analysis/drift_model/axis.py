@@ -28,7 +28,9 @@ from fusion.analysis.drift_model.admissibility import (
     WARM_UP_SHARE,
     AxisGrounds,
     CandidateScorer,
+    free_warm_ups,
     inconsistent_patterns,
+    is_shown_by_one_warm_up,
     prior_rows,
     refuse,
     refuse_in_heteroscedastic_drift,
@@ -41,10 +43,10 @@ from fusion.analysis.drift_model.evaluation import (
     Surroundings,
     Unseen,
     answers,
-    contradicted_places,
     describe_step,
     leading_pattern,
     left_out_of_forecast,
+    unsupported_places,
     withheld_for,
 )
 from fusion.analysis.drift_model.gains import Products, by_width, orthogonalise, reductions, sum_products
@@ -268,7 +270,7 @@ def close_axis(
     state = reject_inconsistent_patterns(problem, second_search(problem, state))
     wrong = inconsistent_patterns(state.model, state.added, effects)
     steps = report_steps(state, wrong, problem.ask_hold_out(before, state))
-    away = left_out_of_forecast(problem, before, contradicted_places(steps))
+    away = left_out_of_forecast(problem, before, unsupported_places(steps))
     forecast = before.kept(away)
     plain = plain_errors(readings, used)
     errors = {
@@ -289,6 +291,7 @@ def close_axis(
         away=frozenset(away),
         remainder=examine_remainder(state.model, seed, set_aside),
         wandering_um=wandering_um(state.model.fit),
+        warm_up_only=shown_by_one_warm_up(state.model, len(state.declared)),
         declared_coefficients=coefficients_beside(problem, state, steps),
         before=start.model,
         after=state.model,
@@ -590,6 +593,7 @@ def on_corrected_fields(
         hold_out_errors={**result.hold_out_errors, "final": errors_um},
         remainder=examine_remainder(model, seed, ()),
         wandering_um=wandering_um(model.fit),
+        warm_up_only=shown_by_one_warm_up(model, len(state.declared)),
         after=model,
     )
 
@@ -833,6 +837,10 @@ class AxisResult(LoopResult):
         )
 
     @property
+    def _drift(self) -> list[Array]:
+        return drift_of(self.after)
+
+    @property
     def unexplained(self) -> schema.AxisUnexplained:
         """What is left, with the effect that explains the largest share of it."""
         added = {step.effect for step in self.steps}
@@ -981,11 +989,30 @@ def average_over_drifts(model: ModelFit) -> ModelFit:
     return replace(model, fit=replace(fit, coefficients=mean, covariance=covariance))
 
 
+def drift_of(model: ModelFit) -> list[Array]:
+    """What every term of a model of all readings makes of the drift, and last its random drift, about the mean of every site, um."""
+    parts = [*(model.series(term)[0] for term in model.terms), unexplained_drift(model.fit)[0].sum(axis=1)]
+    return [_about_sites(model.readings.site, part) for part in parts]
+
+
+def shown_by_one_warm_up(model: ModelFit, declared: int) -> tuple[str, ...]:
+    """Return the declared effects that the readings show by one warm-up alone."""
+    free = free_warm_ups(model.readings.subset(model.used))
+
+    def own(term: Term) -> NDArray[np.bool_]:
+        place = np.zeros(model.fit.design.shape[1], bool)
+        place[model.place(term)] = True
+        return place
+
+    found = [term for term in model.terms[:declared] if is_shown_by_one_warm_up([model.fit], [own(term)], [free])]
+    return tuple(term.effect for term in found)
+
+
 def coefficients_beside(
     problem: AxisProblem, state: AxisState, steps: Sequence[AddedEffect]
 ) -> list[schema.DeclaredCoefficient]:
     """Coefficients of the declared effects beside the added ones; those that are contradicted must not move them."""
-    contradicted = contradicted_places(steps)
+    contradicted = unsupported_places(steps)
     sure = fit_model(problem.readings, state.kept(contradicted)) if contradicted else state.model
     return declared_coefficients(sure, len(state.declared), moved_by_rivals(problem, state, steps, sure))
 

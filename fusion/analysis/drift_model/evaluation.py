@@ -347,6 +347,8 @@ def describe_step(
     before_um, after_um, without_um = (np.nan,) * 3
     if not step.is_from_second_search:
         before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
+    # The hold-out set does not show when an event happened before it.
+    unseen_um = cross_um if np.isnan(without_um) or step.score.is_event else (without_um, state.errors_um[-1])
     return {
         "effect": step.effect,
         "parameters": state.added[place].candidate.parameters,
@@ -359,6 +361,7 @@ def describe_step(
         "cross_rmse_after_um": cross_um[1],
         "rms_um": rms_um,
         "tied": tied,
+        "lowers_error": unseen_um[1] < unseen_um[0],
         "withheld": withheld,
         "runner_up": runner_up,
         **answer.described(),
@@ -369,15 +372,15 @@ def describe_step(
 # What follows from it: whether the model has skill, and the verdict.
 
 
-def contradicted_places(steps: Sequence[schema.StepPart]) -> list[int]:
-    """Return the places of the added effects that readings which they were not fitted to contradict."""
+def unsupported_places(steps: Sequence[schema.StepPart]) -> list[int]:
+    """Return the places of the added effects that readings which they were not fitted to contradict, or are predicted no better with."""
     return [place for place, step in enumerate(steps) if not step.keeps_name]
 
 
-def left_out_of_forecast(problem: Problem[M], state: LoopState[M], contradicted: Collection[int]) -> set[int]:
-    """Places of the steps that leave the forecast: contradicted ones, and those with which the hold-out set is predicted worse."""
+def left_out_of_forecast(problem: Problem[M], state: LoopState[M], unsupported: Collection[int]) -> set[int]:
+    """Places of the steps that leave the forecast: unsupported ones, and those with which the hold-out set is predicted worse."""
     steps = range(len(state.errors_without_um))
-    left = set(contradicted) & set(steps)
+    left = set(unsupported) & set(steps)
     while left != set(steps) and problem.hold_out_error(state.kept(left)) > schema.ERROR_BY_CHANCE * state.errors_um[0]:
         left.add(min(set(steps) - left, key=lambda place: problem.hold_out_error(state.kept(left | {place}))))
     return left
@@ -429,6 +432,20 @@ def errors_of_predictions(hold_out: Mapping[str, schema.ErrorInterval]) -> dict[
     }
 
 
+def shares_of_drift(parts: Sequence[Array], left: Array) -> tuple[list[float], float]:
+    """Shares of a drift's variance by the effects (n,) or (n, channels) that make it, and the share that is left beside them.
+
+    What the effects explain together is divided among them by their covariance with their sum, so that it is negative for an effect that
+    cancels a part of another.
+    """
+    explained = np.sum([np.zeros(left.shape), *parts], axis=0)
+    total, together = (float(np.nanmean(one**2)) for one in (explained + left, explained))
+    if not total or not together:
+        return [0.0 for _ in parts], 1.0
+    share = min(1.0, float(np.nanmean(left**2)) / total)
+    return [(1.0 - share) * float(np.nanmean(one * explained)) / together for one in parts], share
+
+
 def _words_of(parameter: tuple[str, Any]) -> str:
     """Name and value of a parameter, numbers to three digits."""
     name, value = parameter
@@ -463,6 +480,8 @@ class LoopResult:
         Structure that the final model leaves.
     wandering_um : float, um
         Root mean square of the random drift beside everything that the model names.
+    warm_up_only : tuple of str
+        Declared effects that the readings show by one warm-up alone.
     """
 
     #: What may be left beside the noise, as a multiple of it, and the level at which an effect without a name shows that something is left.
@@ -480,6 +499,7 @@ class LoopResult:
     away: frozenset[int]
     remainder: ResidualStructure
     wandering_um: float
+    warm_up_only: tuple[str, ...]
 
     def __repr__(self) -> str:
         added = ", ".join(f"{step.effect} (p = {step.p_value:.2g})" for step in self.steps) or "nothing"
@@ -603,6 +623,9 @@ class LoopResult:
             "unconfirmed_effects": self.unnamed,
             "separable": self.separable,
             "wandering_um": self.wandering_um,
+            "warm_up_only": self.warm_up_only,
+            "drift_um": float(np.sqrt(np.nanmean(np.sum(self._drift, axis=0) ** 2))),
+            "followed": self._followed[0],
             "tracking": self.tracking,
             "left_out_of_forecast": tuple(self.steps[place].effect for place in sorted(self.away)),
             "unexplained": self.unexplained,
@@ -615,6 +638,26 @@ class LoopResult:
     def unexplained(self) -> schema.Unexplained:
         """What is left."""
 
+    @property
+    @abstractmethod
+    def _drift(self) -> list[Array]:
+        """What every term of the final model makes of the drift, and last what is left, (n,) or (n, channels) about their means, um."""
+
+    @property
+    def _followed(self) -> tuple[list[schema.DriftShare], float]:
+        """Shares of the drift by what it follows, and the share of what is left; of that is what unseen readings do not support."""
+        *parts, left = self._drift
+        names = [*self.declared, *(term.effect for term in self.state.added)]
+        # Errors of the camera that were taken out of the fields are steps, and no terms of the model any more.
+        steps = [step for step in self.steps if step.effect in names]
+        away = {len(self.declared) + place for place in unsupported_places(steps)}
+        left = left + np.sum([np.zeros(left.shape), *(parts[place] for place in away)], axis=0)
+        kept = [place for place in range(len(parts)) if place not in away]
+        shares, rest = shares_of_drift([parts[place] for place in kept], left)
+        return [
+            schema.DriftShare(effect=names[place], share=one) for place, one in zip(kept, shares, strict=True)
+        ], rest
+
     def _left(self) -> dict[str, Any]:
         """Shape, size and p-value of what is left."""
         left = self.remainder
@@ -624,4 +667,4 @@ class LoopResult:
         # What a step without a name describes is not explained either, whether a shape is left beside it or not.
         nameless = [step.rms_um or 0.0 for step, kept in zip(self.steps, self._kept, strict=True) if not kept]
         size = float(np.linalg.norm([size if shape else 0.0, *nameless]))
-        return {"shape": shape, "rms_um": size, "p_value": left.p_value}
+        return {"shape": shape, "rms_um": size, "share": self._followed[1], "p_value": left.p_value}

@@ -28,7 +28,7 @@ from fusion.analysis.alignment.sensor_health import (
     is_implausible,
 )
 from fusion.analysis.diagnosis.residual import PermutationTest, ResidualStructure, permutation_test
-from fusion.analysis.drift_model.admissibility import NOISE_SHARE, refuse
+from fusion.analysis.drift_model.admissibility import NOISE_SHARE, free_warm_ups, is_shown_by_one_warm_up, refuse
 from fusion.analysis.drift_model.evaluation import (
     Answer,
     Contribution,
@@ -36,11 +36,11 @@ from fusion.analysis.drift_model.evaluation import (
     Surroundings,
     Unseen,
     answers,
-    contradicted_places,
     describe_step,
     exceeds_noise,
     leading_pattern,
     left_out_of_forecast,
+    unsupported_places,
     withheld_for,
 )
 from fusion.analysis.drift_model.gains import Gains, by_width, profile_gains
@@ -820,9 +820,7 @@ def examine(model: RecordFit, hold_out_rmse: Array, step: Array, rng: np.random.
     noise = noise_floor(model.sigma, step)
     error_um, noise_um = float(np.sqrt(known_mean(hold_out_rmse**2))), float(np.sqrt(np.mean(noise**2)))
     if exceeds_noise(error_um, noise_um, RESIDUAL_SHARE):
-        words.append(
-            f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
-        )
+        words.append(f"a slow drift without a name, largest in {_largest(record, hold_out_rmse)}")
     shape = " and ".join(words)
     return RecordRemainder(test.p_value, test.p_values, shape, 0.0, share)
 
@@ -1004,6 +1002,11 @@ class RecordResult(LoopResult):
         )
 
     @property
+    def _drift(self) -> list[Array]:
+        moved = self.record.displacement - np.nanmean(self.record.displacement, axis=0)
+        return [*self.contributions, moved - np.sum([np.zeros(moved.shape), *self.contributions], axis=0)]
+
+    @property
     def unexplained(self) -> schema.RecordUnexplained:
         """What is left, and the effect of the last round that comes closest to it."""
         left, last = self._left(), self.state.rounds[-1].scores
@@ -1116,7 +1119,7 @@ def close_record(
         ),
     )
     steps = report_steps(record, state, told, contributed, withheld, left_out)
-    away = left_out_of_forecast(problem, state, contradicted_places(steps))
+    away = left_out_of_forecast(problem, state, unsupported_places(steps))
     kept = state.kept(away)
     forecast = problem.predict(kept)
     predicted = {
@@ -1139,6 +1142,7 @@ def close_record(
         away=frozenset(away),
         remainder=examine(whole, channel_rmse(errors["final"]), step, np.random.default_rng(seed)),
         wandering_um=drift_um,
+        warm_up_only=shown_by_one_warm_up(whole, state.declared),
         record=record,
         is_held_out=~train,
         predicted=predicted,
@@ -1148,6 +1152,17 @@ def close_record(
         chained=chained,
         rounding=rounding,
     )
+
+
+def shown_by_one_warm_up(model: RecordFit, declared: Sequence[Term]) -> tuple[str, ...]:
+    """Return the declared effects that a record of one run shows by one warm-up alone."""
+    if model.record.runs:
+        return ()
+    curves, width = free_warm_ups(model.record.view()), columns_of(model.record, declared).shape[1]
+    own = [np.arange(fit.design.shape[1]) - levels for fit, levels in zip(model.channels, model.levels, strict=True)]
+    masks = [(place >= 0) & (place < width) for place in own]
+    free = [curves[rows] for rows in model.rows]
+    return tuple(term.effect for term in declared if is_shown_by_one_warm_up(model.channels, masks, free))
 
 
 def series_of(terms: Sequence[Term], predicted: Prediction) -> list[Array]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fusion.common import Array, FusionError
-from fusion.report.wording import environment, sentences
+from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
 from fusion.results.recursion import Recursion, RecursionInput
 from fusion.results.results import Results
@@ -420,7 +420,7 @@ def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
         machine=", serial number ".join(str(part) for part in (report.get("machine"), serial) if part),
         active=str(report.get("machine_compensation") or ""),
         axis=str(stated.get("campaign", {}).get("axis") or ""),
-        verdict=results.loop.verdict if results.loop is not None else "",
+        verdict=say("verdict_word", results.loop) if results.loop is not None else "",
         state=state,
         results_sha256=file_sha256(folder / "results.json"),
     )

@@ -29,6 +29,7 @@ from fusion.report.fleet import (
     with_findings,
     write_book,
 )
+from fusion.report.wording import say
 from fusion.results.results import assemble, read_results
 from fusion.results.store import open_dataset, write_json
 from tests.browser import CHROMIUM, record_faults
@@ -46,7 +47,7 @@ def whole(results_folder):
 def test_a_row_says_what_the_results_say(whole, results_folder):
     results = read_results(results_folder)
     assert whole.title == results.campaign
-    assert whole.verdict == results.loop.verdict
+    assert whole.verdict == say("verdict_word", results.loop)
     assert whole.drift_um == max(results.drift.range_um)
     assert whole.drift_u_um in results.drift.range_u_um
     assert (whole.anomalies, whole.warnings) == (len(results.anomalies), len(results.warnings))

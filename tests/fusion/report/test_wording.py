@@ -9,15 +9,18 @@ from rich.console import Console
 from fusion.pipeline.consistency import inputs_part
 from fusion.report import findings as answers
 from fusion.report import wording
+from fusion.report.campaign import describe_model
 from fusion.report.findings import action, next_steps, step_phrase
 from fusion.report.wording import Row, Words, effect_words, print_table, say, table
 from fusion.results import numbers
 from fusion.results.axis import DutyPart, Evidence, Iso230Direction, Iso230Window, Iso230WithTable, SourcePart
 from fusion.results.loop import (
     AxisStep,
+    AxisUnexplained,
     Baselines,
     ChannelErrors,
     Coefficient,
+    DriftShare,
     ErrorInterval,
     Loop,
     RecordStep,
@@ -216,15 +219,18 @@ def results(found: Loop | None, **parts: Any) -> Results:
 @pytest.mark.parametrize(
     ("found", "stated"),
     [
-        (loop("complete"), ["the expansion of the axis", "no missing effect"]),
+        (loop("complete"), ["the expansion of the axis", "Nothing else is detected."]),
         (loop("complete", declared=()), ["No effect is declared"]),
         (
             loop("explained", step("dead_path"), step("air_index")),
-            ["lacks the laser's dead path and the refractive index of the air.", "No further cause"],
+            ["lacks the laser's dead path and the refractive index of the air.", "Nothing else is detected."],
         ),
         (
             loop("partial", step("dead_path"), step("air_index", confirmed=False, borne_out="no")),
-            ["lacks the laser's dead path.", "remains unexplained"],
+            [
+                "lacks the laser's dead path.",
+                "What is left, 0.20 µm rms, what was added without a name included, has no cause",
+            ],
         ),
         (
             loop("explained", step("dead_path", confirmed=False, borne_out="cannot tell"), wandering_um=0.16),
@@ -232,13 +238,13 @@ def results(found: Loop | None, **parts: Any) -> Results:
         ),
         (
             loop("unexplained", shape="a wave"),
-            ["predicted to 0.66 µm (last", "(0.20 µm rms)", "none of the known effects"],
+            ["predicted to 0.66 µm (last", "What is left, 0.20 µm rms, has no cause that can be identified."],
         ),
         (
             loop("unexplained", step("dead_path"), separable=False),
             ["with lags predict it to 0.31 µm; a cause is not separable."],
         ),
-        (loop("unexplained"), ["Part of the drift remains unexplained"]),
+        (loop("unexplained"), ["has no cause that can be identified"]),
         (loop("no_skill"), ["repeating the last cycle or the mean"]),
         (None, ["without a model"]),
     ],
@@ -248,13 +254,60 @@ def test_every_verdict_has_its_statement(found, stated):
     assert all(part in told for part in stated), told
 
 
+@pytest.mark.parametrize(
+    ("shares", "changes", "stated"),
+    [
+        ((0.83, 0.12), {}, "83 % of the drift (3.0 µm rms) follows the expansion of the axis and 12 % a shift with"),
+        ((0.997,), {}, "More than 99 % of the drift (3.0 µm rms) follows the expansion of the axis."),
+        # Where one effect cancels a part of another there is no share of each.
+        ((1.4, -0.43), {}, "97 % of the drift (3.0 µm rms) follows the expansion of the axis and a shift with the"),
+        ((0.9, 0.1), {"drift_um": 0.2}, "The drift, 0.20 µm rms, is less than half of the scatter of single readings"),
+    ],
+)
+def test_the_first_sentence_names_what_the_drift_follows_and_its_share(shares, changes, stated):
+    names = ("axis_expansion", "table_offset")[: len(shares)]
+    followed = tuple(map(share_of, names, shares))
+    for verdict in ("complete", "unexplained"):
+        told = loop(verdict, declared=names, followed=followed, **{"drift_um": 3.0, **changes})
+        assert answers.headline(results(told)).startswith(stated)
+
+
+def share_of(effect: str, share: float) -> DriftShare:
+    return DriftShare(effect=effect, share=share)
+
+
+def test_what_is_left_is_told_with_what_it_resembles():
+    left = AxisUnexplained(
+        shape="a slow drift", rms_um=0.3, p_value=0.4, closest_effect="unseen_heat_source", closest_effect_p=0.06,
+        closest_effect_share=0.99, closest_effect_parameters={"follows": "duty"},
+    )  # fmt: skip
+    told = answers.headline(results(loop("unexplained", unexplained=left)))
+    assert "resembles a heat source that no sensor sees (follows duty, 99 % of its variance), without" in told
+    assert "p = 0.06" in say("what_remains", results(loop("unexplained", unexplained=left)))
+    far = left.model_copy(update={"closest_effect_share": 0.4})
+    assert "resembles" not in answers.headline(results(loop("unexplained", unexplained=far)))
+
+
+def test_a_single_warm_up_is_said_with_the_verdict_and_the_coefficients():
+    conditional = loop("complete", warm_up_only=("axis_expansion",))
+    assert say("verdict_word", conditional) == "complete (not refutable: one warm-up)"
+    assert "whatever else warmed alike is counted with the expansion of the axis" in answers.headline(
+        results(conditional)
+    )
+    assert any("switched at random" in step for step in next_steps(results(conditional)))
+    whole = assemble("A", PARTS, []).loop
+    assert "nothing else warmed alike" not in describe_model(whole)[0][1]
+    conditional = whole.model_copy(update={"warm_up_only": ("axis_expansion",)})
+    assert describe_model(conditional)[0][1].endswith("if nothing else warmed alike (one warm-up)")
+
+
 def test_what_predicts_no_better_than_the_mean_explains_nothing():
     noise = answers.headline(results(loop("complete", baselines=baselines(mean_um=0.661))))
-    assert "show no drift that the declared model" in noise and "0.66 and 0.66 µm" in noise and "explains" not in noise
-    assert "explains the drift" in answers.headline(results(loop("complete", baselines=baselines(mean_um=0.70))))
+    assert "as well (0.66 µm) as the model (0.66 µm)" in noise
+    assert "predicts" not in answers.headline(results(loop("complete", baselines=baselines(mean_um=0.70))))
     worse = loop("unexplained", shape="a wave", rmse_final_um=140.0, baselines=baselines(mean_um=81.0, last_um=67.0))
     told = answers.headline(results(worse))
-    assert "no better than the last cycle simply repeated does (140 and 67 µm)" in told and "Part" not in told
+    assert "the last cycle simply repeated predicts better (67 µm) than the model (140 µm)" in told
     # What a mean leaves less of is no share, and what the noise hides is no random drift.
     assert [wording.variance_left(share) for share in (0.12, 1.146, None)] == ["12 %", "all", "–"]
     assert "random drift" not in answers.headline(results(loop("complete", wandering_um=1e-4)))
@@ -343,7 +396,7 @@ def test_the_headline_names_the_positions_that_stand_out_in_place_of_nothing_els
     model = loop("explained", step("dead_path"))
     one = anomaly.model_copy(update={"position_mm": -40.0})
     others = [one.model_copy(update={"target": target, "position_mm": 0.0}) for target in (9, 7, 5)]
-    assert say("why", results(model, anomalies=())).endswith("Nothing else detected.")
+    assert say("why", results(model, anomalies=())).endswith("Nothing else is detected.")
     told = say("why", results(model, anomalies=(one,)))
     assert "Nothing" not in told and told.endswith(" dead path. Position 3 (−40 mm) repeats worse than the others.")
     assert say("why", results(loop("no_skill"), anomalies=(one,))).endswith("repeats worse than the others.")
@@ -507,7 +560,7 @@ def test_effects_that_are_not_separated_are_told_as_one_of_these():
     words = step_phrase(open_end, None, record=False)
     assert words.startswith("something that moves like a part") and words.endswith("130 min and more fits)")
     told = say("verdict", loop("unexplained", open_end), None, False)
-    assert f"can be identified as its cause; it holds {words}." in told
+    assert f"It holds {words}." in told
     assert action(open_end, None, record=False).startswith("Not confirmed, check this only where nothing else is found")
 
 

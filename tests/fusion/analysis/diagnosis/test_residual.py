@@ -178,9 +178,7 @@ def test_a_drift_counts_from_half_the_noise_of_a_reading_on(monkeypatch, order, 
     drift = np.column_stack([np.full(4, 0.1), [1.1, -1.1, 1.1, -1.1]])
     monkeypatch.setattr(module, "unexplained_drift", lambda fit: (drift, basis))
     found = module.with_drift(remainder, fit)
-    assert found.shape == (
-        f"a slow, {course} drift that no effect of the library follows; growing along the axis, both directions"
-    )
+    assert found.shape == (f"a slow, {course} drift without a name; growing along the axis, both directions")
     assert found.rms_um == pytest.approx(1.1) and found.series.tolist() == [1.1, -1.1, 1.1, -1.1]
     # A constant is no explanation of it: the basis of the model takes it out.
     np.testing.assert_allclose(found.free(np.ones((4, 1))), 0.0, atol=1e-12)

@@ -21,7 +21,7 @@ from fusion.analysis.drift_model.admissibility import (
     refuse_in_heteroscedastic_drift,
     warm_up_share,
 )
-from fusion.analysis.drift_model.axis import AxisProblem, detection_limits, hold_out
+from fusion.analysis.drift_model.axis import AxisProblem, detection_limits, hold_out, shown_by_one_warm_up
 from fusion.analysis.drift_model.model import ModelFit, fit_model
 from fusion.analysis.drift_model.search import TIE_GAIN, Decision, Reason, Score
 from fusion.analysis.effects.effect import Candidate, Effect, warm_up
@@ -228,6 +228,20 @@ def test_what_a_plain_warm_up_explains_is_refused_unless_it_gains_beside_free_on
     assert warm_up_share(readings, waved) > 0.99
     following = replace(readings, response=30.0 * waved.columns[:, 0] + noise)
     assert AxisGrounds(model_of(following)).refuse_single_excitation("thermal_lag", "field", waved) is None
+
+
+@pytest.mark.parametrize(
+    ("size", "wave", "alone"),
+    [(3.0, 0.0, True), (30.0, 0.03, False), (0.0, 0.0, False)],
+    ids=["seen", "waved", "not seen"],
+)
+def test_a_declared_effect_that_only_one_warm_up_shows_is_told(rng, size, wave, alone):
+    """Not one that a wave shows as well, nor one that the readings do not show at all."""
+    readings = seen(1.0 - np.exp(-20.0 * np.arange(300) / 1200.0))
+    course = warm_up(readings, 20.0) + wave * np.sin(readings.seconds / 97.0)
+    noise = 0.1 * rng.standard_normal(readings.seconds.size)
+    model = model_of(replace(readings, response=size * course + noise), [term(course, "table_offset")])
+    assert shown_by_one_warm_up(model, 1) == (("table_offset",) if alone else ())
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,8 @@ from fusion.analysis.drift_model.evaluation import (
     has_skill,
     is_separable,
     reasons_against,
+    shares_of_drift,
+    unsupported_places,
     verdict,
 )
 from fusion.analysis.drift_model.model import ModelFit, coefficient_spread, fit_model, unexplained_drift
@@ -148,6 +150,7 @@ def result(looped: LoopState[ModelFit], left: Remainder) -> AxisResult:
         away=frozenset(),
         remainder=left,
         wandering_um=0.05,
+        warm_up_only=(),
         declared_coefficients=declared_coefficients(model, 1),
         before=model,
         after=model,
@@ -256,6 +259,30 @@ def test_what_lasts_is_borne_out_by_the_hold_out_set(slope, word, verdict):
         }[word]
     )
     assert replace(result(looped, remainder()), steps=[step]).verdict == verdict
+
+
+@pytest.mark.parametrize("falls", [False, True])
+def test_a_name_that_is_not_borne_out_stands_only_where_unseen_readings_are_predicted_better(falls):
+    looped = state(model_of(measured(), [term(WAVE, "axis_expansion"), term(LATE, "step_event")]))
+    looped = replace(looped, errors_um=(0.8, 0.79 if falls else 0.8), errors_without_um=(0.8,))
+    (step,) = report_steps(looped, {}, [Answer()])
+    assert (step.borne_out, step.lowers_error, step.keeps_name) == ("cannot tell", falls, falls)
+    assert unsupported_places([step]) == ([] if falls else [0])
+    told = replace(result(looped, remainder()), steps=[step])
+    assert told.verdict == ("explained" if falls else "unexplained")
+    # What no unseen reading supports is followed by nothing.
+    assert [one.effect for one in told._described()["followed"]] == ["axis_expansion", "step_event"][: 1 + falls]
+
+
+def test_shares_of_a_drift_are_those_of_its_variance():
+    first, second = np.array([[1.0], [-1.0], [0.0], [0.0]]), np.array([[0.0], [0.0], [2.0], [-2.0]])
+    left = np.array([[1.0], [1.0], [-1.0], [np.nan]])
+    shares, rest = shares_of_drift([first, second], left)
+    # Of 5/3 over the three known places 1 is left; one and four parts of the rest follow the effects.
+    assert rest == pytest.approx(0.6) and shares == pytest.approx([0.08, 0.32])
+    assert shares_of_drift([first, -first], left) == ([0.0, 0.0], 1.0)
+    shares, rest = shares_of_drift([2.0 * first, -first], 0.0 * first)
+    assert shares == pytest.approx([2.0, -1.0]) and rest == 0.0
 
 
 def test_nothing_is_explained_where_the_final_error_is_beyond_the_noise_and_a_plain_prediction_is_better():

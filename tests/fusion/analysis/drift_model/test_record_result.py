@@ -84,6 +84,7 @@ def result(*, shape: str = "") -> RecordResult:
             away=frozenset(),
             remainder=RecordRemainder(0.5, {"periodicity": 0.5}, shape, 0.0, np.array([0.1, 0.3])),
             wandering_um=0.15,
+            warm_up_only=(),
             record=record,
             is_held_out=np.array([False, False, True, True]),
             predicted={},
@@ -236,6 +237,7 @@ def test_the_nearest_effect_is_the_strongest_of_the_last_round():
     assert result().described([]).unexplained.model_dump() == {
         "shape": "",
         "rms_um": 0.0,
+        "share": 1.0,
         "p_value": 0.5,
         "p_values": {"periodicity": 0.5},
         "variance_share": pytest.approx(0.2),
@@ -484,7 +486,7 @@ def test_a_drift_that_nothing_follows_counts_from_three_times_the_noise():
     noise = float(np.sqrt(np.mean(quiet_fit(record).sigma ** 2)))
     below, above = (examined(record, hold_out_rmse=factor * np.sqrt(10.0) * noise) for factor in (0.99, 1.01))
     assert below.shape == ""
-    assert above.shape == "a slow drift that neither temperatures nor drivers follow, largest in all channels alike"
+    assert above.shape == "a slow drift without a name, largest in all channels alike"
     np.testing.assert_allclose(above.variance_share, 1.01**2 * 10.0 * noise**2 / record.displacement.var(axis=0))
     assert not above.is_tested
 
