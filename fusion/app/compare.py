@@ -133,7 +133,7 @@ def comparison_parts(pairs: list[PairComparison]) -> ui.Parts:
     parts += [ui.heading("Side by side", level=3), figures]
     profiles = "Drift-free profiles, mean of both approaches, each about its mean, with 95 % bands."
     parts += shown_if(plot_profiles(tests, short), profiles)
-    parts += shown_if(plot_scatters(tests, short), "Scatter of single readings with 95 % intervals.")
+    parts += shown_if(plot_scatters(tests, short), "Scatter of single readings with 95 % limits.")
     trends = follow_trends(pairs)
     for trend in trends:
         parts += shown_if(draw_trend(trend), f"{trend_caption(trend)} {trend_notes(pairs, trends)}".strip())

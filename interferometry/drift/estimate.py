@@ -237,6 +237,15 @@ def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
     return set_flag(deviations, OUTLIER, beyond)
 
 
+def scatter_limits(scatter: Array, freedom: Array, sigma: float) -> Array:
+    """Return the 95 % limits (2, ...), um, of standard deviations (...) by the chi-square distribution of their degrees of freedom; of one
+    that is nothing beside the uncertainty of the drift, the upper limit is that of the common one.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = (np.sqrt(freedom / special.chdtri(freedom, tail)) for tail in (0.025, 0.975))
+    return np.stack([scatter * low, np.where(scatter == 0.0, sigma, scatter) * high])
+
+
 @dataclass(frozen=True)
 class JointFit:
     """The joint estimate as numbers: readings in measuring order without gross outliers, direction and target index of every profile column

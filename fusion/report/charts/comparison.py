@@ -26,12 +26,13 @@ from fusion.report.charts.style import (
     span_words,
 )
 from fusion.results.numbers import number, print_unit
+from interferometry.drift.estimate import scatter_limits
 from interferometry.plots import ACCENT, INK
 
 #: Height of a line of a legend, px.
 _LEGEND_LINE_PX = 28
 _MARKS = ("circle", "square", "triangle", "diamond", "inverted_triangle", "x")
-#: Values of a campaign over position, and half their 95 % intervals, from its drift in order of position.
+#: Values of a campaign over position, and half their 95 % intervals (n,) or (2, n), from its drift in order of position.
 _Values = Callable[[xr.Dataset], tuple[np.ndarray, np.ndarray]]
 
 
@@ -51,7 +52,8 @@ def plot_scatters(campaigns: Sequence[ComparedCampaign], names: Sequence[str]) -
 
     def scatter(drift: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         value, freedom = drift["scatter_position"].values, drift["scatter_freedom"].sum("direction").values
-        return value, 2 * value / np.sqrt(2 * np.maximum(freedom, 1.0))
+        low, high = scatter_limits(value, freedom, float(drift["sigma"]))
+        return value, np.stack([value - low, high - value])
 
     return _plot_campaigns(campaigns, names, scatter, "scatter s", "Scatter of single readings by position", line=False)
 

@@ -34,6 +34,7 @@ from fusion.report.charts.style import (
     span_words,
 )
 from fusion.results.numbers import join, number, print_unit
+from interferometry.drift.estimate import scatter_limits
 from interferometry.plots import ACCENT, ARROWS, COLOURS, INK, MUTED, hours_since_start
 
 # Charts of the joint estimate: drift of every position over time, drift-free profile.
@@ -104,7 +105,7 @@ def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
 
 
 def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Set[int]) -> Chart:
-    """Draw the random scatter of every position and approach with its 95 % interval; flagged positions are shaded."""
+    """Draw the random scatter of every position and approach with its 95 % limits; flagged positions are shaded."""
     x = position.values.astype(float)
     step = float(np.median(np.diff(np.sort(x)))) if x.size > 1 else 1.0
     drawn = new_figure(x="position / mm", y="scatter s / µm")
@@ -112,13 +113,18 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Se
         place = float(position.sel(target=target))
         sides = {"left": place - 0.4 * step, "right": place + 0.4 * step}
         drawn.add_layout(BoxAnnotation(**sides, fill_color=ACCENT, fill_alpha=0.12, level="underlay"))
-    courses = Courses(drawn, {"position / mm": x})
+    courses, highest = Courses(drawn, {"position / mm": x}), 0.0
     for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
-        value, half = (drift[name].sel(direction=direction).values for name in ("scatter", "scatter_u"))
-        name, looks = ARROWS[direction], {"line": False, "half": 2 * half, **of_direction(direction)}
-        courses.add(x + shift * step, value, name, f"scatter, {name} / µm", f"95 % interval ±, {name} / µm", **looks)
-    highest = float((drift["scatter"] + 2 * drift["scatter_u"]).max())
-    fix_range(drawn, 0.0, 1.06 * highest if np.isfinite(highest) else 1.0)
+        row = drift.sel(direction=direction)
+        value = row["scatter"].values
+        low, high = scatter_limits(value, row["scatter_freedom"].values, float(drift["sigma"]))
+        name, looks = (
+            ARROWS[direction],
+            {"line": False, "half": np.stack([value - low, high - value]), **of_direction(direction)},
+        )
+        courses.add(x + shift * step, value, name, f"scatter, {name} / µm", f"95 % limits, {name} / µm", **looks)
+        highest = np.fmax(highest, np.fmax.reduce(high))
+    fix_range(drawn, 0.0, 1.06 * highest if highest else 1.0)
     places = join([f"{float(position.sel(target=target)):g} mm" for target in sorted(flagged)])
     seen = f"Random scatter of {x.size} positions: {span_words(drift['scatter'], 'µm')}; " + (
         f"marked as standing out: {places}." if flagged else "none is marked as standing out."

@@ -173,12 +173,13 @@ def add_series(
     size: float = 7.0,
     legend: bool = True,
 ) -> None:
-    """Draw a named series with its values under the pointer."""
+    """Draw a named series with its values under the pointer; `half` the length (n,) of its error bars to either side, or (2, n) of each."""
     source = ColumnDataSource({"x": np.asarray(x), "y": np.asarray(y)})
     named, parts = name if legend else "", []
     if half is not None:
-        source.data["half"] = np.asarray(half)
-        source.data["low"], source.data["high"] = np.asarray(y) - half, np.asarray(y) + half
+        below, above = np.broadcast_to(half, (2, len(y)))
+        ends = {"half": above, "low": np.asarray(y) - below, "high": np.asarray(y) + above}
+        source.data = {**source.data, **ends}
         bars = Segment(x0="x", y0="low", x1="x", y1="high", line_color=colour, line_width=1.3)
         add_mark(drawn, source, bars, named)
     if line:
@@ -188,8 +189,12 @@ def add_series(
         points = Scatter(x="x", y="y", marker=value(marker), size=size, line_color=colour, fill_color=colour)
         parts.append(add_mark(drawn, source, points, named))
     (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
-    shown = "@y{0.000}" + (" ± @half{0.000}" if half is not None else "")
-    tips = [("", literal(name)), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {literal(y_unit)}")]
+    bars_shown = "" if half is None else " ± @half{0.000}" if np.ndim(half) == 1 else " (@low{0.000} to @high{0.000})"
+    tips = [
+        ("", literal(name)),
+        (along, f"@x{{0.[000]}} {unit}"),
+        (quantity, f"@y{{0.000}}{bars_shown} {literal(y_unit)}"),
+    ]
     add_hover(drawn, tips, parts[-1:])
 
 
@@ -202,11 +207,16 @@ class Courses:
     def add(
         self, x: np.ndarray, y: np.ndarray, name: str, column: str = "", bars: str = "", seen: str = "", **looks: Any
     ) -> None:
-        """Draw a series; `column` and `seen` where they are not its name with the unit and its span, `bars` heads half its error bars."""
+        """Draw a series; `column` and `seen` where they are not its name with the unit and its span, `bars` heads half its error bars,
+        or both ends of those that are unequal.
+        """
         add_series(self.figure, x, y, name=name, **looks)
         self.columns[own_name(column or f"{name} / {self.unit}", self.columns)] = y
-        if bars:
+        if bars and np.ndim(looks["half"]) == 1:
             self.columns[bars] = looks["half"]
+        elif bars:
+            below, above = looks["half"]
+            self.columns |= {f"{bars}, from": y - below, f"{bars}, to": y + above}
         self.told.append(f"{name} {seen or span_words(y, self.unit)}")
 
     def chart(self, subject: str) -> Chart:

@@ -13,6 +13,7 @@ from interferometry.drift.estimate import (
     component_loadings,
     estimate_drift,
     flag_outliers,
+    scatter_limits,
     state_weights,
 )
 from interferometry.drift.gls import DriftFit, estimate
@@ -383,3 +384,10 @@ def test_the_approaches_may_be_stored_in_any_order_and_one_may_lack(rng):
         empty = estimate_drift(test.where(test["direction"] == name).assign(position=test["position"]))
         np.testing.assert_array_equal(alone["profile"].sel(direction=name), empty["profile"].sel(direction=name))
         assert (alone.sizes["direction"], alone["reversal"].isnull().all()) == (1, True)
+
+
+def test_the_limits_of_a_scatter_are_those_of_chi_square():
+    """10 degrees of freedom: 20.48 and 3.247 are the 2.5 % points of the table; a scatter of nothing is below that of the others."""
+    low, high = scatter_limits(np.array([1.0, 0.0, np.nan, 1.0]), np.array([10.0, 10.0, 10.0, 0.0]), 2.0)
+    np.testing.assert_allclose(low, [np.sqrt(10 / 20.483), 0.0, np.nan, np.nan], rtol=1e-4)
+    np.testing.assert_allclose(high, [np.sqrt(10 / 3.247), 2.0 * np.sqrt(10 / 3.247), np.nan, np.nan], rtol=1e-4)
