@@ -20,6 +20,7 @@ from fusion.analysis.attribution.modes import Region, cluster_cells, disc
 from fusion.analysis.attribution.sensors import SensorChoice, choose_sensors
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.campaign.inputs import Source
+from fusion.common import Array
 from fusion.pipeline.drift_model import place_scale_u, scaled
 from fusion.pipeline.positioning import average_cycles
 from fusion.report.wording import say
@@ -125,7 +126,12 @@ def _describe_correlation(
     strength = source.sensitivity_um_per_K.model_dump(exclude_unset=True)
     scale_u = place_scale_u(fields, *np.array([source.x_mm, source.y_mm], float))
     area = regions[source.name] if source.kind == "region" else source.area
-    completed = {"area": area, "sensitivity_um_per_K": Sensitivity(**scaled(strength, scale_u))}
+    limits = np.array([source.sensitivity_um_per_K.value, *(source.sensitivity_interval_um_per_K or ())], float)
+    completed = {
+        "area": area,
+        "sensitivity_um_per_K": Sensitivity(**scaled(strength, scale_u)),
+        "sensitivity_interval_um_per_K": _with_scale(limits, scale_u),
+    }
     return schema.CorrelationPart(
         p_resolution=1.0 / (int(maps.attrs["draws"]) + 1),
         verdict=maps.attrs["verdict"],
@@ -145,6 +151,14 @@ def _describe_correlation(
 
 def _sensitivity(found: xr.Dataset, scale_u: float) -> Sensitivity:
     return Sensitivity(**scaled({"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}, scale_u))
+
+
+def _with_scale(found: Array, scale_u: float) -> tuple[float, float]:
+    """Limits of a sensitivity (its value and both limits) with the scale of the rise (k = 2), which moves none of them across 0."""
+    value, low, high = found.tolist()
+    scale = 2.0 * scale_u * value
+    below, above = value - float(np.hypot(value - low, scale)), value + float(np.hypot(high - value, scale))
+    return max(below, 0.0) if low > 0.0 else below, min(above, 0.0) if high < 0.0 else above
 
 
 def _describe_duty(duty: xr.Dataset) -> list[schema.DutyPart]:
@@ -192,6 +206,9 @@ def _describe_places(
             parts[channel] = schema.TestedPart(
                 p_value=found["p_value"],
                 sensitivity_um_per_K=_sensitivity(found, scale_u),
+                sensitivity_interval_um_per_K=_with_scale(
+                    np.array([float(found[f"sensitivity{end}"]) for end in ("", "_low", "_high")]), scale_u
+                ),
                 lag_s=found["lag"],
                 detectable_um_per_K=found["detectable_sensitivity"],
                 **({"p_given_leading_mode": found["p_beside"]} if kind == "mode" else {}),

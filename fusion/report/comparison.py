@@ -227,7 +227,7 @@ def describe_places(pairs: Sequence[PairComparison], pair: PairComparison) -> di
     rows: list[list[str]] = []
     for source, name in zip(pair.places.sources, numbers.values(), strict=True):
         near = numbers.get((source.channel, *source.agreed_near_mm[:2])) if source.agreed_near_mm else None
-        of_tests = (source.sensitivity_um_per_K, source.sensitivity_u_um_per_K, source.lag_s)
+        of_tests = (source.sensitivity_um_per_K, source.sensitivity_interval_um_per_K, source.lag_s)
         shown = [say("source_shown", *one) for one in zip(source.p_value, pair.places.least_p, *of_tests, strict=True)]
         verdict = say("source_verdict", source, tests, near, ATTRIBUTION_LEVEL)
         where = f"{place(source.x_mm, source.y_mm)}, {CHANNELS.get(source.channel, source.channel)}"

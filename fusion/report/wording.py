@@ -22,6 +22,7 @@ from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230W
 from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, Loop, Range, RecordLoop
 from fusion.results.numbers import (
     alike,
+    decimals_of,
     duration,
     exact,
     fixed,
@@ -176,6 +177,15 @@ def quantity(found: Quantity, unit: str = "") -> str:
     return measured(found.value, found.u, unit)
 
 
+def limited(value: float | None, limits: tuple[float, float] | None, unit: str = "") -> str:
+    """Return a value with the limits of its interval as ``value [low to high] unit``."""
+    low, high = (None, None) if limits is None else limits
+    if value is None or low is None or high is None or not np.isfinite([value, low, high]).all():
+        return measured(value, None, unit)
+    places = decimals_of((high - low) / 4.0)
+    return f"{fixed(value, places)} [{fixed(low, places)} to {fixed(high, places)}]{f' {unit}' if unit else ''}"
+
+
 def region_words(name: str) -> str:
     """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself."""
     return re.sub(r"^hotspot (?=\d+$)", "disc about hotspot ", name)
@@ -306,8 +316,8 @@ def environment(*, html: bool) -> jinja2.Environment:
     )  # fmt: skip
     formats = (
         anomaly_cause, anomaly_place, caption, condition, conditional, counted, drift_size, duration, exact, fixed, gain, lower_first,
-        measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small, upper_first,
-        variance_left, whole_percent,
+        limited, measured, moment, number, p_cell, p_words, parameters, percent, place, print_unit, quantity, region_words, small,
+        upper_first, variance_left, whole_percent,
     )  # fmt: skip
     made.filters |= {function.__name__: function for function in formats}
     made.filters |= {

@@ -31,7 +31,9 @@ class AssociationPart(ResultPart):
     p_value: Number
     """p-value, family-wise over everything that was tested."""
     sensitivity_um_per_K: Sensitivity
-    """Drift per rise, um/K, at the far end of travel for the parts that grow along the axis."""
+    """Drift per rise, um/K, at the far end of travel for parts that grow along the axis; u over the drifts and lags that the data allow."""
+    sensitivity_interval_um_per_K: tuple[Number, Number] | None = None
+    """Limits of it at this lag with 95 % for everything that was tested at once, um/K: they hold 0 where p is above 0.05."""
     lag_s: Number
     """Time constant between temperature and drift, s."""
     detectable_um_per_K: Number
@@ -132,7 +134,7 @@ class CorrelationPart(ResultPart):
     excitation: str
     """How the heat sources were excited."""
     false_alarm_rate: Number
-    """Rate of false alarms on simulations without a source, 1."""
+    """Rate of false alarms on series simulated from the drift that was fitted, without a source, 1."""
     source: SourcePart
     """The leading candidate."""
     recommended_test: str

@@ -159,7 +159,8 @@ def correlate(
     -------
     DataTree
         Root: maps (channel, y, x) ``statistic``, ``p_value`` (family-wise), ``q_value`` (false discovery), ``sensitivity``,
-        ``sensitivity_u`` and ``detectable_sensitivity`` (um/K; the last with 80 % power), ``lag`` (s), ``verdict``, and
+        ``sensitivity_u``, ``sensitivity_low`` and ``sensitivity_high`` (95 % for all places at once, at their lag) and
+        ``detectable_sensitivity`` (um/K; the last with 80 % power), ``lag`` (s), ``verdict``, and
         ``naive_correlation`` for contrast only; per channel ``threshold``, ``noise`` (um), ``unexplained_drift`` (um over one hour),
         ``drift_order``; ``false_alarm_rate`` of everything tested, ``cells_false_alarm_rate``, ``warm_up_share``; attribute ``verdict``.
         Group ``modes``: the same over channel and mode, with ``pattern`` (1 at the strongest cell, at ``at_x``, ``at_y``) and
@@ -323,6 +324,8 @@ class _Session:
             "q_value": test.q_value,
             "sensitivity": test.coefficient,
             "sensitivity_u": test.coefficient_u,
+            "sensitivity_low": test.low,
+            "sensitivity_high": test.high,
             "detectable_sensitivity": test.detectable,
             "lag": np.asarray(self.lags_s, float)[test.lag_index],
             "verdict": verdict.astype(np.int8),
@@ -370,6 +373,7 @@ class _Session:
                 "p_value": found.p_value,
                 "sensitivity": found.sensitivity,
                 "sensitivity_u": found.sensitivity_u,
+                "sensitivity_half_width": found.half_width,
                 "lag": np.asarray(self.lags_s, float)[found.lag_index],
             }
             laid_out = self.candidates.lay_out(name, "series", quantities, _OF_TARGETS)
@@ -417,7 +421,10 @@ def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.D
 _EQUAL_RATIO = 3.84
 #: Separate pieces of a mode that reach this share of its peak are places of their own.
 _PEAK = 0.7
-_QUANTITIES = ("p_value", "statistic", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity", "threshold")
+_QUANTITIES = (
+    "p_value", "statistic", "sensitivity", "sensitivity_u", "sensitivity_low", "sensitivity_high", "lag",
+    "detectable_sensitivity", "threshold",
+)  # fmt: skip
 #: Sets of candidates in the order in which they are asked, and the kind of each.
 _KINDS = {"modes": "mode", "cells": "cell", "regions": "region"}
 
@@ -430,6 +437,9 @@ def find_source(maps: xr.DataTree) -> SourcePart:
     chosen = passed[0] if passed else min(smallest, key=lambda name: smallest[name])
     best, kind = leaders[chosen], _KINDS[chosen]
     inside, others = _surroundings(maps, chosen, best)
+    value, low, high = (float(best[name]) for name in ("sensitivity", "sensitivity_low", "sensitivity_high"))
+    # The strongest of many places is too strong by chance: its interval allows for that, its own uncertainty does not.
+    u = max(float(best["sensitivity_u"]), (high - value) / 2.0, (value - low) / 2.0)
     return SourcePart(
         kind=kind,
         name="" if kind == "cell" else str(best[kind].values),
@@ -439,7 +449,8 @@ def find_source(maps: xr.DataTree) -> SourcePart:
         # A region has an outline of its own.
         area=area_of(inside, maps.to_dataset()),
         p_value=float(best["p_value"]),
-        sensitivity_um_per_K=Sensitivity(value=float(best["sensitivity"]), u=float(best["sensitivity_u"])),
+        sensitivity_um_per_K=Sensitivity(value=value, u=u),
+        sensitivity_interval_um_per_K=(low, high),
         lag_s=float(best["lag"]),
         detectable_um_per_K=float(best["detectable_sensitivity"]),
         equivalent_places_mm=others,

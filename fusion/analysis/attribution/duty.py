@@ -23,8 +23,10 @@ from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.attribution.drift_channels import DriftSeries, clock_readings, reduce_channels
 from fusion.analysis.attribution.modes import level_and_trend
 from fusion.analysis.attribution.significance import (
+    Estimate,
     NullBank,
-    estimate_effects,
+    combine_fits,
+    fit_regressors,
     likelihood_ratios,
     monte_carlo_p,
     null_bank,
@@ -159,7 +161,7 @@ def randomisation_test(
     null = _statistics(series, banks, duty_responses(seconds, fresh)).max(axis=1).reshape(draws, -1).max(axis=1)
     best, chosen = measured.max(axis=1), measured.argmax(axis=1)
     p_value = monte_carlo_p(best, null)
-    size, size_u = _effects(series, banks, responses[:, np.arange(len(names)), chosen])
+    effect = _effect(series, banks, responses, chosen)
     strongest = int(best.argmax())
     size_name = "drift at the far end of travel at full duty"
     constants_s = np.array(_RESPONSES_S)[chosen]
@@ -169,23 +171,24 @@ def randomisation_test(
             "statistic": (("source",), best, {"units": "1"}),
             "time_constant": (("source",), constants_s[:, 0], {"units": "s"}),
             "second_time_constant": (("source",), constants_s[:, 1], {"units": "s"}),
-            "sensitivity": (("source",), size, {"units": "um", "long_name": size_name}),
-            "sensitivity_u": (("source",), size_u, {"units": "um"}),
+            "sensitivity": (("source",), effect.coefficient, {"units": "um", "long_name": size_name}),
+            "sensitivity_u": (("source",), effect.coefficient_u, {"units": "um"}),
         },
         coords={"source": names},
         attrs={"source": names[strongest] if p_value[strongest] <= ATTRIBUTION_LEVEL else "", "draws": draws},
     )
 
 
-def _effects(series: Sequence[DriftSeries], banks: Sequence[NullBank], responses: Array) -> tuple[Array, Array]:
-    """Drift at full duty at the far end of travel and its standard uncertainty, (sources,) um, from responses (grid, sources)."""
-    effects = [
-        estimate_effects(bank, np.ascontiguousarray(channel.sampling @ responses, np.float32))
+def _effect(
+    series: Sequence[DriftSeries], banks: Sequence[NullBank], responses: Array, chosen: NDArray[np.int64]
+) -> Estimate:
+    """Drift at full duty of every source at the far end of travel, um, where common drift and that proportional to position add up."""
+    flat = responses.reshape(responses.shape[0], -1)
+    fits = [
+        fit_regressors(bank, np.ascontiguousarray(channel.sampling @ flat, np.float32))
         for channel, bank in zip(series, banks, strict=True)
     ]
-    # At the far end of travel, the common drift and that proportional to position add up.
-    size = np.sum([effect.coefficient for effect in effects], axis=0)
-    return size, np.sqrt(np.sum([effect.coefficient_u**2 for effect in effects], axis=0))
+    return combine_fits(fits, chosen)
 
 
 def _hold(duty: xr.DataArray) -> tuple[Array, NDArray[np.datetime64], Array]:

@@ -24,7 +24,10 @@ from fusion.common import Array, FusionError
 #: Places of the two tests count as the same within this distance: half the width of the halo of a heat source.
 _SAME_PLACE_MM = 50.0
 #: Quantities of a candidate, and their values where there is none.
-_BLANK = {"statistic": -1.0, "p_value": 1.0, "sensitivity": 0.0, "sensitivity_u": np.inf, "lag": 0.0}
+_BLANK = {
+    "statistic": -1.0, "p_value": 1.0, "sensitivity": 0.0, "sensitivity_u": np.inf, "sensitivity_low": -np.inf, "sensitivity_high": np.inf,
+    "lag": 0.0,
+}  # fmt: skip
 #: Sensitivities disagree where they differ by more than this many standard uncertainties.
 _DISAGREEMENT = 3.0
 
@@ -66,6 +69,7 @@ class SourceAgreement:
     p_value: tuple[float, float]
     sensitivity_um_per_K: tuple[float, float]
     sensitivity_u_um_per_K: tuple[float, float]
+    sensitivity_interval_um_per_K: tuple[tuple[float, float], tuple[float, float]]
     lag_s: tuple[float, float]
     agrees: bool
     separate: bool
@@ -184,6 +188,7 @@ def _source_at(
 ) -> SourceAgreement:  # fmt: skip
     """A source with what both tests show at its cell."""
     pair, cell = pairs[channel], _cell_of(plan, *place_mm)
+    low, high = pair.at("sensitivity_low", *cell), pair.at("sensitivity_high", *cell)
     return SourceAgreement(
         channel=channel,
         x_mm=place_mm[0],
@@ -192,6 +197,7 @@ def _source_at(
         p_value=pair.at("p_value", *cell),
         sensitivity_um_per_K=pair.at("sensitivity", *cell),
         sensitivity_u_um_per_K=pair.at("sensitivity_u", *cell),
+        sensitivity_interval_um_per_K=((low[0], high[0]), (low[1], high[1])),
         lag_s=pair.at("lag", *cell),
         agrees=len(shown_by) == 2,
         separate=separate,

@@ -40,6 +40,8 @@ _WALK_PER_HOUR = 0.1 * 3.0 ** np.arange(8)
 _INTEGRATED_PER_HOUR = 0.1 * 3.0 ** np.arange(10)
 #: Columns of one tile: with a thousand simulated series the products of a tile stay in the second-level cache.
 _TILE = 512
+#: Score of a regressor without information: above that of any other, and finite.
+_NOTHING = 1e6
 #: A whitened regressor that keeps less than this share of its length given the nuisance regressors carries no information.
 _VANISHING = 1e-5
 
@@ -254,20 +256,106 @@ def _log_ratio(null_score: Array32, best: Array32, freedom: float) -> None:
 
 def likelihood_ratios(whitened: Whitened, regressors: Array32) -> Array32:
     """Return the profile likelihood ratio of every regressor for every series."""
+    return _test_regressors(whitened, regressors)[0]
+
+
+def _test_regressors(whitened: Whitened, regressors: Array32) -> tuple[Array32, Array32, Array32]:
+    """Likelihood ratios (draws, columns); products of the first series with the whitened regressors, their lengths, (grid, columns)."""
     draws = whitened.series.shape[1]
     best = np.empty((draws, regressors.shape[1]), np.float32)
     best[:] = whitened.null_score[:, None]
+    products, lengths = np.empty((2, len(whitened.projects), regressors.shape[1]), np.float32)
     for g, (project, series) in enumerate(zip(one_by_one(whitened.projects), one_by_one(whitened.series), strict=True)):
-        unit, _ = _unit_regressors(project, regressors)
-        _take_best(series @ unit, whitened.penalised[g], whitened.penalty[g], best)
+        unit, lengths[g] = _unit_regressors(project, regressors)
+        product = series @ unit
+        products[g] = product[0]
+        _take_best(product, whitened.penalised[g], whitened.penalty[g], best)
     _log_ratio(whitened.null_score, best, float(whitened.freedom))
-    return best
+    return best, products, lengths
+
+
+@dataclass(frozen=True)
+class Fits:
+    """Fits of regressors to one series at every grid point, (grid, columns): coefficients, their standard uncertainties, and scores.
+
+    A score is -2 log of the restricted likelihood over the degrees of freedom ``freedom``. Uncertainty and score are infinite where a
+    regressor carries no information. ``null`` is the grid point of the fitted null model.
+    """
+
+    coefficient: Array
+    coefficient_u: Array
+    score: Array
+    freedom: int
+    null: int
+
+    @staticmethod
+    def of(bank: NullBank, products: Array32, lengths: Array32) -> Fits:
+        """From products of the whitened series with whitened regressors of length one, and the lengths of these, (grid, columns)."""
+        informative = lengths > 0
+        safe = np.where(informative, lengths, 1.0).astype(float)
+        squares = np.array([series @ series for series in bank.whitened])[:, None]
+        rss = np.maximum(squares - products.astype(float) ** 2, 1e-300)
+        penalty = np.array([point.log_penalty for point in bank.whitenings])[:, None]
+        return Fits(
+            products / safe,
+            np.where(informative, np.sqrt(rss / (bank.freedom - 1)) / safe, np.inf),
+            np.where(informative, np.log(rss) + penalty, np.inf),
+            bank.freedom,
+            bank.best,
+        )
+
+    def take(self, columns: NDArray[np.int64]) -> Fits:
+        """The fits of some of the regressors."""
+        return Fits(
+            self.coefficient[:, columns],
+            self.coefficient_u[:, columns],
+            self.score[:, columns],
+            self.freedom,
+            self.null,
+        )
+
+    @property
+    def best(self) -> Array:
+        """Coefficients (columns,) at the grid point of highest likelihood."""
+        return np.take_along_axis(self.coefficient, self.score.argmin(axis=0)[None], axis=0)[0]
+
+    @property
+    def null_u(self) -> Array:
+        """Standard uncertainties (columns,) under the fitted null model."""
+        square = self.coefficient_u[self.null] ** 2 * (self.freedom - 1) + self.coefficient[self.null] ** 2
+        return np.asarray(np.sqrt(square / self.freedom))
+
+    def average(self) -> tuple[Array, Array, Array]:
+        """Over the drifts of the grid by their likelihood: log of its sum, mean and variance of the coefficients, (columns,) each."""
+        lowest = np.minimum(self.score.min(axis=0), _NOTHING)
+        weight = np.exp(-0.5 * self.freedom * (self.score - lowest))
+        total = np.maximum(weight.sum(axis=0), 1e-300)
+        weight /= total
+        mean = (weight * self.coefficient).sum(axis=0)
+        square = np.where(weight > 0, self.coefficient_u, 0.0) ** 2
+        variance = (weight * (square + (self.coefficient - mean) ** 2)).sum(axis=0)
+        return -0.5 * self.freedom * lowest + np.log(total), mean, variance
+
+    def limits(self, ratio: float) -> tuple[Array, Array]:
+        """Lowest and highest coefficient (columns,) whose likelihood ratio to the best is at most `ratio`, the drift profiled."""
+        lowest = np.minimum(self.score.min(axis=0), _NOTHING)
+        margin = lowest + ratio / self.freedom - self.score
+        inside = margin >= 0
+        u = np.where(inside, self.coefficient_u, 0.0)
+        half = u * np.sqrt((self.freedom - 1) * np.expm1(np.where(inside, margin, 0.0)))
+        low = np.where(inside, self.coefficient - half, np.inf).min(axis=0)
+        high = np.where(inside, self.coefficient + half, -np.inf).max(axis=0)
+        known = lowest < _NOTHING
+        return np.where(known, low, -np.inf), np.where(known, high, np.inf)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Effect of each regressor at the grid point where its likelihood is highest, um/K, with its standard uncertainty there and at the
-    fitted null model, from which the detection limit follows.
+    """Effect of each regressor at its most likely drift and alternative, um/K, with its standard uncertainty over all of them.
+
+    ``coefficient_u`` is the root mean square distance of the truth from the coefficient, averaged by likelihood over the drifts of the
+    grid and the alternatives (time constants) of a regressor: that of the most likely ones alone is too small by half where the data do
+    not decide. ``null_u`` is the uncertainty under the fitted null model, from which the detection limit follows.
     """
 
     coefficient: Array
@@ -275,31 +363,53 @@ class Estimate:
     null_u: Array
 
 
-def estimate_effects(bank: NullBank, regressors: Array32, *, whitened: Whitened | None = None) -> Estimate:
+def combine_fits(fits: Sequence[Fits], chosen: NDArray[np.int64]) -> Estimate:
+    """Estimate the sum of the effects of each regressor on several series.
+
+    The columns are alternatives of the regressors, those of one regressor beside each other; ``chosen`` says which of them is reported.
+    """
+    shape = (chosen.size, -1)
+    evidence, mean, variance = (
+        np.sum(parts, axis=0).reshape(shape) for parts in zip(*(one.average() for one in fits), strict=True)
+    )
+    columns = np.arange(chosen.size) * evidence.shape[1] + chosen
+    parts = [one.take(columns) for one in fits]
+    coefficient = np.sum([one.best for one in parts], axis=0)
+    weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    square = (weight * (variance + (mean - coefficient[:, None]) ** 2)).sum(axis=1) / weight.sum(axis=1)
+    known = np.all([np.isfinite(one.score).any(axis=0) for one in parts], axis=0)
+    return Estimate(
+        coefficient, np.where(known, np.sqrt(square), np.inf), np.hypot.reduce([one.null_u for one in parts])
+    )
+
+
+#: Shares of a likelihood ratio that the first of two effects may take.
+_SPLITS = np.sin(np.linspace(0.0, np.pi / 2, 9)) ** 2
+
+
+def joint_limits(fits: Sequence[Fits], ratio: float) -> tuple[Array, Array]:
+    """Return the limits of an effect on one series, or of the sum of those on two, at a likelihood ratio; no looser than the test."""
+    if len(fits) == 1:
+        return fits[0].limits(ratio)
+    parts = [np.add(fits[0].limits(share * ratio), fits[1].limits((1.0 - share) * ratio)) for share in _SPLITS]
+    low, high = np.stack(parts, axis=1)
+    return low.min(axis=0), high.max(axis=0)
+
+
+def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
     """Estimate the coefficient of every regressor, with the drift variance profiled."""
-    columns = regressors.shape[1]
-    best = np.full(columns, np.inf)
-    coefficient = np.zeros(columns)
-    uncertainty = np.full(columns, np.inf)
-    null_u = np.full(columns, np.inf)
-    exact = (point.project.astype(np.float32) for point in bank.whitenings)
-    projects = exact if whitened is None else one_by_one(whitened.projects)
-    for g, (point, project) in enumerate(zip(bank.whitenings, projects, strict=True)):
-        unit, length = _unit_regressors(project, regressors)
-        series = bank.whitened[g]
-        product = (series.astype(np.float32) @ unit).astype(float)
-        rss = float(series @ series) - product**2
-        informative = length > 0
-        safe = np.where(informative, length, 1.0)
-        score = np.where(informative, np.log(np.maximum(rss, 1e-300)) + point.log_penalty, np.inf)
-        better = score < best
-        best = np.where(better, score, best)
-        coefficient = np.where(better, product / safe, coefficient)
-        spread = np.sqrt(np.maximum(rss, 0.0) / (bank.freedom - 1)) / safe
-        uncertainty = np.where(better, spread, uncertainty)
-        if g == bank.best:
-            null_u = np.where(informative, np.sqrt(float(series @ series) / bank.freedom) / safe, np.inf)
-    return Estimate(coefficient, uncertainty, null_u)
+    fits = fit_regressors(bank, regressors)
+    return combine_fits([fits], np.zeros(regressors.shape[1], np.int64))
+
+
+def fit_regressors(bank: NullBank, regressors: Array32) -> Fits:
+    """Fit every regressor at every grid point."""
+    shape = (len(bank.whitenings), regressors.shape[1])
+    products, lengths = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for g, (point, series) in enumerate(zip(bank.whitenings, bank.whitened, strict=True)):
+        unit, lengths[g] = _unit_regressors(point.project.astype(np.float32), regressors)
+        products[g] = series.astype(np.float32) @ unit
+    return Fits.of(bank, products, lengths)
 
 
 def tiles(columns: int, group: int) -> Sequence[slice]:
@@ -321,9 +431,10 @@ _POWER_80 = 0.8416
 #: Bins of the pooled null distribution of the statistic of one cell.
 _BINS = np.concatenate([np.arange(0.0, 40.0, 0.1), [np.inf]])
 
-#: Mean length of the blocks of whitened residuals that are permuted, as a share of the session. Switched loads leave traces of several
-#: cycles in the residuals; permuting single values gave twice the nominal rate of false alarms there.
-_RUN_SHARE = 0.1
+#: Mean length of the runs of whitened residuals that are permuted: a tenth of the session, and at least so many seconds, up to a quarter
+#: of it. A switched load leaves a trace in the residuals for as long as its heat spreads, however short the session is: permuting single
+#: values gave twice the nominal rate of false alarms, runs of 21 min in sessions of 3.5 h one and a half times.
+_RUN_SHARE, _RUN_S, _MOST_OF_SESSION = 0.1, 2520.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -340,8 +451,10 @@ class FamilyTest:
 
     The channel ``"joint"`` (common and proportional together) is last where both exist; its coefficients are at the far end of travel.
     Statistics are profile likelihood ratios at the best lag, p-values family-wise over everything tested, q-values false-discovery rates
-    within the channel, coefficients um/K, ``detectable`` those detected with 80 % power, ``threshold`` (channels,) the statistic at the
-    family-wise level. The false alarm rate is the share of fresh simulated series in which any column passed; NaN without such series.
+    within the channel, coefficients um/K. ``low`` and ``high`` limit them at their lag, for everything tested at once with 95 %: they hold
+    0 exactly where p is above the level (``"joint"``: at least there, as one end of travel may stay where the other moves).
+    ``detectable`` are found with 80 % power, ``threshold`` (channels,) is the statistic at the family-wise level. The false alarm rate is
+    the share of fresh simulated series in which any column passed; NaN without such series.
     """
 
     names: tuple[str, ...]
@@ -351,6 +464,8 @@ class FamilyTest:
     q_value: Array
     coefficient: Array
     coefficient_u: Array
+    low: Array
+    high: Array
     detectable: Array
     threshold: Array
     false_alarm_rate: float
@@ -451,6 +566,20 @@ class _Source:
     response: Array32
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """What a tile of temperatures shows in one channel.
+
+    The largest ratios over the lags (1 + simulated, cells), the lag of the measured series (cells,), the effect, and the fits at that lag,
+    of both series where two are tested together.
+    """
+
+    best: Array32
+    chosen: NDArray[np.int64]
+    effect: Estimate
+    fits: list[Fits]
+
+
 class _Tally:
     """Running results of one set over its tiles."""
 
@@ -461,9 +590,26 @@ class _Tally:
         self.pooled = np.zeros((channels, _BINS.size - 1))
         # Coefficient, its standard uncertainty, and its standard uncertainty under the fitted null model.
         self.effects = np.zeros((3, channels, columns))
+        self.fits: list[list[tuple[slice, list[Fits]]]] = [[] for _ in range(channels)]
 
     def finish(self, names: Sequence[str], p_value: Array, threshold: Array, false_alarm_rate: float) -> FamilyTest:
         """Result of the set, from its p-values (channels, columns) and thresholds (channels,)."""
+        low, high = np.zeros((2, *p_value.shape))
+        for channel, tiles_of in enumerate(self.fits):
+            for cells, parts in tiles_of:
+                low[channel, cells], high[channel, cells] = joint_limits(parts, threshold[channel])
+                if len(parts) == 1:
+                    # The drifts of the grid are few: between the limits of two of them may be a gap, in which 0 lies.
+                    passed, sign = (
+                        p_value[channel, cells] <= ATTRIBUTION_LEVEL,
+                        np.sign(self.effects[0, channel, cells]),
+                    )
+                    low[channel, cells] = np.where(
+                        passed & (sign > 0), np.maximum(low[channel, cells], 0.0), low[channel, cells]
+                    )
+                    high[channel, cells] = np.where(
+                        passed & (sign < 0), np.minimum(high[channel, cells], 0.0), high[channel, cells]
+                    )
         return FamilyTest(
             names=tuple(names),
             statistic=self.statistic,
@@ -472,16 +618,21 @@ class _Tally:
             q_value=np.stack([_false_discovery(*pair) for pair in zip(self.statistic, self.pooled, strict=True)]),
             coefficient=self.effects[0],
             coefficient_u=self.effects[1],
+            low=low,
+            high=high,
             detectable=(np.sqrt(threshold)[:, None] + _POWER_80) * self.effects[2],
             threshold=threshold,
             false_alarm_rate=false_alarm_rate,
         )
 
-    def add(self, channel: int, cells: slice, best: Array32, chosen: NDArray[np.int64], effects: Array) -> None:
-        """Enter what a tile of cells shows in one channel, see `_test_tile`."""
+    def add(self, channel: int, cells: slice, shown: _Shown) -> None:
+        """Enter what a tile of cells shows in one channel."""
+        best = shown.best
         self.statistic[channel, cells] = best[0]
-        self.lag_index[channel, cells] = chosen
-        self.effects[:, channel, cells] = effects
+        self.lag_index[channel, cells] = shown.chosen
+        effect = shown.effect
+        self.effects[:, channel, cells] = effect.coefficient, effect.coefficient_u, effect.null_u
+        self.fits[channel].append((cells, shown.fits))
         if best.shape[0] > 1:
             self.maxima[channel] = np.maximum(self.maxima[channel], best[1:].max(axis=1))
             bins = np.minimum((best[1:] / _BINS[1]).astype(np.int64), _BINS.size - 2)
@@ -496,24 +647,18 @@ def _test_field(sources: Sequence[_Source], field: FieldSeries, lags: int, tally
     tested = side_by_side(lambda cells: _test_tile(sources, values[:, cells], lags, joint), places)
     for cells, channels in zip(places, tested, strict=True):
         for channel, shown in enumerate(channels):
-            tally.add(channel, cells, *shown)
+            tally.add(channel, cells, shown)
         yield cells
 
 
-def _test_tile(
-    sources: Sequence[_Source], field: Array32, lags: int, joint: bool
-) -> list[tuple[Array32, NDArray[np.int64], Array]]:
-    """Test a tile of temperatures (frames, cells) against every series, and against the first two together where asked for.
-
-    Of each series: the largest ratios over the lags (1 + simulated, cells), the lag of the measured series (cells,), and at that lag the
-    coefficient, its uncertainty, and that under the fitted null model (3, cells).
-    """
+def _test_tile(sources: Sequence[_Source], field: Array32, lags: int, joint: bool) -> list[_Shown]:
+    """Test a tile of temperatures (frames, cells) against every series, and against the first two together where asked for."""
     count = field.shape[1]
-    regressors = [_respond_tile(source.response, field) for source in sources]
-    ratios = [
-        likelihood_ratios(source.whitened, columns).reshape(-1, count, lags)
-        for source, columns in zip(sources, regressors, strict=True)
-    ]
+    ratios, fits = [], []
+    for source in sources:
+        best, products, lengths = _test_regressors(source.whitened, _respond_tile(source.response, field))
+        ratios.append(best.reshape(-1, count, lags))
+        fits.append(Fits.of(source.bank, products, lengths))
     summed = [[k] for k in range(len(sources))]
     if joint:
         ratios.append(ratios[0] + ratios[1])
@@ -523,17 +668,11 @@ def _test_tile(
     for ratio, together in zip(ratios, summed, strict=True):
         chosen = ratio[0].argmax(axis=1)
         columns = np.arange(count) * lags + chosen
-        parts = np.stack([_estimate(sources[k], regressors[k][:, columns]) for k in together])
-        effects = np.stack([parts[:, 0].sum(axis=0), *np.hypot.reduce(parts[:, 1:])])
+        parts = [fits[k] for k in together]
         # Lag after lag: over an axis as short as that of the lags `max` takes six times as long.
-        channels.append((reduce(np.maximum, ratio.transpose(2, 0, 1)), chosen, effects))
+        best = reduce(np.maximum, ratio.transpose(2, 0, 1))
+        channels.append(_Shown(best, chosen, combine_fits(parts, chosen), [one.take(columns) for one in parts]))
     return channels
-
-
-def _estimate(source: _Source, regressors: Array32) -> Array:
-    """Coefficients of regressors (n, columns), their uncertainties, and those under the fitted null model, (3, columns)."""
-    estimate = estimate_effects(source.bank, regressors, whitened=source.whitened)
-    return np.stack([estimate.coefficient, estimate.coefficient_u, estimate.null_u])
 
 
 def _draw(
@@ -541,7 +680,9 @@ def _draw(
 ) -> list[Array]:
     """The measured series, `draws` simulated with its permuted residuals, and `checks` with Gaussian ones, stacked."""
     longest = max(channel.values.size for channel in series)
-    orders = np.stack([_shuffle_blocks(longest, rng) for _ in range(draws)])
+    duration_s = max(float(np.ptp(channel.seconds)) for channel in series)
+    share = min(max(_RUN_SHARE, _RUN_S / duration_s), _MOST_OF_SESSION)
+    orders = np.stack([_shuffle_blocks(longest, share, rng) for _ in range(draws)])
     stacks = []
     for channel, bank in zip(series, banks, strict=True):
         n = channel.values.size
@@ -553,9 +694,9 @@ def _draw(
     return stacks
 
 
-def _shuffle_blocks(length: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """A permutation of 0..length-1 in blocks, so that the effect of one event on its neighbours stays with it."""
-    cuts = np.flatnonzero(rng.random(length) < 1.0 / (_RUN_SHARE * length))
+def _shuffle_blocks(length: int, share: float, rng: np.random.Generator) -> NDArray[np.int64]:
+    """A permutation of 0..length-1 in blocks of a mean share of it, so that the effect of one event on its neighbours stays with it."""
+    cuts = np.flatnonzero(rng.random(length) < 1.0 / (share * length))
     turned = np.roll(np.arange(length), int(rng.integers(length)))
     blocks = np.split(turned, cuts[cuts > 0])
     return np.concatenate([blocks[k] for k in rng.permutation(len(blocks))])
@@ -569,7 +710,6 @@ def _respond_tile(response: Array32, cells: Array32) -> Array32:
 
 def _family_wise(statistics: Sequence[Array], maxima: Array, ease: Array) -> tuple[list[Array], Array]:
     """Family-wise p-value of every row of statistics, and thresholds (rows,), from the maxima (rows, draws) of the simulated series."""
-    draws = maxima.shape[1]
     measured = np.array([values.max() for values in statistics])
     middle, upper = np.quantile(np.column_stack([measured, maxima]), [0.5, 0.95], axis=1)
     unit = np.maximum(upper - middle, 1e-9)
@@ -577,9 +717,12 @@ def _family_wise(statistics: Sequence[Array], maxima: Array, ease: Array) -> tup
     largest = np.sort(((maxima - middle[:, None]) / unit[:, None]).max(axis=0))
     scaled = zip(statistics, middle, unit, strict=True)
     p_values = [monte_carlo_p((values - centre) / step, largest) for values, centre, step in scaled]
-    # What passes exceeds all but the share ATTRIBUTION_LEVEL of the simulated series.
-    limit = largest[draws - max(int(np.floor(ATTRIBUTION_LEVEL * (draws + 1))), 1)]
-    return p_values, middle + limit * unit
+    return p_values, middle + _limit(largest) * unit
+
+
+def _limit(largest: Array) -> float:
+    """What passes exceeds all but the share ATTRIBUTION_LEVEL of the simulated series, whose largest statistics (draws,) are in order."""
+    return float(largest[largest.size - max(int(np.floor(ATTRIBUTION_LEVEL * (largest.size + 1))), 1)])
 
 
 def _false_discovery(statistic: Array, counts: Array) -> Array:
@@ -608,13 +751,15 @@ _MOST_EXPLAINED = 1.0 - 1e-6
 class Screening:
     """Result of the screening over series and columns: likelihood ratios at the best lag, sensitivities (um/K) there, family-wise p-values.
 
-    ``maxima`` (permutations, series) are the largest statistics; the p-values are NaN without permutations.
+    ``half_width`` of the intervals that hold for all series and columns at once with 95 %: p is at most the level exactly where a
+    sensitivity is larger. ``maxima`` (permutations, series) are the largest statistics; without permutations p and interval are NaN.
     """
 
     statistic: Array32
     lag_index: NDArray[np.int8]
     sensitivity: Array32
     sensitivity_u: Array32
+    half_width: Array32
     maxima: Array
     p_value: Array32
 
@@ -748,13 +893,15 @@ class _Result:
             size[group.rows] = group.size
             shares[:, group.rows] = group.maxima.reshape(group.rows.size, permutations).T
         maxima = _target_log_ratio(np.minimum(shares, _MOST_EXPLAINED), self.freedom[None, :])
-        p_value = np.full(statistic.shape, np.nan, np.float32)
+        p_value, threshold = np.full(statistic.shape, np.nan, np.float32), np.nan
         if permutations:
-            p_value = monte_carlo_p(statistic, maxima.max(axis=1)).astype(np.float32)
-        spread = np.sqrt((1.0 - share) * self.weight / (self.freedom - 1)[:, None]) * size[:, None]
-        return Screening(
-            statistic.astype(np.float32), self.lag, self.coefficient, spread.astype(np.float32), maxima, p_value
-        )
+            largest = np.sort(maxima.max(axis=1))
+            p_value, threshold = monte_carlo_p(statistic, largest).astype(np.float32), _limit(largest)
+        spread = np.sqrt((1.0 - share) * self.weight) * size[:, None]
+        u = spread / np.sqrt(self.freedom - 1)[:, None]
+        half = spread * np.sqrt(np.expm1(threshold / self.freedom))[:, None]
+        found = (self.coefficient, u.astype(np.float32), half.astype(np.float32))
+        return Screening(statistic.astype(np.float32), self.lag, *found, maxima, p_value)
 
 
 def _target_log_ratio(share: Array | Array32, freedom: NDArray[np.int64]) -> Array:

@@ -169,12 +169,12 @@ def _label_places(clusters: xr.Dataset, count: int) -> list[tuple[int, float, fl
 
 
 def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray) -> Chart:
-    """Draw the sensitivity of every target and direction to one region, each tested singly, with 95 % interval; filled where p <= 0.05."""
+    """Draw the sensitivity of every target and direction to one region, tested singly, with 95 % interval for all; filled: p <= 0.05."""
     chosen = targets.sel(region=region)
     step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
     drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region), zero=True)
     place = position.sel(target=chosen["series_target"].values).values.astype(float)
-    value, half = chosen["sensitivity"].values, 2 * chosen["sensitivity_u"].values
+    value, half = chosen["sensitivity"].values, chosen["sensitivity_half_width"].values
     side, passed = chosen["series_direction"].values, chosen["p_value"].values <= ATTRIBUTION_LEVEL
     for shift, direction in ((-0.1, "positive"), (0.1, "negative")):
         for rows, words in ((passed, "p ≤ 0.05"), (~passed, "p > 0.05")):

@@ -254,13 +254,24 @@ def test_a_last_value_outside_its_limits_leads_the_document(tmp_path):
 
 
 AGREED = SourceAgreement(
-    "joint", 330.0, 90.0, (0, 1), (0.004, 0.004), (4.04, 5.75), (0.5, 0.6), (0.0, 0.0), True, False
+    "joint",
+    330.0,
+    90.0,
+    (0, 1),
+    (0.004, 0.004),
+    (4.04, 5.75),
+    (0.5, 0.6),
+    ((1.9, 6.2), (3.1, 8.4)),
+    (0.0, 0.0),
+    True,
+    False,
 )
 ALONE = replace(
     replace(AGREED, x_mm=405.0, y_mm=95.0, shown_by=(0,), agrees=False, power=0.97, agreed_near_mm=(330.0, 90.0, 75.2)),
     p_value=(0.002, 0.006),
     sensitivity_um_per_K=(3.76, 7.8),
     sensitivity_u_um_per_K=(0.08, 0.85),
+    sensitivity_interval_um_per_K=((3.4, 4.1), (-1.2, 16.8)),
     lag_s=(0.0, 600.0),
     separate=True,
 )
@@ -294,7 +305,7 @@ def test_what_one_test_shows_alone_has_the_chance_of_the_other(pairs):
     missed = replace(ALONE, p_value=(0.002, 0.6), agreed_near_mm=None, shown_by=(0,), power=0.31)
     _, ((*_, shown, verdict),) = described(pairs, missed)
     assert verdict.startswith(f"shown by the test {FOUND} only; ") and verdict.endswith("a probability of 31 %")
-    assert shown == "p 0.6, 7.8 ± 1.7 µm/K, lag 10 min"
+    assert shown == "p 0.6, 7.8 [−1.2 to 16.8] µm/K, lag 10 min"
 
 
 def test_a_place_that_both_tests_show_repeats(pairs):

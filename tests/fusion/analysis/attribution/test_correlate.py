@@ -65,8 +65,9 @@ def test_the_map_says_what_it_could_have_found(null_maps):
     # The drift that was put in: unit random walks of 100 steps scaled to 3 um rms; a walk's rms fixes its hourly size to a factor of 2-3.
     common = null_maps.to_dataset().sel(channel="common")
     assert 0.4 < float(common["unexplained_drift"]) < 8.0
-    detectable = common["detectable_sensitivity"].values
-    assert (detectable[np.isfinite(detectable)] > 3 * common["sensitivity_u"].values.min()).all()
+    # Found four times of five is more than what can just be told from nothing.
+    half = (common["sensitivity_high"] - common["sensitivity_low"]) / 2.0
+    assert float(common["detectable_sensitivity"].median()) > float(half.median()) > 0.0
 
 
 def test_one_warm_up_is_not_separable_whatever_the_drift(rng):

@@ -117,14 +117,18 @@ def test_the_logged_state_is_held_on_an_even_grid_to_the_end_of_the_log():
     assert courses[:, 0].tolist() == [0.0] * 7 + [1.0] * 6 + [0.0] * 3
 
 
-def test_effects_of_common_and_stretch_add_up_at_the_far_end_and_their_uncertainties_in_square(monkeypatch):
-    answers = iter(
-        SimpleNamespace(coefficient=np.array([value]), coefficient_u=np.array([u]))
-        for value, u in ((2.0, 0.3), (-0.5, 0.4))
-    )
-    monkeypatch.setattr(module, "estimate_effects", lambda bank, columns: next(answers))
-    size, u = module._effects([SimpleNamespace(sampling=np.eye(3))] * 2, [None, None], np.ones((3, 1)))
-    assert (size[0], u[0]) == (1.5, pytest.approx(0.5))
+def test_effects_of_common_and_stretch_add_up_at_the_far_end_and_their_uncertainties_in_square(rng):
+    seconds, columns = 300.0 * np.arange(40), rng.standard_normal((40, 2, 1))
+    series, banks = [], []
+    for size in (2.0, -0.5):
+        values = size * columns[:, 0, 0] + 0.1 * rng.standard_normal(40)
+        banks.append(module.null_bank(values, seconds, np.ones(40), module.level_and_trend(seconds), integrated=False))
+        series.append(SimpleNamespace(sampling=np.eye(40)))
+    alone = [module._effect([one], [bank], columns, np.zeros(2, int)) for one, bank in zip(series, banks, strict=True)]
+    both = module._effect(series, banks, columns, np.zeros(2, int))
+    assert both.coefficient[0] == pytest.approx(1.5, abs=0.2)
+    np.testing.assert_allclose(both.coefficient, alone[0].coefficient + alone[1].coefficient)
+    np.testing.assert_allclose(both.coefficient_u, np.hypot(alone[0].coefficient_u, alone[1].coefficient_u), rtol=0.05)
 
 
 def test_a_dwell_is_counted_from_change_to_change_within_two_steps_of_the_log():

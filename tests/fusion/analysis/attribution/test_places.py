@@ -156,11 +156,13 @@ def session_by_hand(mode_statistic=30.0):
         "p_value": (dims, 0.25 * statistic[None]),
         "sensitivity": (dims, 0.05 * statistic[None]),
         "sensitivity_u": (dims, 0.1 * statistic[None]),
+        "sensitivity_low": (dims, -0.2 * statistic[None]),
+        "sensitivity_high": (dims, 0.3 * statistic[None]),
         "lag": (dims, 300.0 * statistic[None]),
         "threshold": ("channel", [10.0]),
     }
     of_mode = {"statistic": mode_statistic, "p_value": 0.01, "sensitivity": 3.0, "sensitivity_u": 0.4}
-    of_mode |= {"lag": 1200.0, "threshold": 20.0}
+    of_mode |= {"sensitivity_low": 1.8, "sensitivity_high": 4.2, "lag": 1200.0, "threshold": 20.0}
     modes = {name: (("channel", "mode"), [[value]]) for name, value in of_mode.items()}
     places = {"at_x": ("mode", [26.0]), "at_y": ("mode", [14.0])}
     plan = xr.Dataset(cells, {"channel": ["joint"], "y": [5.0, 15.0, 25.0], "x": [5.0, 15.0, 25.0, 35.0]})
@@ -170,8 +172,10 @@ def session_by_hand(mode_statistic=30.0):
 def test_the_candidate_of_a_cell_is_itself_or_the_mode_that_has_its_peak_there():
     found = module._candidates(session_by_hand(), "joint")
     assert found["statistic"].tolist() == [[-0.1, 0.2, 0.2, 0.2], [0.2, 0.2, 1.5, 0.2], [0.2, 0.2, 0.2, 0.2]]
-    of_mode = [float(found[name][1, 2]) for name in ("p_value", "sensitivity", "sensitivity_u", "lag")]
-    assert of_mode == [0.01, 3.0, 0.4, 1200.0]
+    of_mode = [
+        float(found[name][1, 2]) for name in ("p_value", "sensitivity", "sensitivity_low", "sensitivity_high", "lag")
+    ]
+    assert of_mode == [0.01, 3.0, 1.8, 4.2, 1200.0]
     assert (found["p_value"][0, 0], found["sensitivity"][0, 0], found["sensitivity_u"][0, 0]) == (1.0, 0.0, np.inf)
     assert (found["x"][1, 2], found["y"][1, 2]) == (25.0, 15.0)
     # A mode below its threshold by more than the cell is leaves the cell as it is.
@@ -215,7 +219,7 @@ def test_a_candidate_is_seen_from_every_cell_within_reach_and_from_no_other():
     statistic[3, 4] = 5.0
     statistic[0, 0] = 1.0
     row, column = np.mgrid[:7, :8]
-    blank = {name: np.zeros((7, 8)) for name in ("p_value", "sensitivity", "sensitivity_u", "lag")}
+    blank = {name: np.zeros((7, 8)) for name in module._BLANK if name != "statistic"}
     found = module._strongest_nearby({"statistic": statistic, "x": column, "y": row, **blank}, reach)
     near = np.hypot(row - 3, column - 4) <= reach
     assert ((found["statistic"] == 5.0) == near).all()
