@@ -11,6 +11,7 @@ from fusion.campaign.config import Campaign, CampaignError
 from fusion.campaign.recompensation import StatedBudget
 from fusion.common import FusionError
 from fusion.pipeline.iso230 import complete_sheet, evaluate_standard, read_test
+from fusion.report.wording import say
 from fusion.results.axis import Iso230Part
 from fusion.results.numbers import moment
 from fusion.results.parts import decide
@@ -213,6 +214,8 @@ def test_windows_that_decide_otherwise_are_counted():
     }  # fmt: skip
     # Equal spacings.
     assert part.is_acceptance_test is False
+    told = say("decision", part)
+    assert "µm. 1 of 3 windows differ." in told and say("judged", part.tolerances[1], part) == "pass, 1 of 3 windows otherwise"
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
