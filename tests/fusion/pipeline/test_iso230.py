@@ -215,7 +215,10 @@ def test_windows_that_decide_otherwise_are_counted():
     # Equal spacings.
     assert part.is_acceptance_test is False
     told = say("decision", part)
-    assert "µm. 1 of 3 windows differ." in told and say("judged", part.tolerances[1], part) == "pass, 1 of 3 windows otherwise"
+    assert (
+        "µm. 1 of 3 windows differ." in told
+        and say("judged", part.tolerances[1], part) == "pass, 1 of 3 windows otherwise"
+    )
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
