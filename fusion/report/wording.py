@@ -337,8 +337,8 @@ def environment(*, html: bool) -> jinja2.Environment:
         "numeric": lambda title: not isinstance(title, Words),
     }
     found = (
-        alike, baseline_words, beaten_by_repetition, better_plain, drift_extremes, figures_of, figures_of_anomalies, quoted_term,
-        quoted_values, randomised_causes, untouched, worse_channels,
+        alike, baseline_words, beaten_by_repetition, better_plain, drift_extremes, extrapolates, figures_of, figures_of_anomalies,
+        quoted_term, quoted_values, randomised_causes, untouched, worse_channels,
     )  # fmt: skip
     made.globals |= {"say": say, **{function.__name__: function for function in found}}
     return made
@@ -483,6 +483,15 @@ def beaten_by_repetition(loop: Loop) -> str:
     if plain is None or declared is None or final is None:
         return ""
     return "model" if plain < final else "declared" if plain < declared else ""
+
+
+#: Error of the declared model over that of the last value from which on it is no reference for what was added.
+_EXTRAPOLATED = 2.0
+
+
+def extrapolates(loop: Loop) -> bool:
+    """Return whether the declared model misses the hold-out set by a multiple of what repeating the last value misses it by."""
+    return (loop.rmse_declared_um or 0.0) > _EXTRAPOLATED * (loop.rmse_persistence_um or float("inf"))
 
 
 class PlainPrediction(NamedTuple):

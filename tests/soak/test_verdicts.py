@@ -13,10 +13,11 @@ import pytest
 
 from fusion.analysis.alignment.align import AxisGeometry, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.drift_model.axis import AxisResult, declare, drift_of, shown_by_one_warm_up
+from fusion.analysis.drift_model.axis import AxisProblem, AxisResult, declare, drift_of, hold_out, shown_by_one_warm_up
 from fusion.analysis.drift_model.closed_loop import close_loop
 from fusion.analysis.drift_model.evaluation import shares_of_drift
 from fusion.analysis.drift_model.model import fit_model
+from fusion.analysis.drift_model.predictions import plain_errors, rmse
 from fusion.analysis.effects.library import library
 from tests.soak.rates import campaigns, first_seed, rate
 from tests.soak.simulator import DIRECTION, ORIGIN_MM, Array, Campaign, Machine, measure
@@ -120,3 +121,39 @@ def test_no_verdict_is_stated_without_the_condition_that_it_rests_on(
     with capsys.disabled():
         told = ", ".join(f"{word} {verdicts.count(word)}" for word in dict.fromkeys(verdicts))
         print(f"\n{name}: {told}; shift per kelvin within 2 u in {rate(inside, len(verdicts))}")
+
+
+def integrated_walk(rng: np.random.Generator, seconds: Array) -> Array:
+    """A smooth drift of 2 um rms that goes on at its rate for a while."""
+    order = np.argsort(seconds, axis=None)
+    course = np.cumsum(np.cumsum(rng.standard_normal(order.size)))
+    drift = np.empty(order.size)
+    drift[order] = 2.0 * course / course.std()
+    return drift.reshape(seconds.shape)
+
+
+#: Drifts that are smooth.
+SMOOTH = {"restless rhythm": restless_rhythm, "integrated walk": integrated_walk}
+
+
+@pytest.mark.parametrize("name", list(SMOOTH))
+def test_a_smooth_drift_is_carried_on_as_it_predicts_best(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    case, effects = Case("switched", SMOOTH[name], alone=False, share_error=np.inf), library()
+    errors = []
+    for run in range(RUNS):
+        _, _, readings = measured(case, [FIRST_SEED, 200 + list(SMOOTH).index(name), run])
+        used, _ = hold_out(readings)
+        problem = AxisProblem(readings, used, effects, np.random.default_rng(1))
+        terms = declare(readings, DECLARED, effects)
+        ways = [fit_model(readings, terms, used=used, order=order) for order in (2, 1)]
+        missed = [rmse(model.open_loop_errors()[0]) for model in (*ways, problem.forecast(terms))]
+        errors.append([*missed, rmse(plain_errors(readings, used)["last_value"][~used])])
+    rate_um, level_um, chosen_um, last_um = np.sqrt(np.mean(np.square(errors), axis=0))
+    worst = np.max(errors, axis=0)
+    with capsys.disabled():
+        print(
+            f"\n{name}, {RUNS} campaigns: error at its rate {rate_um:.2f} um (largest {worst[0]:.1f}), at its level {level_um:.2f} "
+            f"({worst[1]:.1f}), as chosen {chosen_um:.2f} ({worst[2]:.1f}), last value {last_um:.2f} ({worst[3]:.1f})"
+        )
+    # The choice is made before, from two quarters of the training cycles: it need not always be right.
+    assert chosen_um < 1.1 * min(rate_um, level_um) and chosen_um < last_um

@@ -272,6 +272,7 @@ def close_axis(
     steps = report_steps(state, wrong, problem.ask_hold_out(before, state))
     away = left_out_of_forecast(problem, before, unsupported_places(steps))
     forecast = before.kept(away)
+    ahead = problem.forecast(forecast)
     plain = plain_errors(readings, used)
     errors = {
         "declared": problem.hold_out_errors(terms),
@@ -281,7 +282,7 @@ def close_axis(
     late = any(step.is_from_second_search for step in state.steps)
     result = AxisResult(
         state=state,
-        held_out=description,
+        held_out=f"{description}, drift carried on at its {'level' if ahead.fit.system.order == 1 else 'rate'}",
         noise_floor_um=state.model.fit.sigma,
         hold_out_errors=errors,
         hold_out=error_intervals(errors, readings.cycle[~used], seed=seed),
@@ -329,6 +330,16 @@ class AxisProblem(Problem[ModelFit]):
         self._fits.append(fit_model(self.readings, terms, used=self.used))
         return self._fits[-1]
 
+    def forecast(self, terms: Sequence[Term]) -> ModelFit:
+        """The model by which the hold-out set is predicted: the drift is carried on at its level alone where that predicts the later half of
+        the training part better.
+        """
+        model = self.fitted(terms)
+        if model.fit.system.order == 1:
+            return model
+        level = fit_model(self.readings, terms, used=self.used, order=1)
+        return min((model, level), key=lambda one: rmse(errors_ahead(one)))
+
     def refit(self, model: ModelFit, terms: Sequence[Term]) -> ModelFit:
         """Fit other terms to the readings that a model was fitted to."""
         if model.used is self.used:
@@ -368,7 +379,7 @@ class AxisProblem(Problem[ModelFit]):
     def hold_out_errors(self, terms: Sequence[Term]) -> Array:
         """Open-loop errors on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
         if not any(self.is_late(term) for term in terms):
-            return self.fitted(terms).open_loop_errors()[0]
+            return self.forecast(terms).open_loop_errors()[0]
         half = self.readings.target_index % 2 == 0
         errors = np.full(self.used.size, np.nan)
         for fitted in (half, ~half):
@@ -455,7 +466,7 @@ def hold_out(readings: Readings) -> tuple[NDArray[np.bool_], str]:
     first = numbers[-max(2, round(HOLD_OUT_SHARE * numbers.size))]
     return (
         readings.cycle < first,
-        f"cycles {first} to {numbers[-1]} held out; coefficients frozen at cycle {first - 1}, drift state carried in open loop",
+        f"cycles {first} to {numbers[-1]} held out; coefficients frozen at cycle {first - 1}",
     )
 
 
@@ -739,6 +750,8 @@ def _cycle_of(frame_time: Array, fused: xr.Dataset) -> Array:
 #: Blocks of cycles, each as long as the hold-out set; all but the first are left out in turn. The first alone knows in which state the
 #: machine was when the log began, so that nothing predicts it.
 _BLOCKS = 5
+#: Parts of the training cycles that are as long as the hold-out set.
+_QUARTERS = 4
 
 
 def cross_errors(model: ModelFit, event_s: float | None = None) -> Array:
@@ -755,6 +768,15 @@ def cross_errors(model: ModelFit, event_s: float | None = None) -> Array:
     for block in blocks:
         errors[block] = _left_out(model, block)
     return errors
+
+
+def errors_ahead(model: ModelFit) -> Array:
+    """Errors of predicting quarters of the later half of the cycles, each as long as the hold-out set, from the cycles before."""
+    cycle = model.readings.cycle[model.used]
+    numbers = np.unique(cycle)
+    quarter = np.searchsorted(numbers, cycle) * _QUARTERS // numbers.size
+    later = range(_QUARTERS // 2, _QUARTERS)
+    return np.concatenate([_left_out(model, quarter >= one)[quarter[quarter >= one] == one] for one in later])
 
 
 def _around(model: ModelFit, event_s: float) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from interferometry.drift.gls import (
     fit_fixed_effects,
     memory_of_each,
 )
-from interferometry.drift.kalman import DriftModelError, DriftSystem
+from interferometry.drift.kalman import DriftModelError, DriftSystem, Order
 
 # How much drift there may be: the grids of drift variances over which a likelihood is maximised or drawn from.
 
@@ -205,14 +205,18 @@ class ModelFit:
         return missed[~self.used], np.sqrt(self.fit.sigma**2 * spread + own)[~self.used]
 
 
-def fit_model(readings: Readings, terms: Sequence[Term], *, used: NDArray[np.bool_] | None = None) -> ModelFit:
-    """Fit static profile, terms and drift by restricted maximum likelihood and generalised least squares."""
+def fit_model(
+    readings: Readings, terms: Sequence[Term], *, used: NDArray[np.bool_] | None = None, order: Order | None = None
+) -> ModelFit:
+    """Fit static profile, terms and drift by restricted maximum likelihood and generalised least squares; the order of the drift is that
+    of the larger likelihood where none is given.
+    """
     used = np.ones(readings.seconds.size, bool) if used is None else used
     profile = readings.profile
     profile = profile[:, _determined(profile[used])]
     design = np.column_stack([profile, *(term.candidate.columns for term in terms)])[used]
     seconds, loadings, response = readings.seconds[used], readings.loadings[used], readings.response[used]
-    first = estimate(seconds, loadings, response, design, robust=True)
+    first = estimate(seconds, loadings, response, design, order=order, robust=True)
     of_used = readings.subset(used)
     variance = _site_variance(of_used, first) * _growth(of_used, first) * first.system.variance
     fit = estimate(

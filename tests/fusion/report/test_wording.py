@@ -346,6 +346,15 @@ def test_nothing_has_to_be_done_with_what_was_measured():
             ["does not fall (0.73 µm before, 0.74 µm after)", "gives 0.41 µm (less than the model"],
         ),
         ({"rmse_persistence_um": 1.0}, ["gives 1.00 µm (less than the declared model alone)"]),
+        (
+            {"rmse_persistence_um": 0.9},
+            [
+                "cycles 49 to 60 is 0.66 µm;",
+                "is no reference",
+                "misses by 1.94 µm",
+                "the last cycle repeated, 0.90 µm.",
+            ],
+        ),
         ({"steps": ()}, ["measured before: 1.94 µm; repeating the last cycle gives 2.50 µm,"]),
     ],
 )

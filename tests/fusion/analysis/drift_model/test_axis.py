@@ -39,6 +39,21 @@ from fusion.analysis.effects.library import library
 from tests.fusion.small_campaign import campaign, model_of, term
 
 
+@pytest.mark.parametrize(("course", "order"), [("straight", 2), ("rhythm", 1)])
+def test_a_drift_is_carried_on_at_its_rate_only_where_that_predicts_better_before(rng, course, order):
+    """Both are smooth; only the straight one goes on as it did."""
+    readings = campaign(cycles=40)
+    hours = readings.seconds / 3600.0
+    drift = 20.0 * hours if course == "straight" else 2.0 * np.sin(2.0 * np.pi * hours / 0.45)
+    readings = replace(readings, response=drift + 0.1 * rng.standard_normal(hours.size))
+    used, _ = axis.hold_out(readings)
+    problem = AxisProblem(readings, used, {}, rng)
+    smooth = fit_model(readings, [], used=used, order=2)
+    problem._fits.append(smooth)
+    assert problem.fitted([]) is smooth
+    assert problem.forecast([]).fit.system.order == order
+
+
 @pytest.mark.parametrize(("cycles", "first"), [(10, 9), (12, 11), (13, 11), (50, 41)])
 def test_the_last_fifth_of_the_cycles_is_held_out_but_two_at_least(cycles, first):
     readings = campaign(cycles=cycles)
