@@ -153,9 +153,9 @@ class StepPart(ResultPart):
         """Whether readings that it was not fitted to bear it out, or do not contradict it and are predicted better with it; otherwise it
         stands in no headline and in no forecast.
         """
-        if self.borne_out is None or self.confirmed:
+        if self.borne_out is None:
             return self.confirmed
-        return self.borne_out == "cannot tell" and self.lowers_error
+        return self.borne_out == "yes" or (self.borne_out == "cannot tell" and self.lowers_error)
 
 
 class AxisStep(StepPart):

@@ -331,8 +331,8 @@ class AxisProblem(Problem[ModelFit]):
         return self._fits[-1]
 
     def forecast(self, terms: Sequence[Term]) -> ModelFit:
-        """The model by which the hold-out set is predicted: the drift is carried on at its level alone where that predicts the later half of
-        the training part better.
+        """The model by which the hold-out set is predicted: the drift is carried on at its level alone where that predicts the later half
+        of the training part better.
         """
         model = self.fitted(terms)
         if model.fit.system.order == 1:
