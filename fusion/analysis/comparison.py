@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -32,6 +32,11 @@ LEAST_POSITIONS = 5
 _LEAST_SHARE = 1e-6
 #: Most shapes by which a changed profile is described where steps and blocks are among them: with more they imitate any profile.
 _MOST_WITH_RUNS = 2
+#: Variance of a shape that the drift of a test tells, over that of least squares on a known course: successive cycles, whose first mode it
+#: is, give 1.2 to 1.8 times that in a warm-up of 30 cycles, the more the longer the memory that was taken out (none to 0.6).
+_SHAPE_VARIANCE = 1.8
+#: Rounds in which the sizes of shapes and the covariance that these give settle.
+_SIZINGS = 4
 #: Shapes that the thermal state of a test may take, by drift component.
 _STATE = {"shift": "offset", "stretch": "slope", "bend": "bow"}
 
@@ -50,6 +55,8 @@ class ProfileChange:
         family-wise level, the strongest first: single positions (of both approaches together, or their reversal), steps and blocks; last
         the rest of the profile, with its largest value and the p-value of all of it
     tests : how many tests were made
+    untold : position (mm) and size (um) of the largest difference beyond the shapes of a thermal state, where it exceeds the noise but not
+        the uncertainty of these shapes: a changed machine is not told from another thermal state; None elsewhere
     """
 
     position_mm: Array
@@ -58,28 +65,50 @@ class ProfileChange:
     remaining_u_um: Array
     shapes: tuple[Change, ...]
     tests: int
+    untold: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """A shape over the cells (direction, target) of both tests; `until_mm` and `machine` as in `Change`."""
+    """A shape over the cells (direction, target) of both tests; `until_mm` and `machine` as in `Change`.
+
+    `variance` is the covariance of a column (1) that the drift of a test tells; None where it is exact.
+    """
 
     name: str
     position_mm: float | None
     column: Array
     machine: bool
     until_mm: float | None = None
+    variance: Array | None = None
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """Differences of the cells that both tests hold: their places, values (um), a root of their covariance, and degrees of freedom."""
+    """Differences of the cells that both tests hold: their places, values (um), covariances that add up (um2), those of the tests first,
+    and degrees of freedom.
+    """
 
     position_mm: Array
     sign: Array
     value: Array
-    root: Array
+    covariances: tuple[Array, ...]
     freedom: float
+
+    @cached_property
+    def root(self) -> Array:
+        """A root of their covariance."""
+        return np.asarray(np.linalg.cholesky(np.sum(self.covariances, axis=0)), float)
+
+    def beside(self, shapes: Sequence[_Shape]) -> _Difference:
+        """Return the same with what the uncertainty of the shapes adds at the sizes that suit the values best."""
+        wider = self
+        for _ in range(_SIZINGS if any(shape.variance is not None for shape in shapes) else 0):
+            sizes, _ = wider.fit(shapes)
+            pairs = zip(sizes, shapes, strict=True)
+            own = [size**2 * shape.variance for size, shape in pairs if shape.variance is not None]
+            wider = replace(self, covariances=(*self.covariances, *own))
+        return wider
 
     def fit(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
         """Return the sizes of shapes and their covariance (um2), by generalised least squares, widened by Birge's ratio."""
@@ -135,12 +164,20 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     candidates += _single_positions(difference, positions)
     steps, blocks = _steps(difference, positions), _blocks(difference, positions)
     made = len(candidates) + len(steps) + 1
-    search = partial(_search, difference, state, most=positions.size // 2, level=level, tests=tests + made)
-    found = search([*candidates, *steps], blocks)
+    search = partial(_search, difference, most=positions.size // 2, level=level, tests=tests + made)
+    found = search(state, [*candidates, *steps], blocks)
+    exact = [replace(shape, variance=None) for shape in state]
+    untold = None
+    if not found and search(exact, [*candidates, *steps], blocks):
+        beyond, _ = _remaining(difference, exact, positions)
+        place = int(np.argmax(np.abs(beyond)))
+        untold = float(positions[place]), float(abs(beyond[place]))
     several = any(shape in [*steps, *blocks] for shape in found)
-    if several and (len(found) > _MOST_WITH_RUNS or difference.remainder_p([*state, *found]) * (tests + made) <= level):
-        found = search(candidates, ())
+    left_p = difference.beside([*state, *found]).remainder_p([*state, *found])
+    if several and (len(found) > _MOST_WITH_RUNS or left_p * (tests + made) <= level):
+        found = search(state, candidates, ())
     reported = [*state, *([reversal] if judged and reversal not in found else []), *found]
+    difference = difference.beside(reported)
     size, covariance = difference.fit(reported)
     u = np.sqrt(np.diag(covariance))
     shapes = [
@@ -159,7 +196,7 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
         Change("rest of the profile" if found else "profile", "profile", at, "um", None, None, largest, p_rest, True)
     )
     remaining, remaining_u = _remaining(difference, state, positions)
-    return ProfileChange(positions, left_out, remaining, remaining_u, tuple(shapes), made)
+    return ProfileChange(positions, left_out, remaining, remaining_u, tuple(shapes), made, untold)
 
 
 def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Difference, int]:
@@ -176,16 +213,14 @@ def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Differe
     present = np.isfinite(one["profile"].values) & np.isfinite(other["profile"].values)
     if present.sum() < LEAST_POSITIONS:
         raise ComparisonError("no direction of approach was measured in both tests: measure both approaches")
-    covariance = sum(test["covariance"].values[present][:, present] for test in (one, other))
+    covariances = tuple(test["covariance"].values[present][:, present] for test in (one, other))
     sign = np.where(np.array(sides) == "positive", 1.0, -1.0)
     place = np.broadcast_to(one["position"].values, present.shape)[present].astype(float)
     values = (other["profile"].values - one["profile"].values)[present]
     freedom = min(float(np.nansum(test["scatter_freedom"].values)) for test in (one, other))
     signs = np.broadcast_to(sign[:, None], present.shape)[present]
     left_out = before.sizes["target"] + after.sizes["target"] - 2 * common
-    return _Difference(
-        place, signs, values, np.asarray(np.linalg.cholesky(covariance), float), max(freedom, 1.0)
-    ), left_out
+    return _Difference(place, signs, values, covariances, max(freedom, 1.0)), left_out
 
 
 def _at_common_positions(before: xr.Dataset, after: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
@@ -211,14 +246,18 @@ def _state_shapes(difference: _Difference, tests: Sequence[xr.Dataset]) -> list[
         _Shape(name, None, COMPONENTS[component](difference.sign, place), machine=False)
         for component, name in _STATE.items()
     ]
-    for test in tests:
+    alike = difference.position_mm[:, None] == difference.position_mm
+    mean = alike / alike.sum(axis=1)
+    for test, covariance in zip(tests, difference.covariances, strict=True):
         for component in test["component"].values:
-            if component in _STATE:
+            size = float(test["drift_size"].sel(component=component))
+            if component in _STATE or size == 0.0:
                 continue
             share = test["drift_share"].sel(component=component)
             column = _at_cells(share, test["position"].values, difference)
             name = "mean reversal" if component == "reversal" else "drift"
-            shape = _Shape(name, None, column, machine=False)
+            variance = None if component == "reversal" else _SHAPE_VARIANCE * mean @ covariance @ mean.T / size**2
+            shape = _Shape(name, None, column, machine=False, variance=variance)
             if difference.separate(shape, shapes):
                 shapes.append(shape)
     return shapes
@@ -273,7 +312,7 @@ def _blocks(difference: _Difference, positions: Array) -> list[_Shape]:
 
 
 def _search(
-    difference: _Difference,
+    plain: _Difference,
     state: Sequence[_Shape],
     candidates: Sequence[_Shape],
     blocks: Sequence[_Shape],
@@ -286,6 +325,7 @@ def _search(
     found: list[_Shape] = []
     while len(found) < most:
         beside = [*state, *found]
+        difference = plain.beside(beside)
         open_ones = [*candidates, *(blocks if difference.remainder_p(beside) * tests <= level else ())]
         ratios = np.nan_to_num(difference.ratios(open_ones, beside))
         if difference.p_value(float(ratios.max())) * tests > level:
@@ -530,6 +570,10 @@ def _profile(
         yield Lack("profile", (str(reason),))
         return
     yield found
+    if found.untold is not None:
+        yield Lack(
+            "thermal_state", tuple(f"{value:.2g}" if k else f"{value:g}" for k, value in enumerate(found.untold))
+        )
     if found.left_out:
         yield Lack("left_out", (str(found.left_out),))
 

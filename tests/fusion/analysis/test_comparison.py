@@ -139,6 +139,7 @@ def estimate(
             "covariance": (("direction", "target", "other_direction", "other_target"), 0.01 * np.eye(16).reshape(2, 8, 2, 8)),
             "scatter_freedom": (("direction", "target"), np.full((2, 8), 50.0)),
             "drift_share": (("component", "direction", "target"), share),
+            "drift_size": ("component", np.ones(len(named))),
             "position": ("target", position),
         },
         coords={"direction": ["positive", "negative"], "target": np.arange(1, 9), "component": list(named)},
@@ -218,6 +219,43 @@ def test_a_reversal_that_drifts_in_a_test_is_no_change_between_tests(
     reversal = next(shape for shape in found.shapes if shape.quantity == "mean reversal")
     assert reversal.machine is machine
     assert reversal.change.value == pytest.approx(1.0, abs=4 * reversal.change.u)
+
+
+def shaped(rng: np.random.Generator, *, shape: np.ndarray, size_um: float, profile: np.ndarray) -> xr.Dataset:
+    """A test whose drift moved in a shape of its own, by a root mean square of so many um; its profile has no noise."""
+    test = estimate(rng, components=("shape_1",))
+    test["drift_share"][-1], test["drift_size"][-1] = shape, size_um
+    return test.assign(profile=(("direction", "target"), np.broadcast_to(profile, (2, 8)).copy()))
+
+
+@pytest.mark.parametrize("size_um", [0.5, 2.0, 8.0])
+def test_a_shape_is_as_uncertain_as_the_profile_over_the_drift_that_told_it(
+    rng: np.random.Generator, size_um: float
+) -> None:
+    """Variance 1.8 C / size^2 of a shape, C that of a profile of both approaches: half of that of the difference, for each of 4^2 um2."""
+    shape = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    before = shaped(rng, shape=shape, size_um=size_um, profile=np.zeros(8))
+    after = estimate(rng).assign(profile=(("direction", "target"), np.tile(4.0 * shape, (2, 1))))
+    found = compare_profiles(before, after, level=0.05)
+    exact = compare_profiles(before, after.assign(profile=0.0 * after["profile"]), level=0.05)
+    assert found.remaining_u_um / exact.remaining_u_um == pytest.approx(
+        np.full(8, np.sqrt(1.0 + 0.5 * 1.8 * 4.0**2 / size_um**2))
+    )
+
+
+@pytest.mark.parametrize(("size_um", "changed"), [(0.5, False), (50.0, True)])
+def test_what_a_badly_known_thermal_state_may_make_is_no_change_and_is_told(
+    rng: np.random.Generator, size_um: float, changed: bool
+) -> None:
+    shape = np.array([0.0, 0.1, 0.2, 0.9, 1.0, 0.4, 0.2, 0.0])
+    before = shaped(rng, shape=shape, size_um=size_um, profile=np.zeros(8))
+    error = 0.6 * (np.arange(8) == 2)
+    found = compare_profiles(before, shaped(rng, shape=shape, size_um=size_um, profile=4.0 * shape + error), level=0.05)
+    assert bool(moved_positions(found)) is changed
+    assert (found.untold is None) is changed
+    if found.untold is not None:
+        # Offset, slope, bow and shape take a part of the 0.6 um.
+        assert found.untold[0] == 100.0 and 0.2 < found.untold[1] < 0.6
 
 
 def test_what_remains_has_no_slope_and_its_uncertainty(rng: np.random.Generator) -> None:
