@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import uniform_filter1d
 
+from fusion.analysis.drift_model.record import without_faulty_readings
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
 from fusion.campaign.schema import keys_of
@@ -324,7 +325,14 @@ def read_thermal_tests(path: Path) -> StatedTests:
     found: tuple[ThermalTest, ...] = ()
     of = "interferometry" if campaign.record is None else "record"
     if campaign.record is not None:
-        found = thermal_tests(campaign, read_record(campaign))
+        table, faults = without_faulty_readings(read_record(campaign))
+        left_out = [
+            f"{channel}{f' of {run}' if run else ''}: readings that are none of a displacement ({fault.kind.value}) are left out: "
+            f"{fault.readings}."
+            for fault, channel, run in faults
+        ]
+        tests = thermal_tests(campaign, table)
+        found = tuple(one.model_copy(update={"remarks": (*left_out, *one.remarks)}) for one in tests)
     elif campaign.interferometry is not None:
         found = thermal_tests(campaign, read_laser(campaign)["deviations"])
     if not found:

@@ -691,7 +691,9 @@ def _in_stretches(fault: SensorFault, seconds: Array, at_fault: NDArray[np.bool_
 
 
 def _glitches(displacement: Array, drivers: Array | None) -> tuple[NDArray[np.bool_], float]:
-    """Readings that leave the course of a displacement within one sample and come back within one, and the largest distance from it."""
+    """Readings that leave the course of a displacement and come back within one sample, or as a burst of a few that is far from it, and the
+    largest distance from it.
+    """
     at_fault, largest = np.zeros(displacement.size, bool), 0.0
     loads = np.zeros((displacement.size, 1)) if drivers is None else np.nan_to_num(drivers)
     longest = max(_GLITCH_READINGS, int(_GLITCH_SHARE * displacement.size))
@@ -711,6 +713,11 @@ def _glitches(displacement: Array, drivers: Array | None) -> tuple[NDArray[np.bo
             size = float(off[first:end].max())
             # The median itself is off beside a long stretch, so that the steps say where it begins and ends.
             borders = first + np.flatnonzero(steps[first : end + 1] > max(limit, _ABRUPT * size))
+            # A burst of a few readings climbs in parts: more than a course that is steep elsewhere moves in as many.
+            if 0 < first < end < values.size and end - first <= _GLITCH_READINGS:
+                far = size > excursion_limit(1) * max(limit, (end - first) * steepest)
+                if far and abs(values[end] - values[first - 1]) <= limit and not switched[first - 1 : end + 1].any():
+                    borders = np.array([first, end])
             if borders.size == 0:
                 continue
             begin, after = borders[0], borders[-1]

@@ -1251,7 +1251,7 @@ _COMPUTED = 2.0
 
 def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     """Examine displacements and sensors of a record, and leave out what is faulty."""
-    cleaned, readings = _without_faulty_readings(table)
+    cleaned, readings = without_faulty_readings(table)
     sensors = _examine_runs(cleaned)
     names = [str(name) for name in table["sensor"].values]
     faulty = [one for one in sensors if one[0].is_clear]
@@ -1325,7 +1325,7 @@ def _runs_of(table: xr.Dataset) -> Iterator[tuple[str, NDArray[np.bool_], Array]
         yield run, number == k, np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
 
 
-def _without_faulty_readings(table: xr.Dataset) -> tuple[xr.Dataset, list[_Found]]:
+def without_faulty_readings(table: xr.Dataset) -> tuple[xr.Dataset, list[_Found]]:
     """The record without the displacements that are no readings, and what was found, run by run."""
     displacement, found = table["displacement"].copy(), []
     values, read = displacement.values, np.isfinite(table["displacement"].values)

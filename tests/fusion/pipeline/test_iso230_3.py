@@ -100,6 +100,21 @@ def test_another_file_is_refused_with_what_to_name(tmp_path):
         read_thermal_tests(tmp_path / "record.csv")
 
 
+def test_a_burst_of_readings_is_not_the_largest_drift_of_the_sheet(tmp_path):
+    """A logger writes three readings that climb to 1.3 mm, beside a drift of 20 um."""
+    shown = 20.0 * (1.0 - np.exp(-np.arange(SAMPLES) / 60.0)) + np.random.default_rng(3).normal(0.0, 0.1, SAMPLES)
+    shown[200:203] += [450.0, 900.0, 1335.0]
+    rows = [f"{60 * k},{20.0 + 0.01 * (k % 7):.3f},{value:.2f}" for k, value in enumerate(shown)]
+    (tmp_path / "record.csv").write_text("\n".join(["time_s,bearing [degC],X [um]", *rows]) + "\n")
+    (tmp_path / "campaign.toml").write_text(
+        '[campaign]\ntitle = "Spindle"\n[record]\nfile = "record.csv"\ntime = "time_s"\ntime_unit = "s"\n'
+        'temperatures = ["bearing*"]\ndisplacements = ["X*"]\n'
+    )
+    (test,) = read_thermal_tests(tmp_path / "campaign.toml").tests
+    assert test.distortions[0].whole.value == pytest.approx(20.0, abs=1.0)
+    assert test.remarks[0].startswith("X") and test.remarks[0].endswith("(glitch) are left out: 3.")
+
+
 def test_the_sheet_says_whose_test_it_was_and_who_signs_on_the_page_and_in_word(tmp_path):
     minutes = np.arange(SAMPLES)
     rows = [f"{60 * k},{20.0 + 8.0 * (1.0 - np.exp(-k / 60.0)):.3f},{k / 10:.2f}" for k in minutes]

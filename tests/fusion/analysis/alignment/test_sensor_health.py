@@ -137,6 +137,17 @@ def test_glitches_of_a_displacement_are_found_to_the_reading(sound, spoil, resol
 
 
 @pytest.mark.parametrize(
+    "burst", [[1600.0, 2900.0, 4300.0], [900.0, 2400.0, 4300.0, 2500.0, 1300.0], [4300.0, -2900.0, 2200.0]]
+)
+def test_a_burst_that_climbs_in_parts_is_left_out_as_a_whole(sound, burst):
+    seconds, temperature, load = sound
+    values = drifting(seconds)
+    values[600 : 600 + len(burst)] += burst
+    (fault,) = examine_displacements(seconds, values[:, None], temperature, load)
+    assert fault.stretches_s == ((seconds[600], seconds[599 + len(burst)]),)
+
+
+@pytest.mark.parametrize(
     "event",
     [
         lambda at: 500.0 * (at >= 600),
