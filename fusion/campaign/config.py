@@ -543,6 +543,11 @@ class ThermographyTable(_Measured, title="Camera"):
         "Standard uncertainty of the change of the camera's zero between cycles",
         about="at least what the frames leave",
     )
+    reflected_change_u_K: KelvinU | None = key(
+        None,
+        "Standard uncertainty of the change of the reflected temperature between cycles",
+        absent="what discs or the logged air show; else assumed, and named so",
+    )
     region: tuple[RegionTable, ...] = ()
     clock_offset_s: Seconds | None = key(
         None, "Camera clock minus laser clock", example="0 s", absent=_ESTIMATED, show=True, of=_AXIS

@@ -12,7 +12,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AxisGeometry, MeasuredLine, align
 from fusion.analysis.alignment.readings import Readings, read_fused
-from fusion.analysis.consistency.camera import mean_rise, zero_share
+from fusion.analysis.consistency.camera import mean_rise, reflected_share, zero_share
 from fusion.analysis.consistency.model import compare_lines, with_line, withhold_names
 from fusion.analysis.diagnosis.residual import ResidualTests, examine_residual
 from fusion.analysis.drift_model.axis import (
@@ -46,12 +46,12 @@ from thermography.fields.cycle_fields import cycles_with_field
 def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
     """Return the relative standard uncertainty of the rise along the measured line."""
     along = MeasuredLine(fields, axis, position_mm).sample(np.stack(_last_rise(fields)))
-    return float(np.hypot(_weighted(along[0], along[1]), zero_share(fields)))
+    return float(np.linalg.norm([_weighted(along[0], along[1]), zero_share(fields), reflected_share(fields)]))
 
 
 def plan_scale_u(fields: xr.Dataset) -> float:
     """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
-    return float(np.hypot(_weighted(*_last_rise(fields)), zero_share(fields)))
+    return float(np.linalg.norm([_weighted(*_last_rise(fields)), zero_share(fields), reflected_share(fields)]))
 
 
 def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:

@@ -104,6 +104,8 @@ class CameraState:
     correction_K : (frames,), to be added to the temperature of every usable frame; None where nothing is corrected
     u_K : (frames,) ndarray, K
         Standard uncertainty of the camera's zero since the first frame, common to the whole frame; 0 where only the table is in view.
+    reflected_u_K : (frames,) ndarray or None, K
+        Standard uncertainty of the change of the reflected temperature since the first frame; None where neither log nor discs show it.
     part, notices
         Part ``camera`` of results.json, and what was left out, corrected, or cannot be distinguished.
     """
@@ -111,6 +113,7 @@ class CameraState:
     source: CameraInputs
     correction_K: Array | None
     u_K: Array
+    reflected_u_K: Array | None
     part: CameraPart
     notices: list[Notice]
 
@@ -118,23 +121,27 @@ class CameraState:
         """Mean correction and uncertainty of every cycle, its bounds (cycles, 2) on the camera's clock."""
         times = self.source.frame_times
         correction = np.zeros(len(times)) if self.correction_K is None else self.correction_K
-        values = np.full((2, len(bounds)), np.nan)
+        reflected = np.zeros(len(times)) if self.reflected_u_K is None else self.reflected_u_K
+        values = np.full((3, len(bounds)), np.nan)
         for cycle, (start, end) in enumerate(bounds):
             inside = (times >= start) & (times < end)
             if inside.any():
-                values[:, cycle] = correction[inside].mean(), np.sqrt(np.mean(self.u_K[inside] ** 2))
+                u, reflected_u = (np.sqrt(np.mean(one[inside] ** 2)) for one in (self.u_K, reflected))
+                values[:, cycle] = correction[inside].mean(), u, reflected_u
         kelvin = {"units": "K", "units_metadata": "temperature: difference"}
         named = "camera's zero since the first frame"
         correction_of = {"long_name": f"correction of the {named}, contained in the temperatures", **kelvin}
         correction_of["ancillary_variables"] = "camera_correction_u"
         u_of = {"long_name": f"standard uncertainty of the {named} after the correction", **kelvin}
         u_of["comment"] = "common to all cells of a frame"
-        return xr.Dataset(
-            {
-                "camera_correction": ("cycle", values[0], correction_of),
-                "camera_correction_u": ("cycle", values[1], u_of),
-            }
-        )
+        variables = {
+            "camera_correction": ("cycle", values[0], correction_of),
+            "camera_correction_u": ("cycle", values[1], u_of),
+        }
+        if self.reflected_u_K is not None:
+            named = "standard uncertainty of the change of the reflected temperature since the first frame"
+            variables["reflected_change_u"] = ("cycle", values[2], {"long_name": named, **kelvin})
+        return xr.Dataset(variables)
 
 
 def counter(report: Report, label: str, total: int) -> Callable[[int], None]:
@@ -198,9 +205,12 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     ]
     levels = _levels(survey, blocks, kept)
     checked = {"frames_checked": len(source.frames), "frames_damaged": rejected}
+    room = _room(usable)
+    # Surfaces of a room change by no more than its air and what follows it: from nothing to all of it (rectangular, JCGM 100:2008, 4.3.7).
+    reflected_u_K = np.abs(room - room[0]).max(axis=1) / np.sqrt(3.0) if room.shape[1] else None
     if levels is None:
         part = CameraPart(**checked, steps=(), drift_K=0.0, largest_correction_K=0.0, largest_u_K=None)
-        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, _NO_SURROUNDINGS])
+        return CameraState(usable, None, np.zeros(len(frames)), reflected_u_K, part, [*notices, _NO_SURROUNDINGS])
     background, table, spread = levels
     if survey.patch is not None:
         background = survey.patch[kept]
@@ -225,7 +235,7 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         largest_u_K=largest_u_K,
     )
     notices += _correction_notices(correction, frames, largest_u_K)
-    return CameraState(usable, correction_K if correction.corrects else None, u_K, part, notices)
+    return CameraState(usable, correction_K if correction.corrects else None, u_K, reflected_u_K, part, notices)
 
 
 def _held_against_discs(camera: CameraState, registration: Registration) -> tuple[CameraState, dict[str, Any]]:
@@ -242,10 +252,13 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
         "zero_K": 0.0,
         "warming_K": shown.warming_K,
     }
-    if source.thermography.reference_patch_px is not None:
-        return camera, found
     correction_K = np.zeros(len(source.frames)) if camera.correction_K is None else camera.correction_K
     left = shown.common_K + correction_K[shown.index] - correction_K[0]
+    every = np.arange(len(source.frames))
+    # What they reflect, the table reflects too: at most all that they show beside its warming.
+    camera = replace(camera, reflected_u_K=np.interp(every, shown.index, np.abs(left)) / np.sqrt(3.0))
+    if source.thermography.reference_patch_px is not None:
+        return camera, found
     room = _room(source)[shown.index]
     if room.shape[1]:
         # Discs reflect the room, whose surfaces change by no more than its air.
@@ -253,7 +266,7 @@ def _held_against_discs(camera: CameraState, registration: Registration) -> tupl
         left = left - room @ scipy.optimize.lsq_linear(room, left, (0.0, 1.0)).x
         left -= left[0]
     # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
-    zero_u_K = np.interp(np.arange(len(source.frames)), shown.index, np.abs(left)) / np.sqrt(3.0)
+    zero_u_K = np.interp(every, shown.index, np.abs(left)) / np.sqrt(3.0)
     u_K = np.maximum(camera.u_K, zero_u_K)
     part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
     return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
@@ -367,7 +380,7 @@ def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameRefe
 #: Attribute of `InputUncertainty` -> attribute of ``[thermography]`` that states it, with _u before the unit.
 _STATED = {
     name: re.sub("(_K|_m|)$", r"_u\1", name, count=1)
-    for name in (*OVERRIDABLE, "camera_offset_K", "camera_scale", "camera_drift_K")
+    for name in (*OVERRIDABLE, "camera_offset_K", "camera_scale", "camera_drift_K", "reflected_change_K")
 }
 
 
@@ -404,6 +417,8 @@ def complete_fields(
     on_laser = fields.assign_coords(time=camera_on_laser_clock(fields["time"].values, offset_s))
     if (measured_u := _by_material_sensor(source, on_laser, camera.emissivity, inputs.emissivity)) is not None:
         inputs = replace(inputs, emissivity=measured_u)
+    if table.reflected_change_u_K is not None:
+        fields = fields.drop_vars("reflected_change_u", errors="ignore")
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.surfaces]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
     if regions:
@@ -500,6 +515,9 @@ def _budget(
         if name == "camera_drift_K":
             entries.append(_zero_entry(table, fields, inputs))
             continue
+        if name == "reflected_change_K":
+            entries.append(_reflected_entry(table, fields, inputs))
+            continue
         if camera.window_transmission == 1 and name.startswith("window_") and getattr(inputs, name) == 0:
             continue
         unstated = "measured" if measured and name == "emissivity" else "assumed"
@@ -517,6 +535,15 @@ def _zero_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncer
     source = "measured" if left_K > given_K else "assumed" if table.camera_drift_u_K is None else "stated"
     zero = {"input": "camera_drift_K", "value": None, "u": max(left_K, given_K), "source": source}
     return BudgetEntry(**zero, temperature_u_K=0.0, rise_u_percent=None)
+
+
+def _reflected_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> BudgetEntry:
+    """The entry of the budget for a change of what the table reflects: what log or discs show of it, or what is stated or assumed."""
+    u_K, source = inputs.reflected_change_K, "assumed" if table.reflected_change_u_K is None else "stated"
+    if "reflected_change_u" in fields:
+        u_K, source = float(np.nan_to_num(fields["reflected_change_u"].values).max()), "measured"
+    entry = {"input": "reflected_change_K", "value": None, "u": u_K, "source": source}
+    return BudgetEntry(**entry, temperature_u_K=0.0, rise_u_percent=None)
 
 
 def _zero_left_K(fields: xr.Dataset) -> float:

@@ -48,7 +48,7 @@ from thermography.io.frame import FlirFormatError, FrameReference
 from thermography.io.region import Region
 from thermography.io.sequence import camera_names
 from thermography.radiometry.planck import Overrides
-from thermography.radiometry.uncertainty import rise_scale_contributions, temperature_uncertainty
+from thermography.radiometry.uncertainty import reflected_sensitivity, rise_scale_contributions, temperature_uncertainty
 from thermography.registration.displacement import picture_displacements
 
 #: Largest shift of pictures that count as taken from one place, px: a part that warms shifts the best match of two pictures by up to one.
@@ -250,7 +250,8 @@ def _describe_difference(
 
     def u(value: float, *more_K: float) -> float:
         scale = rise_scale_contributions(level + value / 2.0, camera, inputs)
-        parts = [*(float(share) * value for share in scale.values()), inputs.camera_drift_K, *more_K]
+        reflected = inputs.reflected_change_K * float(reflected_sensitivity(level, camera))
+        parts = [*(float(share) * value for share in scale.values()), inputs.camera_drift_K, reflected, *more_K]
         return float(np.linalg.norm(parts))
 
     return schema.DifferencePart(

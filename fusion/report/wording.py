@@ -109,6 +109,7 @@ INPUT_NAMES = {
     "camera_offset_K": "camera, constant part / K",
     "camera_scale": "camera, share of the reading in °C",
     "camera_drift_K": "camera, drift of its zero between cycles / K",
+    "reflected_change_K": "reflected apparent temperature, change between cycles / K",
 }
 
 #: Parts of the drift as the correlation names them, in plain words.

@@ -320,7 +320,7 @@ class BudgetEntry(ResultPart):
     """Contribution to the standard uncertainty of the mean temperature of the last cycle, K, to first order."""
     rise_u_percent: Number
     """Contribution to the standard uncertainty of a rise, in percent of the rise, to first order; null for the camera's zero, which
-    contributes its u to every rise."""
+    contributes its u to every rise, and for the change of what is reflected, which contributes (1 - emissivity) / emissivity of it."""
 
 
 class TwoParts(ResultPart):

@@ -218,7 +218,7 @@ def test_first_order_against_an_independent_monte_carlo(
 ) -> None:
     """Own draws through the formula itself, frame by frame: what the comparison inside the program has to come to."""
     nominal = override(PARAMETERS, **{"object_distance_m": 1.2, "reflected_temperature_K": 295.15, **changes})
-    inputs = InputUncertainty(**u)
+    inputs = InputUncertainty(**u, reflected_change_K=0.0)
     black = override(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
     rng, errors = np.random.default_rng(5), []
     reading = temperature_from_counts(counts_from_temperature([celsius, celsius + 5.0], nominal), black)

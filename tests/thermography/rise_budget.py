@@ -10,6 +10,7 @@ from thermography.radiometry.uncertainty import (
     InputUncertainty,
     TemperatureBudget,
     reading_sensitivity,
+    reflected_sensitivity,
     temperature_uncertainty,
 )
 
@@ -28,8 +29,12 @@ def temperature_rise_uncertainty(
     later = temperature_uncertainty(temperature, parameters, inputs, frames=frames)
     earlier = temperature_uncertainty(reference, reference_parameters or parameters, inputs, frames=reference_frames)
     common = {name: later.common[name] - earlier.common[name] for name in later.common}
-    drift_K = (inputs or InputUncertainty()).camera_drift_K
-    if drift_K > 0:
-        common["camera_drift_K"] = drift_K * reading_sensitivity(temperature, parameters)[1]
+    inputs = inputs or InputUncertainty()
+    if inputs.camera_drift_K > 0:
+        common["camera_drift_K"] = inputs.camera_drift_K * reading_sensitivity(temperature, parameters)[1]
+    if inputs.reflected_change_K > 0:
+        # A rise from a temperature to itself is that of the reference cycle.
+        later_K = np.where(np.equal(temperature, reference), 0.0, inputs.reflected_change_K)
+        common["reflected_change_K"] = later_K * reflected_sensitivity(temperature, parameters)
     per_frame = {name: np.hypot(later.per_frame[name], earlier.per_frame[name]) for name in later.per_frame}
     return TemperatureBudget(common, per_frame)

@@ -30,6 +30,7 @@ from thermography.radiometry.uncertainty import (
     common_contributions,
     monte_carlo_ratio,
     reading_sensitivity,
+    reflected_sensitivity,
     rise_scale_contributions,
     root_sum_square,
 )
@@ -263,7 +264,7 @@ def evaluate_uncertainty(
     inputs = inputs or InputUncertainty()
     shape, dims = fields["temperature"].shape, fields["temperature"].dims
     parts = _parts(fields, parameters, inputs, surfaces)
-    drift_K = _drift(fields, parameters, inputs)
+    drift_K, reflected_K = _drift(fields, parameters, inputs), _reflected_change(fields, inputs)
     total_u, total_rise_u = empty_array(shape, np.float32), empty_array(shape, np.float32)
     noises = (in_pieces(fields[name]) for name in ("temperature_noise_u", "temperature_rise_noise_u"))
     for (some, temperature, rise), (_, noise), (_, rise_noise) in zip(_pieces(fields), *noises, strict=True):
@@ -275,8 +276,10 @@ def evaluate_uncertainty(
             t, r = temperature[cells], rise[cells]
             common[cells] = np.interp(t, part.grid, part.u)
             share = np.interp(t - 0.5 * r, part.grid, part.scale)
-            drift = np.interp(t, part.grid, part.sensitivity) * drift_K[some][np.nonzero(cells)[0]]
-            rise_common[cells] = np.hypot(share * r, drift)
+            cycle = np.nonzero(cells)[0]
+            drift = np.interp(t, part.grid, part.sensitivity) * drift_K[some][cycle]
+            reflected = np.interp(t, part.grid, part.reflected) * reflected_K[some][cycle]
+            rise_common[cells] = np.sqrt((share * r) ** 2 + drift**2 + reflected**2)
             part.shares.append((float(np.sum(share)), share.size))
         # A cell that the first cycle does not show has a temperature and no rise: the noise of its rise is NaN, and so is the total.
         total_u[some] = np.hypot(noise, common)
@@ -286,11 +289,15 @@ def evaluate_uncertainty(
     for part in parts:
         sums, counts = zip(*part.shares, strict=True)
         scale_u[part.cells] = sum(sums) / sum(counts)
+    at_table = np.abs(
+        reflected_sensitivity(_mean(fields["temperature"]), parameters[reference_cycle(fields["temperature"])])
+    )
     return annotate(
         fields.assign(
             temperature_u=(dims, total_u),
             temperature_rise_u=(dims, total_rise_u),
             rise_scale_u=(dims[1:], scale_u.astype(np.float32)),
+            rise_reflected_u=(dims[:1], at_table * reflected_K),
         )
     )
 
@@ -299,8 +306,9 @@ def evaluate_uncertainty(
 class _Part:
     """Cells of a surface in the cycles that were calibrated with one set of parameters, and what they share at temperatures `grid`, degC.
 
-    `u` is the common standard uncertainty of temperatures, K, `scale` that of rises as a share of the rise, `sensitivity` the error of a
-    temperature per error of what the camera reads, (n,) each; `shares` are sum and number of the shares of the cells, piece by piece.
+    `u` is the common standard uncertainty of temperatures, K, `scale` that of rises as a share of the rise, `sensitivity` and `reflected`
+    the error of a temperature per error of what the camera reads and of the reflected temperature, (n,) each; `shares` are sum and number
+    of the shares of the cells, piece by piece.
     """
 
     cells: NDArray[np.bool_]
@@ -309,6 +317,7 @@ class _Part:
     u: Array
     scale: Array
     sensitivity: Array
+    reflected: Array
     shares: list[tuple[float, int]] = field(default_factory=list)
 
 
@@ -340,7 +349,8 @@ def _parts(
             # Corrected where first order fails.
             factor = np.interp(grid, compared.temperature_degC, _beyond_tolerance(compared.ratio))
             scale *= _beyond_tolerance(np.array(compared.rise_ratio))
-            parts.append(_Part(surface.cells, cycles, grid, u * factor, scale, sensitivity))
+            reflected = reflected_sensitivity(grid, camera)
+            parts.append(_Part(surface.cells, cycles, grid, u * factor, scale, sensitivity, reflected))
     return parts
 
 
@@ -362,6 +372,18 @@ def _drift(fields: xr.Dataset, parameters: Sequence[CameraParameters], inputs: I
         drift = np.maximum(np.hypot(left, left[reference]) / at_table, drift)
     drift[reference] = 0.0
     return drift
+
+
+def _reflected_change(fields: xr.Dataset, inputs: InputUncertainty) -> Array:
+    """Standard uncertainty of the change of the reflected temperature since the reference cycle, (cycle,) K: measured, else as assumed."""
+    temperature = fields["temperature"]
+    reference = reference_cycle(temperature)
+    change = np.full(len(temperature), inputs.reflected_change_K)
+    if "reflected_change_u" in fields:
+        measured = fields["reflected_change_u"].values.astype(float)
+        change = np.hypot(measured, measured[reference])
+    change[reference] = 0.0
+    return change
 
 
 def _mean(temperature: xr.DataArray) -> float:

@@ -72,6 +72,9 @@ class InputUncertainty:
     camera_drift_K
         Standard uncertainty of the change of the camera's zero between two cycles, K; it enters rises only, because the accuracy of
         the camera holds at all times. No data sheet states it: 0 by default.
+    reflected_change_K
+        Standard uncertainty of the change of the reflected apparent temperature between two cycles, K; it enters rises only. By default
+        +-1 K as a rectangular distribution, an assumption on a room in which nothing warm is moved.
     netd_K : noise equivalent temperature difference: standard deviation of one pixel in one frame on a black body, K
     netd_temperature_degC : temperature of this black body, degC
 
@@ -91,6 +94,7 @@ class InputUncertainty:
     camera_offset_K: float = 2 / 3**0.5
     camera_scale: float = 0.02 / 3**0.5
     camera_drift_K: float = 0.0
+    reflected_change_K: float = 1 / 3**0.5
     netd_K: float = 0.05
     netd_temperature_degC: float = 30.0
 
@@ -224,6 +228,13 @@ def reading_sensitivity(temperature: ArrayLike, parameters: CameraParameters) ->
     gain, offset = count_line(parameters)
     reading = temperature_of_signal(gain * black_body_signal(kelvin, parameters) + offset, parameters)
     return reading, signal_slope(reading + ZERO_CELSIUS_K, parameters) / (gain * signal_slope(kelvin, parameters))
+
+
+def reflected_sensitivity(temperature: ArrayLike, parameters: CameraParameters) -> Array:
+    """Return the sensitivity of a surface temperature to the reflected apparent temperature, about -(1 - emissivity) / emissivity."""
+    none = {each.name: 0.0 for each in fields(InputUncertainty)}
+    one_K = InputUncertainty(**{**none, "reflected_temperature_K": 1.0})
+    return common_contributions(temperature, parameters, one_K)["reflected_temperature_K"]
 
 
 def rise_scale_contributions(

@@ -516,9 +516,23 @@ def zero_share(fields: xr.Dataset) -> float:
     """Uncertainty of the camera's zero, which changes as slowly as the table warms, as a share of the mean rise; over all cycles."""
     if "camera_correction_u" not in fields:
         return 0.0
-    rise, zero_u = mean_rise(fields), fields["camera_correction_u"].values
-    known = np.isfinite(rise) & np.isfinite(zero_u)
-    return float(np.sqrt((zero_u[known] ** 2).sum() / max((rise[known] ** 2).sum(), np.finfo(float).tiny)))
+    rise, zero_u = _known(fields, "camera_correction_u")
+    return float(np.sqrt((zero_u**2).sum() / max((rise**2).sum(), np.finfo(float).tiny)))
+
+
+def reflected_share(fields: xr.Dataset) -> float:
+    """Uncertainty of a coefficient per kelvin from a change of what the table reflects, which lasts, as a share of it; over all cycles."""
+    if "rise_reflected_u" not in fields:
+        return 0.0
+    rise, reflected_u = _known(fields, "rise_reflected_u")
+    return float((np.abs(rise) * reflected_u).sum() / max((rise**2).sum(), np.finfo(float).tiny))
+
+
+def _known(fields: xr.Dataset, name: str) -> tuple[Array, Array]:
+    """Mean rise and an uncertainty, K, of the cycles that have both."""
+    rise, u = mean_rise(fields), fields[name].values.astype(float)
+    known = np.isfinite(rise) & np.isfinite(u)
+    return rise[known], u[known]
 
 
 # Checks of the registration: fiducials that are missing or unchecked, hints that contradict, a plan of another size

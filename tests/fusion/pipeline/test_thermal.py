@@ -241,7 +241,7 @@ def test_a_campaign_whose_frames_are_all_damaged_says_so(sound):
         _reduce(sound[1])
 
 
-ADDED = ("temperature_u", "temperature_rise_u", "rise_scale_u")
+ADDED = ("temperature_u", "temperature_rise_u", "rise_scale_u", "rise_reflected_u")
 REGION = '\n[[thermography.region]]\nname = "steel"\nrectangle = [["80 mm", "20 mm"], ["240 mm", "160 mm"]]\n'
 
 
@@ -302,7 +302,7 @@ def test_results_give_both_parts_and_say_what_was_assumed(results_folder):
     # Contact of the material sensor, whose place is stated, 2 %; scale of the camera 1.2 %.
     assert part["rise_scale_u"] == pytest.approx(0.0242, abs=0.002)
     sources = {entry["input"]: entry["source"] for entry in part["budget"]}
-    assert sources.pop("camera_drift_K") == sources.pop("emissivity") == "measured"
+    assert {sources.pop(name) for name in ("camera_drift_K", "reflected_change_K", "emissivity")} == {"measured"}
     assert set(sources.values()) == {"assumed"}
     total = np.sqrt(sum(entry["temperature_u_K"] ** 2 for entry in part["budget"]))
     assert total == pytest.approx(temperature["common_K"], rel=0.02)
@@ -336,6 +336,17 @@ def test_the_larger_of_stated_and_measured_drift_is_taken_and_said(campaign, res
     assert (u > stated_K) if taken == "stated" else (u < 1.0)
     notice = next(item for item in outcome.notices if item.code == "camera_drift_stated")
     assert "The larger was taken" in notice.message
+
+
+def test_a_stated_change_of_what_is_reflected_replaces_what_log_and_discs_show(campaign, results_folder):
+    shown = read_dataset(results_folder / "fields.nc")["rise_reflected_u"].values
+    stated = ("emissivity = 0.97", 'emissivity = 0.97\nreflected_change_u = "2 K"')
+    outcome = completed(campaign, results_folder, stated)
+    entry = next(item for item in outcome.parts.radiometry.budget if item.input == "reflected_change_K")
+    assert (entry.u, entry.source) == (2.0, "stated")
+    found = outcome.dataset["rise_reflected_u"].values
+    assert found[0] == 0.0 and found[1:] == pytest.approx(2.0 * 0.03 / 0.97, rel=0.05)
+    assert (shown[1:] < found[1:]).all()
 
 
 def test_a_region_is_calibrated_with_its_own_emissivity(campaign, results_folder):

@@ -23,7 +23,7 @@ from thermography.radiometry.uncertainty import InputUncertainty, temperature_un
 CAMERA = override(PARAMETERS, emissivity=0.97, object_distance_m=1.2, reflected_temperature_K=295.15)
 #: An emissivity that is far enough from 1 for first order.
 WELL_KNOWN = InputUncertainty(emissivity=0.01)
-NONE = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NONE = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def fields(noise_K: float = 0.01, top: float = 27.0) -> xr.Dataset:
@@ -50,7 +50,7 @@ def test_noise_and_common_part_add_up_to_the_propagated_budget():
 
 
 def test_an_uncertain_emissivity_is_its_share_of_every_rise():
-    inputs = InputUncertainty(0.0097, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    inputs = replace(NONE, emissivity=0.0097)
     done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3, inputs)
     share = done["temperature_rise_u"] / done["temperature_rise"]
     np.testing.assert_allclose(share.values[1:], 0.01, rtol=0.05)
@@ -74,7 +74,7 @@ def test_a_cell_that_the_first_cycle_does_not_show_leaves_the_others_their_uncer
 
 
 def test_of_a_drift_that_is_stated_and_what_a_correction_leaves_the_larger_is_in_the_rise():
-    drifting = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+    drifting = replace(NONE, camera_drift_K=0.1)
     black = override(CAMERA, emissivity=1.0, object_distance_m=0.0)
     stated = evaluate_uncertainty(fields(noise_K=0.0), [black] * 3, drifting).isel(y=1, x=1)
     np.testing.assert_allclose(stated["temperature_rise_u"], [0.0, 0.1, 0.1], rtol=1e-3)
@@ -90,6 +90,23 @@ def test_of_a_drift_that_is_stated_and_what_a_correction_leaves_the_larger_is_in
     np.testing.assert_allclose(left["temperature_rise_u"], [0.0, 0.1, 0.1], rtol=1e-3)
 
 
+@pytest.mark.parametrize("emissivity", [0.97, 0.95, 0.90])
+def test_a_change_of_what_is_reflected_is_in_the_rise_as_the_formula_gives_it(emissivity):
+    camera = override(CAMERA, emissivity=emissivity)
+    reflected_K, levels = camera.reflected_temperature_K, [22.0, 24.0, 27.0]
+    counts = [
+        counts_from_temperature(levels, override(camera, reflected_temperature_K=reflected_K + k)) for k in (-0.5, 0.5)
+    ]
+    per_K = np.diff([temperature_from_counts(one, camera) for one in counts], axis=0)[0]
+    assert per_K[1] == pytest.approx((1.0 - emissivity) / emissivity, rel=0.05)
+    assumed = evaluate_uncertainty(fields(noise_K=0.0), [camera] * 3, replace(NONE, reflected_change_K=0.5))
+    np.testing.assert_allclose(assumed["temperature_rise_u"][:, 1, 1], [0.0, 0.5, 0.5] * per_K, rtol=1e-3)
+    shown = fields(noise_K=0.0).assign(reflected_change_u=("cycle", [0.0, 0.3, 2.0]))
+    found = evaluate_uncertainty(shown, [camera] * 3, replace(NONE, reflected_change_K=0.5))
+    np.testing.assert_allclose(found["temperature_rise_u"][:, 1, 1], [0.0, 0.3, 2.0] * per_K, rtol=1e-3)
+    np.testing.assert_allclose(found["rise_reflected_u"], [0.0, 0.3, 2.0] * per_K, rtol=0.04)
+
+
 def test_surfaces_have_the_uncertainty_of_their_own_emissivity():
     left = np.zeros(PLAN.shape, bool)
     left[:, :3] = True
@@ -102,8 +119,9 @@ def test_surfaces_have_the_uncertainty_of_their_own_emissivity():
 
 def test_metal_is_corrected_to_the_propagated_distribution_or_refused():
     metal = override(CAMERA, emissivity=0.15)
-    first = temperature_rise_uncertainty(27.0, 22.0, metal, InputUncertainty(emissivity=0.04)).common_u
-    done = evaluate_uncertainty(fields(), [metal] * 3, InputUncertainty(emissivity=0.04))
+    inputs = InputUncertainty(emissivity=0.04, reflected_change_K=0.0)
+    first = temperature_rise_uncertainty(27.0, 22.0, metal, inputs).common_u
+    done = evaluate_uncertainty(fields(), [metal] * 3, inputs)
     assert float(done["temperature_rise_u"][2, 0, 0]) > 1.15 * float(first)
     with pytest.raises(RadiometryError, match="paint the surface"):
         evaluate_uncertainty(fields(), [metal] * 3, InputUncertainty(emissivity=0.1))
@@ -111,7 +129,8 @@ def test_metal_is_corrected_to_the_propagated_distribution_or_refused():
 
 def test_drawn_inputs_are_covered(rng):
     """One wrong emissivity, one reflected temperature, one offset and scale of the camera per draw, in all cycles."""
-    done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3, WELL_KNOWN).isel(y=1, x=1)
+    inputs = replace(WELL_KNOWN, reflected_change_K=0.0)
+    done = evaluate_uncertainty(fields(noise_K=0.0), [CAMERA] * 3, inputs).isel(y=1, x=1)
     true = np.array([22.0, 24.0, 27.0])
     black = override(CAMERA, emissivity=1.0, object_distance_m=0.0)
     errors = []

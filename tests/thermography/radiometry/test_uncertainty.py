@@ -83,7 +83,8 @@ def test_standard_uncertainty_equals_monte_carlo(rng, emissivity, window, camera
 
 
 def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng):
-    parameters, inputs = _scene(0.95, window=False), InputUncertainty(emissivity=0.01, camera_scale=0.0)
+    parameters = _scene(0.95, window=False)
+    inputs = InputUncertainty(emissivity=0.01, camera_scale=0.0, reflected_change_K=0.0)
     before, after = 22.0, 27.0
     counts = [counts_from_temperature(t, parameters) for t in (before, after)]
     rises = []
