@@ -171,11 +171,11 @@ def _map_facts(maps: xr.DataTree, name: str, channel: str) -> dict[str, Any]:
 
 def _strongest_cell(maps: xr.Dataset, channel: str) -> dict[str, Any]:
     """Return the cell that one part of the drift follows most closely."""
-    names = ["p_value", "sensitivity", "sensitivity_low", "sensitivity_high", "lag", "detectable_sensitivity"]
-    flat = maps[names].sel(channel=channel).stack(cell=("y", "x"))
+    flat = maps.sel(channel=channel).stack(cell=("y", "x"))
     best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
-    values = {name: float(best[name]) for name in (*names, "x", "y")}
-    limits = values.pop("sensitivity_low"), values.pop("sensitivity_high")
+    values = {name: float(best[name]) for name in ("p_value", "sensitivity", "lag", "detectable_sensitivity", "x", "y")}
+    # Maps that an older program made have no limits.
+    limits = float(best.get("sensitivity_low", np.nan)), float(best.get("sensitivity_high", np.nan))
     random_um = float(maps["unexplained_drift"].sel(channel=channel))
     return {"channel": channel, "random_um": random_um, "limits": limits, **values}
 

@@ -265,7 +265,9 @@ def _maps(plan: xr.Dataset, pairs: dict[str, _Pair], separable: bool) -> xr.Data
 def _candidates(test: xr.DataTree, channel: str) -> dict[str, Array]:
     """Strongest candidate at every place, (y, x) per quantity: the cell itself, or the thermal mode that has its peak there."""
     cells = test.to_dataset().sel(channel=channel)
-    strongest = {name: np.nan_to_num(cells[name].values, nan=blank) for name, blank in _BLANK.items()}
+    # Maps that an older program made have no limits.
+    unknown = xr.full_like(cells["statistic"], np.nan)
+    strongest = {name: np.nan_to_num(cells.get(name, unknown).values, nan=blank) for name, blank in _BLANK.items()}
     strongest["statistic"] = strongest["statistic"] / float(cells["threshold"])
     modes = test.children["modes"].to_dataset().sel(channel=channel) if "modes" in test.children else xr.Dataset()
     for k in range(modes.sizes.get("mode", 0)):
@@ -274,7 +276,7 @@ def _candidates(test: xr.DataTree, channel: str) -> dict[str, Array]:
         ratio = float(mode["statistic"]) / float(mode["threshold"])
         if ratio > strongest["statistic"][place]:
             for name in _BLANK:
-                strongest[name][place] = ratio if name == "statistic" else float(mode[name])
+                strongest[name][place] = ratio if name == "statistic" else float(mode.get(name, _BLANK[name]))
     y, x = np.meshgrid(cells["y"].values, cells["x"].values, indexing="ij")
     return strongest | {"x": x, "y": y}
 

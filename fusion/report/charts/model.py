@@ -174,7 +174,9 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
     step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
     drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region), zero=True)
     place = position.sel(target=chosen["series_target"].values).values.astype(float)
-    value, half = chosen["sensitivity"].values, chosen["sensitivity_half_width"].values
+    value = chosen["sensitivity"].values
+    # Series that an older program tested have no interval.
+    half = chosen.get("sensitivity_half_width", xr.full_like(chosen["sensitivity"], np.nan)).values
     side, passed = chosen["series_direction"].values, chosen["p_value"].values <= ATTRIBUTION_LEVEL
     for shift, direction in ((-0.1, "positive"), (0.1, "negative")):
         for rows, words in ((passed, "p ≤ 0.05"), (~passed, "p > 0.05")):

@@ -178,6 +178,12 @@ def test_the_candidate_of_a_cell_is_itself_or_the_mode_that_has_its_peak_there()
     assert of_mode == [0.01, 3.0, 1.8, 4.2, 1200.0]
     assert (found["p_value"][0, 0], found["sensitivity"][0, 0], found["sensitivity_u"][0, 0]) == (1.0, 0.0, np.inf)
     assert (found["x"][1, 2], found["y"][1, 2]) == (25.0, 15.0)
+    # Maps that an older program made have no limits, and are compared all the same.
+    older = session_by_hand().map_over_datasets(
+        lambda one: one.drop_vars(["sensitivity_low", "sensitivity_high"], errors="ignore")
+    )
+    limits = module._candidates(older, "joint")
+    assert np.isneginf(limits["sensitivity_low"]).all() and np.isposinf(limits["sensitivity_high"]).all()
     # A mode below its threshold by more than the cell is leaves the cell as it is.
     assert module._candidates(session_by_hand(3.0), "joint")["p_value"][1, 2] == 0.5
 
