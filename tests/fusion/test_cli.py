@@ -44,7 +44,8 @@ def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_f
     loop = json.loads((out / "results.json").read_text())["loop"]
     assert "reversal_drift (p < 0.001), held-out error" in result.output
     told = f"{loop['verdict']} (not refutable: one warm-up): "
-    assert told in result.output and "The declared model lacks a reversal error that changes" in result.output
+    shown = " ".join(result.output.replace("│", " ").split())
+    assert told in shown and "The declared model lacks a reversal error that changes" in shown
     assert result.output.rstrip().endswith(f"report: {out / 'report.html'}")
     assert "input files: done in" in result.output
     quiet = invoke("run", campaign_folder / "campaign.toml", "--out", out, "--resume", "--quiet")
