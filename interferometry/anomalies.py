@@ -1,21 +1,22 @@
-"""Anomalous positions: excess scatter, slow local motion, a step, or a periodic motion of one position.
+"""Anomalous positions: excess scatter, slow local motion, a step, or a periodic motion of one position; a jump before it that lasts.
 
-Everything is tested on the random part of the joint estimate, which belongs to one position and direction; differences of neighbouring
-positions would belong to two. Null distributions come from permutations of the readings themselves, so that heavy tails do not raise
-false alarms, and every p-value is family-wise: corrected for all positions, directions and kinds of anomaly.
+A jump from pass to pass between two targets (:mod:`interferometry.links`) is sought first, and taken out. Everything else is tested on the
+random part of the joint estimate, which belongs to one position and direction; differences of neighbouring positions would belong to two.
+Null distributions come from permutations of the readings themselves, so that heavy tails do not raise false alarms, and every p-value is
+family-wise: corrected for all positions, directions and kinds of anomaly.
 
 Two questions are kept apart: "do the positions behave unequally?" (scatter: permutation test, robust against tails; motion: permutation of
 the cycles) and "does one stand out from the natural spread of the others?" (generalised extreme Studentized deviate test). A position is an
 anomaly of the machine only if both say so: scatter differs from position to position, and a drift whose shape the model does not hold moves
 all positions a little.
 
-In this order: the public test; excess scatter; motions over the cycles; the generalised extreme Studentized deviate test.
+In this order: the public test; links; excess scatter; motions over the cycles; the generalised extreme Studentized deviate test.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,10 +27,12 @@ from scipy import special
 
 from interferometry.common import Array, InterferometryError, check_dataset
 from interferometry.deviations import ROUNDING
+from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.gls import memory_of_each, typical_memory, von_neumann_p_value
+from interferometry.links import find_link, fit_jumps
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
-WEIGHTS = {"scatter": 0.7, "slow": 0.1, "step": 0.1, "periodic": 0.1}
+WEIGHTS = {"scatter": 0.6, "link": 0.1, "slow": 0.1, "step": 0.1, "periodic": 0.1}
 #: Standardised readings are winsorised at this many standard deviations (efficiency 0.99 under a normal distribution).
 WINSOR = 3.0
 #: Cycles over which sums are taken for slow motion, and which a step needs before and after it.
@@ -57,13 +60,14 @@ class Anomaly:
     Attributes
     ----------
     direction : "positive", "negative" or "both"
-    kind : "scatter", "slow", "step" or "periodic"
+    kind : "scatter", "link", "slow", "step" or "periodic"; of a link the target is the first that its jumps carry
     p_value : family-wise: corrected for all positions, directions and kinds
     scatter_um : random standard deviation of the position and direction, um
-    extra_um : standard deviation beyond that of the other positions, um; the height of a step, the amplitude of a period
+    extra_um : standard deviation beyond that of the other positions, um; that of the jumps of a link, the height of a step, the amplitude
+        of a period
     stands_out
         Whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme
-        Studentized deviate test at `ESD_LEVELS`)
+        Studentized deviate test at `ESD_LEVELS`); True of a link, which is tested with the scatter of every target as it is
     at_cycle : number of the first cycle after a step
     period_s : period of a periodic motion, s
     least_p_value : smallest p-value that the number of permutations can show; 0 of a periodic motion, whose p-value is calculated
@@ -113,10 +117,11 @@ def detect_anomalies(
 
     Notes
     -----
-    docs/method/anomalies.md. Scatter: readings are permuted between the positions of a pass, the largest excess of a position is compared
-    with its permutation distribution, step down. Slow motion and steps: cycles are permuted, all positions alike (Westfall and Young 1993,
-    *Resampling-based multiple testing*). Periods: largest normalised power over all frequencies and series (Scargle 1982, Astrophys. J.
-    263, 835), Bonferroni. Standing out: Rosner (1983), Technometrics 25, 165.
+    docs/method/anomalies.md. Links: readings are permuted between the positions of a pass; the jumps of one that is found are taken out
+    and the drift is estimated again with the default arguments. Scatter: readings are permuted alike, the largest excess of a position is
+    compared with its permutation distribution, step down. Slow motion and steps: cycles are permuted, all positions alike (Westfall and
+    Young 1993, *Resampling-based multiple testing*). Periods: largest normalised power over all frequencies and series (Scargle 1982,
+    Astrophys. J. 263, 835), Bonferroni. Standing out: Rosner (1983), Technometrics 25, 165.
 
     Examples
     --------
@@ -143,10 +148,52 @@ def detect_anomalies(
     # Courses are those over the cycles as they were measured.
     deviations, estimated = (one.sortby("cycle") for one in (deviations, estimated))
     rng = np.random.default_rng(seed)
-    anomalies = _scatter_anomalies(estimated, level, permutations, rng)
+    links, deviations, estimated = _links(deviations, estimated, level, permutations, rng)
+    anomalies = links + _scatter_anomalies(estimated, level, permutations, rng)
     if estimated.sizes["cycle"] >= SHORTEST_TEST_CYCLES:
         anomalies += _series_anomalies(estimated, deviations, level, permutations, rng)
     return sorted(anomalies, key=lambda anomaly: anomaly.p_value)
+
+
+def _links(
+    deviations: xr.Dataset, estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator
+) -> tuple[list[Anomaly], xr.Dataset, xr.Dataset]:
+    """Return the links that jump, one after the other, and deviations and their estimate without the jumps."""
+    anomalies: list[Anomaly] = []
+    while len(anomalies) < MOST_ANOMALIES:
+        share = level * WEIGHTS["link"]
+        link = find_link(deviations, estimated, level=share, permutations=permutations, rng=rng)
+        if link is None:
+            break
+        jumps = fit_jumps(deviations, link.target, link.direction)
+        if jumps.size_um <= float(estimated["resolution"]):
+            break
+        anomalies.append(
+            Anomaly(
+                target=int(deviations["target"].values[link.target]),
+                direction=link.direction,
+                kind="link",
+                p_value=min(1.0, link.p_value / WEIGHTS["link"]),
+                scatter_um=_scatter_of(estimated, link.target, link.direction),
+                extra_um=jumps.size_um,
+                stands_out=True,
+                least_p_value=_least_p_value("link", permutations),
+            )
+        )
+        deviations = without_jumps(deviations, [anomalies[-1]])
+        estimated = estimate_drift(deviations)
+    return anomalies, deviations, estimated
+
+
+def without_jumps(deviations: xr.Dataset, anomalies: Iterable[Anomaly]) -> xr.Dataset:
+    """Return deviations less the jumps of the links among anomalies, one after the other."""
+    for one in anomalies:
+        if one.kind == "link":
+            target = int(np.flatnonzero(deviations["target"].values == one.target)[0])
+            jumps = fit_jumps(deviations, target, one.direction).readings_um
+            values = deviations["deviation"].transpose("cycle", "direction", "target")
+            deviations = deviations.assign(deviation=values - jumps)
+    return deviations
 
 
 def _scatter_anomalies(

@@ -25,6 +25,8 @@ LINE_LEVEL = 2e-3
 SENSOR_LEVEL = 0.01
 #: Of the bootstrap tests of a cause; local temperature is the cause that costs most when it is wrong.
 CAUSE_LEVELS = {"step": 0.05, "local_temperature": 0.02}
+#: At which the jumps of a link have a course in time, so that they are no lost motion from pass to pass.
+LINK_COURSE_LEVEL = 0.01
 #: Above which a serial p-value is called not significant in a sentence; it takes no part in the choice of the cause.
 SERIAL_LEVEL = 0.05
 #: Of saying that campaigns of one machine differ, over everything that is compared.

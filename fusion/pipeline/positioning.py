@@ -10,7 +10,7 @@ import xarray as xr
 from fusion.analysis.alignment.align import AxisGeometry, add_sensor_line, align, align_logs
 from fusion.analysis.consistency.camera import find_gaps, gap_words, in_gaps
 from fusion.analysis.consistency.readings import find_gross_readings
-from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose
+from fusion.analysis.diagnosis.diagnose import Diagnosis, diagnose, diagnose_link
 from fusion.analysis.levels import POSITION_LEVEL
 from fusion.campaign.inputs import LaserInputs, Source, lacks_course
 from fusion.campaign.time_zones import shown_zone, utc
@@ -22,7 +22,7 @@ from fusion.results.progress import Report, counted, listed, silent
 from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import group, joined
 from interferometry import neighbours
-from interferometry.anomalies import Anomaly, detect_anomalies
+from interferometry.anomalies import Anomaly, detect_anomalies, without_jumps
 from interferometry.deviations import OUTLIER
 from interferometry.drift.estimate import estimate_drift, flag_outliers
 from thermography.fields.cycle_fields import cycles_with_field
@@ -255,12 +255,20 @@ def diagnose_positions(fused: xr.Dataset, deviations: xr.Dataset, explained: xr.
     # Scatter that is only unequal, as it naturally is, makes no position an anomaly; one that stands out does.
     found = detect_anomalies(cleaned, estimate_drift(cleaned), level=POSITION_LEVEL, permutations=_PERMUTATIONS)
     anomalies = [anomaly for anomaly in found if anomaly.stands_out]
-    diagnoses = diagnose(fused.assign(deviation=fused["deviation"].copy(data=left)), anomalies)
+    links = [anomaly for anomaly in anomalies if anomaly.kind == "link"]
+    sites = [anomaly for anomaly in anomalies if anomaly.kind != "link"]
+    remaining = fused.assign(deviation=fused["deviation"].copy(data=left))
+    diagnoses = []
+    for link in links:
+        diagnoses.append(diagnose_link(remaining, link))
+        remaining = without_jumps(remaining, [link])
+    diagnoses += diagnose(remaining, sites)
     position_mm = deviations["position"]
-    return [
+    parts = [
         diagnosed(anomaly, diagnosis, position_mm=float(position_mm.sel(target=anomaly.target)))
-        for anomaly, diagnosis in zip(anomalies, diagnoses, strict=True)
+        for anomaly, diagnosis in zip(links + sites, diagnoses, strict=True)
     ]
+    return sorted(parts, key=lambda part: part.p_value or 0.0)
 
 
 def diagnosed(anomaly: Anomaly, diagnosis: Diagnosis, *, position_mm: float) -> AnomalyPart:
@@ -282,11 +290,10 @@ def diagnosed(anomaly: Anomaly, diagnosis: Diagnosis, *, position_mm: float) -> 
 def sites_of(anomalies: Sequence[AnomalyPart], targets: int) -> list[tuple[int, str]]:
     """Sites that are reported as anomalies, so that the loop does not report them again as a remainder."""
     sides = {"both": ("positive", "negative")}
-    if 4 * len({anomaly.target for anomaly in anomalies}) > targets:
+    alone = [anomaly for anomaly in anomalies if anomaly.evidence.kind != "link"]
+    if 4 * len({anomaly.target for anomaly in alone}) > targets:
         return []
-    return [
-        (anomaly.target, name) for anomaly in anomalies for name in sides.get(anomaly.direction, (anomaly.direction,))
-    ]
+    return [(anomaly.target, name) for anomaly in alone for name in sides.get(anomaly.direction, (anomaly.direction,))]
 
 
 # How much a campaign must hold for each analysis, and the notice that names what a small one would need.

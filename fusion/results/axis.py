@@ -151,7 +151,7 @@ class CorrelationPart(ResultPart):
     """Loads that were switched at random; null where none was."""
 
 
-Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
+Cause = Literal["structural", "local_temperature", "stick_slip", "step", "link", "undetermined"]
 Direction = Literal["positive", "negative", "both"]
 CAUSES: tuple[Cause, ...] = get_args(Cause)
 
@@ -393,9 +393,9 @@ class DriftPart(ResultPart):
 
 
 class Evidence(ResultPart):
-    """What the cause of an anomaly rests on."""
+    """What the cause of an anomaly rests on; of a link, what compares it with scatter of the two targets beside it."""
 
-    kind: Literal["scatter", "slow", "step", "periodic"]
+    kind: Literal["scatter", "link", "slow", "step", "periodic"]
     """What stands out."""
     extra_um: Number
     """Size of what stands out beyond the other targets, um."""
@@ -407,35 +407,45 @@ class Evidence(ResultPart):
     """Sentences against it, the runner-up first."""
     check: str
     """What to inspect on the machine."""
-    probability_structural: Number
+    probability_structural: Number = None
     """Probability of mechanical scatter."""
-    probability_stick_slip: Number
+    probability_link: Number = None
+    """Probability of a jump between the target and the one before, against scatter of either; of a link only."""
+    jump_um: Number = None
+    """Standard deviation of the jumps of a link, um."""
+    jump_u_um: Number = None
+    """Its standard uncertainty, um."""
+    link_before_ratio: Number = None
+    """Standard deviation of the differences to the target before (equation 6) over the median of all links, 1."""
+    link_after_ratio: Number = None
+    """The same of the differences to the target behind, 1."""
+    probability_stick_slip: Number = None
     """Probability of stick-slip."""
-    probability_slow: Number
+    probability_slow: Number = None
     """Probability of a slow motion without a known cause."""
-    probability_step: Number
+    probability_step: Number = None
     """Probability of one step."""
     probability_local_temperature: Number = None
     """Probability of a local temperature; absent where the camera does not see the target."""
-    scatter_typical_um: Number
+    scatter_typical_um: Number = None
     """Median scatter of the other targets, um."""
-    scatter_positive_um: Number
+    scatter_positive_um: Number = None
     """Scatter of the approach in positive direction, um."""
-    scatter_negative_um: Number
+    scatter_negative_um: Number = None
     """Scatter of the approach in negative direction, um."""
     serial_p: Number
-    """p-value of the order of the readings in time."""
-    approach_gain_nats: Number
+    """p-value of the order of the readings, of a link that of its jumps, in time."""
+    approach_gain_nats: Number = None
     """Gain in log-likelihood of an effect bound to the direction of approach, nats."""
-    step_p: Number
+    step_p: Number = None
     """p-value of one step (parametric bootstrap)."""
-    step_um: Number
+    step_um: Number = None
     """Height of the step, um."""
-    step_u_um: Number
+    step_u_um: Number = None
     """Standard uncertainty of the height, um."""
-    step_cycle: int
+    step_cycle: int | None = None
     """First cycle after the step."""
-    step_held_out_nats: Number
+    step_held_out_nats: Number = None
     """Gain of the step on the direction that it was not fitted to, nats."""
     temperature_p: Number = None
     """p-value of the local temperature (parametric bootstrap)."""

@@ -41,6 +41,11 @@ CAUSES: dict[Cause, CauseRecord] = {
         "sudden step",
         "Inspect fixture, optics, clamps and the coupling of the scale, and look for an event at that time in the machine's log.",
     ),
+    "link": CauseRecord(
+        "jump between two positions",
+        "Inspect what carries the motion from the position before to this position: nut and screw (play, preload, a slip), coupling, and "
+        "the joints of the scale and of its reading head; repeat the test with small steps between the two.",
+    ),
     "undetermined": CauseRecord(
         "undetermined",
         "These data do not decide: repeat the test with more cycles in both directions, a varied duty cycle and a temperature "

@@ -14,7 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
+from scipy import special
 
+from fusion.analysis.alignment.readings import known_mean
 from fusion.analysis.diagnosis.causes import CAUSES, undetermined_check
 from fusion.analysis.diagnosis.explanations import (
     LAGS_S,
@@ -32,12 +34,19 @@ from fusion.analysis.diagnosis.explanations import (
     step_instant,
     warm_up_share,
 )
-from fusion.analysis.levels import CAUSE_LEVELS, SERIAL_LEVEL
+from fusion.analysis.levels import CAUSE_LEVELS, LINK_COURSE_LEVEL, SERIAL_LEVEL
 from fusion.results.axis import Cause
-from interferometry.common import one_thread
+from interferometry.common import Array, one_thread
+from interferometry.links import fit_jumps
 
 #: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
-THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
+THRESHOLDS: dict[str, float] = {
+    "structural": 0.3,
+    "local_temperature": 0.8,
+    "stick_slip": 0.4,
+    "step": 0.6,
+    "link": 0.95,
+}
 #: Log-likelihood (nats) that an explanation by the direction of approach must gain over scatter equal in both directions: amounts along
 #: the motion, more scatter in one direction, a random walk in one direction (beside its parameter). Scatter equal in both directions
 #: exceeds one of them by chance in about one case of twenty.
@@ -168,6 +177,68 @@ def diagnose(fused: xr.Dataset, anomalies: Sequence[Flagged], *, seed: int = 0) 
     flagged = {int(anomaly.target) for anomaly in anomalies}
     cases = {target: _fit_explanations(fused, target, flagged, seed) for target in sorted(flagged)}
     return [_judge(cases[int(anomaly.target)], str(anomaly.direction)) for anomaly in anomalies]
+
+
+def diagnose_link(fused: xr.Dataset, link: Flagged) -> Diagnosis:
+    """Diagnose a jump between a target and the one before: against scatter of either, and by its course in time."""
+    targets = fused["target"].values
+    jumps = fit_jumps(fused, int(np.flatnonzero(targets == link.target)[0]), link.direction)
+    before = int(targets[jumps.before])
+    probability = float(special.expit(jumps.gain_nats))
+    against = []
+    if probability < THRESHOLDS["link"]:
+        against.append(
+            f"scatter of target {before} or {link.target} alone fits nearly as well (probability {1.0 - probability:.2f})"
+        )
+    if jumps.serial_p < LINK_COURSE_LEVEL:
+        against.append(
+            f"the jumps have a course in time (serial p = {jumps.serial_p:.2g}): what grows between the two targets, as their temperature"
+        )
+    cause: Cause = "undetermined" if against else "link"
+    ratios = link_ratios(fused, link.target, link.direction)
+    return Diagnosis(
+        target=link.target,
+        direction=link.direction,
+        cause=cause,
+        probability=probability,
+        evidence={
+            "probability_link": probability,
+            "jump_um": jumps.size_um,
+            "jump_u_um": jumps.size_u_um,
+            "serial_p": jumps.serial_p,
+            **dict(zip(("link_before_ratio", "link_after_ratio"), ratios, strict=True)),
+        },
+        for_it=(
+            f"every target from {link.target} on jumps together against those up to {before}, by {jumps.size_um:.2f} ± "
+            f"{2.0 * jumps.size_u_um:.2f} µm (standard deviation from pass to pass, k = 2), beside shift and stretch of the pass",
+            f"scatter of one of the two targets gains {jumps.gain_nats:.1f} nats less",
+            _links_sentence(before, ratios),
+        ),
+        against_it=tuple(against),
+        check=CAUSES[cause].check if cause == "link" else undetermined_check("link"),
+    )
+
+
+def link_ratios(fused: xr.Dataset, target: int, direction: str) -> tuple[float | None, float | None]:
+    """Return the standard deviations of the differences to the neighbours before and behind (equation 6) over the median of all links."""
+    along = fused.isel(target=np.argsort(fused["position"].values, kind="stable")).transpose(
+        "cycle", "direction", "target", ...
+    )
+    sides = [direction in ("both", str(name)) for name in along["direction"].values]
+    differences = np.diff(along["deviation"].values[:, sides], axis=2)
+    known = np.isfinite(differences)
+    centred = np.where(known, differences - known_mean(differences, axis=0), 0.0)
+    scatter = np.sqrt((centred**2).sum(axis=(0, 1)) / np.maximum(known.sum(axis=(0, 1)) - len(centred[0]), 1))
+    ratios: Array = scatter / max(float(np.median(scatter)), 1e-12)
+    at = int(np.flatnonzero(along["target"].values == target)[0])
+    return (float(ratios[at - 1]) if at else None, float(ratios[at]) if at < ratios.size else None)
+
+
+def _links_sentence(before: int, ratios: tuple[float | None, float | None]) -> str:
+    """Return which of the two links of a target equation (6) shows raised."""
+    own, other = ratios
+    behind = "" if other is None else f"; to the one behind {other:.2f} times: a target that scatters raises both alike"
+    return f"differences to target {before} scatter {own:.2f} times as much as those of neighbours usually do{behind}"
 
 
 def _fit_explanations(fused: xr.Dataset, target: int, flagged: set[int], seed: int) -> _Case:

@@ -62,7 +62,7 @@ def remarks(results: Results) -> list[str]:
 
 def _moves(anomaly: AnomalyPart) -> bool:
     """Whether the mean of a position depends on when it was measured, for no reason that the results name."""
-    return anomaly.evidence.kind != "scatter" and anomaly.cause != "local_temperature"
+    return anomaly.evidence.kind not in ("scatter", "link") and anomaly.cause != "local_temperature"
 
 
 # What a compensation table is predicted to do: the systematic error of the axis without and with it.
