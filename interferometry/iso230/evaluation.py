@@ -121,7 +121,7 @@ def evaluate_iso230(
         within = drift.reindex_like(deviations["deviation"]).sel(cycle=numbers)
         varied = _drift_variation(within.values)
         if stated is None:
-            course = _drift_within(within)
+            course = _drift_within(within, deviations["time"].sel(cycle=numbers))
             without_drift = xr.Dataset(_quantities(x - course, count), coords)
             changes = _changes_within(without_drift, course)
     # Without a standard deviation no uncertainty is known either.
@@ -148,12 +148,34 @@ def _drift_variation(within: np.ndarray) -> float:
     return float(np.nanstd(within[:, known], axis=0, ddof=1).max()) if known.any() else np.nan
 
 
-def _drift_within(drift: xr.DataArray) -> np.ndarray:
-    """Return the drift of a window from its mean at every target, um; where a reading has none, that of its cycle."""
+def _drift_within(drift: xr.DataArray, time: xr.DataArray) -> np.ndarray:
+    """Return the drift of a window from its mean at every target, um; where a reading has none, that of its cycle.
+
+    Approaches minutes apart in one drift differ by what it does meanwhile; a difference at the same time is the reversal of that state.
+    """
     drift = drift - drift.mean(("cycle", "direction"))
+    if drift.sizes["direction"] == 2:
+        half = xr.DataArray([0.5, -0.5], dims="direction")
+        drift = drift - half * xr.DataArray(_reversal_at_one_time(drift.values, time.values), dims="target")
     return (
         drift.fillna(drift.mean(("direction", "target"))).fillna(0.0).transpose("cycle", "direction", "target").values
     )
+
+
+def _reversal_at_one_time(drift: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return the mean difference of both approaches at the times of either (target,), um; 0 where their times do not overlap."""
+    seconds = np.where(np.isnat(time) | np.isnan(drift), np.nan, time.astype("datetime64[ns]").astype("f8") * 1e-9)
+    found = np.zeros(drift.shape[2])
+    for target, (at, values) in enumerate(zip(seconds.transpose(2, 1, 0), drift.transpose(2, 1, 0), strict=True)):
+        forth, back = (np.isfinite(one) for one in at)
+        if not forth.any() or not back.any():
+            continue
+        back_at_forth = np.interp(at[0][forth], at[1][back], values[1][back], left=np.nan, right=np.nan)
+        forth_at_back = np.interp(at[1][back], at[0][forth], values[0][forth], left=np.nan, right=np.nan)
+        differences = np.concatenate([values[0][forth] - back_at_forth, forth_at_back - values[1][back]])
+        if np.isfinite(differences).any():
+            found[target] = np.nanmean(differences)
+    return found
 
 
 def _changes_within(axis: xr.Dataset, drift: np.ndarray) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ from interferometry.iso230 import (
     evaluate_other_standards,
     evaluate_windows,
 )
+from interferometry.iso230.budget import SCATTER_ALONE
 from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 
@@ -228,6 +229,20 @@ def test_two_estimates_of_the_drift_at_a_position_have_a_variation_and_one_has_n
     assert np.isnan(evaluate_iso230(test, drift=drift)["drift_variation"])
     drift[3, 0, 2] = 3.0
     assert float(evaluate_iso230(test, drift=drift)["drift_variation"]) == pytest.approx(np.sqrt(2.0))
+
+
+def test_what_approaches_differ_by_at_one_time_is_their_reversal_and_between_passes_drift():
+    """A reversal that drifted by 2 um before the window is its state; a drift of 1 um from one pass to the next is none."""
+    test = test_made(np.random.default_rng(7).normal(0.0, 0.1, (5, 2, 3)))
+    minute = np.timedelta64(1, "m")
+    time = np.datetime64("2026-03-09T06:30") + minute * (2 * np.arange(5)[:, None, None] + np.arange(2)[:, None])
+    test["time"] = test["time"].copy(data=np.broadcast_to(time, (5, 2, 3)))
+    state = test["deviation"].copy(data=np.broadcast_to(np.array([1.0, -1.0])[:, None], (5, 2, 3)))
+    passes = test["deviation"].copy(data=np.broadcast_to(np.arange(10.0).reshape(5, 2, 1), (5, 2, 3)))
+    still, moved = (evaluate_iso230(test, budget=SCATTER_ALONE, drift=one) for one in (state, passes))
+    alone = evaluate_iso230(test, budget=SCATTER_ALONE, drift=xr.zeros_like(state))
+    assert float(still["B_u"]) == pytest.approx(float(alone["B_u"]), rel=1e-9)
+    assert float(moved["B_u"]) > 0.9
 
 
 def test_the_drift_and_the_temperature_of_a_window_enter_its_budget():
