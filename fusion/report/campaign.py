@@ -13,8 +13,10 @@ import xarray as xr
 from fusion.analysis.alignment.sensor_health import describe_fault
 from fusion.analysis.levels import (
     ATTRIBUTION_LEVEL,
+    CAUSE_LEVELS,
     CHECKS,
     ENTRY_LEVEL,
+    POSITION_LEVEL,
     RECORD_ENTRY_LEVEL,
     REMAINDER_LEVEL,
     SEARCH_LEVEL,
@@ -419,18 +421,16 @@ DECIDED_BEFORE = (
 
 
 def errors_table(loop: Loop) -> Table:
-    """Return the errors on the hold-out with their intervals: of the model before and after, and of plain predictions."""
+    """Return the errors on the hold-out: of the model before and after, with what it expects of them, and of plain predictions."""
     named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
     plain = [(words, getattr(loop.baselines, name)) for name, words in baseline_words(loop).items()]
-    listed = [*named, *plain]
-    numbers = alike(
-        [getattr(one, name) for _, one in listed for name in ("rmse_um", "low_um", "high_um")], distinct=False
-    )
+    errors = alike([one.rmse_um for _, one in (*named, *plain)], distinct=False)
+    expected = [say("expected_cell", one) or "–" for _, one in named] + ["–"] * len(plain)
     rows = [
-        Row([name, numbers[3 * at], f"{numbers[3 * at + 1]} to {numbers[3 * at + 2]}"], marked=at < len(named))
-        for at, (name, _) in enumerate(listed)
+        Row([name, error, told], marked=at < len(named))
+        for at, ((name, _), error, told) in enumerate(zip((*named, *plain), errors, expected, strict=True))
     ]
-    return table([Words("Prediction of what was held out"), "Error / µm", "95 % interval / µm"], rows)
+    return table([Words("Prediction of what was held out"), "Error / µm", "Expected by the model / µm"], rows)
 
 
 def steps_table(loop: Loop) -> Table:
@@ -546,7 +546,10 @@ def describe_anomaly(anomaly: AnomalyPart) -> dict[str, Any]:
         "support": evidence.support,
         "against": evidence.against,
         "check": evidence.check,
-        "numbers": [(EVIDENCE[name], in_words(value)) for name, value in evidence.numbers().items()],
+        "numbers": [
+            (EVIDENCE[name], "excluded" if value is None and name.startswith("probability") else in_words(value))
+            for name, value in evidence.numbers().items()
+        ],
     }
 
 
@@ -598,7 +601,7 @@ SECTIONS = (
 _SIGNS = {"positive": "+", "negative": "−"}
 _LEVELS = {
     "search": SEARCH_LEVEL, "second": SECOND_LEVEL, "entry": ENTRY_LEVEL, "remainder": REMAINDER_LEVEL, "attribution": ATTRIBUTION_LEVEL,
-    "record_entry": RECORD_ENTRY_LEVEL,
+    "record_entry": RECORD_ENTRY_LEVEL, "position": POSITION_LEVEL, **CAUSE_LEVELS,
 }  # fmt: skip
 #: Largest number of channels of a record with charts; all of them are in fusion.nc.
 _MOST_CHANNELS = 6

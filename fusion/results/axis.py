@@ -424,9 +424,10 @@ class Evidence(ResultPart):
     probability_slow: Number = None
     """Probability of a slow motion without a known cause."""
     probability_step: Number = None
-    """Probability of one step."""
+    """Probability of one step; null where it is excluded, since its p is above its level."""
     probability_local_temperature: Number = None
-    """Probability of a local temperature; absent where the camera does not see the target."""
+    """Probability of a local temperature; null where it is excluded, since its p is above its level, absent where no
+    camera sees the target."""
     scatter_typical_um: Number = None
     """Median scatter of the other targets, um."""
     scatter_positive_um: Number = None

@@ -1,11 +1,14 @@
-"""Parts of results.json on the closed loop, along an axis and on a record: added effects, search, detection limits, residual."""
+"""Parts of results.json on the closed loop, along an axis and on a record: added effects, search, detection limits, residual.
+
+A p-value of 0.001 stands for any smaller one (`fusion.results.parts.PValue`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Literal
 
-from fusion.results.parts import Number, ResultPart, Sensitivity
+from fusion.results.parts import Number, PValue, ResultPart, Sensitivity
 
 Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
 #: What readings that an effect was not fitted to say of it; "no": they contradict it.
@@ -29,7 +32,7 @@ class RunnerUp(ResultPart):
     """Name of the effect."""
     gain_deficit: Number
     """Difference of its log-likelihood gain beyond chance to that of the chosen effect, nats."""
-    p_value: Number
+    p_value: PValue
     """Its own p-value, family-wise over the search."""
 
 
@@ -55,45 +58,62 @@ class DeclaredCoefficient(Coefficient):
     """Standard deviation by which it moves when a target or a part of the test is left out; null where it rests on one of them alone."""
 
 
-class ErrorInterval(ResultPart):
-    """A root mean square error on the hold-out with its 95 % interval."""
+class HeldOutError(ResultPart):
+    """An error on the hold-out."""
 
     rmse_um: Number
     """Root mean square error, um."""
-    low_um: Number
-    """Lower end of the interval (block bootstrap over the hold-out), um."""
-    high_um: Number
-    """Upper end of the interval, um."""
+
+
+class ModelError(HeldOutError):
+    """An error of the model on the hold-out, and what the model itself expects of it: where more is missed, the model is wrong there."""
+
+    expected_um: Number = None
+    """Root mean square error that drift, noise and coefficients make there, as uncertain as the training part leaves them, um; of a record
+    that of predicting later parts of the training part from earlier ones. Null in results of earlier versions."""
+    expected_low_um: Number = None
+    """Lower end of the range that holds the error in 95 % of such hold-outs where the model is right, um; null of a record."""
+    expected_high_um: Number = None
+    """Its upper end, um; null of a record."""
+    expected_p: Number = None
+    """Probability of an error as large or larger where the model is right, by simulation; null of a record."""
+
+    @property
+    def exceeds(self) -> bool | None:
+        """Whether it is larger than where the model is right; None where that is not known."""
+        if self.rmse_um is None or self.expected_high_um is None:
+            return None
+        return self.rmse_um > self.expected_high_um
 
 
 class ModelErrors(ResultPart):
     """Errors on the hold-out before and after."""
 
-    declared: ErrorInterval
+    declared: ModelError
     """Of the declared model."""
-    final: ErrorInterval
+    final: ModelError
     """With the effects that the training part alone decided on, without those that left the forecast."""
 
 
 class Baselines(ResultPart):
     """Errors of plain predictions of the hold-out from the training part."""
 
-    last_value: ErrorInterval
+    last_value: HeldOutError
     """Repeating the last value."""
-    mean: ErrorInterval
+    mean: HeldOutError
     """The mean of the training part."""
-    least_squares: ErrorInterval
+    least_squares: HeldOutError
     """Least squares on everything that was logged."""
-    ridge: ErrorInterval
+    ridge: HeldOutError
     """Ridge regression on the same."""
-    ridge_with_lags: ErrorInterval
+    ridge_with_lags: HeldOutError
     """Ridge regression on the same and on lagged copies of it."""
 
 
 class RunBaselines(Baselines):
     """The same where a record has several runs."""
 
-    mean_run: ErrorInterval
+    mean_run: HeldOutError
     """The mean course of the other runs."""
 
 
@@ -108,7 +128,7 @@ class StepPart(ResultPart):
     """Parameters; a name ends with its unit."""
     parameter_ranges: Mapping[str, Range]
     """Values of the parameters that fit equally well (profile likelihood, 95 %)."""
-    p_value: Number
+    p_value: PValue
     """p-value that let it in, family-wise over the search."""
     rmse_before_um: Number
     """Root mean square error on the hold-out before it entered, um; null for an effect that entered after the hold-out was opened."""
@@ -137,7 +157,7 @@ class StepPart(ResultPart):
     borne_out: BorneOut | None = None
     """Whether those readings, the hold-out or for an event blocks that are left out, bear it out; no: they contradict it. Either statement
     is false with a probability of 0.05. Null in results of earlier versions."""
-    borne_out_p: Number = None
+    borne_out_p: PValue = None
     """Probability of a size as large there where the effect is not there."""
     borne_out_size: Number = None
     """Size with which it acts there over that predicted, 1: 1 where it is right, 0 where it is not there; null where it does not change."""
@@ -163,7 +183,7 @@ class AxisStep(StepPart):
 
     coefficients: tuple[Coefficient, ...]
     """Coefficients of its columns."""
-    held_out_p: Number
+    held_out_p: PValue
     """p-value of its gain on readings that its coefficients were not fitted to."""
     event_cycle: int | None
     """Cycle in which an event happened; null for an effect that is no event."""
@@ -205,7 +225,7 @@ class Unexplained(ResultPart):
     """Root mean square of what no named effect explains beyond the noise, um: the larger of the shape (along an axis over the readings,
     on a record and of an error of prediction what the hold-out error holds beside the noise) and the random drift that the model allows,
     0 where there is no shape; and, as the root of the sum of squares, of the added effects without a name."""
-    p_value: Number
+    p_value: PValue
     """p-value of any structure in the residual, family-wise over the shapes."""
     closest_effect: str
     """Effect that comes closest to it; empty where none does."""
@@ -216,7 +236,7 @@ class AxisUnexplained(Unexplained):
 
     closest_effect_parameters: Mapping[str, Parameter] = {}
     """Its parameters: what it follows, and how late."""
-    closest_effect_p: Number
+    closest_effect_p: PValue
     """p-value of that effect in the search."""
     closest_effect_share: Number
     """Share of the structure that this effect explains, 1."""
@@ -225,7 +245,7 @@ class AxisUnexplained(Unexplained):
 class RecordUnexplained(Unexplained):
     """Structure that the final model leaves of a record."""
 
-    p_values: Mapping[str, Number]
+    p_values: Mapping[str, PValue]
     """p-value by shape, each shape by itself."""
     variance_share: Number
     """Share of the displacements' variance on the hold-out that is left, mean over the channels, 1."""
@@ -274,7 +294,7 @@ class HoldOutQuestion(ResultPart):
     """Root mean square error on the hold-out without it, um."""
     rmse_after_um: Number
     """Root mean square error on the hold-out with it, um."""
-    p_value: Number
+    p_value: PValue
     """p-value of its gain on the hold-out."""
     entered: bool
     """Always false: the hold-out reports, it does not decide."""
@@ -291,9 +311,9 @@ class CandidateScore(ResultPart):
     """Gain in log-likelihood, nats."""
     excess_gain: Number
     """Gain beyond the mean gain where nothing is missing, nats."""
-    p_value: Number
+    p_value: PValue
     """p-value of the gain for this effect alone."""
-    family_wise_p: Number
+    family_wise_p: PValue
     """p-value of the gain, family-wise over the search."""
 
 
@@ -302,7 +322,7 @@ class AxisScore(CandidateScore):
 
     held_out_gain: Number
     """Gain on readings that its coefficients were not fitted to, nats."""
-    held_out_p: Number
+    held_out_p: PValue
     """p-value of that gain."""
     collinear_share: Number
     """Share of the candidates that are collinear with the model, 1."""
@@ -377,7 +397,7 @@ class AxisLine(ResultPart):
 class ResidualPart(ResultPart):
     """Tests of the residual of one model."""
 
-    p_values: Mapping[str, Number]
+    p_values: Mapping[str, PValue]
     """p-value by shape (permutation test), each shape by itself."""
     drift_common_um: Number
     """Root mean square of the unexplained drift that all targets share, um."""
@@ -416,11 +436,11 @@ class Tracking(ResultPart):
 
     every_min: Number
     """Time from one reading to the next, min."""
-    model: ErrorInterval
+    model: HeldOutError
     """Of the final model, its random drift carried on from the readings by the Kalman filter."""
-    last_reading: ErrorInterval
+    last_reading: HeldOutError
     """Of repeating the last reading."""
-    ridge: ErrorInterval
+    ridge: HeldOutError
     """Of ridge regression started at the last reading."""
 
 
@@ -434,9 +454,9 @@ class Loop(HoldOutErrors):
     noise_floor_um: Number
     """Standard deviation of a single reading or block mean that no model explains, um."""
     errors: ModelErrors
-    """The errors before and after with their intervals."""
+    """The errors before and after, with what the model itself expects."""
     baselines: RunBaselines | Baselines
-    """Errors of plain predictions with their intervals."""
+    """Errors of plain predictions."""
     best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags", "mean_run"]
     """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
     steps: tuple[StepPart, ...]
@@ -456,7 +476,7 @@ class Loop(HoldOutErrors):
     verdict: Verdict
     """complete: nothing is missing; explained: effects added, nothing is left; partial: something is left; unexplained: something is left
     and no effect deserves its name; no_skill: the model predicts no better than the last value or the mean, these data cannot tell."""
-    unconfirmed_effects: Mapping[str, Number]
+    unconfirmed_effects: Mapping[str, PValue]
     """Effects that are significant and were not admitted or not confirmed, with their p-value."""
     tracking: Tracking | None = None
     """Errors with a reading from time to time; null for several runs, and in results of earlier versions."""

@@ -9,6 +9,8 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+#: Least p-value that is stated: below it a p-value is the tail of a distribution that no number of simulations or readings has shown.
+LEAST_P = 0.001
 #: What is smaller, in any unit that is printed (a femtometre, a nanokelvin), is rounding of the arithmetic.
 _ROUNDING = 1e-9
 
@@ -74,14 +76,14 @@ def percent(share: float) -> str:
 
 
 def p_cell(p: float | None, least: float | None = None) -> str:
-    """Return a p-value for a table: to two digits, as a bound below 0.001 and where it is `least`, the resolution of the simulations."""
+    """Return a p-value for a table: to two digits, as a bound up to `LEAST_P` and at `least`, the resolution of simulations."""
     if p is None or not math.isfinite(p):
         return "–"
     if least and p <= least * (1.0 + 1e-9):
         digit = math.floor(math.log10(p))
         rounded = math.ceil(round(p / 10.0**digit, 6)) * 10.0**digit
         return f"≤ {rounded:.{max(0, -digit)}f}"
-    return "< 0.001" if p < 0.001 else f"{p:.2g}"
+    return f"< {LEAST_P:g}" if p <= LEAST_P else f"{p:.2g}"
 
 
 def p_words(p: float | None, least: float | None = None) -> str:

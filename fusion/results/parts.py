@@ -23,8 +23,11 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from fusion.common import FusionError
+from fusion.results.numbers import LEAST_P
 
 Number = float | None
+#: A p-value; ``LEAST_P`` stands for any smaller one.
+PValue = Annotated[Number, AfterValidator(lambda p: p if p is None else max(p, LEAST_P))]
 
 
 class ResultPart(BaseModel):

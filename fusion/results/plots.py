@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.common import FusionError
-from fusion.results.loop import AxisLoop, ErrorInterval, RecordLoop
+from fusion.results.loop import AxisLoop, HeldOutError, ModelError, RecordLoop
 from fusion.results.parts import Number
 from interferometry.plots import COLOURS, MUTED, new_axes
 
@@ -21,7 +21,7 @@ class LoopErrors(Protocol):
     """What `close_loop` returns of its errors: those of every prediction of the hold-out set, and the noise, um."""
 
     @property
-    def hold_out(self) -> Mapping[str, ErrorInterval]:
+    def hold_out(self) -> Mapping[str, HeldOutError]:
         """Errors by prediction, um."""
 
     @property
@@ -89,7 +89,7 @@ def plot_correlation(maps: xr.DataTree, ax: Axes | None = None, *, channel: str 
 
 
 def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) -> Axes:
-    """Plot the errors on the hold-out set: declared model, model with the added effects, and plain predictions, with 95 % intervals.
+    """Plot the errors on the hold-out set: declared model, model with the added effects, and plain predictions.
 
     Parameters
     ----------
@@ -104,13 +104,13 @@ def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) 
 
     Notes
     -----
-    Hold-out set and intervals: docs/method/closed-loop.md.
+    Black bars hold 95 % of the errors that the model itself expects, dots are their root mean square: docs/method/closed-loop.md.
 
     Examples
     --------
     >>> ax = plot_loop(close_loop(fused, ["axis_expansion", "table_offset"]))  # doctest: +SKIP
     """
-    errors: dict[str, ErrorInterval] = (
+    errors: dict[str, HeldOutError] = (
         {**dict(loop.errors), **dict(loop.baselines)}
         if isinstance(loop, AxisLoop | RecordLoop)
         else dict(loop.hold_out)
@@ -118,17 +118,21 @@ def plot_loop(loop: LoopErrors | AxisLoop | RecordLoop, ax: Axes | None = None) 
     ax = new_axes(ax)
     known = {name: error for name, error in errors.items() if error.rmse_um is not None}
     values = np.array([error.rmse_um for error in known.values()], float)
-    ends = np.array([[error.low_um, error.high_um] for error in known.values()], float)
     colours = {"declared": COLOURS["negative"], "final": COLOURS["positive"]}
     ax.barh(
         [_PREDICTIONS[name] for name in known],
         values,
-        xerr=np.abs(ends - values[:, None]).T,
         color=[colours.get(name, MUTED) for name in known],
-        ecolor="black",
     )
+    for name, error in known.items():
+        if isinstance(error, ModelError) and error.expected_um is not None:
+            ends = [
+                error.expected_um if end is None else end for end in (error.expected_low_um, error.expected_high_um)
+            ]
+            ax.plot(ends, [_PREDICTIONS[name]] * 2, color="black")
+            ax.plot(error.expected_um, _PREDICTIONS[name], "o", color="black", markersize=4.0)
     if loop.noise_floor_um is not None:
         ax.axvline(loop.noise_floor_um, color="black", linewidth=0.8, linestyle=":")
     ax.invert_yaxis()
-    ax.set(xlabel="error on the hold-out set / µm (95 % intervals; dotted: noise)")
+    ax.set(xlabel="error on the hold-out set / µm (black: expected by the model; dotted: noise)")
     return ax

@@ -341,6 +341,9 @@ def _renamed(part: Any, key: str = "") -> Any:
     if key == "conditions" and isinstance(name := part.get("name"), str):
         known = "instrument" if name.startswith("Instrument") else name.lower().replace(" ", "_")
         part = {"key": _CONDITIONS.get(name, known), **part}
+    if "rmse_um" in part:
+        # The spread of an error within its own hold-out set was no interval of the error.
+        part = {name: value for name, value in part.items() if name not in ("low_um", "high_um")}
     names = RENAMED_TESTS if key == "p_values" else {} if key in _NAMED_BY_THE_CAMPAIGN else RENAMED_KEYS
     return {names.get(name, name): _renamed(one, name) for name, one in part.items()}
 

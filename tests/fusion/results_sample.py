@@ -35,7 +35,7 @@ STEP = {
     "doubt": "",
     "confirmed_by": "on later blocks of cycles",
 }
-ERROR = {"rmse_um": 0.6, "low_um": 0.5, "high_um": 0.7}
+ERROR = {"rmse_um": 0.6}
 LOOP = {
     "declared": ["axis_expansion"],
     "held_out": "cycles 41 to 60",
@@ -43,11 +43,11 @@ LOOP = {
     "rmse_persistence_um": 0.9,
     "rmse_declared_um": 0.6,
     "rmse_final_um": 0.4,
-    "errors": {"declared": ERROR, "final": {"rmse_um": 0.4, "low_um": 0.35, "high_um": 0.46}},
+    "errors": {"declared": ERROR, "final": {"rmse_um": 0.4}},
     "baselines": {
-        "last_value": {"rmse_um": 0.9, "low_um": 0.8, "high_um": 1.0},
+        "last_value": {"rmse_um": 0.9},
         **dict.fromkeys(("mean", "least_squares", "ridge"), ERROR),
-        "ridge_with_lags": {"rmse_um": 0.5, "low_um": 0.4, "high_um": 0.6},
+        "ridge_with_lags": {"rmse_um": 0.5},
     },
     "best_baseline": "ridge_with_lags",
     "unconfirmed_effects": {},

@@ -116,6 +116,11 @@ class _Case:
         return {"step": self.step} | ({"local_temperature": self.temperature} if self.temperature is not None else {})
 
     @property
+    def excluded(self) -> list[str]:
+        """The explanations that their own tests exclude: as much of them is no rarity in an ordinary slow drift."""
+        return [name for name, fit in self.tested.items() if fit.p_value > CAUSE_LEVELS[name]]
+
+    @property
     def step_cycle(self) -> int:
         """Number of the first cycle after the best step."""
         return int(self.residual.cycle[step_instant(self.step.best)])
@@ -282,9 +287,8 @@ def _probabilities(case: _Case) -> dict[str, float]:
     }
     if case.temperature is not None:
         score["local_temperature"] = case.temperature.log_likelihood - parameter - float(np.log(len(LAGS_S)))
-    for name, fit in case.tested.items():
-        if fit.p_value > CAUSE_LEVELS[name]:
-            score[name] = -np.inf
+    for name in case.excluded:
+        score[name] = -np.inf
     highest = max(score.values())
     weight = {name: float(np.exp(value - highest)) for name, value in score.items()}
     total = sum(weight.values())
@@ -297,12 +301,12 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
     leading = max(probability, key=lambda name: probability[name])
     against = _objections(case, leading, probability[leading])
     cause: Cause = "undetermined" if against or leading == "slow" else leading  # type: ignore[assignment]
-    runner_up = max((name for name in probability if name != leading), key=lambda name: probability[name])
+    others = [name for name in probability if name != leading and name not in case.excluded]
+    runner_up = max(others, key=lambda name: probability[name])
     against.append(f"next best explanation: {_in_words(runner_up)}, probability {probability[runner_up]:.2f}")
     against += [
-        f"{_in_words(name)}: p = {fit.p_value:.2g}, ordinary slow drift would look the same"
-        for name, fit in case.tested.items()
-        if fit.p_value > CAUSE_LEVELS[name]
+        f"{_in_words(name)}: excluded, since ordinary slow drift would look the same (p = {case.tested[name].p_value:.2g})"
+        for name in case.excluded
     ]
     return Diagnosis(
         target=case.residual.target,
@@ -397,7 +401,10 @@ def _directions_sentence(residual: Residual) -> str:
 
 def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:
     """Return every number that the diagnosis rests on."""
-    evidence: dict[str, Any] = {f"probability_{name}": value for name, value in probability.items()}
+    # What its own test excludes has no probability.
+    evidence: dict[str, Any] = {
+        f"probability_{name}": None if name in case.excluded else value for name, value in probability.items()
+    }
     evidence |= {
         "scatter_typical_um": case.residual.typical_um,
         "scatter_positive_um": case.residual.scatter_um[0],

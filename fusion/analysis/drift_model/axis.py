@@ -65,7 +65,7 @@ from fusion.analysis.drift_model.model import (
     unexplained_drift,
     wandering_um,
 )
-from fusion.analysis.drift_model.predictions import error_interval, error_intervals, plain_errors, rmse, track_cycles
+from fusion.analysis.drift_model.predictions import expect_errors, held_out_errors, plain_errors, rmse, track_cycles
 from fusion.analysis.drift_model.search import (
     FINAL,
     HOLD_OUT_SHARE,
@@ -285,7 +285,11 @@ def close_axis(
         held_out=f"{description}, drift carried on at its {'level' if ahead.fit.system.order == 1 else 'rate'}",
         noise_floor_um=state.model.fit.sigma,
         hold_out_errors=errors,
-        hold_out=error_intervals(errors, readings.cycle[~used], seed=seed),
+        hold_out=held_out_errors(errors)
+        | {
+            name: expect_errors(problem.fitted(some), errors[name], seed=seed)
+            for name, some in (("declared", terms), ("final", forecast))
+        },
         skill_um=problem.hold_out_error(state.model.terms) if late else state.errors_um[-1],
         tracking=track_cycles(problem.fitted(forecast), plain["ridge"]),
         steps=steps,
@@ -594,13 +598,13 @@ def on_corrected_fields(
     steps = tuple(_with_tied(found.steps[place], result.steps[place].tied, again) for place in kept)
     state = replace(found, model=model, steps=steps)
     left_out = [at for at, place in enumerate(kept) if place in result.away or found.steps[place].is_from_second_search]
-    errors_um = problem.hold_out_errors(state.kept(left_out))
-    interval = error_interval(errors_um, readings.cycle[~used], np.random.default_rng(seed))
+    forecast = state.kept(left_out)
+    errors_um = problem.hold_out_errors(forecast)
     return replace(
         result,
         declared_coefficients=coefficients_beside(problem, state, [result.steps[place] for place in kept]),
         noise_floor_um=model.fit.sigma,
-        hold_out={**result.hold_out, "final": interval},
+        hold_out={**result.hold_out, "final": expect_errors(problem.fitted(forecast), errors_um, seed=seed)},
         hold_out_errors={**result.hold_out_errors, "final": errors_um},
         remainder=examine_remainder(model, seed, ()),
         wandering_um=wandering_um(model.fit),

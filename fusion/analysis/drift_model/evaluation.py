@@ -34,6 +34,7 @@ from fusion.analysis.effects.library import describe_effect
 from fusion.analysis.levels import ANSWER_LEVEL, DENIAL_LEVEL
 from fusion.common import Array
 from fusion.results import loop as schema
+from fusion.results.numbers import p_words
 from fusion.results.parts import Number
 from interferometry.drift.gls import estimate
 from interferometry.drift.kalman import DriftModelError
@@ -422,11 +423,11 @@ def verdict(*, named: bool, left: bool, skill: bool, separable: bool, tested: bo
     return "unexplained" if left else "complete"
 
 
-def errors_of_predictions(hold_out: Mapping[str, schema.ErrorInterval]) -> dict[str, Any]:
-    """Errors on the hold-out set with their intervals, as ``errors``, ``baselines`` and ``best_baseline`` of a `Loop`."""
+def errors_of_predictions(hold_out: Mapping[str, schema.HeldOutError]) -> dict[str, Any]:
+    """Errors on the hold-out set, as ``errors``, ``baselines`` and ``best_baseline`` of a `Loop`."""
     plain = {name: one for name, one in hold_out.items() if name not in schema.ModelErrors.model_fields}
     return {
-        "errors": schema.ModelErrors(declared=hold_out["declared"], final=hold_out["final"]),
+        "errors": schema.ModelErrors(**{name: hold_out[name] for name in schema.ModelErrors.model_fields}),
         "baselines": schema.RunBaselines(**plain) if "mean_run" in plain else schema.Baselines(**plain),
         "best_baseline": min(plain, key=lambda name: plain[name].rmse_um),  # type: ignore[arg-type, return-value]
     }
@@ -452,6 +453,15 @@ def _words_of(parameter: tuple[str, Any]) -> str:
     return f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
 
 
+def _expected(error: schema.HeldOutError) -> str:
+    """What the model expects of its error, after it; empty where that is not known."""
+    if not isinstance(error, schema.ModelError) or error.expected_um is None:
+        return ""
+    if error.expected_low_um is None or error.expected_high_um is None:
+        return f" ({error.expected_um:.3g} µm expected)"
+    return f" ({error.expected_low_um:.3g} to {error.expected_high_um:.3g} µm expected)"
+
+
 @dataclass(frozen=True, repr=False)
 class LoopResult:
     """Result of the closed loop; it prints a summary, and `plot` draws its errors.
@@ -466,10 +476,11 @@ class LoopResult:
         Standard deviation of one reading about the final model, of a record mean over the channels.
     hold_out_errors : mapping of str to (n_held_out,) or (n_held_out, channels) ndarray, um
         Errors of predicting the hold-out set by the declared and the final model, as ``declared`` and ``final``, and by plain predictions.
-    hold_out : mapping of str to ErrorInterval
-        Their root mean squares with intervals, by the same names.
+    hold_out : mapping of str to HeldOutError
+        Their root mean squares by the same names; of the model with what it expects of them.
     skill_um : float, um
-        Error on the hold-out set by which the skill of the model is judged.
+        Error on the hold-out set by which the skill of the model is judged; one that holds an effect of the second look, an event among the
+        held-out cycles, is carried through them by the readings of half of the targets, which favours it beside the last value.
     tracking : Tracking or None
         Errors on the hold-out set with a reading from time to time, None for several runs.
     steps : list of StepPart
@@ -492,7 +503,7 @@ class LoopResult:
     held_out: str
     noise_floor_um: float
     hold_out_errors: Mapping[str, Array]
-    hold_out: Mapping[str, schema.ErrorInterval]
+    hold_out: Mapping[str, schema.HeldOutError]
     skill_um: float
     tracking: schema.Tracking | None
     steps: Sequence[schema.StepPart]
@@ -502,7 +513,7 @@ class LoopResult:
     warm_up_only: tuple[str, ...]
 
     def __repr__(self) -> str:
-        added = ", ".join(f"{step.effect} (p = {step.p_value:.2g})" for step in self.steps) or "nothing"
+        added = ", ".join(f"{step.effect} ({p_words(step.p_value)})" for step in self.steps) or "nothing"
         return (
             f"LoopResult: {self.verdict}; declared {', '.join(self.declared) or 'nothing'}; added {added}; "
             f"held-out error {self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} um"
@@ -520,7 +531,7 @@ class LoopResult:
         added = [
             (
                 "added",
-                f"{step.effect} ({', '.join(map(_words_of, step.parameters.items()))}), p = {step.p_value:.2g}, "
+                f"{step.effect} ({', '.join(map(_words_of, step.parameters.items()))}), {p_words(step.p_value)}, "
                 f"{step.doubt or 'borne out'}",
             )
             for step in self.steps
@@ -530,14 +541,17 @@ class LoopResult:
             ("declared", ", ".join(self.declared) or "nothing"),
             *(added or [("added", "nothing")]),
             ("held out", self.held_out),
-            ("held-out error", f"{self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} µm"),
+            (
+                "held-out error",
+                f"{self.rmse_declared_um:.3g} -> {self.rmse_final_um:.3g} µm{_expected(self.hold_out['final'])}",
+            ),
             ("last value repeated", f"{self.rmse_persistence_um:.3g} µm"),
             ("noise floor", f"{self.noise_floor_um:.3g} µm"),
             ("what remains", self.remainder.shape or "nothing that these data show"),
         ]
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the errors on the hold-out set with their 95 % intervals; see `fusion.results.plots.plot_loop`."""
+        """Plot the errors on the hold-out set, and what the model expects of its own; see `fusion.results.plots.plot_loop`."""
         from fusion.results.plots import plot_loop
 
         return plot_loop(self, ax)

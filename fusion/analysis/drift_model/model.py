@@ -78,6 +78,8 @@ def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> 
 
 #: Fewest cycles over which a growth of the noise is looked for, and standard errors of its logarithm by which it must be known.
 _FEWEST_CYCLES, _LEAST_GROWTH = 10, 4.0
+#: Latest readings of a site whose noise those have that were not used.
+_LATEST_READINGS = 5
 #: The scatter of a site is trusted like this many further readings with the scatter of all sites.
 _SHRINKAGE_READINGS = 20
 
@@ -180,8 +182,11 @@ class ModelFit:
 
     def whole_system(self) -> DriftSystem:
         """All readings under the fitted drift, those that were used marked as observed."""
-        variance = np.ones(self.used.size)
-        variance[self.used] = self.fit.system.variance
+        site, own, variance = self.readings.site, self.fit.system.variance, np.ones(self.used.size)
+        for number in np.unique(site[self.used]):
+            # Noise goes on as it was at the end; the median passes over outliers.
+            variance[site == number] = np.median(own[site[self.used] == number][-_LATEST_READINGS:])
+        variance[self.used] = own
         return DriftSystem(
             self.readings.seconds,
             self.readings.loadings,

@@ -26,12 +26,14 @@ def simulate_null(
     draws: int = DRAWS,
     memory: Autoregression = NO_MEMORY,
     site: NDArray[np.int64] | None = None,
+    over: DriftSystem | None = None,
 ) -> Array:
     """Simulate responses in which only the model's drift and noise act; the noise is resampled from the fit's residuals.
 
-    ``memory`` is that of the noise of every site over the cycles, ``site`` (n,) that of every simulated reading.
+    ``memory`` is that of the noise of every site over the cycles, ``site`` (n,) that of every simulated reading; ``over`` are the readings
+    that are simulated, by default those of the fit.
     """
-    system = fit.system
+    system = over or fit.system
     relative = fit.white_noise() * fit.sigma
     # Some readings at a time, and those of a long test on disk: these are its largest numbers.
     drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.independent)[:, None]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fusion.analysis.alignment.readings import Readings, known_mean
 from fusion.analysis.drift_model.model import ModelFit
+from fusion.analysis.drift_model.null_simulation import rank_p_value, simulate_null
 from fusion.analysis.drift_model.record_data import Record
 from fusion.analysis.effects.events import cycle_starts
 from fusion.common import Array
@@ -29,43 +30,47 @@ BASELINE_LAGS_MIN = (5.0, 20.0, 80.0)
 READINGS_AGAIN = 10
 
 
-# Errors of predictions.
+# Errors of predictions, and what a model expects of its own.
 
-_RESAMPLES = 1000
-_PERCENT = (2.5, 97.5)
+#: Share of hold-out sets whose error lies in the range that a model states, and how often such a set is simulated.
+_EXPECTED_PERCENT, _DRAWS = (2.5, 97.5), 400
 
 
-def error_interval(errors: Array, unit: NDArray[np.int64], rng: np.random.Generator) -> schema.ErrorInterval:
-    """Root mean square error, mean over channels, and its interval from a circular block bootstrap."""
-    errors = errors[:, None] if errors.ndim == 1 else errors
-    place = np.unique(unit, return_inverse=True)[1]
-    known = np.isfinite(errors)
-    squares, number = (
-        np.column_stack([np.bincount(place, column) for column in values.T])
-        for values in (np.where(known, errors, 0.0) ** 2, known.astype(float))
+def held_out_errors(errors: Mapping[str, Array]) -> dict[str, schema.HeldOutError]:
+    """Root mean square errors of several predictions of the hold-out set."""
+    return {name: schema.HeldOutError(rmse_um=rmse(missed)) for name, missed in errors.items()}
+
+
+def expect_errors(model: ModelFit, errors_um: Array, *, seed: int = 1) -> schema.ModelError:
+    """What a model expects of its own errors (n_held_out,) on the hold-out set, beside what they are.
+
+    Such tests are simulated with the drift and noise that the training part leaves possible, and predicted with coefficients of their own.
+    """
+    drawn = simulated_errors(model, np.random.default_rng(seed))[np.isfinite(errors_um)]
+    each, achieved = np.sqrt(np.mean(drawn**2, axis=0)), rmse(errors_um)
+    low, high = np.percentile(each, _EXPECTED_PERCENT)
+    return schema.ModelError(
+        rmse_um=achieved,
+        expected_um=np.sqrt(np.mean(each**2)),
+        expected_low_um=low,
+        expected_high_um=high,
+        expected_p=rank_p_value(achieved, each),
     )
-    units = squares.shape[0]
-    length = max(1, round(units**0.5))
-    starts = rng.integers(0, units, (_RESAMPLES, -(-units // length)))
-    rows = (starts[:, :, None] + np.arange(length)).reshape(_RESAMPLES, -1)[:, :units] % units
-    resampled = _rmse(squares[rows].sum(axis=1), number[rows].sum(axis=1))
-    low, high = np.nanpercentile(resampled, _PERCENT)
-    return schema.ErrorInterval(rmse_um=_rmse(squares.sum(axis=0), number.sum(axis=0)), low_um=low, high_um=high)
 
 
-def error_intervals(
-    errors: Mapping[str, Array], unit: NDArray[np.int64], *, seed: int = 1
-) -> dict[str, schema.ErrorInterval]:
-    """Intervals of the errors of several predictions, each from the same resamples."""
-    return {name: error_interval(missed, unit, np.random.default_rng(seed)) for name, missed in errors.items()}
-
-
-def _rmse(squares: Array, number: Array) -> Array:
-    """Root mean square over the last axis' channels, mean over those with a value."""
-    known = number > 0.0
-    each = np.sqrt(np.where(known, squares / np.maximum(number, 1.0), 0.0))
-    channels = known.sum(axis=-1)
-    return np.asarray(np.where(channels > 0, each.sum(axis=-1) / np.maximum(channels, 1), np.nan))
+def simulated_errors(model: ModelFit, rng: np.random.Generator) -> Array:
+    """Errors (n_held_out, draws), um, of predicting simulated readings in which only what the model holds acts, in open loop."""
+    whole, sigma = model.whole_system(), model.fit.sigma
+    drawn = simulate_null(model.fit, rng, draws=_DRAWS, memory=model.memory, site=model.readings.site, over=whole)
+    missed, variance = whole.innovations(np.column_stack([model.whole_design(), drawn]))
+    laid = missed[model.used] / np.sqrt(variance[model.used, None])
+    known = np.reshape(
+        [combination * (sigma / prior.u) for combination, prior in model.priors()], (-1, missed.shape[1] - _DRAWS)
+    )
+    laid = np.vstack([laid, np.column_stack([known, sigma * rng.standard_normal((len(known), _DRAWS))])])
+    columns = missed.shape[1] - _DRAWS
+    coefficients = np.linalg.lstsq(laid[:, :columns], laid[:, columns:], rcond=None)[0]
+    return np.asarray((missed[:, columns:] - missed[:, :columns] @ coefficients)[~model.used])
 
 
 def rmse(errors: Array) -> float:
@@ -218,7 +223,7 @@ def track_record(record: Record, train: NDArray[np.bool_], forecast: Array, ridg
         carried[rows, k] = missed[:, 0] - missed[:, 1] * fit.coefficients[0]
     last = record.displacement[held] - record.displacement[before]
     errors = {"model": carried[held], "last_reading": last, "ridge": last - (ridge[held] - ridge[before])}
-    return schema.Tracking(every_min=every * record.block_s / 60.0, **error_intervals(errors, held))
+    return schema.Tracking(every_min=every * record.block_s / 60.0, **held_out_errors(errors))
 
 
 def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:
@@ -280,10 +285,10 @@ def track_cycles(model: ModelFit, ridge: Array) -> schema.Tracking:
         started = ridge - _by_site(readings.site, ridge, measured)["last"]
         for name, values in zip(missed, (own, last, started), strict=True):
             missed[name][here] = values[here]
-    cycle, rng = readings.cycle[~used], np.random.default_rng(1)
-    intervals = {name: error_interval(values[~used], cycle, rng) for name, values in missed.items()}
     cycle_s = float(np.median(np.diff(cycle_starts(readings))))
-    return schema.Tracking(every_min=every * cycle_s / 60.0, **intervals)
+    return schema.Tracking(
+        every_min=every * cycle_s / 60.0, **held_out_errors({name: values[~used] for name, values in missed.items()})
+    )
 
 
 def _by_site(site: NDArray[np.int64], values: Array, used: NDArray[np.bool_]) -> dict[str, Array]:

@@ -56,8 +56,8 @@ from fusion.analysis.drift_model.null_simulation import DRAWS, random_walk, rank
 from fusion.analysis.drift_model.predictions import (
     Prediction,
     channel_rmse,
-    error_intervals,
     folds,
+    held_out_errors,
     last_values,
     plain_predictions,
     predict,
@@ -1121,9 +1121,9 @@ def close_record(
     steps = report_steps(record, state, told, contributed, withheld, left_out)
     away = left_out_of_forecast(problem, state, unsupported_places(steps))
     kept = state.kept(away)
-    forecast = problem.predict(kept)
+    of_declared, forecast = problem.predict(state.declared), problem.predict(kept)
     predicted = {
-        "declared": problem.predict(state.declared).predicted,
+        "declared": of_declared.predicted,
         "final": forecast.predicted,
         **plain_predictions(record, train),
     }
@@ -1135,7 +1135,11 @@ def close_record(
         held_out=description,
         noise_floor_um=float(np.mean(noise_floor(whole.sigma, step))),
         hold_out_errors=errors,
-        hold_out=error_intervals(errors, np.flatnonzero(~train)),
+        hold_out=held_out_errors(errors)
+        | {
+            name: schema.ModelError(rmse_um=rmse(errors[name]), expected_um=one.chained_rmse)
+            for name, one in (("declared", of_declared), ("final", forecast))
+        },
         skill_um=rmse(errors["final"]),
         tracking=None if record.runs else track_record(record, train, forecast.predicted, predicted["ridge"]),
         steps=steps,

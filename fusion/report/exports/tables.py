@@ -159,8 +159,8 @@ def record_tables(results: Results, record: xr.Dataset) -> dict[str, pd.DataFram
         "Contributions": _contributions_table(record),
         "Hold-out errors": _channels_table(loop),
         "Predictions": pd.DataFrame(
-            [(name, one.rmse_um, one.low_um, one.high_um) for name, one in {**named, **plain}.items()],
-            columns=["prediction", "rmse_um", "low_95_percent_um", "high_95_percent_um"],
+            [(name, one.rmse_um, getattr(one, "expected_um", None)) for name, one in {**named, **plain}.items()],
+            columns=["prediction", "rmse_um", "expected_um"],
         ),
         "Readings": record_readings_table(record),
     }

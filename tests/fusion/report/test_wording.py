@@ -21,8 +21,10 @@ from fusion.results.loop import (
     ChannelErrors,
     Coefficient,
     DriftShare,
-    ErrorInterval,
+    HeldOutError,
     Loop,
+    ModelError,
+    ModelErrors,
     RecordStep,
     StepPart,
     Unexplained,
@@ -198,7 +200,7 @@ def baselines(mean_um: float = 2.2, last_um: float = 2.5) -> Baselines:
     """Errors of plain predictions."""
     told = {"last_value": last_um, "mean": mean_um, "ridge_with_lags": 0.31}
     return Baselines.model_construct(
-        **{name: ErrorInterval.model_construct(rmse_um=error, low_um=0.3, high_um=3.0) for name, error in told.items()}
+        **{name: HeldOutError.model_construct(rmse_um=error) for name, error in told.items()}
     )
 
 
@@ -208,6 +210,7 @@ def loop(verdict: str = "explained", *steps: StepPart, shape: str = "", **change
         "verdict": verdict, "declared": ("axis_expansion",), "steps": steps, "unconfirmed_effects": {}, "rmse_persistence_um": 2.5,
         "unexplained": Unexplained.model_construct(shape=shape, rms_um=0.2), "rmse_declared_um": 1.94, "rmse_final_um": 0.66,
         "noise_floor_um": 0.42, "held_out": "cycles 49 to 60 held out; coefficients frozen", "baselines": baselines(),
+        "errors": ModelErrors(declared=ModelError(rmse_um=1.94), final=ModelError(rmse_um=0.66)),
     }  # fmt: skip
     return Loop.model_construct(**{**told, **changes})
 

@@ -11,7 +11,7 @@ import pytest
 from fusion.analysis.drift_model import record as module
 from fusion.analysis.drift_model.evaluation import Answer
 from fusion.analysis.drift_model.model import Term
-from fusion.analysis.drift_model.predictions import error_interval, track_record
+from fusion.analysis.drift_model.predictions import held_out_errors, track_record
 from fusion.analysis.drift_model.record import (
     ChainedResult,
     RecordFit,
@@ -27,7 +27,7 @@ from fusion.analysis.drift_model.record import (
 from fusion.analysis.drift_model.record_data import Record, RecordedRun, reduce_record
 from fusion.analysis.drift_model.search import Confirmation, Confirmed, Decision, LoopState, Reason, Round, Score, Step
 from fusion.analysis.effects.effect import Candidate
-from fusion.results.loop import Baselines, ChainedPart
+from fusion.results.loop import Baselines, ChainedPart, ModelError
 from fusion.twin.recipe import EffectRecipe
 from interferometry.drift.gls import drift_system, fit_fixed_effects
 from tests.fusion.record_tables import record_of, runs_table, searched, twin_table
@@ -113,9 +113,8 @@ def predicting(of: RecordResult, **um: np.ndarray | float) -> RecordResult:
     """The same result with other predictions of a record of zeros."""
     predicted = {**of.predicted, **{name: np.broadcast_to(values, (4, 2)) for name, values in um.items()}}
     errors = {name: -values[of.is_held_out] for name, values in predicted.items()}
-    intervals = {name: error_interval(one, np.arange(2), np.random.default_rng(1)) for name, one in errors.items()}
-    skill_um = intervals["final"].rmse_um
-    return replace(of, predicted=predicted, hold_out_errors=errors, hold_out=intervals, skill_um=skill_um)
+    told = {name: ModelError(rmse_um=one.rmse_um) for name, one in held_out_errors(errors).items()}
+    return replace(of, predicted=predicted, hold_out_errors=errors, hold_out=told, skill_um=told["final"].rmse_um)
 
 
 def answered(of: RecordResult, answer: Answer) -> RecordResult:
