@@ -287,7 +287,7 @@ def close_axis(
         hold_out_errors=errors,
         hold_out=held_out_errors(errors)
         | {
-            name: expect_errors(problem.fitted(some), errors[name], seed=seed)
+            name: expect_errors(problem.forecast(some), errors[name], seed=seed)
             for name, some in (("declared", terms), ("final", forecast))
         },
         skill_um=problem.hold_out_error(state.model.terms) if late else state.errors_um[-1],
@@ -604,7 +604,7 @@ def on_corrected_fields(
         result,
         declared_coefficients=coefficients_beside(problem, state, [result.steps[place] for place in kept]),
         noise_floor_um=model.fit.sigma,
-        hold_out={**result.hold_out, "final": expect_errors(problem.fitted(forecast), errors_um, seed=seed)},
+        hold_out={**result.hold_out, "final": expect_errors(problem.forecast(forecast), errors_um, seed=seed)},
         hold_out_errors={**result.hold_out_errors, "final": errors_um},
         remainder=examine_remainder(model, seed, ()),
         wandering_um=wandering_um(model.fit),
