@@ -97,9 +97,6 @@ ResultsFolder = Annotated[Path, Argument(metavar="RESULTS", help="Results folder
 
 def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
     """End a command as `fusion.messages` says; `folders` are those of its results."""
-    if folders:
-        # What `_kept` needs is loaded while a signal still ends the process at once: numpy cannot be loaded again where one broke it off.
-        import fusion.results.store  # noqa: F401
     return answering(errors, kept=lambda: _kept(folders))
 
 
@@ -204,8 +201,9 @@ def run(
 
         leave_plugins_out()
     written, progress = [folder for _, folder in folders], partial(_progress, quiet=quiet, json_progress=json_progress)
-    # The libraries may take seconds to load: something is seen before that.
-    with _answering(written), progress() as report:
+    # The libraries may take seconds to load: something is seen before that. Nothing is written yet, and a library whose loading a signal
+    # broke off cannot be loaded to say so.
+    with _answering(), progress() as report:
         report("start", 0, 1)
         from fusion.report.findings import summary_table
 

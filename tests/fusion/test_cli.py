@@ -198,7 +198,7 @@ def test_iso230_evaluates_a_window(campaign_folder: Path, tmp_path: Path) -> Non
     assert table.startswith("target,position_mm,mean_positive_um")
     assert "exists already" in invoke("iso230", campaign_folder / "laser.csv", "--out", out).stderr
     refused = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "one")
-    assert refused.exit_code == 2 and '--cycles "one" is not a window of cycles' in refused.stderr
+    assert refused.exit_code == 2 and '--cycles "one": this is not a window of cycles' in refused.stderr
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp850", "utf-8"])
