@@ -96,7 +96,7 @@ def test_an_unseen_source_that_follows_the_load_is_named():
     found = close_loop(readings_of(EffectRecipe("unseen_heat_source", amplitude_um=0.8), seed=11), DECLARED)
     names = {step.effect for step in found.steps} | {name for step in found.steps for name in step.tied}
     assert "unseen_heat_source" in names
-    assert found.rmse_final_um < 0.6 * found.rmse_declared_um
+    assert found.rmse_final_um < 0.8 * found.rmse_declared_um
 
 
 def test_a_camera_step_is_a_fault_of_the_field_not_of_the_machine():
@@ -225,13 +225,12 @@ def test_one_jump_of_the_camera_is_named_once():
 
 
 def test_the_hold_out_set_judges_an_effect_beside_the_others():
-    """The first of two missing effects makes the hold-out error larger, because the drift still bends to the second; both are right."""
+    """Either of two missing effects is judged with the other in the model; both are right."""
     missing = ("air_index", "reversal_drift")
     found = close_loop(readings_of(*(effect_of(name, 0.4, 21001) for name in missing), seed=21001), DECLARED)
     assert {step.effect for step in found.steps} == set(missing)
-    first, last = found.steps[0], found.steps[-1]
-    assert first.rmse_after_um > first.rmse_before_um
-    assert last.rmse_after_um < first.rmse_before_um
+    assert all(step.lowers_error and not step.withheld for step in found.steps)
+    assert found.steps[-1].rmse_after_um < found.steps[0].rmse_before_um
 
 
 def test_a_laser_that_warms_up_is_no_heat_source():

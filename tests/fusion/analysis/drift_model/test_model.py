@@ -10,6 +10,7 @@ from scipy import stats
 
 from fusion.analysis.alignment.readings import Readings
 from fusion.analysis.drift_model.model import (
+    _LATEST_READINGS,
     PARTS,
     SINGLE,
     ModelFit,
@@ -135,7 +136,7 @@ def test_predictions_in_open_loop_are_those_of_dense_algebra(order, rng):
     np.testing.assert_allclose(told, np.sqrt(spread), rtol=1e-6)
 
 
-def test_the_whole_system_keeps_the_weights_of_the_used_readings(rng):
+def test_the_whole_system_keeps_the_weights_of_the_used_readings_and_goes_on_with_the_last_ones(rng):
     readings = with_response(campaign(cycles=8), rng)
     used = readings.cycle <= 5
     model = model_of(readings, [], used)
@@ -143,7 +144,8 @@ def test_the_whole_system_keeps_the_weights_of_the_used_readings(rng):
     model = replace(model, fit=replace(model.fit, system=replace(model.fit.system, variance=weights)))
     whole = model.whole_system()
     np.testing.assert_array_equal(whole.variance[used], weights)
-    np.testing.assert_array_equal(whole.variance[~used], 1.0)
+    last = [np.median(weights[readings.site[used] == site][-_LATEST_READINGS:]) for site in readings.site[~used]]
+    np.testing.assert_array_equal(whole.variance[~used], last)
     np.testing.assert_array_equal(whole.observed, used)
     assert whole.order == 1 and whole.ratios is model.fit.system.ratios
 
