@@ -264,18 +264,16 @@ def places() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
     yield "place of the largest drift", {
         **on(SUMMARISED, where), "report": (where, rf"Largest drift \S+ ± \S+ µm {NUMBER} mm"),
     }  # fmt: skip
-    falls = rf"falls from {NUMBER} to "
     yield "held-out error before", {
-        **on(PRINTED, rf"held-out error:? {NUMBER} ->"), **on(SUMMARISED, falls, rf"held-out error {NUMBER} \["),
-        "report": (falls, rf"declared model {NUMBER}"), "application": (falls, rf"declared model {NUMBER}"),
+        **on(PRINTED, rf"held-out error:? {NUMBER} ->"), **on(SUMMARISED, rf"held-out error {NUMBER} ->"),
+        "report": (rf"declared model {NUMBER}",), "application": (rf"declared model {NUMBER}",),
     }  # fmt: skip
-    falls = rf"falls from [\d.]+ to {NUMBER} µm"
     yield "held-out error after", {
-        **on(PRINTED, rf"-> {NUMBER} µm"), **on(SUMMARISED, falls, rf"\] -> {NUMBER} \["),
-        "report": (falls, rf"Held-out error {NUMBER} µm", rf"with the added effects {NUMBER}"),
-        "application": (falls, rf"with the added effects {NUMBER}"), **on(FLEET, rf"[Hh]eld-out error / µm {NUMBER}"),
+        **on(PRINTED, rf"-> {NUMBER} µm"), **on(SUMMARISED, rf"held-out error [\d.]+ -> {NUMBER} µm"),
+        "report": (rf"Held-out error {NUMBER} µm", rf"with the added effects {NUMBER}"),
+        "application": (rf"with the added effects {NUMBER}",), **on(FLEET, rf"[Hh]eld-out error / µm {NUMBER}"),
     }  # fmt: skip
-    words = {"print": r"verdict:? (\w+)", "terminal": r"verdict (\w+):", "fleet": r"[Vv]erdict (\w+)"}
+    words = {"print": r"verdict:? (\w+)", "terminal": r"verdict (\w+)(?:: | \()", "fleet": r"[Vv]erdict (\w+)"}
     yield "verdict", {
         **on(PRINTED, words["print"]), **on(("terminal", "workbook"), words["terminal"]), **on(FLEET, words["fleet"]),
     }  # fmt: skip
@@ -330,9 +328,9 @@ def places_of_a_record() -> Iterator[tuple[str, dict[str, tuple[str, ...]]]]:
         "workbook": (rf"X µm whole {VALUE}",), "fleet": (rf"Drift / µm {VALUE}",), "fleet workbook": (rf"drift / µm {VALUE}",),
     }  # fmt: skip
     yield "held-out error after", {
-        **on(PRINTED, rf"-> {NUMBER} µm"), "terminal": (rf"held-out error {NUMBER} \[", rf"measured before: {NUMBER} µm"),
+        **on(PRINTED, rf"-> {NUMBER} µm"), "terminal": (rf"held-out error {NUMBER} µm", rf"measured before: {NUMBER} µm"),
         "report": (rf"Held-out error {NUMBER} µm", rf"with the added effects {NUMBER}"), **on(FLEET, rf"[Hh]eld-out error / µm {NUMBER}"),
-        "workbook": (rf"held-out error {NUMBER} \[", rf"with the added effects {NUMBER}"),
+        "workbook": (rf"held-out error {NUMBER} µm", rf"with the added effects {NUMBER}"),
     }  # fmt: skip
     yield "verdict", {
         **on(PRINTED, r"verdict:? (\w+)"), **on(("terminal", "workbook"), r"verdict (\w+):"), **on(FLEET, r"[Vv]erdict (\w+)"),
