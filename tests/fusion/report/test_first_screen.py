@@ -19,7 +19,7 @@ from tests.fusion.report.test_record import record
 from tests.fusion.results_sample import RECORD_LOOP
 
 #: Words that are read in half a minute.
-MOST = 150
+MOST = 160
 STATED = """
 [acceptance]
 A = "20 um"

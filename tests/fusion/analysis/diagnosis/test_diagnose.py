@@ -99,7 +99,9 @@ def test_probabilities_sum_to_one_and_follow_the_anomalies(rng):
     diagnoses = diagnose(fused, [Flag(3), Flag(7, "positive"), Flag(3, "negative")])
     assert [(d.target, d.direction) for d in diagnoses] == [(3, "both"), (7, "positive"), (3, "negative")]
     for diagnosis in diagnoses:
-        total = sum(value for name, value in diagnosis.evidence.items() if name.startswith("probability_") and value is not None)
+        total = sum(
+            value for name, value in diagnosis.evidence.items() if name.startswith("probability_") and value is not None
+        )
         assert total == pytest.approx(1.0)
         assert diagnosis.cause == "undetermined" or diagnosis.probability >= THRESHOLDS[diagnosis.cause]
 
