@@ -618,7 +618,7 @@ class LoopResult:
     def _falls_short(self) -> bool:
         """Whether there is a name, and the final error exceeds the noise and that of the best plain prediction."""
         # No forecast holds an event among the held-out cycles, which has no held-out error of its own.
-        unforeseen = any(np.isnan(step.rmse_after_um) for step in self.steps)
+        unforeseen = any(np.isnan(np.float64(step.rmse_after_um)) for step in self.steps)
         final_um = self.skill_um if unforeseen else self._errors_um["final"]
         plain_um = min(um for name, um in self._errors_um.items() if name not in schema.ModelErrors.model_fields)
         exceeds = exceeds_noise(final_um, self.noise_floor_um, self.noise_share)
