@@ -58,6 +58,7 @@ def fields_of(truth: Truth, *, cell_size_mm: float = 5.0, noise_K: float | None 
             "temperature_noise_u": (dims, uncertainty, _DIFFERENCE),
             "temperature_rise_noise_u": (dims, np.sqrt(2.0) * uncertainty, _DIFFERENCE),
             "rise_scale_u": (dims[1:], np.zeros(uncertainty.shape[1:]), {"units": "1"}),
+            "rise_reflected_u": ("cycle", np.zeros(cycles), _DIFFERENCE),
             "temperature_spread": (dims, by_cycle.std(axis=1), _DIFFERENCE),
             "count": (dims, np.full(mean.shape, burst, dtype=np.int32), {"units": "1"}),
             "cycle_time": ("cycle", truth.clock(middle_s).astype("datetime64[ns]")),
