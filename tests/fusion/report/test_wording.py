@@ -294,9 +294,7 @@ def test_what_is_left_is_told_with_what_it_resembles():
 def test_a_single_warm_up_is_said_with_the_verdict_and_the_coefficients():
     conditional = loop("complete", warm_up_only=("axis_expansion",))
     assert say("verdict_word", conditional) == "complete (not refutable: one warm-up)"
-    assert "whatever else warms alike counts with the expansion of the axis" in answers.headline(
-        results(conditional)
-    )
+    assert "whatever else warms alike counts with the expansion of the axis" in answers.headline(results(conditional))
     assert any("switched at random" in step for step in next_steps(results(conditional)))
     whole = assemble("A", PARTS, []).loop
     assert "nothing else warmed alike" not in describe_model(whole)[0][1]
