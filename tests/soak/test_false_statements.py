@@ -32,7 +32,7 @@ def statements(machine: Machine, seed: list[int]) -> list[str]:
     said += [f"remainder: {found.remainder.shape}"] if found.remainder.shape else []
     declared = fused["deviation"].copy(data=np.broadcast_to(campaign.drift_um, fused["deviation"].shape))
     anomalies = diagnose_positions(fused, campaign.deviations, declared)
-    return [*said, *(f"position {one.target}: {one.kind}, {one.cause}" for one in anomalies)]
+    return [*said, *(f"position {one.target}: {one.evidence.kind}, {one.cause}" for one in anomalies)]
 
 
 @pytest.mark.parametrize("quality", list(QUALITIES))
