@@ -29,7 +29,7 @@ from interferometry.common import Array, InterferometryError, check_dataset
 from interferometry.deviations import ROUNDING
 from interferometry.drift.estimate import estimate_drift
 from interferometry.drift.gls import memory_of_each, typical_memory, von_neumann_p_value
-from interferometry.links import find_link, fit_jumps
+from interferometry.links import Jumps, find_link, fit_jumps
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
 WEIGHTS = {"scatter": 0.6, "link": 0.1, "slow": 0.1, "step": 0.1, "periodic": 0.1}
@@ -180,7 +180,7 @@ def _links(
                 least_p_value=_least_p_value("link", permutations),
             )
         )
-        deviations = without_jumps(deviations, [anomalies[-1]])
+        deviations = _less(deviations, jumps)
         estimated = estimate_drift(deviations)
     return anomalies, deviations, estimated
 
@@ -190,10 +190,14 @@ def without_jumps(deviations: xr.Dataset, anomalies: Iterable[Anomaly]) -> xr.Da
     for one in anomalies:
         if one.kind == "link":
             target = int(np.flatnonzero(deviations["target"].values == one.target)[0])
-            jumps = fit_jumps(deviations, target, one.direction).readings_um
-            values = deviations["deviation"].transpose("cycle", "direction", "target")
-            deviations = deviations.assign(deviation=values - jumps)
+            deviations = _less(deviations, fit_jumps(deviations, target, one.direction))
     return deviations
+
+
+def _less(deviations: xr.Dataset, jumps: Jumps) -> xr.Dataset:
+    """Return deviations less the jumps of one link."""
+    values = deviations["deviation"].transpose("cycle", "direction", "target")
+    return deviations.assign(deviation=values - jumps.readings_um)
 
 
 def _scatter_anomalies(

@@ -209,18 +209,19 @@ def _test(
 ) -> ThermalTest:
     """Return a test from its courses."""
     every = max(1, -(-seconds.size // _KEPT))
+    ranges = [evaluate_distortion(seconds, one.values) for one in (*courses, *sensors)]
+    excess = [_excess_of_ranges(one, seconds) for one in (*courses, *sensors)]
+    found = [*map(_distortion, (*courses, *sensors), ranges, excess)]
     return ThermalTest(
         run=run,
         kind=kind,
         duration_h=float((seconds[-1] - seconds[0]) / 3600.0),
-        distortions=tuple(_distortion(one, seconds) for one in courses),
-        temperatures=tuple(_distortion(one, seconds) for one in sensors),
+        distortions=tuple(found[: len(courses)]),
+        temperatures=tuple(found[len(courses) :]),
         contributions=tuple(
             ThermalContribution(name=one.name, source=source, u=u, origin=origin)
-            for one in courses
-            for source, u, origin in _budget(
-                one, evaluate_distortion(seconds, one.values).whole, _excess_of_ranges(one, seconds).whole
-            )
+            for one, own, widened in zip(courses, ranges, excess, strict=False)
+            for source, u, origin in _budget(one, own.whole, widened.whole)
         ),
         courses=tuple(
             ThermalCourse(
@@ -266,9 +267,8 @@ def _excess_of_ranges(course: _Course, seconds: Array) -> Distortion:
     return Distortion(first, whole, last, 0.0, np.nan)
 
 
-def _distortion(course: _Course, seconds: Array) -> ThermalDistortion:
+def _distortion(course: _Course, found: Distortion, excess: Distortion) -> ThermalDistortion:
     """Return the ranges of a course with their uncertainties."""
-    found, excess = evaluate_distortion(seconds, course.values), _excess_of_ranges(course, seconds)
 
     def quantity(name: str) -> Quantity:
         value = getattr(found, name)

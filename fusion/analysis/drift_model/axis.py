@@ -316,6 +316,7 @@ class AxisProblem(Problem[ModelFit]):
     ) -> None:
         self.readings, self.used, self.effects, self.rng = readings, used, effects, rng
         self._fits: deque[ModelFit] = deque(maxlen=2 * MOST_EFFECTS)
+        self._forecasts: deque[tuple[ModelFit, ModelFit]] = deque(maxlen=2 * MOST_EFFECTS)
 
     def start(self, declared: Sequence[Term]) -> AxisState:
         """The state before the search: the declared model, and the effects that these readings cannot show."""
@@ -335,14 +336,18 @@ class AxisProblem(Problem[ModelFit]):
         return self._fits[-1]
 
     def forecast(self, terms: Sequence[Term]) -> ModelFit:
-        """The model by which the hold-out set is predicted: the drift is carried on at its level alone where that predicts the later half
-        of the training part better.
+        """The model by which the hold-out set is predicted, chosen once: the drift is carried on at its level alone where that predicts the
+        later half of the training part better.
         """
         model = self.fitted(terms)
         if model.fit.system.order == 1:
             return model
+        for fitted, ahead in self._forecasts:
+            if fitted is model:
+                return ahead
         level = fit_model(self.readings, terms, used=self.used, order=1)
-        return min((model, level), key=lambda one: rmse(errors_ahead(one)))
+        self._forecasts.append((model, min((model, level), key=lambda one: rmse(errors_ahead(one)))))
+        return self._forecasts[-1][1]
 
     def refit(self, model: ModelFit, terms: Sequence[Term]) -> ModelFit:
         """Fit other terms to the readings that a model was fitted to."""
@@ -1037,9 +1042,9 @@ def shown_by_one_warm_up(model: ModelFit, declared: int) -> tuple[str, ...]:
 def coefficients_beside(
     problem: AxisProblem, state: AxisState, steps: Sequence[AddedEffect]
 ) -> list[schema.DeclaredCoefficient]:
-    """Coefficients of the declared effects beside the added ones; those that are contradicted must not move them."""
-    contradicted = unsupported_places(steps)
-    sure = fit_model(problem.readings, state.kept(contradicted)) if contradicted else state.model
+    """Coefficients of the declared effects beside the added ones; those that unseen readings do not support must not move them."""
+    unsupported = unsupported_places(steps)
+    sure = fit_model(problem.readings, state.kept(unsupported)) if unsupported else state.model
     return declared_coefficients(sure, len(state.declared), moved_by_rivals(problem, state, steps, sure))
 
 
