@@ -46,12 +46,17 @@ from thermography.fields.cycle_fields import cycles_with_field
 def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
     """Return the relative standard uncertainty of the rise along the measured line."""
     along = MeasuredLine(fields, axis, position_mm).sample(np.stack(_last_rise(fields)))
-    return float(np.linalg.norm([_weighted(along[0], along[1]), zero_share(fields), reflected_share(fields)]))
+    return _with_camera(_weighted(along[0], along[1]), fields)
 
 
 def plan_scale_u(fields: xr.Dataset) -> float:
     """Return the relative standard uncertainty of the mean rise of the plan, as `axis_scale_u`."""
-    return float(np.linalg.norm([_weighted(*_last_rise(fields)), zero_share(fields), reflected_share(fields)]))
+    return _with_camera(_weighted(*_last_rise(fields)), fields)
+
+
+def _with_camera(scale_u: float, fields: xr.Dataset) -> float:
+    """Return the uncertainty of a scale with those of the camera's zero and of a change of what is reflected."""
+    return float(np.linalg.norm([scale_u, zero_share(fields), reflected_share(fields)]))
 
 
 def place_scale_u(fields: xr.Dataset, x_mm: float, y_mm: float) -> float:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 
+import numpy as np
 from statsmodels.stats.proportion import proportion_confint
 
 
@@ -27,3 +29,13 @@ def rate(count: int, of: int, *, digits: int = 3) -> str:
     """A rate with its interval and the number of campaigns, as the documentation quotes it."""
     low, high = wilson(count, of)
     return f"{count / of:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}] of {of}"
+
+
+def within_and_ratio(error: np.ndarray, u: np.ndarray) -> tuple[float, float]:
+    """Share of errors within 2 u, and rms of the errors over that of u."""
+    return float(np.mean(np.abs(error) <= 2.0 * u)), float(np.sqrt(np.mean(error**2) / np.mean(u**2)))
+
+
+def coverage_line(title: str, found: Mapping[str, tuple[float, float]]) -> str:
+    """What `within_and_ratio` found of several quantities, on a line of its own."""
+    return f"\n{title}: " + ", ".join(f"{name} {share:.3f} ({ratio:.2f})" for name, (share, ratio) in found.items())

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from interferometry.drift.estimate import estimate_drift
-from tests.soak.rates import campaigns, first_seed
+from tests.soak.rates import campaigns, coverage_line, first_seed, within_and_ratio
 from tests.soak.simulator import DRIFTS, NOISES, Campaign, Machine, measure
 
 pytestmark = pytest.mark.slow
@@ -44,20 +44,16 @@ def rows(machine: Machine, number: int) -> dict[str, tuple[float, float]]:
     found = {}
     for name in made[0]:
         error, u = (np.concatenate([one[name][part].ravel() for one in made]) for part in (0, 1))
-        found[name] = float(np.mean(np.abs(error) <= 2.0 * u)), float(np.sqrt(np.mean(error**2) / np.mean(u**2)))
+        found[name] = within_and_ratio(error, u)
     return found
-
-
-def show(title: str, found: dict[str, tuple[float, float]], capsys: pytest.CaptureFixture[str]) -> None:
-    with capsys.disabled():
-        print(f"\n{title}: " + ", ".join(f"{name} {share:.3f} (rms {rms:.2f})" for name, (share, rms) in found.items()))
 
 
 @pytest.mark.parametrize("cycles", [8, 15, 40])
 @pytest.mark.parametrize("drift", list(DRIFTS))
 def test_joint_estimate(drift: str, cycles: int, capsys: pytest.CaptureFixture[str]) -> None:
     found = rows(replace(ALONE, drift=drift, cycles=cycles), 10 * list(DRIFTS).index(drift) + cycles)
-    show(f"{drift}, {cycles} cycles", found, capsys)
+    with capsys.disabled():
+        print(coverage_line(f"{drift}, {cycles} cycles", found))
     for name, (share, rms) in found.items():
         # The band of a drift that is not there cannot be as narrow as its error, nothing.
         if drift in HELD and (drift, name) != ("none", "drift"):
@@ -70,6 +66,7 @@ def test_noise(noise: str, quality: str, capsys: pytest.CaptureFixture[str]) -> 
     shape = {"equal": {}, "unequal": {"unequal": 0.25}, "growing": {"growing": 1.0}}[quality]
     number = 1000 + 10 * list(NOISES).index(noise) + ["equal", "unequal", "growing"].index(quality)
     found = rows(replace(ALONE, drift="random walk", noise=noise, **shape), number)
-    show(f"{noise}, {quality}", found, capsys)
+    with capsys.disabled():
+        print(coverage_line(f"{noise}, {quality}", found))
     for name, (share, rms) in found.items():
         assert 0.92 <= share <= 0.98 and 0.7 <= rms <= 1.3, name

@@ -17,7 +17,7 @@ from interferometry.drift.estimate import estimate_drift
 from interferometry.iso230 import Iso230Budget, evaluate_iso230
 from interferometry.iso230.quantities import axis_quantities
 from tests.fusion.record_tables import table_of
-from tests.soak.rates import campaigns
+from tests.soak.rates import campaigns, coverage_line, within_and_ratio
 from tests.soak.simulator import DRIFTS, Machine, deviations_of, times_s, walk
 
 pytestmark = pytest.mark.slow
@@ -60,11 +60,6 @@ CASES = {
 }
 
 
-def within_and_ratio(error: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Share of errors within 2 u, and rms of the errors over that of u."""
-    return float(np.mean(np.abs(error) <= 2.0 * u)), float(np.sqrt(np.mean(error**2) / np.mean(u**2)))
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_the_stated_uncertainty_covers_the_values_of_the_axis(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     case, rng = CASES[name], np.random.default_rng(230)
@@ -88,16 +83,10 @@ def test_the_stated_uncertainty_covers_the_values_of_the_axis(name: str, capsys:
         for symbol, pairs in made.items():
             pairs.append((float(result[symbol]) - float(true[symbol]), float(result[f"{symbol}_u"])))
     found = {symbol: within_and_ratio(*np.transpose(pairs)) for symbol, pairs in made.items()}
-    show(name, found, capsys)
+    with capsys.disabled():
+        print(coverage_line(name, found))
     # A share of 100 is known to 0.02. Where a known excess that the standard leaves in the value decides, nearly all are within.
     assert all(share >= 0.90 and 0.6 <= ratio <= 1.3 for share, ratio in found.values())
-
-
-def show(name: str, found: dict[str, tuple[float, float]], capsys: pytest.CaptureFixture[str]) -> None:
-    with capsys.disabled():
-        print(
-            f"\n{name}: " + ", ".join(f"{symbol} {share:.2f} ({ratio:.2f})" for symbol, (share, ratio) in found.items())
-        )
 
 
 def ranges_of(hours: np.ndarray, course: np.ndarray) -> dict[str, float]:
@@ -130,7 +119,8 @@ def test_ranges_of_an_axis(drift: str, cycles: int, capsys: pytest.CaptureFixtur
                 name = f"{one.name.split(',')[0]} {period}"
                 made.setdefault(name, []).append((found.value - true, found.u))
     rows = {name: within_and_ratio(*np.transpose(pairs)) for name, pairs in made.items()}
-    show(f"{drift}, {cycles} cycles", rows, capsys)
+    with capsys.disabled():
+        print(coverage_line(f"{drift}, {cycles} cycles", rows))
     # A range that is nothing is never below it: an estimate of nothing is exact, and U is that of the readings.
     least = 0.0 if drift == "none" else 0.5
     assert all(share >= 0.88 and least <= ratio <= 1.3 for share, ratio in rows.values())
@@ -154,6 +144,7 @@ def test_ranges_of_a_displacement(kind: str, capsys: pytest.CaptureFixture[str])
             found = getattr(test.distortions[0], period)
             made.setdefault(period, []).append((found.value - value, found.u))
     rows = {name: within_and_ratio(*np.transpose(pairs)) for name, pairs in made.items()}
-    show(f"record, {kind}", rows, capsys)
+    with capsys.disabled():
+        print(coverage_line(f"record, {kind}", rows))
     # The excess of a range of noisy values is contained and not corrected: nearly all are within.
     assert all(share >= 0.92 and 0.55 <= ratio <= 1.3 for share, ratio in rows.values())

@@ -600,16 +600,9 @@ class _Tally:
                 low[channel, cells], high[channel, cells] = joint_limits(parts, threshold[channel])
                 if len(parts) == 1:
                     # The drifts of the grid are few: between the limits of two of them may be a gap, in which 0 lies.
-                    passed, sign = (
-                        p_value[channel, cells] <= ATTRIBUTION_LEVEL,
-                        np.sign(self.effects[0, channel, cells]),
-                    )
-                    low[channel, cells] = np.where(
-                        passed & (sign > 0), np.maximum(low[channel, cells], 0.0), low[channel, cells]
-                    )
-                    high[channel, cells] = np.where(
-                        passed & (sign < 0), np.minimum(high[channel, cells], 0.0), high[channel, cells]
-                    )
+                    passed, effect = p_value[channel, cells] <= ATTRIBUTION_LEVEL, self.effects[0, channel, cells]
+                    np.maximum(low[channel, cells], 0.0, out=low[channel, cells], where=passed & (effect > 0))
+                    np.minimum(high[channel, cells], 0.0, out=high[channel, cells], where=passed & (effect < 0))
         return FamilyTest(
             names=tuple(names),
             statistic=self.statistic,
