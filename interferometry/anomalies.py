@@ -149,7 +149,10 @@ def detect_anomalies(
     deviations, estimated = (one.sortby("cycle") for one in (deviations, estimated))
     rng = np.random.default_rng(seed)
     links, deviations, estimated = _links(deviations, estimated, level, permutations, rng)
-    anomalies = links + _scatter_anomalies(estimated, level, permutations, rng)
+    # The jump of a pass is known with its noise, which at a turn nothing tells from a reading's own.
+    position = deviations["position"].values
+    ends = [int(position.argmin()), int(position.argmax())] if links else []
+    anomalies = links + _scatter_anomalies(estimated, level, permutations, rng, ends)
     if estimated.sizes["cycle"] >= SHORTEST_TEST_CYCLES:
         anomalies += _series_anomalies(estimated, deviations, level, permutations, rng)
     return sorted(anomalies, key=lambda anomaly: anomaly.p_value)
@@ -201,12 +204,12 @@ def _less(deviations: xr.Dataset, jumps: Jumps) -> xr.Dataset:
 
 
 def _scatter_anomalies(
-    estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator
+    estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator, untested: Iterable[int] = ()
 ) -> list[Anomaly]:
     """Return positions with excess scatter, step down: each leaves the pool before the others are tested again."""
     z = _without_memory(estimated["standardised"].values)
     scatter, digit_um = estimated["scatter_position"].values, float(estimated["resolution"])
-    usable = np.flatnonzero(np.isfinite(scatter) & (scatter > 0))
+    usable = np.setdiff1d(np.flatnonzero(np.isfinite(scatter) & (scatter > 0)), untested)
     stands_out = _stands_out(estimated, usable)
     anomalies: list[Anomaly] = []
     pool = usable

@@ -6,6 +6,7 @@ and drifts in ways that nobody declares. The camera's fields and the logs are as
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -80,21 +81,22 @@ DRIFTS: dict[str, Callable[[np.random.Generator, Array, Array], Array]] = {
 }
 
 
-def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], axis: int, memory: float) -> Array:
-    """Noise of standard deviation 1 that keeps a share of itself from one place to the next along an axis."""
-    noise = np.moveaxis(rng.standard_normal(shape), axis, 0)
+def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], memory: float) -> Array:
+    """Noise of standard deviation 1 that keeps a share of itself from one value along the first axis to the next."""
+    noise = rng.standard_normal(shape)
     for place in range(1, noise.shape[0]):
         noise[place] = memory * noise[place - 1] + np.sqrt(1.0 - memory**2) * noise[place]
-    return np.moveaxis(noise, 0, axis)
+    return noise
 
 
 #: Reading noise (cycle, approach, order within the pass) of standard deviation 1.
 NOISES: dict[str, Callable[[np.random.Generator, tuple[int, int, int]], Array]] = {
     "white": lambda rng, shape: rng.standard_normal(shape),
     "Laplace": lambda rng, shape: rng.laplace(0.0, np.sqrt(0.5), shape),
-    "memory .3": lambda rng, shape: autoregressive(rng, shape, 2, 0.3),
-    "memory .6": lambda rng, shape: autoregressive(rng, shape, 2, 0.6),
-    "memory over cycles": lambda rng, shape: autoregressive(rng, shape, 0, 0.5),
+    # In the order of the readings, which are as far apart in time at a turn as within a pass.
+    "memory .3": lambda rng, shape: autoregressive(rng, (math.prod(shape),), 0.3).reshape(shape),
+    "memory .6": lambda rng, shape: autoregressive(rng, (math.prod(shape),), 0.6).reshape(shape),
+    "memory over cycles": lambda rng, shape: autoregressive(rng, shape, 0.5),
 }
 
 
