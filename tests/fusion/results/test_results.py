@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,15 @@ from tests.fusion.results_sample import PARTS, RECORD_LOOP
 pytestmark = pytest.mark.long
 
 
+@cache
+def schema() -> dict[str, Any]:
+    return results_schema()
+
+
+@cache
 def validator() -> jsonschema.Draft202012Validator:
-    jsonschema.Draft202012Validator.check_schema(results_schema())
-    return jsonschema.Draft202012Validator(results_schema())
+    jsonschema.Draft202012Validator.check_schema(schema())
+    return jsonschema.Draft202012Validator(schema())
 
 
 def test_a_full_document_keeps_the_schema_and_the_order_of_the_design() -> None:
@@ -66,8 +73,7 @@ def test_the_schema_refuses_what_the_design_does_not_know(path: tuple[Any, ...],
 
 
 def test_every_field_is_described() -> None:
-    schema = results_schema()
-    tables = {"results": schema, **schema["$defs"]}
+    tables = {"results": schema(), **schema()["$defs"]}
     bare = [
         f"{name}.{key}"
         for name, part in tables.items()
