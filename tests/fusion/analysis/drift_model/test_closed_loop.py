@@ -68,7 +68,7 @@ def test_a_complete_model_stays_as_it_is(complete):
         ("reversal_drift", {}),
         pytest.param("dead_path", {}, marks=pytest.mark.slow),
         ("step_event", {"at_cycle": 25}),
-        ("periodic_disturbance", {"period_min": 23.0}),
+        pytest.param("periodic_disturbance", {"period_min": 23.0}, marks=pytest.mark.slow),
         pytest.param("pitch_error", {}, marks=pytest.mark.slow),
     ],
 )
@@ -97,14 +97,6 @@ def test_an_unseen_source_that_follows_the_load_is_named():
     names = {step.effect for step in found.steps} | {name for step in found.steps for name in step.tied}
     assert "unseen_heat_source" in names
     assert found.rmse_final_um < 0.8 * found.rmse_declared_um
-
-
-def test_a_camera_step_is_a_fault_of_the_field_not_of_the_machine():
-    found = close_loop(readings_of(EffectRecipe("camera_offset", amplitude_K=0.5)), DECLARED)
-    assert [step.effect for step in found.steps] == ["camera_offset"]
-    correction = found.steps[0].coefficients[0]
-    assert correction.unit == "K"
-    assert correction.value == pytest.approx(0.5, abs=4 * correction.u)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +211,7 @@ def _few(*names: str) -> dict[str, Effect]:
 def test_one_jump_of_the_camera_is_named_once():
     """Weighed by the coefficients of two rounds its column differs, and both columns become one when they settle."""
     readings = readings_of(effect_of("camera_offset", 0.4, 9007), seed=9007)
-    found = close_loop(readings, DECLARED)
+    found = close_loop(readings, DECLARED, effects=_few("camera_offset", "reversal_drift"))
     events = [term.candidate.event_s for term in found.after.terms if term.effect == "camera_offset"]
     assert len(events) == len(set(events)) >= 1
 
@@ -227,7 +219,8 @@ def test_one_jump_of_the_camera_is_named_once():
 def test_the_hold_out_set_judges_an_effect_beside_the_others():
     """Either of two missing effects is judged with the other in the model; both are right."""
     missing = ("air_index", "reversal_drift")
-    found = close_loop(readings_of(*(effect_of(name, 0.4, 21001) for name in missing), seed=21001), DECLARED)
+    readings = readings_of(*(effect_of(name, 0.4, 21001) for name in missing), seed=21001)
+    found = close_loop(readings, DECLARED, effects=_few(*missing))
     assert {step.effect for step in found.steps} == set(missing)
     assert all(step.lowers_error and not step.withheld for step in found.steps)
     assert found.steps[-1].rmse_after_um < found.steps[0].rmse_before_um
@@ -236,7 +229,8 @@ def test_the_hold_out_set_judges_an_effect_beside_the_others():
 def test_a_laser_that_warms_up_is_no_heat_source():
     """The memory of a body that starts warm decays alike, but that is no evidence for the load."""
     laser = effect_of("laser_warm_up", 0.4, 22004)
-    found = close_loop(readings_of(laser, seed=22004), DECLARED)
+    few = _few("laser_warm_up", "unseen_heat_source")
+    found = close_loop(readings_of(laser, seed=22004), DECLARED, effects=few)
     assert [step.effect for step in found.steps] == ["laser_warm_up"]
 
 
@@ -244,7 +238,7 @@ def test_an_event_among_the_hold_out_cycles_does_not_hide_what_acts_beside_it():
     """The source is decided on the training cycles, which say nothing of the event: the error after holds the event in full."""
     missing = ("unseen_heat_source:flat", "step_event")
     effects = [effect_of(name, 0.4, 23018) for name in missing]
-    found = close_loop(readings_of(*effects, seed=23018), DECLARED)
+    found = close_loop(readings_of(*effects, seed=23018), DECLARED, effects=_few("unseen_heat_source", "step_event"))
     assert [step.effect for step in found.steps] == ["unseen_heat_source", "step_event"]
     assert [step.confirmed for step in found.steps] == [True, True]
     assert found.rmse_final_um > 1.1 * found.noise_floor_um
@@ -280,6 +274,10 @@ def test_a_camera_error_is_taken_out_of_the_fields(effect: EffectRecipe, share_l
     fused = align(deviations, fields, AXIS, **logs)
     found = close_loop(read_fused(fused), DECLARED)
     assert [step.effect for step in found.steps] == [effect.name]
+    if effect.name == "camera_offset":
+        correction = found.steps[0].coefficients[0]
+        assert correction.unit == "K"
+        assert correction.value == pytest.approx(0.5, abs=4 * correction.u)
 
     errors = find_field_errors(found, fields, fused)
     right = correct_fields(fields, errors)
