@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from tests.fusion.campaign_parts import simulated
+from tests.fusion.campaign_parts import change, simulated, without
 
 RECIPE = """\
 [campaign]
@@ -82,6 +82,44 @@ def results_folder(kept: Callable[[str, Callable[[Path], object]], Path], campai
     from fusion.pipeline.run import run_campaign
 
     return kept("run", lambda folder: run_campaign(campaign_folder / "campaign.toml", folder / "results")) / "results"
+
+
+@pytest.fixture(scope="session")
+def part_results(kept: Callable[[str, Callable[[Path], object]], Path], campaign_folder: Path) -> Callable[..., Path]:
+    """Return a function that runs the small campaign without some tables of its file, once for all workers; tests do not change them."""
+    from fusion.pipeline.run import run_campaign
+
+    def run_once(name: str, *tables: str, added: str = "", changes: dict[str, str] | None = None) -> Path:
+        def fill(folder: Path) -> None:
+            copy = shutil.copytree(campaign_folder, folder / "campaign")
+            path = without(copy / "campaign.toml", *tables, added=added)
+            for old, new in (changes or {}).items():
+                change(path, old, new)
+            run_campaign(path, folder / "results")
+
+        return kept(name, fill) / "results"
+
+    return run_once
+
+
+@pytest.fixture(scope="session")
+def laser_results(part_results: Callable[..., Path]) -> Path:
+    """The products of the small campaign without camera and plan."""
+    return part_results("laser", "thermography", "plan", "model")
+
+
+@pytest.fixture(scope="session")
+def camera_results(part_results: Callable[..., Path]) -> Path:
+    """The products of the small campaign without laser, by windows of time."""
+    windows = {'table = "still"': 'window = "6 min"\ntable = "still"'}
+    return part_results("camera", "interferometry", "plan.axis", "model", changes=windows)
+
+
+@pytest.fixture(scope="session")
+def picture_results(part_results: Callable[..., Path]) -> Path:
+    """The products of the pictures of the small campaign, whose fiducials nobody states."""
+    pixels = '\n[plan]\nregistration = "pixels"\n'
+    return part_results("pictures", "interferometry", "plan", "model", "drivers", added=pixels)
 
 
 @pytest.fixture

@@ -38,14 +38,6 @@ def folder(campaign_folder, tmp_path_factory):
     return shutil.copytree(campaign_folder, tmp_path_factory.mktemp("parts") / "campaign")
 
 
-@pytest.fixture(scope="module")
-def laser_results(folder, tmp_path_factory):
-    """The products of the small campaign without camera and plan."""
-    out = tmp_path_factory.mktemp("laser") / "results"
-    run_campaign(without(folder / "campaign.toml", "thermography", "plan", "model", name="laser.toml"), out)
-    return out
-
-
 def test_the_laser_alone_gives_all_that_needs_no_field(laser_results, results_folder):
     results, both = read_results(laser_results), read_results(results_folder)
     assert (results.iso230, results.drift, results.neighbours) == (both.iso230, both.drift, both.neighbours)
@@ -72,10 +64,8 @@ def test_the_products_of_the_laser_are_exported(laser_results, tmp_path):
     assert "drift.csv" in names and "fields.csv" not in names
 
 
-def test_the_camera_alone_gives_fields_by_windows_of_time(folder, results_folder, tmp_path):
-    path = without(folder / "campaign.toml", "interferometry", "plan.axis", "model", name="camera.toml")
-    camera_results = tmp_path / "results"
-    results = run_campaign(change(path, 'table = "still"', 'window = "6 min"\ntable = "still"'), camera_results)
+def test_the_camera_alone_gives_fields_by_windows_of_time(camera_results, results_folder, tmp_path):
+    results = read_results(camera_results)
     fields, both = read_dataset(camera_results / "fields.nc"), read_dataset(results_folder / "fields.nc")
     # 24 cycles of 3 min, of which two make a window; the same frames in the same places.
     assert fields.sizes["cycle"] == len(list((camera_results / "maps").glob("*.exr"))) == 12
@@ -101,10 +91,8 @@ def test_the_camera_alone_gives_fields_by_windows_of_time(folder, results_folder
         export_results(camera_results, "linuxcnc", tmp_path)
 
 
-def test_frames_without_fiducials_give_pictures_and_nothing_in_mm(folder, tmp_path):
-    tables, pixels = ("interferometry", "plan", "model", "drivers"), '\n[plan]\nregistration = "pixels"\n'
-    out = tmp_path / "results"
-    results = run_campaign(without(folder / "campaign.toml", *tables, name="picture.toml", added=pixels), out)
+def test_frames_without_fiducials_give_pictures_and_nothing_in_mm(picture_results):
+    results, out = read_results(picture_results), picture_results
     assert results.thermograms.scene == "still" and results.regions
     for part in ("registration", "camera", "radiometry", "field", "hotspots"):
         assert getattr(results, part) is None, part

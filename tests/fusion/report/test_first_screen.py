@@ -33,25 +33,16 @@ operator = "J. Doe"
 
 
 @pytest.fixture(scope="module")
-def reports(campaign_folder, tmp_path_factory):
+def reports(campaign_folder, laser_results, camera_results, picture_results, tmp_path_factory):
     """Reports of a campaign with both instruments, of either one alone, and of a record."""
     folder = shutil.copytree(campaign_folder, tmp_path_factory.mktemp("first") / "campaign")
     path = folder / "campaign.toml"
     path.write_text(path.read_text(encoding="utf-8") + STATED, encoding="utf-8")
-    camera = without(path, "interferometry", "plan.axis", "model", "acceptance", name="camera.toml")
-    change(camera, 'table = "still"', 'window = "6 min"\ntable = "still"')
-    parts = {
-        "both": path,
-        "laser": without(path, "thermography", "plan", "model", name="laser.toml"),
-        "camera": camera,
-        "pictures": without(
-            path, "plan", "plan.axis", "interferometry", "model", "drivers", "acceptance", name="pictures.toml"
-        ),
-    }
-    pages = {}
-    for name, campaign in parts.items():
-        run_campaign(campaign, folder / name)
-        pages[name] = folder / name / "report.html"
+    run_campaign(path, folder / "both")
+    runs = {
+        "both": folder / "both", "laser": laser_results, "camera": camera_results, "pictures": picture_results
+    }  # fmt: skip
+    pages = {name: run / "report.html" for name, run in runs.items()}
     pages["record"] = folder / "record.html"
     results = assemble("Spindle", {"loop": RECORD_LOOP}, [])
     pages["record"].write_text(render_report(results, ORIGIN, {"record": record(drivers=0)}), encoding="utf-8")
