@@ -107,7 +107,10 @@ class FlirInspection:
             *(f"  {line}" for line in describe_evaluation(self.evaluation)),
         ]
         if rate_Hz := first.settings.frame_rate_Hz:
-            lines.append(f"  frame rate {rate_Hz:g} Hz, focus {first.settings.focus_distance_m:.3g} m")
+            # 0 and 0xFFFFFFFF mm stand for a distance that the camera does not know.
+            focus_m = first.settings.focus_distance_m
+            known = f", focus {focus_m:.3g} m" if 0.0 < focus_m < 4.29e6 else ""
+            lines.append(f"  frame rate {rate_Hz:g} Hz{known}")
         if housekeeping:
             lines.append(f"  inside the camera, °C: {housekeeping}")
         lines += [f"  note: {note}" for note in dict.fromkeys(note for frame in self.frames for note in frame.notes)]

@@ -38,7 +38,7 @@ from fusion.results.progress import Report, counted, listed
 from fusion.results.results import Notice, Outcome, Parts
 from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
-from thermography.fields.cycle_fields import cycles_with_field, reference_cycle
+from thermography.fields.cycle_fields import CLIPPED, cycles_with_field, reference_cycle
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.fields.survey import (
@@ -68,9 +68,9 @@ from thermography.radiometry.camera import (
     NOISY,
     OFFSET,
     CameraCorrection,
+    Detector,
     LevelSeries,
     estimate_correction,
-    find_bad_pixels,
     find_repeats,
     hold_constant,
     room_temperatures,
@@ -238,10 +238,12 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     return CameraState(usable, correction_K if correction.corrects else None, u_K, reflected_u_K, part, notices)
 
 
-def _held_against_discs(camera: CameraState, registration: Registration) -> tuple[CameraState, dict[str, Any]]:
+def _held_against_discs(
+    camera: CameraState, registration: Registration, detector: Detector
+) -> tuple[CameraState, dict[str, Any]]:
     """The camera with what the discs show of its zero in its uncertainty, and what they show of a pattern in the picture."""
     source = camera.source
-    shown = compare_discs(source.frames, registration)
+    shown = compare_discs(source.frames, registration, detector)
     if shown is None:
         return camera, {"untested": "fewer than five discs of low emissivity are in view, or few frames"}
     change = np.ptp(shown.pattern_K, axis=0)
@@ -598,10 +600,10 @@ def _edge_notices(edge: NDArray[np.bool_], regions: list[EmissivityRegion]) -> I
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
 _REGISTRATION_FRAMES = 5
+#: Share of clipped pixels from which a picture without discs is saturated.
+_SATURATED_SHARE = 0.3
 #: Number of frames above which finished cycles are stored during the reduction; below, this costs more than it saves.
 _CHECKPOINT_FRAMES = 2000
-#: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
-PIXEL_FRAMES = 24
 
 
 def taken_from_laser(source: CameraInputs) -> list[Any]:
@@ -626,21 +628,31 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     report("registration", 0, 1)
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
     first = clear_frames(survey, 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES)
-    reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
-    registration = register_campaign(source, reference)
+    detector = survey.detector
+    reference = np.mean([calibrate(detector.read(frame), override(frame)) for frame in first], axis=0)
+    try:
+        registration = register_campaign(source, reference)
+    except RegistrationError as error:
+        share = float(detector.clipped(first[0].read_counts()).mean())
+        if share < _SATURATED_SHARE:
+            raise
+        raise RegistrationError(
+            f"{first[0].path}: {100.0 * share:.0f} % of the pixels share the highest or lowest count: the picture is saturated, and shows "
+            "no discs; choose a range of the camera that includes the temperature of the table"
+        ) from error
     report("registration", 1, 1)
     camera = examine_camera(source, survey, registration)
     source, notices = camera.source, camera.notices
-    if source.thermography.table == "still":
-        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
+    notices += pixel_notices(detector.flags, "are left out of the fields")
     fields, offset_s, offset_u_s, clock_notices = _reduce_on_clock(
-        camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
+        camera, registration, override, detector, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
+    notices += _clipped_notices(fields, detector, override(first[0]))
     shown: dict[str, Any] = {"untested": "camera or table was displaced, and the discs in the picture with it"}
     if source.thermography.table == "moving":
         shown = {"untested": "the discs move through the picture with the table"}
     elif not json.loads(fields.attrs.get("knocks", "[]")):
-        camera, shown = _held_against_discs(camera, registration)
+        camera, shown = _held_against_discs(camera, registration, detector)
     fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     damaged = [f"{Path(one.file).name}#{one.index}" for one in camera.part.frames_damaged]
@@ -684,6 +696,7 @@ def _reduce_on_clock(
     camera: CameraState,
     registration: Registration,
     override: Overrides,
+    detector: Detector,
     *,
     checkpoint: Path,
     scheduler: str | None,
@@ -698,6 +711,7 @@ def _reduce_on_clock(
         common: dict[str, Any] = {
             "override": override,
             "correction_K": camera.correction_K,
+            "detector": detector,
             "scheduler": scheduler,
             "checkpoint": kept if len(source.frames) > _CHECKPOINT_FRAMES else None,
             "progress": counter(report, "frames", len(source.frames)),
@@ -753,18 +767,46 @@ def _bounds(source: CameraInputs, offset_s: float) -> np.ndarray:
     return source.cycles.bounds + np.timedelta64(round(offset_s * 1e9), "ns")
 
 
-def pixel_notices(counts: np.ndarray) -> Iterator[Notice]:
-    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column)."""
-    flags = find_bad_pixels(counts)
+def _clipped_notices(fields: xr.Dataset, detector: Detector, parameters: CameraParameters) -> Iterator[Notice]:
+    """Return a notice for clipped counts; refuse frames of which no field is left."""
+    if not detector.clips:
+        return
+    count = detector.highest if detector.highest <= 65535 else detector.lowest
+    celsius = float(calibrate(np.array([count], np.uint16), parameters)[0])
+    end = "highest" if detector.highest <= 65535 else "lowest"
+    where = f"at their {end} value, {count} ({celsius:.1f} °C)"
+    empty = (fields["quality_flag"].values & CLIPPED) > 0
+    if not cycles_with_field(fields["temperature"]).any():
+        raise ThermographyError(
+            f"the counts of the frames are clipped {where}, on every cell of the plan: the pictures are saturated; choose a range of the "
+            "camera that includes the temperature of the table"
+        )
+    cells = int(empty.any(axis=0).sum())
+    first = fields["cycle"].values[int(np.argmax(empty.any(axis=(1, 2))))]
+    lost = (
+        f"{counted(cells, 'cell')} of the plan, in or after cycle {first}, are left empty"
+        if cells
+        else "none of the plan"
+    )
+    yield Notice(
+        "counts_clipped",
+        f"Many pixels share one count: clipped {where}. Their temperature is not known: {lost}.",
+        "Choose a range of the camera, or of the conversion, that includes what is seen.",
+    )
+
+
+def pixel_notices(flags: np.ndarray, treatment: str) -> Iterator[Notice]:
+    """Return a notice for pixels that do not follow their neighbours, (row, column), and what was done with them."""
     if flags.any():
         kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
         counts_by_kind = {name: int(np.count_nonzero(flags & flag)) for name, flag in kinds.items()}
         named = ", ".join(f"{count} {name}" for name, count in counts_by_kind.items() if count)
-        pixels = counted(int(np.count_nonzero(flags)), "pixel")
+        bad = int(np.count_nonzero(flags))
+        pixels = f"{counted(bad, 'pixel')} {'does' if bad == 1 else 'do'}"
         yield Notice(
             "bad_pixels",
-            f"{pixels} do not follow their neighbours ({named}); they are included in the averages.",
-            "Have the camera replace them (a one-point correction, or its maker's service); means of few pixels may be off.",
+            f"{pixels} not follow their neighbours ({named}); they {treatment}.",
+            "Have the camera replace them (a one-point correction, or its maker's service).",
         )
 
 

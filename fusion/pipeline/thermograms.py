@@ -24,7 +24,6 @@ from fusion.campaign.inputs import (
 )
 from fusion.campaign.time_zones import utc
 from fusion.pipeline.thermal import (
-    PIXEL_FRAMES,
     counter,
     pixel_notices,
     register_campaign,
@@ -47,10 +46,13 @@ from thermography.io.flir import FlirFrameReference, read_visible_picture
 from thermography.io.frame import FlirFormatError, FrameReference
 from thermography.io.region import Region
 from thermography.io.sequence import camera_names
+from thermography.radiometry.camera import find_bad_pixels
 from thermography.radiometry.planck import Overrides
 from thermography.radiometry.uncertainty import reflected_sensitivity, rise_scale_contributions, temperature_uncertainty
 from thermography.registration.displacement import picture_displacements
 
+#: Number of pictures of a series examined for bad pixels: enough to identify a noisy one.
+_PIXEL_FRAMES = 24
 #: Largest shift of pictures that count as taken from one place, px: a part that warms shifts the best match of two pictures by up to one.
 _LARGEST_SHIFT_PX = 2.0
 #: Most pictures of a series that are compared with one another, spread over it.
@@ -347,7 +349,8 @@ def _series_notices(source: CameraInputs, table: xr.Dataset, camera: str, scene:
     )
     yield from repeat_notices(np.concatenate([[False], same.all(axis=0)]), whole["time"].values)
     if scene == "still":
-        yield from pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:PIXEL_FRAMES]]))
+        flags = find_bad_pixels(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
+        yield from pixel_notices(flags, "are included in the averages")
 
 
 def _scene_notices(source: CameraInputs, part: schema.ThermogramsPart) -> Iterator[Notice]:

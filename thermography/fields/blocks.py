@@ -23,6 +23,7 @@ from thermography.radiometry.averaging import (
     MeanTemperature,
     mean_temperature,
 )
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import FiducialMonitor, RegistrationSpan
 
@@ -41,8 +42,8 @@ class ReductionError(ThermographyError):
 @dataclass(frozen=True)
 class FrameSeries:
     """Frames of one size in the order of time: their times (UTC), start and end of every cycle (cycles, 2) on their clock, the end
-    excluded, the cycle of every frame (`NO_CYCLE` for none), what is added to its temperature, K, and its camera parameters by
-    `override`.
+    excluded, the cycle of every frame (`NO_CYCLE` for none), what is added to its temperature, K, its camera parameters by
+    `override`, and what is wrong with the pixels.
     """
 
     references: Sequence[FrameReference]
@@ -51,6 +52,7 @@ class FrameSeries:
     cycles: NDArray[np.int64]
     correction_K: Array
     override: Override
+    detector: Detector | None = None
 
     def __len__(self) -> int:
         return len(self.references)
@@ -66,7 +68,8 @@ class FrameSeries:
     def temperature(self, index: int) -> Array:
         """Read and calibrate a frame: (row, column) degC, without its correction."""
         reference = self.references[index]
-        return calibrate(reference.read().counts, self.override(reference))
+        counts = reference.read_counts() if self.detector is None else self.detector.read(reference)
+        return calibrate(counts, self.override(reference))
 
     def outside_cycles(self, what: str) -> ReductionError:
         """Return the error where `what` ("no frame", ...) lies within a cycle."""
@@ -88,6 +91,7 @@ def make_frame_series(
     shape: tuple[int, int],
     override: Override,
     correction_K: ArrayLike | None = None,
+    detector: Detector | None = None,
 ) -> FrameSeries:
     """Check frames, cycles and corrections, and assign the frames to the cycles."""
     # Cycle bounds as (cycles, 2) datetime64[ns], in order and without overlap.
@@ -105,7 +109,7 @@ def make_frame_series(
         raise ReductionError(f"correction_K has shape {correction.shape}; give a finite value per frame, {len(times)}")
     index = np.searchsorted(bounds[:, 0], times, side="right") - 1
     inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
-    return FrameSeries(references, times, bounds, np.where(inside, index, NO_CYCLE), correction, override)
+    return FrameSeries(references, times, bounds, np.where(inside, index, NO_CYCLE), correction, override, detector)
 
 
 def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) -> Array:
@@ -152,11 +156,12 @@ class Block:
 @dataclass(frozen=True)
 class RegisteredSensor:
     """What block reduction needs of a registration: weights from pixels to the cells of the plan, and the monitor of the fiducials in their
-    window.
+    window, and what is wrong with the pixels.
     """
 
     weights: PlanWeights
     monitor: FiducialMonitor
+    detector: Detector | None = None
 
     @cached_property
     def sampled(self) -> NDArray[np.int64]:
@@ -217,9 +222,11 @@ def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, s
     """Read the frames of a block and reduce them."""
     weights = sensor.weights
     sums = Accumulator(weights.used.shape)
-    displacements, samples, noise = [], [], np.nan
+    displacements, samples, noise, detector = [], [], np.nan, sensor.detector
     with WindowReader(weights.window) as reader:
         for counts in reader.read_in_chunks(frames, CHUNK_FRAMES):
+            if detector is not None:
+                detector.repair(counts, weights.window)
             sums.add(counts)
             noise = noise_of_differences(counts[0], weights.interior) if np.isnan(noise) else noise
             displacements.append(sensor.monitor.displacements(counts, noise))
@@ -233,11 +240,15 @@ def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, s
         varying = ~(mean.bound_K <= AVERAGING_LIMIT_K) & weights.used
         if varying.any():
             _calibrate_per_frame(mean, varying, frames, parameters, weights.window)
+    if detector is not None:
+        clipped = (sums.lowest <= detector.lowest) | (sums.highest >= detector.highest)
+        mean.mean[clipped.reshape(mean.mean.shape) & weights.used] = np.nan
+        mean.variance[clipped.reshape(mean.mean.shape) & weights.used] = np.inf
     sampled = np.concatenate(samples)
     # Slope of the calibration at the middle of the samples.
     middle = np.uint16(np.median(sampled[0])) if sampled[0].size else np.uint16(0)
     low, high = calibrate(np.array([middle, middle + np.uint16(1)]), parameters)
-    cells, noise_K = weights.resample(mean.mean), noise * float(high - low)
+    cells, noise_K = weights.resample(mean.mean, mean.clipped), noise * float(high - low)
     return BlockResult(cells, np.concatenate(displacements), calibrate(sampled, parameters), noise_K, mean)
 
 

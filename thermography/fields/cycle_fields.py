@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from thermography.common import FIELD_ATTRIBUTES, MAD_TO_SIGMA, Array
-from thermography.fields.resampling import PlanWeights
+from thermography.fields.resampling import LEAST_COVERAGE, PlanWeights
 from thermography.large_arrays import empty_array, fill_array, give_back, in_pieces, piece_slices
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
 from thermography.registration.plan import PlanGrid
@@ -27,9 +27,12 @@ _FLAGS = {
     "not_seen": 8,
     "no_frame": 16,
     "surface_edge": 32,
+    "clipped": 128,
 }
 #: Flag of cells that see two surfaces of different emissivity.
 SURFACE_EDGE = _FLAGS["surface_edge"]
+#: Flag of cells in view that are empty because pixels are clipped, or show less than any temperature.
+CLIPPED = _FLAGS["clipped"]
 #: Coverage below which a cell is flagged as partly seen.
 PARTLY_SEEN_BELOW = 0.99
 #: In images of more pixels than this, ...
@@ -78,9 +81,9 @@ class CyclePart:
         """Average pixels over the cells of the plan and release them."""
         assert self.pixels is not None
         pixels = self.pixels
-        self.mean = weights.resample(pixels.mean)
+        self.mean = weights.resample(pixels.mean, pixels.clipped)
         sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
-        self.spread = np.sqrt(weights.average(pixels.variance) * sample)
+        self.spread = np.where(np.isnan(self.mean), np.nan, np.sqrt(weights.average(pixels.variance) * sample))
         self.noise_variance = weights.noise_factor * noise_of_differences(pixels.mean, weights.interior) ** 2
         varying = ~(pixels.bound_K <= AVERAGING_LIMIT_K)
         self.fell_back = (
@@ -195,6 +198,7 @@ def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[
         "calibrated_per_frame": np.any([part.fell_back for part in parts], axis=0),
         "several_registrations": np.full(mean.shape, len(parts) > 1),
         "not_seen": np.isnan(mean),
+        "clipped": np.isnan(mean) & (coverage >= LEAST_COVERAGE),
     }
     return np.sum([np.where(where, _FLAGS[name], 0) for name, where in limits.items()], axis=0, dtype=np.uint8)
 

@@ -32,6 +32,7 @@ from thermography.fields.still import BLOCK_S, BlockFrames, Checkpoint, cut_stre
 from thermography.io.frame import FrameReference
 from thermography.io.sequence import WindowReader
 from thermography.radiometry.averaging import CHUNK_FRAMES
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import temperature_from_counts
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.plan import PlanGrid, mask_discs
@@ -188,7 +189,7 @@ def add_frame(counts: Array, calibration: Array, sampling: CellWeights, correcti
 
 @njit(nogil=True)
 def _temperature_of_mean(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
-    """Temperature of the mean count of a cell, degC; NaN where the counts of its pixels differ too much for that."""
+    """Temperature of the mean count of a cell, degC; NaN where the counts of its pixels differ too much for that, or one has none."""
     left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
     total, low, high = 0.0, np.uint16(65535), np.uint16(0)
     for i in range(top, top + rows):
@@ -197,7 +198,8 @@ def _temperature_of_mean(counts: Array, window: Array, weights: Array, calibrati
             total += weights[place] * value
             place += np.uint64(1)
             low, high = min(low, value), max(high, value)
-    return _calibrate(calibration, total) if high - low <= _NARROW_COUNTS else np.nan
+    narrow = high - low <= _NARROW_COUNTS and not np.isnan(calibration[low] + calibration[high])
+    return _calibrate(calibration, total) if narrow else np.nan
 
 
 @njit(nogil=True)
@@ -248,6 +250,7 @@ def reduce_moving_frames(
     reach_mm: float = 500.0,
     override: Override = lambda frame: frame.parameters,
     correction_K: Array | None = None,
+    detector: Detector | None = None,
     block_s: float = BLOCK_S,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
@@ -277,6 +280,8 @@ def reduce_moving_frames(
         From a frame reference to the camera parameters to calibrate the frame with; by default the frame's own.
     correction_K : (frames,) ndarray, K, or None
         Added to the temperature of every frame.
+    detector : Detector or None
+        Bad pixels, whose weight goes to their sound neighbours, and clipped counts, of which a cell is empty.
     block_s : float, s
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
     scheduler : str or None
@@ -306,7 +311,12 @@ def reduce_moving_frames(
     """
     axis = np.asarray(direction, float) / np.hypot(*np.asarray(direction, float))
     frames = make_frame_series(
-        references, cycle_bounds, shape=registration.shape, override=override, correction_K=correction_K
+        references,
+        cycle_bounds,
+        shape=registration.shape,
+        override=override,
+        correction_K=correction_K,
+        detector=detector,
     )
     spans = [RegistrationSpan(0, registration)]
     blocks = cut_blocks(frames, spans, block_s=block_s)
@@ -316,7 +326,7 @@ def reduce_moving_frames(
         kept = Checkpoint(checkpoint, {**description, "axis": axis.tolist(), "reach_mm": reach_mm})
     tracker = make_tracker(registration, grid, -axis, reach_mm=reach_mm)
     samples = sample_points(registration, grid)
-    results = _reduce_blocks(blocks, frames, (tracker, samples), kept, scheduler=scheduler, progress=progress)
+    results = _reduce_blocks(blocks, frames, (tracker, samples, detector), kept, scheduler=scheduler, progress=progress)
     return _assemble(frames, results, samples, registration, axis)
 
 
@@ -354,7 +364,7 @@ def _load(checkpoint: Checkpoint, blocks: Sequence[Block]) -> list[_BlockResult]
 def _reduce_blocks(
     blocks: Sequence[Block],
     frames: FrameSeries,
-    prepared: tuple[TableTracker, Samples],
+    prepared: tuple[TableTracker, Samples, Detector | None],
     checkpoint: Checkpoint | None,
     *,
     scheduler: str | None,
@@ -382,20 +392,27 @@ def _reduce_blocks(
     return results
 
 
-def _reduce_stretch(blocks: Sequence[BlockFrames], prepared: tuple[TableTracker, Samples]) -> list[_BlockResult]:
+def _reduce_stretch(
+    blocks: Sequence[BlockFrames], prepared: tuple[TableTracker, Samples, Detector | None]
+) -> list[_BlockResult]:
     """Locate the table in every frame of some blocks and add the frame to their cells: the task of a thread or of a worker."""
-    tracker, samples = prepared
+    tracker, samples, detector = prepared
     shape, cells = tracker.registration.shape, len(samples.valid)
     results = []
     with WindowReader((slice(0, shape[0]), slice(0, shape[1]))) as reader:
         for block, frames, _, correction_K in blocks:
             calibration = temperature_from_counts(np.arange(65536.0), block.parameters)
+            if detector is not None:
+                # A cell with a clipped pixel in one of the frames has no mean.
+                calibration[detector.clipped(np.arange(65536))] = np.nan
             sums = CellSums(np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells))
             shift_mm, u_mm = np.full((len(frames), 2), np.nan), np.full(len(frames), np.nan)
             discs = np.zeros(len(frames), np.int64)
             previous, sampled_mm = None, np.full(2, np.nan)
             chunks = reader.read_in_chunks(frames, CHUNK_FRAMES)
             for i, counts in enumerate(counts for chunk in chunks for counts in chunk):
+                if detector is not None:
+                    detector.repair(counts[None])
                 position = locate_table(counts, tracker, previous)
                 previous = None if position is None else position.shift_mm
                 if position is None:

@@ -65,8 +65,10 @@ class PlanWeights:
             variance[moved] = _row_squares(sparse.csr_array(self.areas[moved] + self.centring[moved] @ self.areas))
         return self._on_plan(variance)
 
-    def resample(self, values: Array) -> Array:
-        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen."""
+    def resample(self, values: Array, clipped: NDArray[np.bool_] | None = None) -> Array:
+        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen, and
+        where a pixel is clipped, without which the rest would be no mean of the cell.
+        """
         cells = self.areas @ values.ravel()
         if np.isnan(cells).any():
             # Average over every cell of the pixels that have a value; NaN where they cover less than half of it.
@@ -75,6 +77,8 @@ class PlanWeights:
             share = self.areas @ present.astype(float)
             with np.errstate(invalid="ignore", divide="ignore"):
                 cells = np.where(share >= LEAST_COVERAGE, self.areas @ np.where(present, pixels, 0.0) / share, np.nan)
+        if clipped is not None and clipped.any():
+            cells = np.where(self.areas @ clipped.ravel().astype(float) > 0, np.nan, cells)
         return self._on_plan(cells + self.centring @ cells)
 
     def average(self, values: Array) -> Array:
@@ -102,13 +106,18 @@ def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slic
     return slice(top, bottom + 1), slice(0, columns)
 
 
-def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> PlanWeights:
-    """Weights of the pixels of a registered camera in the cells of the plan."""
+def plan_weights(
+    registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0, bad: NDArray[np.bool_] | None = None
+) -> PlanWeights:
+    """Weights of the pixels of a registered camera in the cells of the plan, those of bad pixels (row, column) 0."""
     window = plan_window(registration, grid)
     if registration.is_picture:
         # The edge of the picture is the edge of nothing that could be blurred into it.
         margin_px = 0.0
     cell, pixel, area, x, y = _pieces(registration, grid, window, margin_px)
+    if bad is not None and bad.any():
+        sound = ~bad[window].ravel()[pixel]
+        cell, pixel, area, x, y = (values[sound] for values in (cell, pixel, area, x, y))
     if len(cell) == 0:
         raise ThermographyError("no pixel of the frame is on the plan; check the fiducials and the plan's size")
     cells = grid.shape[0] * grid.shape[1]

@@ -42,6 +42,7 @@ from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.sequence import WindowReader
 from thermography.large_arrays import Spool, fill_array
 from thermography.radiometry.averaging import MeanTemperature
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import (
     KNOCK_PX,
@@ -115,6 +116,8 @@ def describe_reduction(
             texts[camera] = str(camera)
         digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{texts[camera]}".encode())
     digest.update(np.ascontiguousarray(frames.correction_K, float).tobytes())
+    if frames.detector is not None:
+        digest.update(frames.detector.flags.tobytes() + f"{frames.detector.lowest} {frames.detector.highest}".encode())
     matrices = [(span.first_frame, span.registration.projection.plan_to_sensor.tolist()) for span in spans]
     return {
         "frames": digest.hexdigest(),
@@ -163,8 +166,8 @@ class Registrations:
     the position of every cell (y, x, 2, 2), mm2.
     """
 
-    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid) -> None:
-        self.grid = grid
+    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid, detector: Detector | None = None) -> None:
+        self.grid, self.detector = grid, detector
         self.spans: list[RegistrationSpan] = []
         self.sensors: list[RegisteredSensor] = []
         self.covariances: list[Array] = []
@@ -178,7 +181,9 @@ class Registrations:
         with ThreadPoolExecutor(1) as executor:
             monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
             covariance = executor.submit(registration.position_covariance, grid.centres_mm)
-            sensor = RegisteredSensor(plan_weights(registration, grid), monitor.result())
+            bad = None if self.detector is None else self.detector.bad
+            weights = plan_weights(registration, grid, bad=bad)
+            sensor = RegisteredSensor(weights, monitor.result(), self.detector)
         self.spans.insert(index, span)
         self.sensors.insert(index, sensor)
         self.covariances.insert(index, covariance.result())
@@ -353,8 +358,10 @@ class Obstructions:
         sensor, reference = self.registrations.sensors[span], self.frames.references[i]
         buffer = np.empty((1, *sensor.weights.used.shape), np.uint16)
         with WindowReader(sensor.weights.window) as reader:
-            counts = reader.read([reference], buffer).ravel()[sensor.sampled]
-        return calibrate(counts, self.frames.override(reference))
+            counts = reader.read([reference], buffer)
+        if sensor.detector is not None:
+            sensor.detector.repair(counts, sensor.weights.window)
+        return calibrate(counts.ravel()[sensor.sampled], self.frames.override(reference))
 
 
 # Stretches of a recording: what a thread or a worker of a cluster reads and reduces at a time, and how the sums are
@@ -490,6 +497,7 @@ def reduce_frames(
     *,
     override: Override = lambda frame: frame.parameters,
     correction_K: ArrayLike | None = None,
+    detector: Detector | None = None,
     block_s: float = BLOCK_S,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
@@ -515,6 +523,9 @@ def reduce_frames(
         From a frame reference to the camera parameters to calibrate the frame with; by default the frame's own.
     correction_K : (frames,) array, K, or None
         Added to the temperature of every frame, to correct artefacts of the camera (NUC/FFC events, drift).
+    detector : Detector or None
+        Bad pixels, which have no weight, and clipped counts, of which a cell is empty, as `thermography.fields.survey.survey_frames`
+        finds them.
     block_s : float, s
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
     scheduler : str or None
@@ -552,7 +563,12 @@ def reduce_frames(
     if not starts or starts[0] != 0 or (np.diff(starts) <= 0).any():
         raise ReductionError(f"registrations start at frames {starts}; they must start at 0 and rise")
     frames = make_frame_series(
-        references, cycle_bounds, shape=spans[0].registration.shape, override=override, correction_K=correction_K
+        references,
+        cycle_bounds,
+        shape=spans[0].registration.shape,
+        override=override,
+        correction_K=correction_K,
+        detector=detector,
     )
     if (frames.cycles == NO_CYCLE).all():
         raise frames.outside_cycles("no frame")
@@ -602,7 +618,7 @@ class StillReduction:
         self, frames: FrameSeries, grid: PlanGrid, spans: Sequence[RegistrationSpan], checkpoint: Checkpoint | None
     ) -> None:
         self.frames, self.grid, self.checkpoint = frames, grid, checkpoint
-        self.registrations = Registrations(spans, grid)
+        self.registrations = Registrations(spans, grid, frames.detector)
         self.displacement = Displacements(frames, self.registrations)
         self.obstructions = Obstructions(frames, self.registrations)
         self.folder = None if checkpoint is None else checkpoint.folder

@@ -19,6 +19,7 @@ from thermofuse.compiled import njit
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
+from thermography.radiometry.camera import Detector, examine_detector
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     count_line,
@@ -54,6 +55,8 @@ _END_STRETCH = 2
 _SAMPLE_PX = 1200
 #: Fewest blocks outside the table that tell the camera from the table.
 LEAST_SURROUNDING_BLOCKS = 4
+#: Frames, evenly spaced, that represent a series for `examine_detector`.
+_DETECTOR_FRAMES = 48
 #: Width of the lens's blur at the table's edge, px.
 _MARGIN_PX = 4
 
@@ -62,7 +65,7 @@ _MARGIN_PX = 4
 class Survey:
     """Frames of a series whose pixels are intact, and what one pass over them shows: mean of every block of pixels (n, rows, columns),
     degC, and of a patch where one was asked for, frames that equal the one before, pixels outside the calibrated range, pixels of every
-    block that are off the frames before and after, by frame, and the damaged frames.
+    block that are off the frames before and after, by frame, the damaged frames, and bad pixels and clipped counts of the detector.
     """
 
     frames: list[FrameReference]
@@ -73,6 +76,7 @@ class Survey:
     outside: NDArray[np.int64]
     off: dict[int, NDArray[np.int64]]
     damaged: list[RejectedFrame]
+    detector: Detector
 
 
 def survey_frames(
@@ -84,6 +88,9 @@ def survey_frames(
     progress: Callable[[int], None] | None = None,
 ) -> Survey:
     """Read every frame of a series once."""
+    spread = np.linspace(0, len(references) - 1, min(len(references), _DETECTOR_FRAMES)).round().astype(int)
+    chosen = {id(references[i]) for i in spread}
+    representative = []
     rows, columns = references[0].shape
     edge_px = max(columns // _BLOCKS_ACROSS, 1)
     frames: list[FrameReference] = []
@@ -99,6 +106,8 @@ def survey_frames(
                 damaged.append(RejectedFrame(reference.path, reference.index, counts))
                 continue
             frames.append(reference)
+            if id(reference) in chosen:
+                representative.append(counts)
             parameters, limits = override(reference), reference.limits
             means = _block_sums(counts, edge_px) / edge_px**2
             levels.append(temperature_from_counts(means, parameters).astype(np.float32))
@@ -120,6 +129,9 @@ def survey_frames(
         outside=np.array(outside, np.int64),
         off=neighbours.off,
         damaged=damaged,
+        detector=examine_detector(np.stack(representative))
+        if representative
+        else Detector(np.zeros((rows, columns), np.uint8)),
     )
 
 
@@ -350,13 +362,21 @@ class DiscCourses:
     names: tuple[str, ...]
 
 
-def compare_discs(frames: Sequence[FrameReference], registration: Registration) -> DiscCourses | None:
-    """Compare the discs with the table around them; None where too few are of low emissivity."""
+def compare_discs(
+    frames: Sequence[FrameReference], registration: Registration, detector: Detector | None = None
+) -> DiscCourses | None:
+    """Compare the discs with the table around them; None where too few are of low emissivity and not clipped."""
     masks = _disc_masks(registration)
     index = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _COMPARED)).round().astype(np.intp))
     if len(masks) < _LEAST_DISCS or index.size < _LEAST_FRAMES:
         return None
-    pictures = (frames[i].read_counts() for i in index)
+    detector = detector or Detector(np.zeros(registration.shape, np.uint8))
+    if detector.clips:
+        clipped = np.any([detector.clipped(frames[i].read_counts()) for i in index], axis=0) & ~detector.bad
+        masks = {name: pair for name, pair in masks.items() if not any(clipped[mask].any() for mask in pair)}
+        if len(masks) < _LEAST_DISCS:
+            return None
+    pictures = (detector.read(frames[i]) for i in index)
     counts = np.array([[[picture[mask].mean() for mask in pair] for pair in masks.values()] for picture in pictures])
     parameters = frames[0].parameters
     for place, i in enumerate(index):

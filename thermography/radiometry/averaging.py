@@ -151,13 +151,19 @@ def _sums(frames: int, first: Array, deviations: Array, squares: Array, far_squa
 @dataclass(frozen=True)
 class MeanTemperature:
     """Mean of the temperature of each pixel over the frames in which it had one, degC (NaN: in none), mean squared deviation from it, K2,
-    and bound on the error of the mean, K, beyond `AVERAGING_LIMIT_K` of which the frames are calibrated one by one.
+    and bound on the error of the mean, K, beyond `AVERAGING_LIMIT_K` of which the frames are calibrated one by one; a pixel that is clipped
+    in one of the frames has no mean, and an infinite deviation.
     """
 
     frames: int
     mean: Array
     variance: Array
     bound_K: Array
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """Pixels that are clipped in one of the frames."""
+        return np.isinf(self.variance)
 
     def merge(self, other: MeanTemperature) -> MeanTemperature:
         """Return mean and variance of both sets of frames together."""
@@ -171,6 +177,8 @@ class MeanTemperature:
             for lost, kept in ((self, other), (other, self)):
                 replaced = np.isnan(lost.mean)
                 mean[replaced], variance[replaced] = kept.mean[replaced], kept.variance[replaced]
+            clipped = self.clipped | other.clipped
+            mean[clipped], variance[clipped] = np.nan, np.inf
         return MeanTemperature(frames, mean, variance, np.maximum(self.bound_K, other.bound_K))
 
 

@@ -7,17 +7,21 @@ changes from frame to frame. What none of them explains may be the room or the c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
+import cv2
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy import linalg, special
 
+from thermofuse.compiled import njit
 from thermography.common import MAD_TO_SIGMA, Array
+from thermography.io.frame import FrameReference
 
-# Detects artefacts of the camera in a series of frames: repeated frames, frozen output and bad pixels.
+# Detects artefacts of the camera in a series of frames: repeated frames, frozen output, bad pixels and clipped counts.
 
 Cause = Literal["repeated_frame", "frozen_frames"]
 #: More repeats in a row than this mean that the camera output was frozen, not that a frame was written twice.
@@ -27,6 +31,12 @@ _MAX_REPEATS = 2
 DEAD, OFFSET, NOISY = 1, 2, 4
 #: Place of the 90th percentile among the 24 pixels that surround a pixel.
 _RING_RANK = 21
+#: Pixels that share the highest or lowest count are clipped from this number on, ...
+_LEAST_CLIPPED = 30
+#: ... where they are this multiple of those at any of the counts next to it: noise makes the ends of a histogram thin, ...
+_CLIPPED_MULTIPLE = 5
+#: ... as long as its standard deviation is at least this share of the step between counts.
+_LEAST_NOISE_STEPS = 0.5
 
 
 @dataclass(frozen=True)
@@ -53,25 +63,114 @@ def find_repeats(repeated: NDArray[np.bool_], time: NDArray[np.datetime64]) -> l
     return flags
 
 
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """What is wrong with the pixels of a series: flags (row, column) of those that do not follow their neighbours, and the counts at and
+    below which, at and above which the camera or a conversion has clipped them.
+    """
+
+    flags: NDArray[np.uint8]
+    lowest: int = -1
+    highest: int = 65536
+
+    @cached_property
+    def bad(self) -> NDArray[np.bool_]:
+        """Pixels that do not follow their neighbours, (row, column)."""
+        return self.flags > 0
+
+    @property
+    def clips(self) -> bool:
+        """Whether counts are clipped."""
+        return self.lowest >= 0 or self.highest <= 65535
+
+    def clipped(self, counts: Array) -> NDArray[np.bool_]:
+        """Tell which counts are clipped."""
+        return np.asarray((counts <= self.lowest) | (counts >= self.highest))
+
+    def read(self, frame: FrameReference) -> NDArray[np.uint16]:
+        """Read the counts of a frame, bad pixels repaired."""
+        counts = frame.read_counts()
+        return self.repair(counts.copy()[None])[0] if self.bad.any() else counts
+
+    def repair(
+        self, counts: NDArray[np.uint16], window: tuple[slice, slice] = (slice(None), slice(None))
+    ) -> NDArray[np.uint16]:
+        """Give bad pixels of a window of frames (time, row, column) the mean of their sound neighbours, in place."""
+        bad = self.bad[window]
+        rows, columns = np.nonzero(bad)
+        if rows.size:
+            _repair(counts, rows, columns, bad)
+        return counts
+
+
+@njit(nogil=True)
+def _repair(counts: Array, rows: Array, columns: Array, bad: Array) -> None:
+    """As `Detector.repair`; a pixel without a sound neighbour keeps its count."""
+    for k in range(len(rows)):
+        top, bottom = max(rows[k] - 1, 0), min(rows[k] + 2, bad.shape[0])
+        left, right = max(columns[k] - 1, 0), min(columns[k] + 2, bad.shape[1])
+        for frame in range(len(counts)):
+            total, sound = 0, 0
+            for i in range(top, bottom):
+                for j in range(left, right):
+                    if not bad[i, j]:
+                        total, sound = total + counts[frame, i, j], sound + 1
+            if sound > 0:
+                counts[frame, rows[k], columns[k]] = np.uint16(total / sound + 0.5)
+
+
+def examine_detector(counts: NDArray[np.uint16]) -> Detector:
+    """Find bad pixels and clipped counts in frames (time, row, column) that represent a series."""
+    detector = Detector(find_bad_pixels(counts))
+    sound = ~detector.bad
+    lowest, highest = int(counts[:, sound].min()), int(counts[:, sound].max())
+    clips_low, clips_high = False, False
+    for frame in counts:
+        values, numbers = np.unique(frame[sound], return_counts=True)
+        if values.size < 4 or not (values[0] == lowest or values[-1] == highest):
+            # Of a picture that is one value nothing is seen: so is a shutter, or a lens that is covered.
+            clips_high |= values.size < 4 and numbers.max() >= _LEAST_CLIPPED and values[-1] == highest
+            continue
+        step = int(np.diff(values).min())
+        down = np.diff(frame.astype(np.int32), 2, axis=0)
+        noise = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(down, 2, axis=1)))) / 6.0
+        if noise < _LEAST_NOISE_STEPS * step:
+            continue
+        clips_low |= bool(values[0] == lowest and _piled(numbers))
+        clips_high |= bool(values[-1] == highest and _piled(numbers[::-1]))
+    return replace(detector, lowest=lowest if clips_low else -1, highest=highest if clips_high else 65536)
+
+
+def _piled(numbers: NDArray[np.intp]) -> bool:
+    """Whether far more pixels share the outermost count than any of those next to it."""
+    return bool(numbers[0] >= max(_LEAST_CLIPPED, _CLIPPED_MULTIPLE * int(numbers[1:4].max())))
+
+
 def find_bad_pixels(counts: NDArray[np.uint16], *, threshold: float = 8.0) -> NDArray[np.uint8]:
-    """Find pixels whose mean or noise differs from that of their neighbours."""
+    """Find pixels whose mean or noise differs from that of their neighbours in frames (time, row, column) that represent a series."""
     stack = counts.astype(np.float32)
-    mean, noise = stack.mean(axis=0), stack.std(axis=0)
-    flags = np.where(_outliers(mean, threshold), OFFSET, 0).astype(np.uint8)
+    step = np.float32(np.diff(np.unique(counts[0])).min(initial=65535)) if np.ptp(counts[0]) else np.float32(1.0)
+    flags = np.where(_outliers(stack.mean(axis=0), threshold, step), OFFSET, 0).astype(np.uint8)
     if len(stack) >= 8:
-        flags |= np.where((noise == 0) & (np.median(noise) > 0), DEAD, 0).astype(np.uint8)
-        flags |= np.where(_outliers(noise, threshold) & (noise > np.median(noise)), NOISY, 0).astype(np.uint8)
+        still = np.ptp(counts, axis=0) == 0
+        # Against its neighbours, so that neither the warming nor the motion of what is seen counts as noise.
+        for image in stack:
+            image -= cv2.medianBlur(image, 3)
+        noise = stack.std(axis=0)
+        # Where all pixels around stand still too they are clipped, or show what does not change.
+        flags |= np.where(still & (cv2.medianBlur(noise, 5) > step), DEAD, 0).astype(np.uint8)
+        flags |= np.where(_outliers(noise, threshold, step) & (noise > np.median(noise)), NOISY, 0).astype(np.uint8)
     return flags
 
 
-def _outliers(image: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+def _outliers(image: NDArray[np.float32], threshold: float, step: np.float32) -> NDArray[np.bool_]:
     """Return which pixels deviate from their neighbours much further than the pixels of their surroundings do."""
     rows, columns = image.shape
     padded = np.pad(image, 1, mode="reflect")
     shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
     differences = [np.abs(image - padded[row : row + rows, column : column + columns]) for row, column in shifts]
     deviation = np.partition(differences, 2, axis=0)[2]
-    typical = max(np.median(deviation), np.float32(1.0))
+    typical = max(np.median(deviation), step)
     # Few pixels deviate further than those of the whole picture do: of these alone the surroundings are looked at.
     outlying = deviation > threshold * typical
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(deviation, 2, mode="symmetric"), (5, 5))[outlying]

@@ -34,6 +34,7 @@ from tests.fusion.campaign_parts import change, simulated
 from tests.thermography.flir_mutations import without_checksums
 from thermography.common import ThermographyError
 from thermography.io.flir import index_frames
+from thermography.radiometry.camera import find_bad_pixels
 from thermography.radiometry.planck import Overrides, counts_from_temperature, temperature_from_counts
 from thermography.radiometry.uncertainty import InputUncertainty
 from thermography.registration.clock_offset import ClockOffset
@@ -42,15 +43,15 @@ from thermography.registration.register import RegistrationError
 
 def test_bad_pixels_are_counted_by_kind(rng):
     counts = np.round(16000 + 2.0 * np.arange(80) + rng.normal(0, 8, (24, 60, 80))).astype(np.uint16)
-    assert list(pixel_notices(counts)) == []
+    assert list(pixel_notices(find_bad_pixels(counts), "are left out of the fields")) == []
     counts[:, 20, 30] = 16060
     counts[:, 40, 50] += 900
     counts[:, 10, 70] = 16140 + np.round(rng.normal(0, 400, 24)).astype(np.int64)
-    (notice,) = pixel_notices(counts)
+    (notice,) = pixel_notices(find_bad_pixels(counts), "are left out of the fields")
     assert notice.code == "bad_pixels"
     assert notice.message.startswith("3 pixels do not follow their neighbours (1 dead, ")
     assert "off its neighbours" in notice.message
-    assert notice.message.endswith("1 noisy); they are included in the averages.")
+    assert notice.message.endswith("1 noisy); they are left out of the fields.")
 
 
 def test_the_offset_of_a_periodic_test_is_said_as_an_assumption():

@@ -9,10 +9,12 @@ from thermography.radiometry.camera import (
     DEAD,
     NOISY,
     OFFSET,
+    Detector,
     LevelSeries,
     _diagonal_of_inverse,
     _fit,
     estimate_correction,
+    examine_detector,
     find_bad_pixels,
     find_repeats,
     hold_constant,
@@ -208,3 +210,40 @@ def test_planted_bad_pixels_are_found_and_edges_are_not(rng):
 def test_a_good_detector_has_no_bad_pixels(rng):
     stack = (18000 + rng.normal(0, 8, (32, 120, 160))).astype(np.uint16)
     assert not find_bad_pixels(stack).any()
+
+
+def test_a_pixel_that_blinks_for_a_part_of_the_test_is_found_while_the_scene_moves(rng):
+    column = np.arange(80)
+    stack = np.stack([16000 + 400 * np.sin((column + 2 * k) / 9.0) + rng.normal(0, 8, (60, 80)) for k in range(48)])
+    stack[10:14, 30, 40] += 340
+    stack[:, 20, 60] = 16300
+    flags = find_bad_pixels(np.rint(stack).astype(np.uint16))
+    assert flags[30, 40] & NOISY and flags[20, 60] & DEAD
+    assert np.count_nonzero(flags) == 2
+
+
+def test_clipped_counts_are_found_and_coarse_or_sound_pictures_are_not_accused(rng):
+    row, column = np.mgrid[:60, :80]
+    hill = 16000 + 900 * np.exp(-((row - 30) ** 2 + (column - 40) ** 2) / 200)
+    stack = np.rint(hill + np.arange(24)[:, None, None] * 5 + rng.normal(0, 8, (24, 60, 80))).astype(np.uint16)
+    sound = examine_detector(stack)
+    assert not sound.clips and not sound.bad.any()
+    # A pixel that is stuck at the end of the counts does not hide the others.
+    stuck = np.minimum(stack, 16700)
+    stuck[:, 5, 5] = 65535
+    high, low = examine_detector(stuck), examine_detector(np.maximum(stack, 16040))
+    assert (high.lowest, high.highest) == (-1, 16700) and high.bad[5, 5]
+    assert (low.lowest, low.highest) == (16040, 65536)
+    # Steps of 40 counts, five times the noise: whole plains share a count, also the highest one.
+    coarse = examine_detector((stack // 40 * 40).astype(np.uint16))
+    assert not coarse.clips and not coarse.bad.any()
+    assert examine_detector(np.full((8, 60, 80), 65535, np.uint16)).highest == 65535
+
+
+def test_bad_pixels_get_the_mean_of_their_sound_neighbours():
+    counts = np.tile(np.arange(100, 105, dtype=np.uint16), (2, 5, 1))
+    flags = np.zeros((5, 5), np.uint8)
+    flags[2, 2] = flags[2, 3] = DEAD
+    counts[:, 2, 2:4] = 60000
+    Detector(flags).repair(counts)
+    np.testing.assert_array_equal(counts[:, 2], [[100, 101, 102, 103, 104]] * 2)
