@@ -2,7 +2,6 @@
 
 import shutil
 
-import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,7 +13,7 @@ from fusion.pipeline.drift_model import join_fusion
 from fusion.pipeline.positioning import align_recordings
 from fusion.report.campaign import describe_correlation
 from fusion.results.progress import silent
-from fusion.results.results import SCHEMA_VERSION, assemble, results_schema
+from fusion.results.results import SCHEMA_VERSION, Results, assemble
 from fusion.results.store import plain, read_dataset
 from fusion.twin.machine import duty_levels
 from fusion.twin.recipe import Duty
@@ -50,7 +49,7 @@ def outcome(campaign, results_folder):
 def test_the_part_of_the_results_keeps_the_schema(outcome):
     _, parts, _ = outcome
     document = {"schema": SCHEMA_VERSION, "campaign": "x", "warnings": [], **plain(parts)}
-    jsonschema.Draft202012Validator(results_schema()).validate(document)
+    Results.model_validate(document)
 
 
 def test_regions_and_hotspots_are_tested_by_name(outcome):

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,7 +16,7 @@ from fusion.pipeline.workers import Worker, second_process
 from fusion.results.folder import MANIFEST, read_manifest
 from fusion.results.loop import AxisLoop
 from fusion.results.progress import Report
-from fusion.results.results import read_results, results_schema
+from fusion.results.results import read_results
 from fusion.results.store import check, file_sha256, read_dataset
 from tests.fusion.campaign_parts import simulated
 from thermography.common import FIELDS
@@ -29,8 +28,6 @@ pytestmark = pytest.mark.chain
 def test_all_products_are_written_and_keep_their_contracts(results_folder):
     names = {"results.json", "report.html", "fields.nc", "deviations.nc", "fusion.nc", "maps", "provenance.json"}
     assert names <= {path.name for path in results_folder.iterdir()}
-    results = json.loads((results_folder / "results.json").read_text())
-    jsonschema.Draft202012Validator(results_schema()).validate(results)
     check(read_dataset(results_folder / "fields.nc"), FIELDS, name="fields.nc")
     assert len(list((results_folder / "maps").glob("cycle_*.exr"))) == 24
     assert not list(results_folder.rglob("*.partial*"))
