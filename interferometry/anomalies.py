@@ -16,7 +16,7 @@ In this order: the public test; links; excess scatter; motions over the cycles; 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -204,12 +204,12 @@ def _less(deviations: xr.Dataset, jumps: Jumps) -> xr.Dataset:
 
 
 def _scatter_anomalies(
-    estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator, untested: Iterable[int] = ()
+    estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator, untested: Sequence[int] = ()
 ) -> list[Anomaly]:
     """Return positions with excess scatter, step down: each leaves the pool before the others are tested again."""
     z = _without_memory(estimated["standardised"].values)
     scatter, digit_um = estimated["scatter_position"].values, float(estimated["resolution"])
-    usable = np.setdiff1d(np.flatnonzero(np.isfinite(scatter) & (scatter > 0)), untested)
+    usable = np.setdiff1d(np.flatnonzero(np.isfinite(scatter) & (scatter > 0)), np.array(untested, int))
     stands_out = _stands_out(estimated, usable)
     anomalies: list[Anomaly] = []
     pool = usable
