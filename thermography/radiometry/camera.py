@@ -126,18 +126,22 @@ def examine_detector(counts: NDArray[np.uint16]) -> Detector:
     lowest, highest = int(counts[:, sound].min()), int(counts[:, sound].max())
     clips_low, clips_high = False, False
     for frame in counts:
-        values, numbers = np.unique(frame[sound], return_counts=True)
+        numbers = np.bincount(frame[sound])
+        values = np.flatnonzero(numbers)
+        numbers = numbers[values]
         if values.size < 4 or not (values[0] == lowest or values[-1] == highest):
             # Of a picture that is one value nothing is seen: so is a shutter, or a lens that is covered.
             clips_high |= values.size < 4 and numbers.max() >= _LEAST_CLIPPED and values[-1] == highest
             continue
+        low = values[0] == lowest and _piled(numbers)
+        high = values[-1] == highest and _piled(numbers[::-1])
+        if not (low or high):
+            continue
         step = int(np.diff(values).min())
         down = np.diff(frame.astype(np.int32), 2, axis=0)
         noise = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(down, 2, axis=1)))) / 6.0
-        if noise < _LEAST_NOISE_STEPS * step:
-            continue
-        clips_low |= bool(values[0] == lowest and _piled(numbers))
-        clips_high |= bool(values[-1] == highest and _piled(numbers[::-1]))
+        if noise >= _LEAST_NOISE_STEPS * step:
+            clips_low, clips_high = clips_low or low, clips_high or high
     return replace(detector, lowest=lowest if clips_low else -1, highest=highest if clips_high else 65536)
 
 
