@@ -825,7 +825,17 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
         "fiducial_leave_one_out": ([registration.leave_one_out_mm[name] for name in names], "mm"),
     }
     variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
-    variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
+    projection = registration.projection
+    placed_by = {
+        "units": "1",
+        "long_name": "homography from sensor (column, row) without lens distortion, px, to plan (x, y), mm, of the first registration",
+        "lens_model": registration.model,
+        "distortion_k1_k2_p1_p2": projection.distortion,
+        "focal_length_px": projection.focal_length_px,
+        "principal_point_px": projection.principal_point_px,
+        "comment": "sensor places are distorted as by OpenCV: k1, k2, p1, p2 of (place - principal point) / focal length",
+    }
+    variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, placed_by)
     variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
     variables["fiducial_name"] = ("fiducial", names)
     return xr.Dataset(variables)
@@ -839,6 +849,10 @@ def _describe_registration(registration: Registration, source: CameraInputs) -> 
     same = ("model", "rms_mm", "unchecked", "contradicted_hints", "mirrored", "area_ratio", "leave_one_out_mm")
     return RegistrationPart(
         **{name: getattr(registration, name) for name in same},
+        homography=registration.homography.tolist(),
+        distortion=registration.projection.distortion.tolist(),
+        focal_length_px=registration.projection.focal_length_px,
+        principal_point_px=registration.projection.principal_point_px,
         frames_rejected=source.frames_rejected,
         position_u_mm=np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2)),
         fiducials_listed=sum(fiducial.marker is None for fiducial in source.fiducials),
@@ -910,7 +924,7 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
     """Write the fields of every cycle as OpenEXR maps and return the files; the mask is 1 where the table was seen."""
     total = fields.sizes["cycle"]
     paths: list[Path] = []
-    mapped = fields[["temperature", "temperature_rise", "temperature_u"]]
+    mapped = fields[["temperature", "temperature_rise", "temperature_u", "cycle_time"]]
     for some in piece_slices(mapped["temperature"].shape):
         piece = mapped.isel(cycle=some).load()
         for cycle in piece["cycle"].values:
@@ -924,7 +938,16 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
             }
             maps = {name: np.ascontiguousarray(values, dtype="f4") for name, values in named.items()}
             path = folder / map_name(cycle)
-            write_maps(path, maps)
+            attributes = {
+                "cell_size_mm": abs(float(field["x"][1] - field["x"][0])) if field.sizes["x"] > 1 else 0.0,
+                "first_column_x_mm": float(field["x"][0]),
+                "first_row_y_mm": float(field["y"][0]),
+                "direction": "centres of cells on the plan; x grows from column to column, y grows from row to row",
+                "cycle": int(cycle),
+                "time": utc(field["cycle_time"].values),
+            }
+            units = {"temperature": "degC", "rise": "K", "uncertainty": "K"}
+            write_maps(path, maps, units=units, attributes=attributes)
             paths.append(path)
     report("OpenEXR maps", total, total)
     return paths

@@ -188,6 +188,14 @@ class RegistrationPart(ResultPart):
     """Whether the plan appears as in a mirror."""
     model: str = ""
     """Lens model."""
+    homography: tuple[tuple[float, ...], ...] = ()
+    """Homography of the first registration, (3, 3): from sensor (column, row) without lens distortion, px, to plan (x, y), mm."""
+    distortion: tuple[float, ...] = ()
+    """Distortion (k1, k2, p1, p2), OpenCV's, of (place on the sensor - principal point) / focal length."""
+    focal_length_px: Number = None
+    """Unit of the coordinates that are distorted, px."""
+    principal_point_px: tuple[float, ...] = ()
+    """Centre of the distortion (column, row), px."""
     leave_one_out_mm: Mapping[str, Number]
     """Distance by which each fiducial is missed when it takes no part in the registration, mm, by name."""
     frames_rejected: tuple[RejectedFrame, ...]

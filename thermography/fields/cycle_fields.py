@@ -45,7 +45,8 @@ _NOISE_ROWS = 32
 class CyclePart:
     """The frames of one cycle under one registration: means over pixels while it is open, cells (y, x) once it is finished, with mean,
     degC, spread of a pixel over the frames, K, variance of the mean from noise, K2, whether pixels were calibrated frame by frame, and
-    frames averaged; `seconds` sums the times since the first frame.
+    frames averaged; `seconds` sums the times since the first frame, `seen_s` are the mean times since then at which a cell was seen,
+    where not all frames show it.
     """
 
     cycle: int
@@ -59,6 +60,7 @@ class CyclePart:
     noise_variance: Array = field(default_factory=lambda: np.empty(0))
     fell_back: Array = field(default_factory=lambda: np.empty(0))
     count: Array = field(default_factory=lambda: np.empty(0))
+    seen_s: Array = field(default_factory=lambda: np.empty(0))
 
     def add(self, reduced: MeanTemperature, times: Array) -> None:
         """Add a block of frames: means over its pixels, and the times of its frames, (frames,) datetime64."""
@@ -127,6 +129,7 @@ def assemble_fields(
     """Assemble the cycles to one Dataset: mean, rise, rate, spread, count, uncertainties and flags on the plan."""
     shape = (cycles, *grid.shape)
     mean, spread, noise = (fill_array(shape, float, lambda _: np.nan, folder) for _ in range(3))
+    late_s = fill_array(shape, np.float32, lambda _: 0.0, folder)
     span_of = np.zeros(cycles, int)
     count = fill_array(shape, np.int32, lambda _: 0, folder)
     flags = fill_array(shape, np.uint8, lambda _: _FLAGS["no_frame"], folder)
@@ -134,23 +137,32 @@ def assemble_fields(
     step = next(piece_slices(shape)).stop
     for number, (cycle, group) in enumerate(groupby(parts, lambda part: part.cycle), start=1):
         of_cycle = list(group)
-        # Mean time of all frames since the first one of the first part, ns.
+        # Mean time of all frames since the first one of the first part, s, and of those that show a cell.
         start = of_cycle[0].first_time
-        total = sum(
-            part.seconds + part.frames * float((part.first_time - start) / np.timedelta64(1, "s")) for part in of_cycle
-        )
-        time[cycle] = of_cycle[0].first_time + np.timedelta64(
-            round(1e9 * total / sum(part.frames for part in of_cycle)), "ns"
-        )
+        begun = [float((part.first_time - start) / np.timedelta64(1, "s")) for part in of_cycle]
+        total = sum(part.seconds + part.frames * since for part, since in zip(of_cycle, begun, strict=True))
+        mean_s = total / sum(part.frames for part in of_cycle)
+        time[cycle] = start + np.timedelta64(round(1e9 * mean_s), "ns")
+        shown = [
+            part.count * (since + (part.seen_s if part.seen_s.size else part.seconds / part.frames) - mean_s)
+            for part, since in zip(of_cycle, begun, strict=True)
+        ]
+        late_s[cycle] = sum(shown) / np.maximum(sum(part.count for part in of_cycle), 1)
         mean[cycle], spread[cycle], noise[cycle] = merged = _merge(of_cycle)
         span_of[cycle] = of_cycle[-1].span
         count[cycle] = sum(part.count for part in of_cycle)
         flags[cycle] = _flags(of_cycle, merged[0], np.max([coverages[part.span] for part in of_cycle], axis=0))
         if number % step == 0:
-            give_back(mean, spread, noise, count, flags)
+            give_back(mean, spread, noise, late_s, count, flags)
     plan = ("cycle", "y", "x")
     temperatures = {name: empty_array(shape, np.float32, folder) for name in _TEMPERATURES}
     first, first_span = parts[0].cycle, parts[0].span
+
+    def late_K(some: slice) -> Array:
+        """What a cell shows too much of its cycle as it was seen later than the others."""
+        return np.asarray(np.nan_to_num(_rate_of(mean, time, some)) / 3600.0 * late_s[some])
+
+    late_first_K = late_K(slice(first, first + 1))
     for some in piece_slices(shape):
         means, noises, spans = mean[some], noise[some], span_of[some]
         position = np.full(means.shape, np.nan)
@@ -163,7 +175,9 @@ def assemble_fields(
         # The noise of the reference cycle enters every rise but its own, which is zero by definition.
         is_first = np.arange(some.start, some.stop)[:, None, None] == first
         rise_noise = np.where(is_first, 0.0, noises + noise[first])
-        noise_u, rise_noise_u = np.sqrt(noises + position), np.sqrt(rise_noise + rise_position)
+        late = late_K(some)
+        noise_u = np.sqrt(noises + position + late**2)
+        rise_noise_u = np.sqrt(rise_noise + rise_position + (late - late_first_K) ** 2)
         values = (means, noise_u, rise, rise_noise_u, _rate_of(mean, time, some), spread[some])
         for array, value in zip(temperatures.values(), values, strict=True):
             array[some] = value

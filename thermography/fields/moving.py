@@ -468,6 +468,9 @@ def _cycle_parts(frames: FrameSeries, results: Sequence[_BlockResult], samples: 
         count, mean, squares = _merge(of_cycle)
         plan_mean = on_plan(count, mean, samples)
         seen = np.isfinite(plan_mean)
+        block_times = [frames.mean_time(slice(one.block.first, one.block.stop)) for one in of_cycle]
+        block_s = (np.array(block_times) - times[0]) / np.timedelta64(1, "s")
+        shown_s = np.dot(block_s, [one.count for one in of_cycle]) / np.maximum(count, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             spread = np.sqrt(np.where(count > 1, squares / (count - 1), np.nan))
         parts.append(
@@ -482,6 +485,7 @@ def _cycle_parts(frames: FrameSeries, results: Sequence[_BlockResult], samples: 
                 noise_variance=np.where(seen, pixel_noise(plan_mean, seen) ** 2, np.nan),
                 fell_back=np.zeros(shape, bool),
                 count=np.where(seen, count.reshape(shape), 0).astype(np.int32),
+                seen_s=shown_s.reshape(shape),
             )
         )
     return parts

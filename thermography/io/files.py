@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import OpenEXR
@@ -75,8 +76,14 @@ class ExrError(ThermographyError):
     """A map cannot be written or read; the message names the file and the quantity."""
 
 
-def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.floating]]) -> None:
-    """Write maps of one shape as one ZIP-compressed OpenEXR file and verify that they read back."""
+def write_maps(
+    path: str | os.PathLike[str],
+    maps: Mapping[str, NDArray[np.floating]],
+    *,
+    units: Mapping[str, str] = MappingProxyType({}),
+    attributes: Mapping[str, str | int | float] = MappingProxyType({}),
+) -> None:
+    """Write maps of one shape, with their units and attributes, as one ZIP-compressed OpenEXR file and verify that they read back."""
     path = Path(path)
     parts = {name: _as_float32(path, name, values) for name, values in maps.items()}
     if not parts:
@@ -89,8 +96,11 @@ def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.float
     def write_parts(temporary: Path) -> None:
         # The library takes no Path, and silently writes wrong values for arrays that are not contiguous (openexr issue 1929).
         try:
-            header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-            each = [OpenEXR.Part({**header, "name": name}, {"Y": values}, name) for name, values in parts.items()]
+            header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, **attributes}
+            each = [
+                OpenEXR.Part({**header, "name": name, "unit": units.get(name, "1")}, {"Y": values}, name)
+                for name, values in parts.items()
+            ]
             OpenEXR.File(each).write(str(temporary))
         except RuntimeError as error:
             raise ExrError(f"{path}: cannot be written ({error}); make room, or name another folder") from error

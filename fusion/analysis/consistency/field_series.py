@@ -9,7 +9,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.analysis.alignment.first_order_lag import respond
-from fusion.analysis.alignment.reflections import seen_throughout
 from fusion.common import Array
 from thermography.large_arrays import in_pieces, piece_slices
 
@@ -29,7 +28,7 @@ class FieldSeries:
     ----------
     start : time of the first frame
     seconds : (n,) times since `start`, at least a minute apart, s
-    temperature : (n, cells) of cells that every frame shows whole, degC
+    temperature : (n, cells) of cells that every one of these frames shows whole, degC
     x_mm, y_mm : (cells,) centres of the cells, mm
     """
 
@@ -60,25 +59,23 @@ def thin_fields(fields: xr.Dataset) -> FieldSeries | None:
 
 
 def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries | None:
-    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it that every frame shows."""
+    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it, in the frames that show them; None
+    where they are too few.
+    """
     frames = _thinned(fields)
-    seen = seen_throughout(frames).ravel()
-    if len(frames) < LEAST_FRAMES or not seen.any():
+    y_mm, x_mm = (at.ravel() for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
+    away = np.column_stack([x_mm - place_mm[0], y_mm - place_mm[1]])
+    about = np.flatnonzero(np.hypot(*away.T) <= _COARSE_MM)
+    values = np.concatenate([some.reshape(len(some), -1)[:, about].astype(float) for _, some in in_pieces(frames)])
+    shown = np.isfinite(values).sum(axis=0)
+    # A moving table shows the place in some frames: the cells that most of these show.
+    cells = 2 * shown > shown.max(initial=0)
+    whole = np.isfinite(values[:, cells]).all(axis=1)
+    if cells.sum() < 3 or whole.sum() < LEAST_FRAMES:
         return None
-    y_mm, x_mm = (at.ravel()[seen] for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
-    away = np.array([x_mm - place_mm[0], y_mm - place_mm[1]])
-    distance = np.hypot(*away)
-    about = np.flatnonzero(distance <= _COARSE_MM)
-    if about.size < 3:
-        weight, about = np.ones(1), np.array([np.argmin(distance)])
-    else:
-        weight = np.linalg.pinv(np.column_stack([np.ones(about.size), *away[:, about]]))[0]
-    chosen = np.flatnonzero(seen)[about]
-    temperature = np.concatenate(
-        [some.reshape(len(some), -1)[:, chosen].astype(float) @ weight for _, some in in_pieces(frames)]
-    )
+    weight = np.linalg.pinv(np.column_stack([np.ones(cells.sum()), away[about[cells]]]))[0]
     place = np.array([[place_mm[0]], [place_mm[1]]])
-    return FieldSeries(*_clock(frames), temperature[:, None], *place)
+    return FieldSeries(*_clock(frames[whole]), values[whole][:, cells] @ weight[:, None], *place)
 
 
 def _thinned(fields: xr.Dataset) -> xr.DataArray:

@@ -7,10 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import xarray as xr
 
+from fusion.campaign.time_zones import utc
 from fusion.pipeline.run import run_campaign
 from fusion.pipeline.workers import Worker, second_process
 from fusion.results.folder import MANIFEST, read_manifest
@@ -45,6 +48,31 @@ def test_maps_hold_the_fields_bit_by_bit(results_folder):
         seen = np.isfinite(expected)
         np.testing.assert_array_equal(maps[name][seen], expected[seen])
     np.testing.assert_array_equal(maps["mask"] > 0, np.isfinite(fields["temperature"].sel(cycle=24).values))
+
+
+def test_a_product_alone_places_the_plan(results_folder, campaign_folder):
+    """Against the twin's view, and by the products' numbers in the lens model of OpenCV, which they name."""
+    homography = read_dataset(results_folder / "fields.nc")["homography"]
+    part = json.loads((results_folder / "results.json").read_text())["registration"]
+    truth = json.loads(next(campaign_folder.parent.rglob("truth.json")).read_text())
+    corners = np.array([[0.0, 0.0], [700.0, 0.0], [700.0, 180.0], [0.0, 180.0]])
+    view, lens = np.array(truth["plan_to_sensor"]), truth["distortion"]
+    ideal = cv2.perspectiveTransform(corners[None], view)[0]
+    u = (ideal - lens["centre_px"]) / lens["focal_px"]
+    seen = ideal + lens["focal_px"] * lens["k1"] * (u**2).sum(axis=1, keepdims=True) * u
+    of_fields = [homography.attrs[name] for name in ("focal_length_px", "principal_point_px", "distortion_k1_k2_p1_p2")]
+    of_results = [part[name] for name in ("focal_length_px", "principal_point_px", "distortion")]
+    for matrix, (focal, centre, distortion) in ((homography.values, of_fields), (part["homography"], of_results)):
+        camera = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
+        often = (cv2.TERM_CRITERIA_COUNT, 40, 0.0)
+        flat = cv2.undistortImagePoints(seen[None], camera, np.array(distortion, float), arg1=often)
+        placed = cv2.perspectiveTransform(flat.reshape(1, -1, 2), np.array(matrix))[0]
+        np.testing.assert_allclose(placed, corners, atol=0.05)
+    header = OpenEXR.File(str(results_folder / "maps" / "cycle_0024.exr")).parts[0].header
+    fields = read_dataset(results_folder / "fields.nc").sel(cycle=24)
+    expected = {"unit": "degC", "cell_size_mm": 20.0, "first_column_x_mm": 10.0, "first_row_y_mm": 10.0, "cycle": 24}
+    assert {name: header[name] for name in expected} == expected
+    assert header["time"] == utc(fields["cycle_time"].values)
 
 
 def test_the_undeclared_effect_of_the_twin_is_found(results_folder):

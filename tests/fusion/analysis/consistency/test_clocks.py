@@ -312,10 +312,23 @@ def test_the_temperature_at_a_place_is_that_of_a_plane_through_the_cells_about_i
     place = field_at(holed, (42.0, 17.0))
     assert place is not None
     np.testing.assert_allclose(place.temperature[:, 0], 20.0 + np.arange(20) + 4.2)
-    far = field_at(holed, (500.0, 10.0))
-    assert far is not None
-    np.testing.assert_allclose(far.temperature[:, 0], 20.0 + np.arange(20) + 9.75)
     assert field_at(fields(11, 60.0), (42.0, 17.0)) is None
+
+
+def test_a_place_that_some_frames_show_is_followed_in_these_and_one_that_too_few_show_is_not() -> None:
+    travelling = fields(20, 60.0)
+    # The table carries the place out of view, and a cell beside it a frame earlier.
+    travelling["frame_temperature"][5:12, :, 6:] = np.nan
+    travelling["frame_temperature"][4, 3, 8] = np.nan
+    place = field_at(travelling, (42.0, 17.0))
+    assert place is not None
+    shown = np.delete(np.arange(20), np.arange(4, 12))
+    np.testing.assert_array_equal(place.seconds, 60.0 * shown)
+    np.testing.assert_allclose(place.temperature[:, 0], 20.0 + shown + 4.2)
+    travelling["frame_temperature"][:10, :, :] = np.nan
+    assert field_at(travelling, (42.0, 17.0)) is None
+    # No cell within 20 mm: another place tells nothing.
+    assert field_at(fields(20, 60.0), (500.0, 10.0)) is None
 
 
 def test_a_sensor_follows_with_its_time_constant() -> None:
