@@ -104,6 +104,9 @@ class CameraState:
     correction_K : (frames,), to be added to the temperature of every usable frame; None where nothing is corrected
     u_K : (frames,) ndarray, K
         Standard uncertainty of the camera's zero since the first frame, common to the whole frame; 0 where only the table is in view.
+    surroundings_K : (frames,) ndarray, K
+        Largest change of the surroundings of the table up to every frame after the correction: no zero changes by more. Infinite where
+        they are not in view.
     reflected_u_K : (frames,) ndarray or None, K
         Standard uncertainty of the change of the reflected temperature since the first frame; None where neither log nor discs show it.
     part, notices
@@ -113,6 +116,7 @@ class CameraState:
     source: CameraInputs
     correction_K: Array | None
     u_K: Array
+    surroundings_K: Array
     reflected_u_K: Array | None
     part: CameraPart
     notices: list[Notice]
@@ -210,7 +214,10 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     reflected_u_K = np.abs(room - room[0]).max(axis=1) / np.sqrt(3.0) if room.shape[1] else None
     if levels is None:
         part = CameraPart(**checked, steps=(), drift_K=0.0, largest_correction_K=0.0, largest_u_K=None)
-        return CameraState(usable, None, np.zeros(len(frames)), reflected_u_K, part, [*notices, _NO_SURROUNDINGS])
+        unseen = np.full(len(frames), np.inf)
+        return CameraState(
+            usable, None, np.zeros(len(frames)), unseen, reflected_u_K, part, [*notices, _NO_SURROUNDINGS]
+        )
     background, table, spread = levels
     if survey.patch is not None:
         background = survey.patch[kept]
@@ -234,8 +241,12 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
         largest_correction_K=np.abs(correction_K).max(),
         largest_u_K=largest_u_K,
     )
-    notices += _correction_notices(correction, frames, largest_u_K)
-    return CameraState(usable, correction_K if correction.corrects else None, u_K, reflected_u_K, part, notices)
+    shown_by = "temperature of the housing" if survey.patch is None else "reference patch"
+    notices += _correction_notices(correction, frames, largest_u_K, shown_by=shown_by)
+    left_K = share * (background - background[0] + correction.correction_K)
+    surroundings_K = np.maximum.accumulate(np.abs(left_K))
+    added_K = correction_K if correction.corrects else None
+    return CameraState(usable, added_K, u_K, surroundings_K, reflected_u_K, part, notices)
 
 
 def _held_against_discs(
@@ -267,8 +278,9 @@ def _held_against_discs(
         room = room - room[0]
         left = left - room @ scipy.optimize.lsq_linear(room, left, (0.0, 1.0)).x
         left -= left[0]
-    # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7).
-    zero_u_K = np.interp(every, shown.index, np.abs(left)) / np.sqrt(3.0)
+    # The zero or what the discs reflect: from nothing to all of it is the camera's (rectangular, JCGM 100:2008, 4.3.7), but no more than
+    # the surroundings show, which share the zero.
+    zero_u_K = np.minimum(np.interp(every, shown.index, np.abs(left)), camera.surroundings_K) / np.sqrt(3.0)
     u_K = np.maximum(camera.u_K, zero_u_K)
     part = camera.part.model_copy(update={"largest_u_K": float(u_K.max())})
     return replace(camera, u_K=u_K, part=part), {**found, "zero_K": float(np.ptp(left))}
@@ -348,7 +360,9 @@ _NO_SURROUNDINGS = Notice(
 )
 
 
-def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameReference], u_K: float) -> Iterator[Notice]:
+def _correction_notices(
+    correction: CameraCorrection, frames: Sequence[FrameReference], u_K: float, *, shown_by: str
+) -> Iterator[Notice]:
     """Return one notice each for steps, for a drift, and for what cannot be distinguished."""
     if correction.steps:
         named = [f"{step.value_K:+.2f} K at {utc(frames[step.index].time)}" for step in correction.steps]
@@ -361,8 +375,7 @@ def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameRefe
     if correction.drift_K.any():
         yield Notice(
             "camera_drift_corrected",
-            f"A drift of the camera's zero of {np.ptp(correction.drift_K):.2f} K, as the reference patch or the temperature of the "
-            "housing shows it, was removed.",
+            f"A drift of the camera's zero of {np.ptp(correction.drift_K):.2f} K, as the {shown_by} shows it, was removed.",
             "Switch the camera on an hour before the test.",
         )
     unexplained = float(np.abs(correction.unexplained_K).max())
@@ -938,13 +951,13 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
             }
             maps = {name: np.ascontiguousarray(values, dtype="f4") for name, values in named.items()}
             path = folder / map_name(cycle)
-            attributes = {
+            attributes: dict[str, str | int | float] = {
                 "cell_size_mm": abs(float(field["x"][1] - field["x"][0])) if field.sizes["x"] > 1 else 0.0,
                 "first_column_x_mm": float(field["x"][0]),
                 "first_row_y_mm": float(field["y"][0]),
                 "direction": "centres of cells on the plan; x grows from column to column, y grows from row to row",
                 "cycle": int(cycle),
-                "time": utc(field["cycle_time"].values),
+                "time": utc(np.datetime64(field["cycle_time"].values[()])),
             }
             units = {"temperature": "degC", "rise": "K", "uncertainty": "K"}
             write_maps(path, maps, units=units, attributes=attributes)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -268,12 +268,15 @@ def estimate_correction(series: LevelSeries) -> CameraCorrection:
     shared = _shared_by_table(thin, places, sizes)
     of_housing = slice(room.shape[1], unknowns)
     of_room = slice(0, room.shape[1])
-    drift = housing @ fit.values[of_housing]
-    drifts = (
-        _significant(fit, of_room)
-        and _significant(fit, of_housing)
-        and np.ptp(drift) <= _LARGEST_DRIFT * np.ptp(np.nanmean(thin.housing, axis=1))
-    )
+    drift_values, drift_covariance = fit.values[of_housing], fit.covariance[of_housing, of_housing]
+    drifts = _significant(fit, of_room) and _significant(fit, of_housing)
+    if drifts:
+        # Noise of the log makes too little of the room, and the housing stands in for it; with the log as response it makes too much of
+        # it. The truth lies between (R. Frisch, 1934; S. Klepper and E. E. Leamer, Econometrica 52 (1984) 163): a drift shows in both.
+        reverse, drifts = _with_log_as_response(thin, housing, places)
+        drift_values = (drift_values + reverse.values) / 2.0
+        drift_covariance = (drift_covariance + reverse.covariance) / 2.0
+        drifts &= np.ptp(housing @ drift_values) <= _LARGEST_DRIFT * np.ptp(np.nanmean(thin.housing, axis=1))
     # What camera and rest have added since the first frame, per unknown value.
     response = np.zeros((len(kept), len(fit.values)))
     response[:, :unknowns] = np.column_stack([room, housing]) - np.concatenate([room[0], housing[0]])
@@ -281,14 +284,15 @@ def estimate_correction(series: LevelSeries) -> CameraCorrection:
     of_camera = np.zeros(len(fit.values), bool)
     of_camera[of_housing] = True
     of_camera[unknowns:] = shared
-    variance = np.einsum("ij,jk,ik->i", response * of_camera, fit.covariance, response * of_camera)
+    covariance = fit.covariance.copy()
+    if drifts:
+        covariance[of_housing, of_housing] = drift_covariance
+    variance = np.einsum("ij,jk,ik->i", response * of_camera, covariance, response * of_camera)
     variance += _missed_variance(sizes[shared], sizes_u[shared], fit.limit) * np.linspace(0.0, 1.0, len(kept))
-    corrected = of_camera.copy()
-    corrected[of_housing] = drifts
-    explained = np.ones(len(fit.values), bool)
-    explained[of_housing] = drifts
-    unexplained = thin.background - thin.background[0] - response @ np.where(explained, fit.values, 0.0)
-    drift = (drift - drift[0]) * drifts
+    drift = response[:, of_housing] @ drift_values * drifts
+    explained = fit.values.copy()
+    explained[of_housing] = drift_values * drifts
+    unexplained = thin.background - thin.background[0] - response @ explained
 
     def full(values: Array) -> Array:
         return np.asarray(np.interp(series.seconds, thin.seconds, values))
@@ -331,6 +335,13 @@ class _Fit:
     shocks: Array
     freedom: int
     limit: float
+
+
+class _Drift(NamedTuple):
+    """Drift of the camera per component of the housing, with its covariance."""
+
+    values: Array
+    covariance: Array
 
 
 def _components(temperatures: Array) -> Array:
@@ -464,6 +475,19 @@ def _significant(fit: _Fit, chosen: slice) -> bool:
         return False
     ratio = float(values @ np.linalg.solve(covariance, values)) / values.size
     return bool(special.fdtrc(values.size, fit.freedom, ratio) < _SIGNIFICANCE)
+
+
+def _with_log_as_response(series: LevelSeries, housing: Array, places: list[int]) -> tuple[_Drift, bool]:
+    """The drift by the regression of the logged air on the background, which contains it, and whether it is significant."""
+    columns = np.column_stack([series.background, _components(series.room[:, 1:]), housing])
+    fit = _fit(np.diff(series.room[:, 0]), np.diff(columns, axis=0), places, np.diff(series.seconds))
+    of_housing = slice(columns.shape[1] - housing.shape[1], columns.shape[1])
+    share, values = fit.values[0], fit.values[of_housing]
+    change = np.zeros((len(values), len(fit.values)))
+    change[:, 0] = values / share**2
+    change[:, of_housing] = -np.eye(len(values)) / share
+    drift = _Drift(-values / share, change @ fit.covariance @ change.T)
+    return drift, _significant(fit, slice(0, 1)) and _significant(fit, of_housing)
 
 
 def _first_after(series: LevelSeries, kept: NDArray[np.intp], place: int) -> int:

@@ -59,21 +59,25 @@ def thin_fields(fields: xr.Dataset) -> FieldSeries | None:
 
 
 def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries | None:
-    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it, in the frames that show them; None
-    where they are too few.
+    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it, or the nearest of one or two, in
+    the frames that show them; None where these are too few.
     """
     frames = _thinned(fields)
     y_mm, x_mm = (at.ravel() for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
     away = np.column_stack([x_mm - place_mm[0], y_mm - place_mm[1]])
-    about = np.flatnonzero(np.hypot(*away.T) <= _COARSE_MM)
+    distance = np.hypot(*away.T)
+    about = np.flatnonzero(distance <= _COARSE_MM)
     values = np.concatenate([some.reshape(len(some), -1)[:, about].astype(float) for _, some in in_pieces(frames)])
     shown = np.isfinite(values).sum(axis=0)
     # A moving table shows the place in some frames: the cells that most of these show.
     cells = 2 * shown > shown.max(initial=0)
     whole = np.isfinite(values[:, cells]).all(axis=1)
-    if cells.sum() < 3 or whole.sum() < LEAST_FRAMES:
+    if not cells.any() or whole.sum() < LEAST_FRAMES:
         return None
-    weight = np.linalg.pinv(np.column_stack([np.ones(cells.sum()), away[about[cells]]]))[0]
+    if cells.sum() < 3:
+        weight = np.eye(cells.sum())[distance[about[cells]].argmin()]
+    else:
+        weight = np.linalg.pinv(np.column_stack([np.ones(cells.sum()), away[about[cells]]]))[0]
     place = np.array([[place_mm[0]], [place_mm[1]]])
     return FieldSeries(*_clock(frames[whole]), values[whole][:, cells] @ weight[:, None], *place)
 

@@ -78,6 +78,22 @@ def test_a_sound_camera_is_left_alone():
     assert corrected <= 1
 
 
+def test_a_housing_that_is_cleaner_than_the_log_does_not_stand_in_for_the_room():
+    """Surroundings that are 0.93 of the air, a housing that warms by 0.5 K and is logged without noise or nearly so, a log with noise."""
+    seconds, minute = 125.0 * np.arange(28), np.arange(0.0, 3600.0, 60.0)
+    corrected = 0
+    for seed in range(48):
+        rng = np.random.default_rng([seed, 31])
+        phase = rng.uniform(0, 2 * np.pi)
+        air, logged = (23.4 + 0.25 * np.sin(2 * np.pi * at / 5200 + phase) for at in (seconds, minute))
+        housing = 300 + 0.5 * (1 - np.exp(-seconds[:, None] / 2400)) + rng.normal(0, 0.003 * (seed % 2), (28, 1))
+        logged += rng.normal(0, (0.01, 0.03)[seed // 2 % 2], minute.size)
+        room = room_temperatures(seconds, minute, logged)
+        table = 23 + 3 * (1 - np.exp(-seconds / 5000))
+        corrected += estimate_correction(LevelSeries(seconds, 0.93 * air, table, housing, room)).corrects
+    assert corrected == 0
+
+
 def test_a_step_has_its_place_size_and_uncertainty_and_one_beside_the_table_is_the_rooms():
     offset = np.where(np.arange(FRAMES) >= 20, 0.25, 0.0)
     (step,) = estimate_correction(_with_camera(_sound(1), offset)).steps
