@@ -957,7 +957,7 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
                 "first_row_y_mm": float(field["y"][0]),
                 "direction": "centres of cells on the plan; x grows from column to column, y grows from row to row",
                 "cycle": int(cycle),
-                "time": utc(np.datetime64(field["cycle_time"].values[()])),
+                "time": utc(np.datetime64(field["cycle_time"].item(), "ns")),
             }
             units = {"temperature": "degC", "rise": "K", "uncertainty": "K"}
             write_maps(path, maps, units=units, attributes=attributes)
