@@ -940,7 +940,7 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
     mapped = fields[["temperature", "temperature_rise", "temperature_u", "cycle_time"]]
     for some in piece_slices(mapped["temperature"].shape):
         piece = mapped.isel(cycle=some).load()
-        for cycle in piece["cycle"].values:
+        for cycle, time in zip(piece["cycle"].values, piece["cycle_time"].values, strict=True):
             report("OpenEXR maps", len(paths), total)
             field = piece.sel(cycle=cycle)
             named = {
@@ -957,7 +957,7 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
                 "first_row_y_mm": float(field["y"][0]),
                 "direction": "centres of cells on the plan; x grows from column to column, y grows from row to row",
                 "cycle": int(cycle),
-                "time": utc(np.datetime64(field["cycle_time"].item(), "ns")),
+                "time": utc(time),
             }
             units = {"temperature": "degC", "rise": "K", "uncertainty": "K"}
             write_maps(path, maps, units=units, attributes=attributes)
