@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 
 from fusion.analysis.attribution.correlate import (
@@ -20,6 +21,7 @@ from fusion.analysis.attribution.modes import Region, cluster_cells, disc
 from fusion.analysis.attribution.sensors import SensorChoice, choose_sensors
 from fusion.analysis.levels import ATTRIBUTION_LEVEL
 from fusion.campaign.inputs import Source
+from fusion.campaign.time_zones import utc
 from fusion.common import Array
 from fusion.pipeline.drift_model import place_scale_u, scaled
 from fusion.pipeline.positioning import average_cycles
@@ -28,6 +30,7 @@ from fusion.results import axis as schema
 from fusion.results.parts import AreaPart, Quantity, Sensitivity
 from fusion.results.progress import Report
 from fusion.results.results import Outcome, Parts
+from thermography.fields.cycle_fields import SURFACE_EDGE
 from thermography.fields.hotspots import Hotspot, detect_hotspots
 
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
@@ -40,7 +43,7 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     # What the parts of results.json say of targets needs all readings as they are.
     readings = fused
     fused, field, averaged = average_cycles(fused, field)
-    spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
+    spots = _find_hotspots(fields)
     report("correlation", 0, 100)
     regions = [*source.regions, *_hotspot_regions(spots, field)]
 
@@ -68,17 +71,52 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
 
 def describe_hotspots(fields: xr.Dataset) -> tuple[schema.HotspotPart, ...]:
     """Return the hotspots where no drift was measured, or too little of it to be tested."""
-    spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
+    spots = _find_hotspots(fields)
     return tuple(_hotspot(f"hotspot {k}", spot, fields) for k, spot in enumerate(spots, start=1))
 
 
+def _find_hotspots(fields: xr.Dataset) -> list[Hotspot]:
+    """The hotspots of all cycles, but objects on the table, and those whose height the emissivity of a named surface may have made."""
+    flags, attrs = fields["quality_flag"].values, fields["quality_flag"].attrs
+    bits = dict(zip(attrs.get("flag_meanings", "").split(), attrs.get("flag_masks", ()), strict=True))
+    rise = fields["temperature_rise"].where((flags & bits.get("object", 0)) == 0)
+    spots = detect_hotspots(rise, noise_u=fields["temperature_rise_noise_u"])
+    if "rise_scale_u" not in fields:
+        return spots
+    border = scipy.ndimage.binary_dilation((flags & SURFACE_EDGE).any(axis=0), np.ones((3, 3)))
+    x, y, kept = fields["x"].values, fields["y"].values, []
+    for spot in spots:
+        left, right, low, high = spot.extent_mm
+        zone = np.ix_((y > low) & (y < high), (x > left) & (x < right))
+        scale = fields["rise_scale_u"].values[zone]
+        if not border[zone].any() or spot.prominence_K > 2.0 * np.nanmax(scale) * spot.peak_rise_K:
+            kept.append(spot)
+    return kept
+
+
 def _hotspot(name: str, spot: Hotspot, fields: xr.Dataset, **tested: Any) -> schema.HotspotPart:
-    """Place, area and rise of a hotspot; without results where it was not tested."""
-    u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
-    area = dict(zip(AreaPart.model_fields, spot.extent_mm, strict=True))
+    """Place, time, area and rise of a hotspot; without results where it was not tested."""
+    cycle, at = fields.isel(cycle=spot.cycle), {"x": spot.x_mm, "y": spot.y_mm}
+    total, noise = (float(cycle[f"temperature_rise{end}"].sel(at, method="nearest")) for end in ("_u", "_noise_u"))
+    if not np.isfinite(total):  # of a cell that is not seen: the largest that the plan shows
+        total, noise = (float(cycle[f"temperature_rise{end}"].max()) for end in ("_u", "_noise_u"))
+    place_u = float(fields["position_u"].max()) / np.sqrt(2.0)
+    end, times = spot.end_cycle, fields["cycle_time"].values
+    described = {
+        "x_u_mm": float(np.hypot(spot.x_u_mm, place_u)),
+        "y_u_mm": float(np.hypot(spot.y_u_mm, place_u)),
+        "peak_rise_u_K": float(np.sqrt(spot.peak_rise_u_K**2 + max(total**2 - noise**2, 0.0))),
+        "area": dict(zip(AreaPart.model_fields, spot.extent_mm, strict=True)),
+        "cycle": fields["cycle"][spot.cycle],
+        "onset_cycle": fields["cycle"][spot.onset_cycle],
+        "end_cycle": None if end is None else fields["cycle"][end],
+        "time": utc(times[spot.cycle]),
+        "onset_time": utc(times[spot.onset_cycle]),
+        "end_time": None if end is None else utc(times[end]),
+    }
     own = {key: value for key, value in vars(spot).items() if key in schema.HotspotPart.model_fields}
     untested = {"targets": (), "p_value": None, "lag_s": None}
-    return schema.HotspotPart(name=name, peak_rise_u_K=u, area=area, **own, **{**untested, **tested})
+    return schema.HotspotPart(name=name, **{**own, **described, **untested, **tested})
 
 
 def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Region]:

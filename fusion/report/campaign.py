@@ -84,6 +84,38 @@ if TYPE_CHECKING:
 # Drift and field in the report: the facts that its templates state.
 
 
+class _NearestHotspot(NamedTuple):
+    """The hotspot nearest to the middle of the place that the drift follows, and whether it may be that place."""
+
+    name: str
+    distance_mm: float
+    u_mm: float
+    same: bool
+
+
+def _nearest_hotspot(results: Results) -> _NearestHotspot | None:
+    """Relate the place that the drift follows to the hotspots; an area holds its source anywhere, with the same probability."""
+    if results.correlation is None or not results.hotspots:
+        return None
+    source = results.correlation.source
+    area = source.area
+    if area is None:
+        middle, place_u = np.array([source.x_mm, source.y_mm], float), np.zeros(2)
+    else:
+        edges = np.array([[area.x_low_mm, area.x_high_mm], [area.y_low_mm, area.y_high_mm]])
+        middle, place_u = edges.mean(axis=1), np.diff(edges).ravel() / np.sqrt(12.0)
+    related = []
+    for spot in results.hotspots:
+        apart = np.array([spot.x_mm, spot.y_mm], float) - middle
+        u = np.hypot(place_u, np.nan_to_num(np.array([spot.x_u_mm, spot.y_u_mm], float)))
+        distance = float(np.hypot(*apart))
+        along = apart / distance if distance else np.full(2, np.sqrt(0.5))
+        related.append(
+            _NearestHotspot(spot.name, distance, float(np.hypot(*(along * u))), bool((np.abs(apart) <= 2 * u).all()))
+        )
+    return min(related, key=lambda one: (not one.same, one.distance_mm))
+
+
 def describe_correlation(
     fused: xr.DataTree, results: Results, joint: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
@@ -100,6 +132,7 @@ def describe_correlation(
     return {
         "headline": conditional(say("place_sentence", correlation), results.inputs, "attribution"),
         "attributable": attributable,
+        "nearest_hotspot": _nearest_hotspot(results),
         "causes": randomised_causes(correlation),
         "repeated": None if joint is None else joint["repeated"],
         "adding": adding,

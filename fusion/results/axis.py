@@ -499,7 +499,7 @@ class AnomalyPart(ResultPart):
 
 
 class HotspotPart(ResultPart):
-    """A place that warms more than its surroundings."""
+    """A place that warms more than its surroundings, in any cycle."""
 
     name: str = ""
     """Its name, the same as among the regions of the correlation."""
@@ -513,10 +513,30 @@ class HotspotPart(ResultPart):
     """Place of the peak on the plan, x, mm."""
     y_mm: Number
     """Place of the peak on the plan, y, mm."""
+    x_u_mm: Number = None
+    """Standard uncertainty of its x from noise, shape and registration, mm."""
+    y_u_mm: Number = None
+    """Standard uncertainty of its y, mm."""
+    masked: bool = False
+    """Whether the peak lies on or beside cells that are not seen, as under a fiducial: place and rise follow from the shape around."""
+    at_edge: bool = False
+    """Whether its area reaches the edge of the seen plan, beyond which its true peak may lie."""
     peak_rise_K: Number
-    """Rise of the peak since the first cycle, K."""
+    """Rise of the peak since the first cycle in the cycle of its largest rise, K."""
     peak_rise_u_K: Number = None
-    """Standard uncertainty of the rise of its cell, noise and scale of the rise, K; null where the cell is not seen."""
+    """Standard uncertainty of that rise from noise, shape and what all cells share, K."""
+    cycle: int | None = None
+    """Cycle of its largest rise: of several that noise does not tell apart the last one of the test, or else the middle one."""
+    time: str | None = None
+    """Time of that cycle, UTC."""
+    onset_cycle: int | None = None
+    """First cycle in which it stands out from its surroundings and from the noise."""
+    onset_time: str | None = None
+    """Time of that cycle, UTC."""
+    end_cycle: int | None = None
+    """Last cycle in which it stands out; null where it does so to the end of the test."""
+    end_time: str | None = None
+    """Time of that cycle, UTC; null where it stands out to the end of the test."""
     targets: tuple[int, ...]
     """Targets whose drift follows it."""
     p_value: Number

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,26 +20,44 @@ from thermography.registration.plan import Polygon, PolygonError
 _SMOOTHING_CELLS = 1.0
 #: The prominence of a peak must exceed this many standard deviations of the noise of the smoothed field.
 _LEAST_SIGNIFICANCE = 6.0
+#: A source is followed through cycles in which its peak has at least this share of the prominence that it needs to be named.
+_FOLLOWED = 0.5
+#: Rises that differ by less than this many standard deviations of the smoothed noise count as equally large.
+_EQUAL_RISE = 3.0
+#: Radii of the discs of cells to which the shape of a peak is fitted, cells.
+_RADII = (2, 3, 5, 8, 12)
+#: A fit holds where its mean square exceeds that of the noise by at most this many of its standard deviations.
+_LARGEST_MISFIT = 2.0
+#: Mean square of the distance of the points of a cell from its centre along one axis, cells2: what averaging over it widens a peak by.
+_OF_CELL = 1.0 / 12.0
 
 
 @dataclass(frozen=True)
 class Hotspot:
-    """A peak of the temperature rise and the zone around it.
+    """A source of heat: a peak of the temperature rise, in the cycle of its largest rise, and the zone around it.
 
     Attributes
     ----------
-    x_mm, y_mm : mm, position of the peak on the plan
-    peak_rise_K : K, rise at the peak
+    x_mm, y_mm, x_u_mm, y_u_mm : mm, position of the peak on the plan and its standard uncertainty from noise and shape
+    peak_rise_K, peak_rise_u_K : K, rise at the peak and its standard uncertainty from noise and shape
     prominence_K : float, K
         Height of the peak above the highest level at which it is connected to a higher peak, or above the lowest rise on the plan.
     area_mm2, centroid_x_mm, centroid_y_mm, mean_rise_K : mm2, mm, mm and K, of the connected zone above half the prominence
     extent_mm : mm, smallest and largest x, smallest and largest y of that zone: edges of its outermost cells
     at_edge : the zone reaches the edge of the seen plan: the true peak may lie outside
+    masked : the peak lies on or beside cells that are not seen: its place and rise are what the shape around them shows
+    cycle, onset_cycle : int
+        Position along the stack of the cycle of the largest rise (of several that the noise does not tell apart the last of the stack, or
+        else the middle one) and of the first one in which the source stands out; 0 for one field.
+    end_cycle : the last one in which it stands out, None where that is the last of the stack
     """
 
     x_mm: float
     y_mm: float
+    x_u_mm: float
+    y_u_mm: float
     peak_rise_K: float
+    peak_rise_u_K: float
     prominence_K: float
     area_mm2: float
     centroid_x_mm: float
@@ -47,34 +65,56 @@ class Hotspot:
     mean_rise_K: float
     extent_mm: tuple[float, float, float, float]
     at_edge: bool
+    masked: bool
+    cycle: int = 0
+    onset_cycle: int = 0
+    end_cycle: int | None = None
 
 
-def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limit: int = 20) -> list[Hotspot]:
-    """Detect the peaks of one field that stand out from their surroundings and from its noise.
+@dataclass(frozen=True)
+class _Peak:
+    """A maximum of the smoothed field of one cycle; `zone` holds the cells (y, x) in which its source may lie."""
+
+    cycle: int
+    place: tuple[int, int]
+    rise_K: float
+    prominence_K: float
+    stands_out: bool
+    noise_K: float
+    zone: NDArray[np.bool_]
+
+
+def detect_hotspots(
+    rise: xr.DataArray, *, noise_u: xr.DataArray | None = None, least_prominence_K: float = 0.1, limit: int = 20
+) -> list[Hotspot]:
+    """Detect the sources whose peaks stand out from their surroundings and from the noise, in one field or in any of a stack.
 
     Parameters
     ----------
-    rise : (y, x) DataArray, K
-        Temperature rise with coordinates in mm; NaN where the plan is not seen.
+    rise : (y, x) or (cycle, y, x) DataArray, K
+        Temperature rise with coordinates in mm; NaN where the plan is not seen. Such cells are no low ones: they make no peak.
+    noise_u : DataArray of the shape of `rise`, K, or None
+        Standard uncertainty of every cell by noise, where it differs from place to place; never less than what the field itself shows.
     least_prominence_K : float, K
-        Smallest prominence of a hotspot; six standard deviations of the noise are required in any case.
+        Smallest prominence of a hotspot, and its smallest rise; six standard deviations of the noise are required of both in any case.
     limit : int
         Largest number of hotspots to return.
 
     Returns
     -------
     list of Hotspot
-        Most prominent first.
+        Most prominent first; one for each source, however many cycles show it.
 
     Raises
     ------
     ThermographyError
-        The field has other dims than (y, x), or fewer than 3 x 3 cells.
+        The field has other dims than these, or fewer than 3 x 3 cells.
 
     Notes
     -----
-    Extended maxima by h-maxima transform (P. Soille, Morphological Image Analysis, 2nd ed. (2003), ch. 6) of the smoothed field; the
-    position is the vertex of a paraboloid fitted to the 5 x 5 cells around the maximum.
+    Extended maxima by h-maxima transform (P. Soille, Morphological Image Analysis, 2nd ed. (2003), ch. 6) of the smoothed field. Place and
+    rise are those of a Gaussian on a level or sloping background, averaged over the cells as the field is, fitted by least squares to
+    discs of several sizes about the maximum. The uncertainty holds the noise and the scatter of all fits that the noise admits.
 
     Examples
     --------
@@ -84,28 +124,74 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     >>> round(spot.x_mm), round(spot.y_mm), round(spot.peak_rise_K, 1)
     (150, 70, 2.0)
     """
-    if rise.dims != ("y", "x") or min(rise.shape) < 3:
-        raise ThermographyError(f"rise has dims {rise.dims} and shape {rise.shape}; give (y, x) of 3 x 3 cells or more")
-    values = rise.values.astype(float)
+    if rise.dims[-2:] != ("y", "x") or rise.ndim not in (2, 3) or min(rise.shape[-2:]) < 3:
+        raise ThermographyError(
+            f"rise has dims {rise.dims} and shape {rise.shape}; give (y, x) or (cycle, y, x) of 3 x 3 cells or more"
+        )
+    stack = rise.values.astype(float).reshape(-1, *rise.shape[-2:])
+    noises = (
+        np.zeros(stack.shape) if noise_u is None else np.nan_to_num(noise_u.values.astype(float)).reshape(stack.shape)
+    )
+    found = [
+        peak
+        for cycle, (values, noise) in enumerate(zip(stack, noises, strict=True))
+        for peak in _peaks(values, noise, cycle, least_prominence_K)
+    ]
+    sources = _sources(sorted(found, key=lambda peak: -peak.prominence_K))
+    seen = np.flatnonzero(np.isfinite(stack).any(axis=(1, 2)))
+    last = int(seen[-1]) if seen.size else 0
+    return [_hotspot(rise, stack, source, last) for source in sources[:limit]]
+
+
+def _peaks(values: Array, noise: Array, cycle: int, least_prominence_K: float) -> list[_Peak]:
+    """The peaks of one field with a noise of its own in each cell, both (y, x), that may belong to a source."""
     seen = np.isfinite(values)
     if not seen.any():
         return []
     smooth = _smooth_seen(values, _SMOOTHING_CELLS)
-    floor = float(smooth[seen].min())
-    field = np.where(seen, smooth, floor)
+    # An empty cell is as warm as the nearest seen one: it neither cuts a zone off nor counts as the lowest.
+    nearest = scipy.ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    field = smooth[tuple(nearest)]
     # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise; what it takes away shows how large that is.
     left = 1 / (4 * np.pi * _SMOOTHING_CELLS**2)
-    noise_K = MAD_TO_SIGMA * float(np.median(np.abs((values - smooth)[seen]))) * np.sqrt(left / (1 - left))
-    least = max(least_prominence_K, _LEAST_SIGNIFICANCE * noise_K)
-    if field.max() - floor < least:
-        return []
-    peaks = measure.label(morphology.h_maxima(field, least), connectivity=2)
-    spots = []
-    for label in range(1, peaks.max() + 1):
-        peak = np.where((peaks == label) & seen, field, -np.inf)
-        place = np.unravel_index(int(np.argmax(peak)), field.shape)
-        spots.append(_hotspot(rise, values, field, seen, place, floor))
-    return sorted(spots, key=lambda spot: -spot.prominence_K)[:limit]
+    noise_K = MAD_TO_SIGMA * float(np.median(np.abs((values - smooth)[seen]))) / np.sqrt(1 - left)
+    least = max(least_prominence_K, _LEAST_SIGNIFICANCE * noise_K * np.sqrt(left))
+    floor, middle = float(field.min()), float(np.median(smooth[seen]))
+    maxima = measure.label(morphology.h_maxima(field, _FOLLOWED * least), connectivity=2)
+    peaks = []
+    for label in range(1, maxima.max() + 1):
+        inside = (maxima == label) & seen
+        place = np.unravel_index(int(np.argmax(np.where(inside, field, -np.inf))), field.shape)
+        top = float(field[place])
+        if inside.any() and top >= _FOLLOWED * least:
+            prominence = top - _saddle(field, place, floor)
+            # The lowest of many cells is low by noise alone: the highest one must stand out from the middle one.
+            stands = min(top, top - middle if prominence == top - floor else prominence)
+            own_K = max(noise_K, float(noise[place]))
+            stands_out = stands >= max(least, _LEAST_SIGNIFICANCE * own_K * np.sqrt(left))
+            level = top - max(prominence / 2, _EQUAL_RISE * own_K * np.sqrt(left))
+            zones = measure.label(field >= level, connectivity=1)
+            at = (int(place[0]), int(place[1]))
+            peaks.append(_Peak(cycle, at, top, prominence, stands_out, own_K, zones == zones[place]))
+    return peaks
+
+
+def _sources(peaks: Sequence[_Peak]) -> list[list[_Peak]]:
+    """The peaks, most prominent first, of every source: of each cycle the one that lies in the zone of its most prominent and it in its."""
+    sources: list[list[_Peak]] = []
+    for peak in peaks:
+        homes = [
+            source
+            for source in sources
+            if source[0].zone[peak.place]
+            and peak.zone[source[0].place]
+            and all(one.cycle != peak.cycle for one in source)
+        ]
+        if homes:
+            min(homes, key=lambda source: np.hypot(*np.subtract(source[0].place, peak.place))).append(peak)
+        elif peak.stands_out:
+            sources.append([peak])
+    return sources
 
 
 def _smooth_seen(values: Array, width_cells: float) -> Array:
@@ -117,32 +203,46 @@ def _smooth_seen(values: Array, width_cells: float) -> Array:
         return np.where(seen, total / weight, np.nan)
 
 
-def _hotspot(
-    rise: xr.DataArray, values: Array, field: Array, seen: NDArray[np.bool_], place: tuple[Any, ...], floor: float
-) -> Hotspot:
-    """The hotspot of a maximum of the smoothed field at a cell (row, column)."""
+def _hotspot(rise: xr.DataArray, stack: Array, source: Sequence[_Peak], last: int) -> Hotspot:
+    """The hotspot of the peaks of one source."""
+    course = sorted(source, key=lambda peak: peak.cycle)
+    top = max(course, key=lambda peak: peak.rise_K)
+    equal = [peak for peak in course if top.rise_K - peak.rise_K <= _EQUAL_RISE * peak.noise_K / 2]
+    peak = equal[-1] if equal[-1].cycle == last else equal[len(equal) // 2]
+    values, seen = stack[peak.cycle], np.isfinite(stack[peak.cycle])
     x, y = rise["x"].values, rise["y"].values
     cell = float(x[1] - x[0])
-    prominence = field[place] - _saddle(field, place, floor)
-    zones = measure.label((field >= field[place] - prominence / 2) & seen, connectivity=1)
-    zone = zones == zones[place]
+    field = np.where(seen, _smooth_seen(values, _SMOOTHING_CELLS), -np.inf)
+    zone = peak.zone & (field >= peak.rise_K - peak.prominence_K / 2)
     rows, columns = np.nonzero(zone)
-    filled = np.pad(scipy.ndimage.binary_fill_holes(seen), 1)
-    outside = ~scipy.ndimage.binary_erosion(filled, np.ones((3, 3)))[1:-1, 1:-1]
-    column, row, peak = _vertex(values, field, place)
+    whole = scipy.ndimage.binary_fill_holes(seen)
+    outside = ~scipy.ndimage.binary_erosion(np.pad(whole, 1), np.ones((3, 3)))[1:-1, 1:-1]
+    column, row, height, u = _vertex(values, peak)
+    # Where noise does not tell the edge of the seen plan from the peak, the peak may lie there.
+    rim = np.argwhere(zone & outside & (field >= peak.rise_K - _EQUAL_RISE * peak.noise_K / 2))
+    if len(rim):
+        u[:2] = np.hypot(u[:2], np.abs(rim - (row, column)).max(axis=0)[::-1] / np.sqrt(3.0))
+    at = (min(max(round(row), 0), len(y) - 1), min(max(round(column), 0), len(x) - 1))
     left, lower = float(x[columns].min() - cell / 2), float(y[rows].min() - cell / 2)
     right, upper = float(x[columns].max() + cell / 2), float(y[rows].max() + cell / 2)
     return Hotspot(
         x_mm=float(x[0] + column * cell),
         y_mm=float(y[0] + row * cell),
-        peak_rise_K=peak,
-        prominence_K=float(prominence),
+        x_u_mm=float(u[0] * cell),
+        y_u_mm=float(u[1] * cell),
+        peak_rise_K=height,
+        peak_rise_u_K=float(u[2]),
+        prominence_K=peak.prominence_K,
         area_mm2=float(len(rows) * cell**2),
         centroid_x_mm=float(x[columns].mean()),
         centroid_y_mm=float(y[rows].mean()),
         mean_rise_K=float(values[zone].mean()),
         extent_mm=(left, right, lower, upper),
         at_edge=bool((zone & outside).any()),
+        masked=bool(scipy.ndimage.binary_dilation(whole & ~seen, np.ones((3, 3)))[at]),
+        cycle=peak.cycle,
+        onset_cycle=course[0].cycle,
+        end_cycle=None if course[-1].cycle == last else course[-1].cycle,
     )
 
 
@@ -162,24 +262,110 @@ def _saddle(field: Array, place: tuple[Any, ...], floor: float) -> float:
     return float(levels[low]) if low >= 0 else floor
 
 
-def _vertex(values: Array, field: Array, place: tuple[Any, ...]) -> tuple[float, float, float]:
-    """Column, row and height of the vertex of a paraboloid fitted to the 5 x 5 cells around a peak; the cell itself without one."""
-    row, column = int(place[0]), int(place[1])
-    rows, columns = np.mgrid[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-    inside = (rows < field.shape[0]) & (columns < field.shape[1])
-    rows, columns = rows[inside], columns[inside]
-    seen = np.isfinite(values[rows, columns])
-    rows, columns = rows[seen], columns[seen]
-    if len(rows) >= 15:
-        u, v = columns - column, rows - row
-        basis = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v]).astype(float)
-        c = np.linalg.lstsq(basis, values[rows, columns], rcond=None)[0]
-        hessian = np.array([[2 * c[3], c[4]], [c[4], 2 * c[5]]])
-        if np.linalg.eigvalsh(hessian)[1] < 0:
-            step = -np.linalg.solve(hessian, c[1:3])
-            if np.abs(step).max() <= 2:
-                return column + step[0], row + step[1], float(c[0] + 0.5 * c[1:3] @ step)
-    return float(column), float(row), float(field[place])
+def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
+    """Column, row and rise of the top of the shape around a peak, and their standard uncertainties, cells and K."""
+    row, column = peak.place
+    tops, us = [], []
+    for sloping in (False, True):
+        for radius in _RADII:
+            fitted = _fit_shape(values, peak, radius, sloping)
+            if fitted is not None and fitted[2] > 1.0:
+                break
+            if fitted is not None:
+                tops.append(fitted[0])
+                us.append(fitted[1])
+    if not tops:
+        # No shape: the cells that the noise does not tell from the warmest.
+        rows, columns = np.nonzero(peak.zone)
+        u = [max(float(np.std(each)), np.sqrt(_OF_CELL)) for each in (columns, rows)]
+        return float(column), float(row), peak.rise_K, np.array([*u, np.hypot(peak.noise_K, peak.prominence_K / 4)])
+    top, each_u = np.array(tops), np.array(us)
+    best = int(np.argmin(each_u.prod(axis=1)))
+    weight = 1.0 / each_u**2
+    scatter = (weight * (top - top[best]) ** 2).sum(axis=0) / weight.sum(axis=0)
+    x, y, height = top[best].tolist()
+    return column + x, row + y, height, np.sqrt(each_u[best] ** 2 + scatter)
+
+
+def _fit_shape(values: Array, peak: _Peak, radius: int, sloping: bool) -> tuple[Array, Array, float] | None:
+    """Top (column, row, rise) of a Gaussian fitted to the cells within a radius of a peak, counted from it, its standard uncertainties,
+    and its misfit over the largest one that the noise admits; None where the cells show no such peak.
+    """
+    v, u = np.nonzero(np.isfinite(values))
+    v, u = v - peak.place[0], u - peak.place[1]
+    near = np.hypot(u, v) <= radius + 0.5
+    v, u = v[near].astype(float), u[near].astype(float)
+    z = values[np.isfinite(values)][near]
+    count = 9 if sloping else 7
+    if len(z) < count + 4:
+        return None
+    # A field without noise is known to the digits of its numbers.
+    noise_K = max(peak.noise_K, 1e-6 * (1.0 + np.abs(z).max()))
+
+    def shape(p: Array) -> tuple[Array, Array]:
+        du, dv = u - p[0], v - p[1]
+        g = np.exp(np.clip(-0.5 * (p[2] * du**2 + 2 * p[3] * du * dv + p[4] * dv**2), -50.0, 50.0))
+        a = p[5] * g
+        slopes = [
+            a * (p[2] * du + p[3] * dv),
+            a * (p[3] * du + p[4] * dv),
+            -a * du**2 / 2,
+            -a * du * dv,
+            -a * dv**2 / 2,
+            g,
+            np.ones_like(u),
+        ]
+        return a + p[6] + (p[7] * u + p[8] * v if sloping else 0.0), np.stack(
+            slopes + ([u, v] if sloping else []), axis=1
+        )
+
+    height = max(float(np.ptp(z)), 4 * noise_K)
+    start = [0.0, 0.0, 1.0 / radius**2, 0.0, 1.0 / radius**2, height, float(z.min()), 0.0, 0.0][:count]
+    found = scipy.optimize.least_squares(
+        lambda p: (shape(p)[0] - z) / noise_K, start, jac=lambda p: shape(p)[1] / noise_K, method="lm", max_nfev=40
+    )
+    top = _top_of(found.x)
+    freedom = len(z) - count
+    if top is None or np.abs(top[:2]).max() > radius:
+        return None
+    column, row = np.array(peak.place[::-1]) + top[:2]
+    if not (-0.5 <= column <= values.shape[1] - 0.5 and -0.5 <= row <= values.shape[0] - 0.5):
+        return None
+    # Derivatives of the top by the parameters.
+    by = np.empty((3, count))
+    for k in range(count):
+        step = 1e-4 * max(abs(found.x[k]), 1e-3)
+        moved = _top_of(found.x + step * (np.arange(count) == k))
+        if moved is None:
+            return None
+        by[:, k] = (moved - top) / step
+    misfit = 2 * found.cost / freedom
+    covariance = by @ np.linalg.pinv(found.jac.T @ found.jac, rcond=1e-12) @ by.T
+    variance = np.maximum(np.diag(covariance), 1e-18) * max(misfit, 1.0)
+    return top, np.sqrt(variance), misfit / (1.0 + _LARGEST_MISFIT * np.sqrt(2.0 / freedom))
+
+
+def _top_of(p: Array) -> Array | None:
+    """Column, row and height of the top of a Gaussian on its background as it is before it is averaged over cells; None without one."""
+    inverse = np.array([[p[2], p[3]], [p[3], p[4]]])
+    if p[5] <= 0 or np.linalg.eigvalsh(inverse)[0] <= 1e-9:
+        return None
+    wide = np.linalg.inv(inverse)
+    narrow = wide - _OF_CELL * np.eye(2)
+    if np.linalg.eigvalsh(narrow)[0] < 2 * _OF_CELL:
+        return None
+    height = p[5] * np.sqrt(np.linalg.det(wide) / np.linalg.det(narrow))
+    slope, shift = (p[7:9] if len(p) > 7 else np.zeros(2)), np.zeros(2)
+    # Where the slopes of Gaussian and background cancel: a fixed point that is stable inside the point of inflexion.
+    for _ in range(30):
+        g = height * np.exp(-0.5 * shift @ np.linalg.solve(narrow, shift))
+        before, shift = shift, narrow @ slope / g
+        if shift @ np.linalg.solve(narrow, shift) > 0.9:
+            return None
+        if np.abs(shift - before).max() < 1e-7:
+            break
+    at = p[:2] + shift
+    return np.array([*at, p[6] + slope @ at + height * np.exp(-0.5 * shift @ np.linalg.solve(narrow, shift))])
 
 
 # Time series of polygonal regions of the plan from stacks of temperature fields.

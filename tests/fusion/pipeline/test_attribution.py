@@ -8,7 +8,7 @@ import xarray as xr
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
-from fusion.pipeline.attribution import correlate_field
+from fusion.pipeline.attribution import correlate_field, describe_hotspots
 from fusion.pipeline.drift_model import join_fusion
 from fusion.pipeline.positioning import align_recordings
 from fusion.report.campaign import describe_correlation
@@ -60,6 +60,20 @@ def test_regions_and_hotspots_are_tested_by_name(outcome):
     assert set(parts.correlation.regions[0].parts) == {"common", "proportional", "reversal", "joint"}
     assert maps["target_regions/p_value"].sizes == {"series": 12, "region": len(names)}
     assert len(parts.hotspots) >= len(names) - 1
+
+
+def test_what_is_flagged_as_an_object_is_no_hotspot(results_folder):
+    fields = read_dataset(results_folder / "fields.nc").load()
+    before = describe_hotspots(fields)
+    assert before[0].x_u_mm > 0 and before[0].onset_time is not None and before[0].end_cycle is None
+    near = np.hypot(fields["x"] - 60.0, fields["y"] - 130.0) < 15.0
+    fields["temperature_rise"] = fields["temperature_rise"] + 5.0 * near * (fields["cycle"] > 6)
+    assert any(abs(spot.x_mm - 60.0) < 20.0 and abs(spot.y_mm - 130.0) < 20.0 for spot in describe_hotspots(fields))
+    attrs = {"flag_meanings": "object", "flag_masks": np.array([64], np.uint8)}
+    hidden = xr.where(near & (fields["cycle"] > 6), 64, 0).transpose("cycle", "y", "x").astype(np.uint8)
+    fields["quality_flag"] = hidden.assign_attrs(attrs)
+    after = describe_hotspots(fields)
+    assert not any(abs(spot.x_mm - 60.0) < 20.0 and abs(spot.y_mm - 130.0) < 20.0 for spot in after)
 
 
 def test_the_switched_load_gets_its_own_verdict(outcome):

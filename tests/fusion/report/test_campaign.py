@@ -58,7 +58,7 @@ def test_results_without_products_still_make_a_page():
         for name in ("fields", "loop")
     )
     tables = tables_of(page)
-    assert tables["Hotspots"][1][4:] == ["3", "–", "–"]
+    assert tables["Hotspots"][1][6:] == ["3", "–", "–"]
     limit = tables["Detection limit of every effect"][1]
     assert limit[:5] == ["dead path of the laser", "never", "–", "10 %", "refractive index of the air"]
 

@@ -53,7 +53,7 @@ def test_masked_discs_neither_make_nor_break_hotspots(rng):
 
 def test_what_is_no_field_is_refused():
     with pytest.raises(ThermographyError, match="dims"):
-        detect_hotspots(xr.concat([plane()], "cycle"))
+        detect_hotspots(plane().transpose())
 
 
 def test_a_second_peak_within_six_standard_deviations_of_the_noise_is_none(rng):
@@ -72,16 +72,7 @@ def test_the_zone_of_a_peak_is_that_above_half_its_height_to_the_edges_of_its_ce
     assert spot.x_mm == pytest.approx(202.5) and spot.y_mm == pytest.approx(92.5)
 
 
-def test_vertex_and_saddle_are_exact():
-    row, column = np.mgrid[:9, :11]
-    u, v = column - 5.3, row - 3.6
-    values = 4.0 - 0.2 * u**2 - 0.3 * v**2 + 0.15 * u * v
-    assert module._vertex(values, values, (4, 5)) == pytest.approx((5.3, 3.6, 4.0))
-    # At the border of the plan the fit takes the cells that there are.
-    assert module._vertex(values[:6, :7], values[:6, :7], (4, 5)) == pytest.approx((5.3, 3.6, 4.0))
-    # A ridge has no vertex: the cell itself.
-    ridge = -0.3 * v**2
-    assert module._vertex(ridge, ridge, (4, 5))[:2] == (5.0, 4.0)
+def test_saddle_is_exact():
     field = np.zeros((3, 9))
     field[1] = [0.0, 2.0, 5.0, 3.0, 4.0, 9.0, 6.0, 8.0, 1.0]
     assert module._saddle(field, (1, 2), 0.0) == 3.0
@@ -111,6 +102,66 @@ def test_prominence_limits_ranks_and_edges():
 def test_a_zone_that_reaches_any_edge_is_marked(place, at_edge):
     (spot,) = detect_hotspots(plane((*place, 3.0, 20.0)))
     assert spot.at_edge is at_edge
+
+
+def test_a_closed_ring_of_empty_cells_makes_no_hotspot(rng):
+    """The border of a named surface is empty; within it the field goes on."""
+    field = plane(slope=2.0 / 700.0) + 1.0
+    within = (abs(field["x"] - 345) < 55) & (abs(field["y"] - 85) < 45)
+    ring = (abs(field["x"] - 345) < 65) & (abs(field["y"] - 85) < 55) & ~within
+    whole = detect_hotspots(field)
+    assert len(detect_hotspots(field.where(~ring))) == len(whole) == 1
+    # A surface of low emissivity is noisier.
+    noise_u = xr.where(within, 0.12, 0.02).transpose("y", "x")
+    noisy = (field + noise_u * rng.normal(0, 1, field.shape)).where(~ring)
+    assert all(spot.x_mm > 600 for spot in detect_hotspots(noisy, noise_u=noise_u))
+
+
+def test_a_peak_below_no_rise_is_none_and_noise_alone_has_none(rng):
+    assert detect_hotspots(plane((300.0, 90.0, 1.0, 20.0)) - 1.5) == []
+    # 20 fields whose highest cell stands six standard deviations above the lowest.
+    for _ in range(20):
+        assert detect_hotspots(plane() + rng.normal(0, 0.2, (36, 140))) == []
+
+
+@pytest.mark.parametrize("width", [7.0, 20.0])
+def test_place_and_rise_are_right_within_their_uncertainty(rng, width):
+    """Cells of 5 mm are means over 8 x 8 points; 12 peaks give the root mean square of a normal value to 20 %."""
+    over = []
+    for _ in range(12):
+        x0, y0, height = rng.uniform(200, 500), rng.uniform(60, 120), rng.uniform(1, 3)
+        points = [(np.arange(8 * n) + 0.5) * 5.0 / 8 for n in (140, 36)]
+        fine = height * np.exp(-((points[0] - x0) ** 2 + (points[1][:, None] - y0) ** 2) / (2 * width**2))
+        cells = fine.reshape(36, 8, 140, 8).mean(axis=(1, 3)) + rng.normal(0, 0.014, (36, 140))
+        (spot,) = detect_hotspots(plane().copy(data=cells))
+        errors = np.array([spot.x_mm - x0, spot.y_mm - y0, spot.peak_rise_K - height])
+        over.append(errors / (spot.x_u_mm, spot.y_u_mm, spot.peak_rise_u_K))
+    assert 0.3 < np.sqrt(np.mean(np.square(over))) < 1.4
+    assert np.abs(over).max() < 4.0
+
+
+def test_a_peak_under_a_disc_is_said_to_lie_there(rng):
+    field = plane((300.0, 90.0, 2.0, 30.0)) + rng.normal(0, 0.014, (36, 140))
+    hidden = field.where(np.hypot(field["x"] - 303, field["y"] - 87) > 16)
+    (spot,) = detect_hotspots(hidden)
+    assert spot.masked and not detect_hotspots(field)[0].masked
+    assert abs(spot.x_mm - 300) < 3 * spot.x_u_mm and abs(spot.y_mm - 90) < 3 * spot.y_u_mm
+    assert abs(spot.peak_rise_K - 2.0) < 3 * spot.peak_rise_u_K
+
+
+def test_a_source_is_one_hotspot_over_all_cycles_with_onset_and_end(rng):
+    """One warms up and stays, one passes in mid-test, nothing follows it."""
+    passing = 1.5 * np.exp(-((np.arange(12) - 5.0) ** 2) / 2.0)
+    lasting = 2.0 * (1 - np.exp(-np.arange(12) / 4.0))
+    fields = [
+        plane((500.0, 90.0, a, 30.0), (160.0, 60.0, b, 20.0)) + rng.normal(0, 0.014, (36, 140))
+        for a, b in zip(lasting, passing, strict=True)
+    ]
+    first, second = detect_hotspots(xr.concat(fields, "cycle"))
+    assert (round(first.x_mm / 10), first.cycle, first.onset_cycle, first.end_cycle) == (50, 11, 1, None)
+    assert (round(second.x_mm / 10), second.cycle) == (16, 5)
+    assert (second.onset_cycle, second.end_cycle) == (3, 7)
+    assert second.peak_rise_K == pytest.approx(1.5, abs=4 * second.peak_rise_u_K)
 
 
 SQUARE = {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]}
