@@ -40,6 +40,7 @@ from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
 from thermography.fields.cycle_fields import CLIPPED, cycles_with_field, reference_cycle
 from thermography.fields.moving import reduce_moving_frames
+from thermography.fields.objects import leave_out_objects
 from thermography.fields.still import reduce_frames
 from thermography.fields.survey import (
     LEAST_SURROUNDING_BLOCKS,
@@ -664,7 +665,9 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     shown: dict[str, Any] = {"untested": "camera or table was displaced, and the discs in the picture with it"}
     if source.thermography.table == "moving":
         shown = {"untested": "the discs move through the picture with the table"}
-    elif not json.loads(fields.attrs.get("knocks", "[]")):
+    else:
+        fields = leave_out_objects(fields)
+    if source.thermography.table == "still" and not json.loads(fields.attrs.get("knocks", "[]")):
         camera, shown = _held_against_discs(camera, registration, detector)
     fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))

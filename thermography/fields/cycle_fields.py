@@ -27,12 +27,15 @@ _FLAGS = {
     "not_seen": 8,
     "no_frame": 16,
     "surface_edge": 32,
+    "object": 64,
     "clipped": 128,
 }
 #: Flag of cells that see two surfaces of different emissivity.
 SURFACE_EDGE = _FLAGS["surface_edge"]
 #: Flag of cells in view that are empty because pixels are clipped, or show less than any temperature.
 CLIPPED = _FLAGS["clipped"]
+#: Flag of cells that show an object on the table.
+OBJECT = _FLAGS["object"]
 #: Coverage below which a cell is flagged as partly seen.
 PARTLY_SEEN_BELOW = 0.99
 #: In images of more pixels than this, ...

@@ -142,7 +142,7 @@ _OFF_SIGMAS = 8.0
 #: A frame is obstructed if more than this share of the sampled pixels is off, beyond single bad pixels.
 _OFF_SHARE = 0.02
 #: An obstruction passes within this time, s, or this number of frames; what stays longer is a change of the scene.
-_PASSING_S, _PASSING_FRAMES = 300.0, 3
+_PASSING_S, _PASSING_FRAMES = 900.0, 5
 #: Number of frames whose median is the first state of the table.
 _FIRST_FRAMES = 5
 #: Least number of sampled pixels for the comparison.

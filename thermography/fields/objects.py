@@ -1,0 +1,189 @@
+"""Parts of a still table that change abruptly: objects that are laid on it or taken away, and the cells that show them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+import xarray as xr
+from numpy.typing import NDArray
+
+from thermography.common import MAD_TO_SIGMA, Array
+from thermography.fields.cycle_fields import OBJECT
+from thermography.large_arrays import median_of_pieces, piece_slices
+
+#: A cell jumps if its change from one frame to the next exceeds its changes before and after by more than this, K, ...
+JUMP_K = 0.3
+#: ... and by more than this many standard deviations of its noise.
+_JUMP_SIGMAS = 8.0
+#: At the ends of a series a change may exceed the only one beside it by this factor, as the course of a table that begins to warm.
+_END_STRETCH = 2.0
+#: Fewest connected cells that are a part of the table.
+_LEAST_CELLS = 4
+#: A jump whose edge takes more than `_SHARP` of its size within this distance, mm, is no heat: in steel it spreads 100 mm in four minutes.
+_EDGE_MM, _SHARP = 10.0, 0.5
+#: Share of the table from which a jump without such an edge is named: a reflection.
+_LEAST_SHARE = 0.02
+#: Largest share of the table that is left out; beyond it no field would remain.
+_LARGEST_SHARE = 0.25
+_EIGHT = np.ones((3, 3), bool)
+
+
+@dataclass(eq=False)
+class AbruptPart:
+    """Connected cells (y, x) that differ by `step_K` from frame `first` on, up to before `stop` (None: to the end); objects are `sharp`."""
+
+    cells: NDArray[np.bool_]
+    step_K: float
+    sharp: bool
+    first: int
+    stop: int | None = None
+
+    def ended_by(self, later: AbruptPart) -> bool:
+        """Whether a later jump takes this one back."""
+        common = np.count_nonzero(self.cells & later.cells)
+        smaller = min(np.count_nonzero(self.cells), np.count_nonzero(later.cells))
+        return bool(self.stop is None and self.step_K * later.step_K < 0 and common >= smaller / 2)
+
+
+def find_abrupt_parts(frames: xr.DataArray) -> list[AbruptPart]:
+    """Find the parts of a still table that change abruptly in frames (time, y, x), degC; NaN where the table is not seen."""
+    found: list[AbruptPart] = []
+    if len(frames) < 4:
+        return found
+    seconds = np.diff(frames["time"].values) / np.timedelta64(1, "s")
+    cell_mm = abs(float(frames["x"][1] - frames["x"][0]))
+    least_K = _least_jump(frames)
+    for some in piece_slices((len(seconds), *frames.shape[1:])):
+        change, excess = _excess(frames, seconds, some)
+        for at, (changed, beyond) in enumerate(zip(change, excess, strict=True)):
+            if np.count_nonzero(beyond > least_K) < _LEAST_CELLS:
+                continue
+            for sign in (1.0, -1.0):
+                labels, count = scipy.ndimage.label((beyond > least_K) & (sign * changed > 0), _EIGHT)
+                for label in range(1, count + 1):
+                    cells = labels == label
+                    sharp = bool(np.count_nonzero(cells) >= _LEAST_CELLS and _is_sharp(changed, cells, cell_mm))
+                    if not sharp and np.count_nonzero(cells) < _LEAST_SHARE * np.count_nonzero(np.isfinite(changed)):
+                        continue
+                    part = AbruptPart(cells, float(np.median(changed[cells])), sharp, some.start + at + 1)
+                    before = next((one for one in reversed(found) if one.ended_by(part)), None)
+                    if before is None and _stood_before(frames[part.first - 1 : part.first + 1].values, cells):
+                        found.append(AbruptPart(cells, -part.step_K, sharp, 0, part.first))
+                    elif before is None:
+                        found.append(part)
+                    else:
+                        before.stop = part.first
+                        before.cells = before.cells | cells
+    return found
+
+
+def _stood_before(pair: Array, cells: NDArray[np.bool_]) -> bool:
+    """Whether cells differ from those around them more in the first of two frames than in the second: something was taken away."""
+    inner = scipy.ndimage.binary_dilation(cells, _EIGHT, iterations=2)
+    around = scipy.ndimage.binary_dilation(inner, _EIGHT, iterations=2) & ~inner
+    if not np.isfinite(pair[:, around]).any(axis=1).all():
+        return False
+    before, after = (abs(np.nanmedian(frame[cells]) - np.nanmedian(frame[around])) for frame in pair)
+    return bool(before > after)
+
+
+def _is_sharp(changed: Array, cells: NDArray[np.bool_], cell_mm: float) -> bool:
+    """Whether a change takes most of its size within `_EDGE_MM` along a row or a column of the cells."""
+    far = max(round(_EDGE_MM / cell_mm), 1)
+    near = scipy.ndimage.binary_dilation(cells, _EIGHT, iterations=far)
+    values = np.where(near, changed, np.nan)
+    steps = [np.abs(values[far:] - values[:-far]), np.abs(values[:, far:] - values[:, :-far])]
+    largest = max((float(np.nanmax(step)) for step in steps if np.isfinite(step).any()), default=0.0)
+    return largest > _SHARP * float(np.abs(changed[cells]).max())
+
+
+def _changes(frames: xr.DataArray, first: int, stop: int) -> Array:
+    """Changes from frame to frame, those from `first` up to `stop`, beyond the one that most of the table makes, (changes, y, x) K."""
+    change = np.diff(frames[first : stop + 1].values.astype(float), axis=0)
+    return np.asarray(change - np.nanmedian(change, axis=(1, 2), keepdims=True))
+
+
+def _least_jump(frames: xr.DataArray) -> float:
+    """Excess of a change beyond which it is a jump, K: large against the noise of the changes."""
+    pairs = (len(frames) - 2, *frames.shape[1:])
+
+    def differences() -> Iterator[Array]:
+        return (np.abs(np.diff(_changes(frames, some.start, some.stop + 1), axis=0)) for some in piece_slices(pairs))
+
+    return max(JUMP_K, _JUMP_SIGMAS * MAD_TO_SIGMA * median_of_pieces(differences) / np.sqrt(6.0))
+
+
+def _excess(frames: xr.DataArray, seconds: Array, some: slice) -> tuple[Array, Array]:
+    """Some changes, and their excess over what those before and after them allow, (changes, y, x) K."""
+    first, stop = max(some.start - 1, 0), min(some.stop + 1, len(seconds))
+    change, lasted = _changes(frames, first, stop), seconds[first:stop, None, None]
+    rate = np.abs(change) / lasted
+    before, after = np.roll(rate, 1, axis=0), np.roll(rate, -1, axis=0)
+    if first == 0:
+        before[0] = _END_STRETCH * after[0]
+    if stop == len(seconds):
+        after[-1] = _END_STRETCH * before[-1]
+    # A source that is switched on bends the temperature, so that the change exceeds only the one before, or only the one after.
+    excess = np.abs(change) - lasted * np.maximum(before, after)
+    inner = slice(some.start - first, some.stop - first)
+    return change[inner], excess[inner]
+
+
+def leave_out_objects(fields: xr.Dataset) -> xr.Dataset:
+    """Leave the cells of objects empty and flagged in every frame and cycle that shows them; attribute `abrupt_parts` names all parts."""
+    frames = fields["frame_temperature"]
+    parts = find_abrupt_parts(frames)
+    fields = fields.assign_attrs(abrupt_parts=json.dumps([describe_part(part, fields) for part in parts]))
+    # The lens blurs the rim of an object over its neighbours.
+    covered = [
+        (slice(part.first, part.stop), scipy.ndimage.binary_dilation(part.cells, _EIGHT))
+        for part in parts
+        if part.sharp
+    ]
+    shown = np.isfinite(frames[0].values)
+    union = np.any([cells for _, cells in covered], axis=0) if covered else np.zeros(shown.shape, bool)
+    if not covered or np.count_nonzero(union & shown) > _LARGEST_SHARE * np.count_nonzero(shown):
+        return fields
+    hidden = np.zeros(fields["temperature"].shape, bool)
+    stack = frames.values.copy()
+    for during, cells in covered:
+        stack[during, cells] = np.nan
+        of_cycles = fields["frame_cycle"].values[during]
+        hidden[np.unique(of_cycles[of_cycles > 0]) - 1] |= cells
+    changed = {"frame_temperature": frames.copy(data=stack)}
+    start = int(np.flatnonzero(np.isfinite(fields["temperature"].values).any(axis=(1, 2)))[0])
+    for name in _LEFT_EMPTY:
+        # A rise counts from a cycle that must show the table too.
+        empty = hidden | hidden[start] if name.startswith("temperature_rise") else hidden
+        changed[name] = fields[name].where(~empty)
+    flags = fields["quality_flag"]
+    changed["quality_flag"] = flags.copy(data=flags.values | np.where(hidden, OBJECT, 0).astype(np.uint8))
+    return fields.assign(changed)
+
+
+_LEFT_EMPTY = (
+    "temperature", "temperature_noise_u", "temperature_rise", "temperature_rise_noise_u", "temperature_rate", "temperature_spread"
+)  # fmt: skip
+
+
+def describe_part(part: AbruptPart, fields: xr.Dataset) -> dict[str, Any]:
+    """Place, length and width, mm, step, K, share of the table, and times of a part."""
+    rows, columns = np.nonzero(part.cells)
+    x, y, times = (fields[name].values for name in ("x", "y", "time"))
+    until = None if part.stop is None else np.datetime_as_string(times[part.stop], unit="s")
+    return {
+        "x_mm": float(x[columns].mean()),
+        "y_mm": float(y[rows].mean()),
+        # Of an ellipse with the same second moments.
+        "size_mm": sorted(4.0 * np.sqrt(np.linalg.eigvalsh(np.cov(x[columns], y[rows])).clip(0.0)), reverse=True),
+        "step_K": part.step_K,
+        "share": len(rows) / max(int(np.isfinite(fields["frame_temperature"][part.first].values).sum()), 1),
+        "sharp": part.sharp,
+        "since": np.datetime_as_string(times[part.first], unit="s"),
+        "until": until,
+    }
