@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -37,6 +38,19 @@ def variables(product: str) -> tuple[Contract, dict[str, dict[str, str]]]:
         name: {key: text for key, text in one.items() if key not in ("dims", "kind")} for name, one in described.items()
     }
     return contract, attributes
+
+
+#: Signs that are typed or decoded for the degree sign: ordinals and rings above, UTF-8 read in a code page, a character that was lost.
+_DEGREE = re.compile(r"Â?[°º˚∘]\s*|\ufffd(?=[CF]$)")
+
+
+def with_degree_sign(unit: str) -> str:
+    """Return a unit with the degree sign in place of what looks like it.
+
+    >>> [with_degree_sign(unit) for unit in ("ºC", "˚ C", "Â°C", "℃", "1/min")]
+    ['°C', '°C', '°C', '°C', '1/min']
+    """
+    return _DEGREE.sub("°", unit.strip().replace("℃", "°C").replace("℉", "°F"))
 
 
 def by_word(meanings: Mapping[str, Sequence[str]]) -> dict[str, str]:

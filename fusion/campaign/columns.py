@@ -27,7 +27,16 @@ from fusion.campaign.logs import (
     within_a_day,
     written_times,
 )
-from fusion.campaign.values import column_unit, is_time, is_unit, name_and_unit, role_of_unit, unit_name
+from fusion.campaign.values import (
+    DAY_NUMBERS,
+    TIME_UNITS,
+    column_unit,
+    is_time,
+    is_unit,
+    name_and_unit,
+    role_of_unit,
+    unit_name,
+)
 from fusion.common import FusionError
 from fusion.results.progress import listed
 from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, RejectedLine
@@ -46,7 +55,7 @@ _VOCABULARY = vocabulary("columns")
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
-_NO_NUMBERS, _BY_VALUES, _NOT_KNOWN = "no numbers", "by its values", "not known"
+_NO_NUMBERS, _BY_VALUES, _NOT_KNOWN, _UNIT_NOT_KNOWN = "no numbers", "by its values", "not known", "unit not known"
 _COUNTS = "whole numbers: counts? then one count with its unit, as 0.0125 mm"
 #: Comment of Klipper's logs: millimetres of one step of the motor.
 _STEP = re.compile(r"#\s*step_dist\w*\s*=\s*([\d.]+)\s*$")
@@ -57,8 +66,8 @@ _ROWS_OF_VALUES = 3
 #: Rows that may stand between them: an empty one, a remark, a header that is repeated.
 _ROWS_BETWEEN = 2
 _MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?\s+\S")
-_TIME_UNITS = ("ms", "s", "min", "h")
-_PER = re.compile(r"/\s*(ms|s|min|h)$")
+#: Years in which days that are counted from a date are told by their numbers: 2000 to 2040.
+_DAYS_FROM, _DAYS_TO = 10957.0, 25568.0
 _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|datetime|last_changed$|时间|時間)", re.I)
 _VALUE = re.compile(r"[-+]?[\d.,]*\d[\d.,]*([eE][-+]?\d+)?|nan|[-+]?inf|n/?a|\d{1,4}[-/.:]\d{1,2}[-/.:].*", re.I)
 #: Marks of loggers and drivers of sensors for "no reading" that look like numbers.
@@ -235,7 +244,9 @@ def propose_table(path: Path) -> TableProposal:
     else:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
-        columns = [*(Column(name, "time", keys.get("time_unit", ""), _first(frame[name])) for name in times), *columns]
+        remark = _UNIT_NOT_KNOWN if asked.get("time_unit", "").endswith(_UNIT_NOT_KNOWN) else ""
+        timed = (Column(name, "time", keys.get("time_unit", ""), _first(frame[name]), remark=remark) for name in times)
+        columns = [*timed, *columns]
     steps = [match[1] for _, text, _ in head if (match := _STEP.match(text))]
     if steps:
         columns = [
@@ -416,11 +427,11 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
             if not _grows(frame[name]):
                 continue
             keys["time"] = name
-            per = _PER.search(name)
-            if per:
-                keys["time_unit"] = per[1]
-            elif {unit_name(rows.units.get(name, "")), column_unit(name)}.isdisjoint(_TIME_UNITS):
+            stated = [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name)) if unit.strip("- ")]
+            if not {*stated} & {*TIME_UNITS}:
                 _place_times(_finite(frame[name]), keys, asked)
+                if stated and "time_unit" in asked:
+                    asked["time_unit"] += f", in {stated[0]}: {_UNIT_NOT_KNOWN}"
             return (name,)
         for columns in ([name, *[two for two in days if two != name][:1]], [name]):
             form = _clock(_sample(written_times(frame, columns)))
@@ -434,7 +445,7 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
 
 def _is_time_name(heading: str, unit: str) -> bool:
     """Whether a heading, or its unit in a row of units, is that of a time or a date."""
-    return is_time(heading) or unit_name(unit) in _TIME_UNITS or _TIME.match(heading.strip()) is not None
+    return is_time(heading) or unit_name(unit) in TIME_UNITS or _TIME.match(heading.strip()) is not None
 
 
 def _sample(column: pd.Series) -> list[str]:
@@ -470,6 +481,10 @@ def _place_times(numbers: np.ndarray, keys: dict[str, Any], asked: dict[str, str
     ):  # fmt: skip
         if low < numbers[0] < high:
             keys |= {"time_unit": unit, "start": start}
+            return
+    for unit, of_1970 in DAY_NUMBERS.items():
+        if _DAYS_FROM < numbers[0] - of_1970 < _DAYS_TO and not (numbers == np.round(numbers)).all():
+            keys["time_unit"], asked["time_unit"] = unit, f"{numbers[0]:.6f} to {numbers[-1]:.6f}"
             return
     length = float(numbers[-1] - numbers[0])
     keys["time_unit"] = next((unit for unit, s in (("s", 1.0), ("min", 60.0)) if length * s >= _SHORTEST_S), "h")
@@ -546,6 +561,8 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return replace(known, role="driver", unit=unit or "1", remark="set point")
     if unit:
         of_unit = role_of_unit(unit)
+        if role == "temperature" and of_unit == "driver" and not is_unit(unit):
+            return replace(known, role=role, remark=_UNIT_NOT_KNOWN)
         taken = role == "out" or (role == "driver" and of_unit == "displacement")
         return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
     if role == "out":
@@ -594,7 +611,7 @@ def _usual_unit(role: str, column: Column) -> tuple[str, str]:
 def _is_unit_of(role: str, unit: str) -> bool:
     """Whether a column of a role may be in a unit."""
     if role == "time":
-        return unit in _TIME_UNITS
+        return unit in TIME_UNITS
     return role in ("driver", "out") or role_of_unit(unit) == role
 
 

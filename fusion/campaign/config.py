@@ -28,6 +28,7 @@ from fusion.analysis.effects.library import library
 from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.values import (
     FILE_KEYS,
+    TIME_UNITS,
     Celsius,
     Cycles,
     Feed,
@@ -47,6 +48,7 @@ from fusion.campaign.values import (
     PositiveSeconds,
     Seconds,
     ShareOfLengthU,
+    TimeUnit,
     TimeZone,
     area,
     check_pattern,
@@ -799,8 +801,11 @@ class LoggedTable(Table):
     time_format: str | None = key(
         None, "How the times are written (strptime)", example="%Y/%m/%d-%H:%M:%S", about="where they are not ISO 8601"
     )
-    time_unit: Literal["ms", "s", "min", "h"] | None = key(
-        None, "Unit of times that are numbers", absent="that in the heading"
+    time_unit: TimeUnit | None = key(
+        None, "Unit of times that are numbers", example="min", about=", ".join(TIME_UNITS), absent="that in the heading"
+    )
+    guessed: tuple[str, ...] = key(
+        (), "Keys and columns whose unit was taken from the values", about="and is not stated; remove what was checked"
     )
     start: str | None = key(None, "Time from which they count")
     time_zone: TimeZone | None = key(None, _ZONE)

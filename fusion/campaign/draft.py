@@ -522,8 +522,10 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
             written = " ".join(column.first[0] for column in table.of("time"))
             question = f"Times such as {written} are written, %d the day and %m the month"
             keys[key] = asker.choice(question, (keys[key], shown))
+        elif key == "time_unit" and table.of("time")[0].remark and not asker.ask:
+            keys[key] = TO_FILL
         elif key == "time_unit":
-            units = (keys[key], *(unit for unit in ("s", "min", "h") if unit != keys[key]))
+            units = (keys[key], *(unit for unit in ("s", "min", "h", "d") if unit != keys[key]))
             keys[key] = asker.choice(f"Unit of the times in {table.of('time')[0].heading}, {shown}", units)
         else:
             keys[key] = asker.value(known_keys()["record.every"], "60 s" if asker.ask else "") or TO_FILL
@@ -534,7 +536,9 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
         answer = asker.unit(f"Unit of {about}; of counts one count, such as 0.0125 mm", "um", unit)
         taken = {column: replace(column, unit=answer) for column in group}
         table = replace(table, columns=tuple(taken.get(column, column) for column in table.columns))
-    return replace(table, keys=keys)
+    assumed = ["time_unit"] if "time_unit" in table.asked and keys["time_unit"] != TO_FILL else []
+    assumed += [column.heading for column in guessed]
+    return replace(table, keys=keys | ({"guessed": assumed} if assumed and asker.ask is None else {}))
 
 
 def _optional(key: str, content: FolderContent, kind: Kind) -> Iterator[str]:

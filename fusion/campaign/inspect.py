@@ -224,7 +224,7 @@ def _names_a_record(found: Recognised) -> bool:
 
 def _logs_drivers(found: Recognised) -> bool:
     units = [column_unit(name) for name in found.first_line if name != "time"]
-    return "time" in found.first_line and len(found.first_line) > 1 and all(units)
+    return "time" in found.first_line and len(found.first_line) > 1 and all(units) and not _logs_environment(found)
 
 
 def _logs_environment(found: Recognised) -> bool:

@@ -23,7 +23,15 @@ from pandas.io.parsers import TextParser  # type: ignore[attr-defined]
 from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
 from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, LongTable, RecordTable
 from fusion.campaign.time_zones import bring_to_utc
-from fusion.campaign.values import QuantityError, column_conversion, name_and_unit, role_of_unit, unit_name
+from fusion.campaign.values import (
+    DAY_NUMBERS,
+    TIME_UNITS,
+    QuantityError,
+    column_conversion,
+    name_and_unit,
+    role_of_unit,
+    unit_name,
+)
 from fusion.common import Array, FusionError
 from interferometry.io.faults import Numerals, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
@@ -39,6 +47,7 @@ from interferometry.io.tables import (
     fields_of,
     find_header,
     parse_time,
+    raise_if_clock_restarts,
     read_table,
     read_timed_rows,
     where_clock_goes_back,
@@ -228,6 +237,8 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         left_out += without_number
     keep = ~np.isnat(time)
     goes_back = [] if record.long is not None else where_clock_goes_back(path, frame.index[keep], time[keep])
+    if record.long is None:
+        raise_if_clock_restarts(path, frame.index[keep], time[keep])
     order = np.argsort(time[keep], kind="stable")
 
     def block(role: str, unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
@@ -518,11 +529,16 @@ def read_times(
         unit = record.time_unit or rows.units.get(headings[0], "") or name_and_unit(headings[0])[1]
         if not unit:
             raise TableError(
-                f'{path}: the times in the column "{headings[0]}" are numbers without a unit; write time_unit = "s" (or "ms", "min", "h") '
-                "in the campaign file, where it names this one"
+                f'{path}: the times in the column "{headings[0]}" are numbers without a unit; write time_unit = "s" (or '
+                f"{', '.join(unit for unit in TIME_UNITS if unit != 's')}) in the campaign file, where it names this one"
             )
-        elapsed = in_unit(seconds, unit, "s", column=headings[0], path=path)
-        time, words, _ = _after_start(elapsed, record, path)
+        if unit in DAY_NUMBERS:
+            # To the millisecond: in a day since the year 0 a double resolves 0.01 ms.
+            milliseconds = np.round((seconds - DAY_NUMBERS[unit]) * 86_400e3)
+            time, words = _since(NO_START, milliseconds / 1e3), NO_ZONE
+        else:
+            elapsed = in_unit(seconds, unit, "s", column=headings[0], path=path)
+            time, words, _ = _after_start(elapsed, record, path)
     elif record.time_format is not None:
         time, zone = _formatted_times(path, column, record)
         words = describe_time_zone(path, {zone: 0})
@@ -557,10 +573,15 @@ def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[
             start, zone = parse_time(record.start)  # type: ignore[assignment]
         except BadReading as fault:
             raise TableError(f'start = "{record.start}": {fault.reason}, needed for {path}') from None
+    return _since(start, elapsed), describe_time_zone(path, {zone: 0}), []
+
+
+def _since(start: np.datetime64, elapsed: np.ndarray) -> np.ndarray:
+    """Return the times that lie `elapsed` seconds after a start, NaT where that is no number of a time."""
     known = np.abs(elapsed) < _LONGEST_RECORD_S
     time = start + np.where(known, np.round(np.where(known, elapsed, 0.0) * 1e9), 0).astype("m8[ns]")
     time[~known] = np.datetime64("NaT")
-    return time, describe_time_zone(path, {zone: 0}), []
+    return time
 
 
 def within_a_day(text: str) -> tuple[str, int]:

@@ -16,7 +16,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from fusion.common import FusionError, suggest
-from thermofuse.resources import by_word, vocabulary
+from thermofuse.resources import by_word, vocabulary, with_degree_sign
 
 _VOCABULARY = vocabulary("units")
 
@@ -32,6 +32,10 @@ _SPELLINGS = by_word(_VOCABULARY["spellings"])
 _WORDS = by_word(_VOCABULARY["words"])
 #: Other units, and what loggers write in a row of units for their own columns.
 _OF_LOGGERS = frozenset(_VOCABULARY["of_loggers"])
+#: Days that are counted from a date: number of 1970-01-01.
+DAY_NUMBERS: Mapping[str, float] = _VOCABULARY["day_numbers"]
+#: Units of times that are numbers.
+TIME_UNITS = (*_UNITS["s"], *DAY_NUMBERS)
 _EXAMPLES = {
     "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
     "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min", "px": "4 px",
@@ -49,6 +53,8 @@ _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?
 _CYCLES = re.compile(r"\s*(\d{1,99})(?:\s*-\s*(\d{1,99}))?\s*")
 #: Heading of a column with its unit, ``"name [unit]"`` or ``"name(unit)"``.
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+#: The same as ISO 80000 writes it, ``"T1 / °C"``; without spaces of a time alone, as m/s is a unit.
+_QUOTIENT = re.compile(r"\s*(?:(.+?)\s+/\s+|(t|time|zeit)/)(\S.*?)\s*", re.IGNORECASE)
 
 
 class QuantityError(FusionError):
@@ -57,14 +63,17 @@ class QuantityError(FusionError):
 
 def unit_name(text: str) -> str:
     """Return the house spelling of a unit (``"°C"`` -> ``"degC"``), or the text itself where none is known."""
-    text = text.strip()
+    text = with_degree_sign(text)
     return _SPELLINGS.get(text) or _WORDS.get(text.lower(), text)
 
 
 def name_and_unit(heading: str) -> tuple[str, str]:
     """Return name and unit of the heading of a column; the unit is empty where it has none."""
-    match = _HEADING.fullmatch(heading)
-    return (match.group(1), unit_name(match.group(2))) if match else (heading.strip(), "")
+    if match := _HEADING.fullmatch(heading):
+        return match[1], unit_name(match[2])
+    if (match := _QUOTIENT.fullmatch(heading)) and is_unit(match[3]):
+        return match[1] or match[2], unit_name(match[3])
+    return heading.strip(), ""
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:
@@ -92,7 +101,8 @@ def column_conversion(unit: str, target: str) -> tuple[float, float]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit that columns of loggers have."""
-    return any(unit_name(text) in units for units in _UNITS.values()) or text.strip() in _OF_LOGGERS
+    name = unit_name(text)
+    return any(name in units for units in _UNITS.values()) or name in DAY_NUMBERS or text.strip() in _OF_LOGGERS
 
 
 def role_of_unit(unit: str) -> Literal["temperature", "displacement", "driver"]:
@@ -113,7 +123,7 @@ def is_time(heading: str) -> bool:
     """Return whether a heading is that of the time: ``time`` or ``date`` in a language that is read, or a column in units of time."""
     from interferometry.io.tables import read_heading
 
-    return read_heading(heading).role in ("time", "date") or column_unit(heading) in ("s", "ms", "min", "h")
+    return read_heading(heading).role in ("time", "date") or column_unit(heading) in TIME_UNITS
 
 
 def read_quantity(value: object, target: str) -> float:
@@ -255,6 +265,16 @@ def _zone(name: str) -> str:
 
 
 TimeZone = Annotated[str, AfterValidator(_zone)]
+
+
+def _time_unit(text: str) -> str:
+    """Accept a unit of times that are numbers."""
+    if (name := unit_name(text)) not in TIME_UNITS:
+        raise ValueError(f"this is not a unit of a time; use one of {', '.join(TIME_UNITS)}")
+    return name
+
+
+TimeUnit = Annotated[str, AfterValidator(_time_unit), WithJsonSchema({"type": "string", "enum": [*TIME_UNITS]})]
 
 
 def _several(cycles: tuple[int, int]) -> tuple[int, int]:

@@ -55,6 +55,7 @@ def read_record_source(campaign: Campaign) -> RecordSource:
         *left_out_notices(table, "record_rows_left_out"),
         *clock_notices(table),
         *_unread_notices(table),
+        *guess_notices(campaign),
     ]
     return RecordSource(
         record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
@@ -92,6 +93,19 @@ def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
     if named:
         message = f"Samples without a reading: {listed(named)}. They are left out of the means over blocks."
         yield Notice("record_readings_missing", message, "Look at contact and cable, or at record.missing.")
+
+
+def guess_notices(campaign: Campaign) -> Iterator[Notice]:
+    """Notice of the units that nobody stated and the values alone suggested."""
+    if (record := campaign.record) is not None and record.guessed:
+        units = {"time_unit": record.time_unit} | {name: column.unit for name, column in record.columns.items()}
+        named = listed(f"{name} = {units.get(name) or 'not stated'}" for name in record.guessed)
+        yield Notice(
+            "units_guessed",
+            f"Assumed, because the table does not state it and its values suggest it: {named}. Another unit changes every time constant or "
+            "every displacement by its factor.",
+            "Look it up at the logger, correct it where it is another, and remove it from record.guessed.",
+        )
 
 
 def model_record(source: RecordSource, *, report: Report) -> Outcome:

@@ -62,7 +62,7 @@ def clock_notices(dataset: Read) -> list[Notice]:
     return [
         Notice(
             "clock_goes_back",
-            f"The clock of {path} goes back {counted(len(named), 'time')}: {listed(named)}. The rows are sorted by their times.",
+            f"The clock of {path} goes back {counted(len(named), 'time')}: {listed(named)}. These rows are sorted by their times.",
             f"Correct the times of {path}, or give what was logged before and after in files of its own.",
         )
         for path, named in _lines_by_file(dataset, "clock")

@@ -27,7 +27,7 @@ from interferometry.io.faults import (
     raise_if_mostly_invalid,
 )
 from interferometry.io.spreadsheets import is_workbook, read_sheets
-from thermofuse.resources import vocabulary
+from thermofuse.resources import vocabulary, with_degree_sign
 
 #: Words of tables: headings, directions, units, months.
 _VOCABULARY = vocabulary("headings")
@@ -205,7 +205,7 @@ def fold(text: str) -> str:
 def find_unit(text: str) -> str | None:
     """Return the key of a unit as it is written, None where it is none."""
     # Two signs are used for micro: the Greek letter and the micro sign.
-    cleaned = text.strip().casefold().replace("μ", "µ").replace("’’", "''")
+    cleaned = with_degree_sign(text).casefold().replace("μ", "µ").replace("’’", "''")
     return cleaned if cleaned in UNITS else None
 
 
@@ -457,6 +457,12 @@ def fields_of(line: str, delimiter: str) -> list[str]:
         raise LaserFormatError(f"{fault}; the file is damaged or not a table, export it again") from None
 
 
+#: Rows that are out of place, as two loggers that write one table leave them, and not the start of another stretch.
+_OUT_OF_PLACE = 2
+#: Steps back that are looked at.
+_MOST_STEPS_BACK = 1000
+
+
 def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.datetime64]) -> list[RejectedLine]:
     """Return the lines whose time is before that of the line above, in a table with its newest line first after it."""
     later = np.sign(np.diff(times).astype(np.int64))
@@ -471,6 +477,23 @@ def where_clock_goes_back(path: Path, lines: Sequence[int], times: NDArray[np.da
         )
         for at in against
     ]
+
+
+def raise_if_clock_restarts(path: Path, lines: Sequence[int], times: NDArray[np.datetime64]) -> None:
+    """Refuse a table whose clock goes back over several rows: sorted by their times, two stretches would be mixed."""
+    later = np.sign(np.diff(times).astype(np.int64))
+    in_order = times if later.sum() >= 0 else times[::-1]
+    numbers = list(lines) if later.sum() >= 0 else list(lines)[::-1]
+    for at in np.flatnonzero(np.diff(in_order).astype(np.int64) < 0)[:_MOST_STEPS_BACK]:
+        before, after = in_order[: at + 1], in_order[at + 1 :]
+        overlap = min(int((before > after[0]).sum()), int((after < before[-1]).sum()))
+        if overlap > _OUT_OF_PLACE:
+            raise LaserFormatError(
+                f"{path}, line {numbers[at + 1]}: the clock goes back from {_written(before[-1])} to {_written(after[0])}, "
+                f"over {overlap} rows; "
+                "sorted by their times, two stretches would be mixed. Give the rows before and after as files of their own, or correct "
+                "their times; at the end of daylight saving write them with their offset from UTC, as 02:00:00+01:00"
+            )
 
 
 def _written(time: np.datetime64) -> str:
@@ -505,6 +528,7 @@ def read_timed_rows(
             zones.setdefault(zone, line)
     raise_if_mostly_invalid(table.path, len(rows), left_out.lines, last=max(kept.values(), default=None))
     instants = np.array(list(rows), dtype="datetime64[ns]")
+    raise_if_clock_restarts(table.path, [kept[instant] for instant in rows], instants)
     goes_back = where_clock_goes_back(table.path, [kept[instant] for instant in rows], instants)
     times = sorted(rows)
     values = np.array([rows[instant] for instant in times])

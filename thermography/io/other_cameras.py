@@ -596,7 +596,7 @@ class TextReader(TemperatureReader):
         for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
             block = _longest_block(lines, delimiter)
             if _is_a_frame(block):
-                return np.array(block)
+                return _without_numbers_of_lines(np.array(block))
         raise ThermographyError(
             f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; export it as CSV, a line per row"
         )
@@ -625,7 +625,8 @@ def _plain_shape(content: bytes) -> tuple[int, int] | None:
     for delimiter in (mark.encode() for mark in _DELIMITERS[:3]):
         columns = {line.rstrip().removesuffix(delimiter).count(delimiter) + 1 for line in lines}
         if len(columns) == 1 and _has_proportions(len(lines), width := columns.pop()):
-            return len(lines), width
+            edges = np.array([lines[0].split(delimiter)[:3], [line.split(delimiter)[0] for line in lines[:3]]], float)
+            return None if (np.diff(edges) == 1.0).all(axis=1).any() else (len(lines), width)
     return None
 
 
@@ -637,6 +638,20 @@ def _has_proportions(rows: int, columns: int) -> bool:
 def _is_a_frame(block: list[list[float]]) -> bool:
     rows, columns = len(block), len(block[0]) if block else 0
     return _has_proportions(rows, columns) and bool(np.isnan(block).mean() <= _MOST_MISSING)
+
+
+def _without_numbers_of_lines(block: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return a frame without a first column of names, and without a first row or column that counts, as pandas and R write them."""
+    if np.isnan(block[:, 0]).all():
+        block = block[:, 1:]
+    if _is_count(block[0]) or (np.isnan(block[0, 0]) and _is_count(block[0, 1:])):
+        block = block[1:]
+    return block[:, 1:] if _is_count(block[:, 0]) else block
+
+
+def _is_count(numbers: NDArray[np.floating]) -> bool:
+    """Whether numbers count from 0 or from 1."""
+    return bool(numbers[0] in (0.0, 1.0) and (np.diff(numbers) == 1.0).all())
 
 
 def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:

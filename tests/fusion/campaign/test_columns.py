@@ -19,6 +19,7 @@ from fusion.campaign.draft import Asker, DraftError, write_campaign
 from fusion.campaign.inputs import read_record
 from fusion.campaign.logs import TableError
 from fusion.pipeline.check import check_campaign
+from fusion.pipeline.record import guess_notices
 from fusion.results.progress import clock_notices
 from interferometry.io.faults import LaserFormatError
 
@@ -400,22 +401,26 @@ def test_rows_without_a_time_below_the_last_one_refuse_no_table(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("back", "lines"),
+    ("back", "line", "sorted_"),
     [
-        ({}, []),
-        ({120: 0}, [122]),  # restarted: its second half has the times of the first
-        ({120: 116, 200: 150}, [122, 202]),  # set back twice
-        ("descending", []),
-        ("2000", [122]),
+        ({}, None, []),
+        ("descending", None, []),
+        ({120: 118.5, 121: 120}, None, [122]),  # one row is out of place
+        ({120: 0}, 122, []),  # restarted: its second half has the times of the first
+        ({120: 116}, 122, []),  # set back by four rows
+        ("2000", 122, []),
     ],
 )
-def test_a_clock_that_goes_back_is_named_with_line_and_time(tmp_path: Path, back: object, lines: list[int]) -> None:
-    place = np.arange(240)
+def test_a_clock_that_goes_back_is_refused_unless_single_rows_are_out_of_place(
+    tmp_path: Path, back: object, line: int | None, sorted_: list[int]
+) -> None:
+    place = np.arange(240.0)
     stamps = STAMPS.copy()
+    step = STAMPS[1] - STAMPS[0]
     if isinstance(back, dict):
         for at, to in back.items():
             place[at:] = to + np.arange(240 - at)
-        stamps = STAMPS[place]
+        stamps = STAMPS[0] + (step * place).astype(step.dtype)
     elif back == "descending":
         stamps = STAMPS[::-1]
     else:
@@ -424,15 +429,90 @@ def test_a_clock_that_goes_back_is_named_with_line_and_time(tmp_path: Path, back
         f"{str(at).replace('T', ' ')},{t1},{z}\n" for at, t1, z in zip(stamps, SPINDLE, NOSE, strict=True)
     )
     (tmp_path / "log.csv").write_text(f"time,T1 [degC],Z [mm]\n{written}")
+    named = [one["line"] for one in json.loads(propose_table(tmp_path / "log.csv").attrs["clock"])]
     path, _ = write_campaign(tmp_path, Asker(None))
+    if line is not None:
+        assert named == [line]
+        with pytest.raises(LaserFormatError, match=f"line {line}: the clock goes back"):
+            read_record(load_campaign(path))
+        return
     data = read_record(load_campaign(path))
-    named = json.loads(data.attrs["clock"])
-    assert [one["line"] for one in named] == lines
+    assert named == [one["line"] for one in json.loads(data.attrs["clock"])] == sorted_
     assert data.sizes["time"] == 240
     assert (np.diff(data["time"].values).astype(int) >= 0).all()
-    assert propose_table(tmp_path / "log.csv").attrs["clock"] == data.attrs["clock"]
-    assert [notice.code for notice in clock_notices(data)] == ["clock_goes_back"] * bool(lines)
-    assert all(str(stamps[one["line"] - 2]).replace("T", " ") == one["value"] for one in named)
+    assert [notice.code for notice in clock_notices(data)] == ["clock_goes_back"] * bool(sorted_)
+
+
+@pytest.mark.parametrize(
+    ("heading", "times"),
+    [
+        *((f"time [{unit}]", 1.0 / per) for unit, per in (
+            ("ms", 1e-3), ("msec", 1e-3), ("1/100 s", 1e-2), ("s", 1), ("sek", 1), ("ks", 1e3), ("min", 60), ("Stunden", 3600),
+            ("h", 3600), ("day", 86400), ("days", 86400), ("d", 86400), ("weeks", 604800),
+        )),
+        ("t / s", 1.0), ("t/h", 1 / 3600.0), ("Zeit / min", 1 / 60.0),
+    ],
+)  # fmt: skip
+def test_a_stated_unit_of_time_is_read(tmp_path: Path, heading: str, times: float) -> None:
+    lines = [f"{60.0 * k * times!r},{20 + k / 100},{k}.5" for k in range(300)]
+    (tmp_path / "log.csv").write_text("\n".join([f"{heading},T1 [degC],Z [um]", *lines]) + "\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    data = read_record(load_campaign(path))
+    seconds = (data["time"].values - data["time"].values[0]) / np.timedelta64(1, "s")
+    np.testing.assert_allclose(seconds, 60.0 * np.arange(300), atol=1e-3)
+    assert load_campaign(path).record.guessed == ()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("unit", "of_1970"), [("Excel day", 25569), ("datenum", 719529), ("JD", 2440587.5), ("MJD", 40587)]
+)
+def test_days_counted_from_a_date_are_told_by_their_numbers_and_marked(
+    tmp_path: Path, unit: str, of_1970: float
+) -> None:
+    """2024-08-01 06:00 is 19936.25 days after 1970."""
+    lines = [f"{of_1970 + 19936.25 + k / 1440:.9f},{20 + k / 100},{k}.5" for k in range(300)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,T1 [degC],Z [um]", *lines]) + "\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    campaign = load_campaign(path)
+    data = read_record(campaign)
+    assert abs(data["time"].values[0] - np.datetime64("2024-08-01T06:00")) < np.timedelta64(2, "ms")
+    assert abs(data["time"].values[-1] - np.datetime64("2024-08-01T10:59")) < np.timedelta64(2, "ms")
+    assert (
+        campaign.record is not None and campaign.record.time_unit == unit and campaign.record.guessed == ("time_unit",)
+    )
+    assert [notice.code for notice in guess_notices(campaign)] == ["units_guessed"]
+
+
+def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path: Path) -> None:
+    lines = [f"{k},{20 + k / 100},{k}.5" for k in range(300)]
+    (tmp_path / "log.csv").write_text("\n".join(["time [years],T1 [degC],Z [um]", *lines]) + "\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    assert 'time_unit = "FILL IN"' in path.read_text()
+    with pytest.raises(CampaignError, match="time_unit"):
+        load_campaign(path)
+
+
+@pytest.mark.parametrize("unit", ["°C", "ºC", "˚C", "Â°C", "\ufffdC", "oC", "C°", "gradC", "° C", "℃"])
+def test_what_looks_like_the_degree_sign_is_one(tmp_path: Path, unit: str) -> None:
+    lines = [f"{60 * k},{20 + k / 100},{k}.5" for k in range(100)]
+    (tmp_path / "log.csv").write_text("\n".join([f"time [s],T1 [{unit}],Z [um]", *lines]) + "\n")
+    assert [column.unit for column in propose_table(tmp_path / "log.csv").of("temperature")] == ["degC"]
+
+
+@pytest.mark.parametrize(("unit", "factor", "offset"), [("℉", 1.8, 32.0), ("mK", 1e3, 273150.0)])
+def test_temperatures_in_other_units_are_converted(tmp_path: Path, unit: str, factor: float, offset: float) -> None:
+    lines = [f"{60 * k},{(20 + k / 100) * factor + offset!r},{k}.5" for k in range(100)]
+    (tmp_path / "log.csv").write_text("\n".join([f"time [s],T1 [{unit}],Z [um]", *lines]) + "\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    np.testing.assert_allclose(read_record(load_campaign(path))["temperature"].values[:, 0], 20 + np.arange(100) / 100)
+
+
+def test_a_temperature_in_an_unknown_unit_is_refused_and_no_driver(tmp_path: Path) -> None:
+    lines = [f"{60 * k},{20 + k / 100},{21 + k / 90},{k}.5" for k in range(100)]
+    (tmp_path / "log.csv").write_text("\n".join(["time [s],temp bed [centi],T2 [degC],Z [um]", *lines]) + "\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    with pytest.raises(CampaignError, match='"centi" is not a unit of a temperature'):
+        read_record(load_campaign(path))
 
 
 @pytest.mark.parametrize("kind", ["workbook", "text"])
