@@ -625,8 +625,12 @@ def _plain_shape(content: bytes) -> tuple[int, int] | None:
     for delimiter in (mark.encode() for mark in _DELIMITERS[:3]):
         columns = {line.rstrip().removesuffix(delimiter).count(delimiter) + 1 for line in lines}
         if len(columns) == 1 and _has_proportions(len(lines), width := columns.pop()):
-            edges = np.array([lines[0].split(delimiter)[:3], [line.split(delimiter)[0] for line in lines[:3]]], float)
-            return None if (np.diff(edges) == 1.0).all(axis=1).any() else (len(lines), width)
+            corner = np.array([[_number(text.decode()) for text in line.split(delimiter)[:4]] for line in lines[:4]])
+            return (
+                None
+                if np.isnan(corner).any() or _counts_alone(corner) or _counts_alone(corner.T)
+                else (len(lines), width)
+            )
     return None
 
 
@@ -644,14 +648,15 @@ def _without_numbers_of_lines(block: NDArray[np.floating]) -> NDArray[np.floatin
     """Return a frame without a first column of names, and without a first row or column that counts, as pandas and R write them."""
     if np.isnan(block[:, 0]).all():
         block = block[:, 1:]
-    if _is_count(block[0]) or (np.isnan(block[0, 0]) and _is_count(block[0, 1:])):
+    if _counts_alone(block) or (np.isnan(block[0, 0]) and _counts_alone(block[:, 1:])):
         block = block[1:]
-    return block[:, 1:] if _is_count(block[:, 0]) else block
+    return block[:, 1:] if _counts_alone(block.T) else block
 
 
-def _is_count(numbers: NDArray[np.floating]) -> bool:
-    """Whether numbers count from 0 or from 1."""
-    return bool(numbers[0] in (0.0, 1.0) and (np.diff(numbers) == 1.0).all())
+def _counts_alone(rows: NDArray[np.floating]) -> bool:
+    """Whether the numbers of the first row, and not those of the second, count from 0 or from 1."""
+    steps = np.diff(rows[:2]) == 1.0
+    return bool(rows[0, 0] in (0.0, 1.0) and steps[0].all() and not steps[1].all())
 
 
 def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:

@@ -496,3 +496,26 @@ def test_emissivity_and_surroundings_of_an_exported_picture_stand_in_its_heading
         [path], StackOptions(unit="degC", start=np.datetime64("2026-03-09T06:30", "ns"), emissivity=0.5)
     )
     assert frame.parameters.emissivity == 0.5
+
+
+@pytest.mark.parametrize("written", ["as it is", "numbered columns", "pandas", "pandas of floats", "R"])
+def test_numbers_of_rows_and_columns_are_no_pixels(tmp_path, written):
+    """As ``DataFrame.to_csv`` and ``write.csv`` write a picture."""
+    frame = np.round(20.0 + np.arange(24)[:, None] / 7 + np.arange(32) / 3, 3)
+    columns = {
+        "numbered columns": range(32),
+        "pandas": range(32),
+        "pandas of floats": np.arange(32.0),
+        "R": [f'"V{k}"' for k in range(1, 33)],
+    }
+    names = {"pandas": range(24), "pandas of floats": np.arange(24.0), "R": [f'"{k}"' for k in range(1, 25)]}.get(
+        written
+    )
+    lines = [",".join(map(str, row)) for row in frame]
+    lines = lines if names is None else [f"{name},{line}" for name, line in zip(names, lines, strict=True)]
+    if written in columns:
+        lines.insert(0, ("," if names is not None else "") + ",".join(map(str, columns[written])))
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines) + "\n")
+    np.testing.assert_array_equal(TextReader().read_values(path, 0, StackOptions()), frame)
+    assert TextReader().contents(path, StackOptions()).shape == (24, 32)
