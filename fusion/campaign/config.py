@@ -246,7 +246,7 @@ RECORD_EFFECTS = (QUASI_STATIC,)
 #: Effects that need positions along an axis; a record that declares them is run without, and the results say so.
 _ALONG_AN_AXIS = ("axis_expansion", "table_offset")
 #: What a plan of pixels does not have.
-_IN_MILLIMETRES = ("size_mm", "cell_size_mm", "fiducials", "regions", "axis")
+_IN_MILLIMETRES = ("size_mm", "cell_size_mm", "fiducials", "fiducials_u_mm", "regions", "axis")
 #: What files of temperatures are corrected for already.
 _CORRECTED_BY_THE_CAMERA = (
     "atmospheric_temperature_degC", "relative_humidity", "object_distance_m", "window_transmission", "window_temperature_degC",
@@ -625,6 +625,11 @@ class PlanTable(Table, title="Plan of the table"):
     )
     fiducials: ExistingFile | None = key(
         None, "Table of the fiducials", about="name,x_mm,y_mm,diameter_mm[,column_px,row_px,marker]"
+    )
+    fiducials_u_mm: PositiveMillimetres | None = key(
+        None,
+        "Uncertainty of their places (k = 1)",
+        about="not given: the table is exact but for the scatter that the frames show",
     )
     regions: ExistingFile | None = key(
         None, "Table of the parts that are tested as sources", about="name,x_mm,y_mm of their corners"

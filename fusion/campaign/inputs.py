@@ -509,7 +509,11 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
         "thermography": thermography,
         "plan": plan,
         "grid": grid,
-        "fiducials": [] if plan.fiducials is None else read_fiducials(campaign.resolve(plan.fiducials)),
+        "fiducials": []
+        if plan.fiducials is None
+        else [
+            replace(disc, u_mm=plan.fiducials_u_mm or 0.0) for disc in read_fiducials(campaign.resolve(plan.fiducials))
+        ],
         "fiducials_file": plan.fiducials or "",
         "frames": frames,
         "pictures": pictures,

@@ -862,7 +862,17 @@ def _describe_registration(registration: Registration, source: CameraInputs) -> 
     # The share of the plan that the fiducials in use span.
     places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
     hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
-    same = ("model", "rms_mm", "unchecked", "contradicted_hints", "mirrored", "area_ratio", "leave_one_out_mm")
+    same = (
+        "model",
+        "rms_mm",
+        "unchecked",
+        "contradicted_hints",
+        "mirrored",
+        "area_ratio",
+        "leave_one_out_mm",
+        "margin_px",
+    )
+    optics = registration.optics
     return RegistrationPart(
         **{name: getattr(registration, name) for name in same},
         homography=registration.homography.tolist(),
@@ -872,12 +882,30 @@ def _describe_registration(registration: Registration, source: CameraInputs) -> 
         frames_rejected=source.frames_rejected,
         position_u_mm=np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2)),
         fiducials_listed=sum(fiducial.marker is None for fiducial in source.fiducials),
+        fiducials_u_mm=source.plan.fiducials_u_mm or 0.0,
+        edge_spread_px=None
+        if np.isnan(registration.area_ratio)
+        else Quantity(value=optics.spread_px, u=optics.spread_u_px),
         span=cv2.contourArea(hull) / (source.grid.width_mm * source.grid.height_mm),
     )
 
 
+#: Edge spread of a focused camera, pixel included, px.
+_SHARP_PX = 1.2
+
+
 def _registration_notices(registration: Registration) -> Iterator[Notice]:
-    """Return one notice for all fiducials that were not used."""
+    """Return one notice for all fiducials that were not used, one for a blurred picture."""
+    optics = registration.optics
+    if optics.spread_px > _SHARP_PX:
+        middle = np.mean([(disc.x_mm, disc.y_mm) for disc in registration.fiducials.values()], axis=0)
+        lost_mm = registration.margin_px / float(registration.projection.px_per_mm(middle))
+        yield Notice(
+            "frames_blurred",
+            f"The discs are blurred by {optics.spread_px:.1f} ± {optics.spread_u_px:.1g} px (standard deviation; "
+            f"focused: up to {_SHARP_PX:g} px): {lost_mm:.1f} mm around every disc and along the plan's edge are left out of the fields.",
+            "Focus the camera on the table; what is smaller than this is too low in the fields.",
+        )
     if registration.left_out:
         named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
         yield Notice(

@@ -184,6 +184,12 @@ class RegistrationPart(ResultPart):
     """Median ratio of the imaged to the listed area of the discs; null for points."""
     span: Number = None
     """Share of the plan's area that the fiducials in use span."""
+    edge_spread_px: Quantity | None = None
+    """Standard deviation of the blur of lens and pixel that the discs show, px; null for points."""
+    margin_px: Number = None
+    """Distance from discs and from the plan's edge within which pixels are left out, px: 2, or three edge spreads where these are more."""
+    fiducials_u_mm: Number = 0.0
+    """Stated standard uncertainty of the places in the list, mm; at 0 a wrong scale of the whole list is in no uncertainty."""
     mirrored: bool = False
     """Whether the plan appears as in a mirror."""
     model: str = ""

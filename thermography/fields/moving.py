@@ -73,7 +73,7 @@ class CellSums(NamedTuple):
     squares: Array
 
 
-def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> Samples:
+def sample_points(registration: Registration, grid: PlanGrid) -> Samples:
     """Lay out the sample points of every cell."""
     steps = ((np.arange(_POINTS_PER_SIDE) + 0.5) / _POINTS_PER_SIDE - 0.5) * grid.cell_size_mm
     across, down = (side.ravel() for side in np.meshgrid(steps, steps))
@@ -86,7 +86,7 @@ def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: floa
         [points[..., 0], grid.width_mm - points[..., 0], points[..., 1], grid.height_mm - points[..., 1]]
     )
     # Interpolation between pixels reaches half a pixel farther than the lens's blur.
-    margin = (margin_px + 0.5) * pixel_mm
+    margin = (registration.margin_px + 0.5) * pixel_mm
     valid = (edge >= margin) & ~mask_discs(points, registration.masked, margin_mm=margin)
     with np.errstate(invalid="ignore"):
         offset = np.where(valid[..., None], points, 0.0).sum(axis=1) / valid.sum(axis=1)[:, None]

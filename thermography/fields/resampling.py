@@ -107,13 +107,11 @@ def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slic
 
 
 def plan_weights(
-    registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0, bad: NDArray[np.bool_] | None = None
+    registration: Registration, grid: PlanGrid, *, margin_px: float | None = None, bad: NDArray[np.bool_] | None = None
 ) -> PlanWeights:
     """Weights of the pixels of a registered camera in the cells of the plan, those of bad pixels (row, column) 0."""
     window = plan_window(registration, grid)
-    if registration.is_picture:
-        # The edge of the picture is the edge of nothing that could be blurred into it.
-        margin_px = 0.0
+    margin_px = registration.margin_px if margin_px is None else margin_px
     cell, pixel, area, x, y = _pieces(registration, grid, window, margin_px)
     if bad is not None and bad.any():
         sound = ~bad[window].ravel()[pixel]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError, scatter_by_median
 from thermography.registration.plan import Fiducial, PlanGrid
@@ -22,6 +24,17 @@ _LEAST_CONTRAST = 2.0
 _LARGEST_ASPECT = 4.0
 #: Standard uncertainty of the centroid of a detected spot, before the disc is located, px.
 SPOT_U_PX = 0.2
+#: Standard deviation of the logarithm of the size of discs about the listed one; least standard deviations of the logarithm of the edge
+#: spread and of the share of the slope among the discs of one picture, whose distance and reflections differ.
+_SIZE_U, _LEAST_SPREAD_U, _LEAST_SHARE_U = 0.3, 0.05, 0.1
+#: Extent of the table around a disc that takes part in its fit, in radii, beyond which the blur adds three edge spreads in quadrature.
+_RING = 2.2
+#: Share of the contrast by which table and disc may miss their planes without being outliers: pixels are squares, the field is curved.
+_MODEL_ERROR = 0.02
+#: Largest number of steps of the fit of a disc.
+_MOST_STEPS = 15
+#: Largest relative difference of the area of a disc from the listed one.
+_LARGEST_AREA_ERROR = 0.35
 #: Smallest area of a spot, px.
 _LEAST_AREA_PX = 12
 
@@ -29,7 +42,8 @@ _LEAST_AREA_PX = 12
 @dataclass(frozen=True)
 class LocatedDisc:
     """An elliptic spot detected in a frame, or a disc fiducial located there: centroid and its standard uncertainty, px; number of pixels,
-    and temperature against the surroundings, K, NaN where not measured.
+    temperature against the surroundings, K, and edge spread (standard deviation of the blur, the pixel's own included) with its
+    standard uncertainty, px; NaN where not measured. `slope_share` is that of `DiscOptics`.
     """
 
     column_px: float
@@ -37,6 +51,36 @@ class LocatedDisc:
     u_px: float
     area_px: float
     contrast_K: float
+    spread_px: float = np.nan
+    spread_u_px: float = np.nan
+    slope_share: float = np.nan
+    slope_share_u: float = np.nan
+
+
+@dataclass(frozen=True)
+class DiscOptics:
+    """How discs are imaged: edge spread of lens and pixel (standard deviation), px, and by how much the slope of the temperature on a disc
+    exceeds that of the table around it, as a share of the latter (-1: the disc is uniform); with their standard uncertainties.
+    """
+
+    spread_px: float
+    spread_u_px: float
+    slope_share: float
+    slope_share_u: float
+
+
+#: Before any disc is measured: a focused lens, and a slope between that of the table and none.
+UNKNOWN_OPTICS = DiscOptics(0.8, 0.6, -0.5, 1.0)
+
+
+def pooled_optics(discs: Collection[LocatedDisc]) -> DiscOptics:
+    """Weighted means over the discs of one picture, with u not below what their scatter says."""
+    values = np.array([(disc.spread_px, disc.slope_share) for disc in discs])
+    weights = np.array([(disc.spread_u_px, disc.slope_share_u) for disc in discs]) ** -2.0
+    means = (weights * values).sum(axis=0) / weights.sum(axis=0)
+    scatter = (weights * (values - means) ** 2).sum(axis=0) / max(len(values) - 1, 1)
+    spread_u, share_u = np.sqrt(np.maximum(scatter, 1.0) / weights.sum(axis=0)).tolist()
+    return DiscOptics(float(means[0]), spread_u, float(means[1]), share_u)
 
 
 def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[LocatedDisc]:
@@ -114,96 +158,143 @@ def locate_disc(
     jacobian: Array,
     *,
     reach_px: float = 3.0,
+    optics: DiscOptics = UNKNOWN_OPTICS,
 ) -> LocatedDisc | str:
-    """Locate a disc near its predicted position by the centroid of its coverage, from 0 (table) to 1 (disc) in every pixel."""
-    radius_mm = fiducial.diameter_mm / 2
+    """Locate a disc near its predicted position: the blurred ellipse on a plane that fits best, given what is known of the optics."""
+    shape = (fiducial.diameter_mm / 2) ** 2 * jacobian @ jacobian.T
+    if not (np.isfinite(shape).all() and np.linalg.det(shape) > 0):
+        return "lies at the edge of the frame"
     to_mm = np.linalg.inv(jacobian)
-    half = np.ceil(2.3 * radius_mm * np.linalg.norm(jacobian, axis=1)).astype(int) + 1
-    blur_mm = 1.5 * float(np.linalg.norm(to_mm, 2))
-    centre = np.asarray(predicted_px, float)
-    for _ in range(12):
+    place = np.array([fiducial.x_mm, fiducial.y_mm])
+    reach = _RING * np.sqrt(np.diag(shape))
+    # Centre (column, row), logarithms of the factor on the diameter and of the edge spread.
+    state = np.array([*predicted_px, 0.0, np.log(optics.spread_px)], float)
+    for step in range(_MOST_STEPS):
+        centre, spread = state[:2], float(np.exp(state[3]))
+        own = np.sqrt(np.diag(shape)) + 1.0
         # A place that is projected to infinity is no whole number.
-        first, last = np.round(centre) - half, np.round(centre) + half
-        if not ((first >= 0).all() and (last < temperature.shape[::-1]).all()):
+        if not ((centre - own >= 0).all() and (centre + own <= np.array(temperature.shape[::-1]) - 1).all()):
             return "lies at the edge of the frame"
-        (left, top), (right, bottom) = first.astype(int), last.astype(int) + 1
-        columns, rows = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
-        offsets = np.stack([columns - centre[0], rows - centre[1]], axis=-1)
-        plan_mm = offsets @ to_mm.T + (fiducial.x_mm, fiducial.y_mm)
-        distance = np.hypot(plan_mm[..., 0] - fiducial.x_mm, plan_mm[..., 1] - fiducial.y_mm)
-        result = _coverage_centroid(
-            temperature[top:bottom, left:right],
-            offsets,
-            distance,
-            radius_mm,
-            blur_mm,
-            grid.contains(plan_mm, margin_mm=blur_mm),
-        )
-        if isinstance(result, str):
-            return result
-        shift, located = result
-        centre = centre + shift
-        if np.hypot(*(centre - predicted_px)) > reach_px:
-            return f"no disc within {reach_px:.1f} px of where it should be"
-        if np.hypot(*shift) < 1e-3:
+        half = np.ceil(np.hypot(reach, 3 * spread + 1))
+        left, top = np.maximum(np.round(centre) - half, 0).astype(int)
+        right, bottom = np.minimum(np.round(centre) + half + 1, temperature.shape[::-1]).astype(int)
+        columns, rows = np.arange(left, right) - centre[0], np.arange(top, bottom) - centre[1]
+        offsets = np.stack(np.meshgrid(columns, rows), axis=-1)
+        dilated = np.linalg.inv(_RING**2 * shape + (3 * spread + 1) ** 2 * np.eye(2))
+        values = temperature[top:bottom, left:right]
+        seen = (np.einsum("...i,ij,...j", offsets, dilated, offsets) < 1) & np.isfinite(values)
+        # Beyond the table's edge, and as near to it as the blur reaches, a pixel shows more than table and disc.
+        plan_mm, row_mm = offsets @ to_mm.T + place, np.linalg.norm(to_mm, axis=1)
+        seen &= (
+            (plan_mm >= 3 * spread * row_mm) & (plan_mm <= (grid.width_mm, grid.height_mm) - 3 * spread * row_mm)
+        ).all(axis=-1)
+        found = _fit_disc(values, columns, rows, seen, shape, state, optics)
+        if isinstance(found, str):
+            return found
+        fit = found
+        move = fit.step.copy()
+        move[:2] *= min(1.0, float(np.sqrt(np.linalg.eigvalsh(shape)[0])) / max(np.hypot(*move[:2]), 1e-9))
+        state = state + np.clip(move, (-np.inf, -np.inf, -0.3, -0.5), (np.inf, np.inf, 0.3, 0.5))
+        off = np.hypot(*(state[:2] - predicted_px)) > reach_px
+        if off or (step and np.abs(move).max() < 1e-3):
             break
-    area = np.pi * radius_mm**2 * abs(np.linalg.det(jacobian))
-    if abs(located.area_px / area - 1) > 0.35:
-        return f"its image has {located.area_px / area:.2f} times the area of a disc of {fiducial.diameter_mm:g} mm"
-    return LocatedDisc(float(centre[0]), float(centre[1]), located.u_px, located.area_px, located.contrast_K)
+    if abs(fit.contrast_K) < max(_LEAST_CONTRAST * fit.noise_K, 1e-3):
+        return f"has no contrast ({fit.contrast_K:.3f} K with {fit.noise_K:.3f} K of noise)"
+    if off:
+        return f"no disc within {reach_px:.1f} px of where it should be"
+    factor = float(np.exp(2 * state[2]))
+    if abs(factor - 1) > _LARGEST_AREA_ERROR:
+        return f"its image has {factor:.2f} times the area of a disc of {fiducial.diameter_mm:g} mm"
+    return LocatedDisc(
+        float(state[0]),
+        float(state[1]),
+        float(np.sqrt(np.mean(fit.u[:2] ** 2))),
+        float(np.pi * np.sqrt(np.linalg.det(shape)) * factor),
+        fit.contrast_K,
+        float(np.exp(state[3])),
+        float(np.exp(state[3]) * fit.u[3]),
+        *fit.slope_share,
+    )
 
 
-def _coverage_centroid(
+class _DiscFit(NamedTuple):
+    """One step of the fit of a disc: steps (4,) of centre and logarithms of size and edge spread with their u, share of the slope
+    with its u, contrast and noise, K.
+    """
+
+    step: Array
+    u: Array
+    slope_share: tuple[float, float]
+    contrast_K: float
+    noise_K: float
+
+
+def _fit_disc(
     values: NDArray[np.floating],
-    offsets: Array,
-    distance: Array,
-    radius_mm: float,
-    blur_mm: float,
-    on_table: NDArray[np.bool_],
-) -> tuple[Array, LocatedDisc] | str:
-    """Shift (column, row) px of the coverage's centroid against the patch's centre, and its uncertainty, area and contrast."""
-    around = (distance > radius_mm + blur_mm) & (distance < 2.2 * radius_mm + blur_mm) & on_table
-    inside = distance < max(radius_mm - blur_mm, 0.45 * radius_mm)
-    counted = distance < radius_mm + blur_mm
-    if around.sum() < 12 or inside.sum() < 3:
+    columns: Array,
+    rows: Array,
+    seen: NDArray[np.bool_],
+    shape: Array,
+    state: Array,
+    optics: DiscOptics,
+) -> _DiscFit | str:
+    """Step of Gauss and Newton for the parameters of a blurred disc, with contrast and plane solved for at once (variable projection)."""
+    size, spread = np.exp(state[2:])
+    coverage, *derivatives = _blurred_ellipse(columns, rows, size**2 * shape, spread)
+    across, down = np.meshgrid(columns, rows)
+    ring = seen & (coverage < 0.01)
+    if ring.sum() < 12 or (seen & (coverage > 0.1)).sum() < 6:
         return "is too small in the frame or too near the plan's edge"
-    basis = np.concatenate([offsets, np.ones((*distance.shape, 1))], axis=-1)
-    table, noise = _robust_plane(basis, values, around)
-    if inside.sum() >= 20:
-        disc, _ = _robust_plane(basis, values, inside)
-    else:
-        disc = np.full(values.shape, np.median(values[inside]))
-    contrast = float((disc - table)[inside].mean())
-    if abs(contrast) < max(_LEAST_CONTRAST * noise, 1e-3):
-        return f"has no contrast ({contrast:.3f} K with {noise:.3f} K of noise)"
-    step = disc - table
-    # Extrapolated to the rim, the two planes may meet: the denominator keeps its sign and 30 % of the contrast.
-    least = 0.3 * abs(contrast)
-    safe = np.where(np.sign(step) == np.sign(contrast), np.maximum(np.abs(step), least), least) * np.sign(contrast)
-    coverage = np.where(counted, (values - table) / safe, 0.0)
-    area = float(coverage.sum())
-    if area <= 0:
-        return "has no contrast"
-    shift = (coverage[..., None] * offsets).sum(axis=(0, 1)) / area
-    moments = (offsets[counted] ** 2).sum(axis=0)
-    u_px = noise / abs(contrast) * float(np.sqrt(moments.mean())) / area
-    return shift, LocatedDisc(np.nan, np.nan, u_px, area, contrast)
-
-
-def _robust_plane(basis: Array, values: NDArray[np.floating], mask: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Fit a plane to the masked pixels without residuals above four standard deviations; the plane everywhere, and the noise."""
-    kept = mask.copy()
+    plane = np.stack([np.ones_like(across), across, down], axis=-1)
+    # Outliers are looked for where there is only table or only disc: near the rim the residuals are those of the parameters.
+    sure = ring | (seen & (coverage > 0.99))
+    basis = np.concatenate([plane, coverage[..., None] * plane], axis=-1)
     for _ in range(3):
-        coefficients = np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0]
-        plane = basis @ coefficients
-        residual = values - plane
-        # Residuals of a fit with a constant term: their deviation is taken about zero.
-        noise = MAD_TO_SIGMA * float(np.median(np.abs(residual[kept])))
-        keep = mask & (np.abs(residual) <= max(4 * noise, 1e-9))
-        if keep.sum() < 6 or (keep == kept).all():
+        kept = basis[seen]
+        first = np.linalg.pinv(kept.T @ kept, hermitian=True) @ (kept.T @ values[seen])
+        residual = values - basis @ first
+        noise = MAD_TO_SIGMA * float(np.median(np.abs(residual[ring & seen])))
+        out = seen & sure & (np.abs(residual) > max(4 * noise, _MODEL_ERROR * abs(float(first[3]))))
+        if not out.any() or (seen & ~out & ring).sum() < 12:
             break
-        kept = keep
-    return plane, noise
+        seen = seen & ~out
+    contrast, slopes = float(first[3]), first[1:3]
+    slope = float(np.hypot(*slopes))
+    if contrast == 0.0:
+        return "has no contrast (0 K)"
+    design = np.concatenate([basis, contrast * np.stack(derivatives, axis=-1)], axis=-1)[seen]
+    prior = np.array([0.0, 0.0, 0.0, np.log(optics.spread_px)])
+    spread_u = max(optics.spread_u_px / optics.spread_px, _LEAST_SPREAD_U)
+    slope_u = max(max(optics.slope_share_u, _LEAST_SHARE_U) * slope, 1e-12)
+    prior_u = np.array([np.inf] * 4 + [slope_u] * 2 + [np.inf, np.inf, _SIZE_U, spread_u])
+    off = np.concatenate([np.zeros(4), optics.slope_share * slopes, prior - state])
+    information = design.T @ design
+    weight = max(noise, 1e-6) ** 2 / prior_u**2
+    covariance = np.linalg.pinv(information + np.diag(weight), hermitian=True)
+    found = covariance @ (design.T @ values[seen] + weight * off)
+    noise = float(np.sqrt(np.sum((values[seen] - design @ found) ** 2) / max(len(design) - len(found), 1)))
+    u = noise * np.sqrt(np.diag(covariance))
+    share = float(found[4:6] @ slopes) / max(slope**2, 1e-24)
+    return _DiscFit(found[6:], u[6:], (share, float(np.hypot(*u[4:6])) / max(slope, 1e-12)), float(found[3]), noise)
+
+
+def _blurred_ellipse(columns: Array, rows: Array, shape: Array, spread_px: float) -> tuple[Array, ...]:
+    """Coverage of pixels by an ellipse that a Gaussian blurs, (rows, columns), and its derivatives by the centre (column, row) and by the
+    logarithms of its size and of the spread; the ellipse x' shape^-1 x = 1 is summed over its chords, as a product of two matrices.
+    """
+    height = float(np.sqrt(shape[1, 1]))
+    angles = np.pi * ((np.arange(count := int(4 * height / spread_px) + 12) + 0.5) / count - 0.5)
+    chord = np.sqrt(np.linalg.det(shape)) / height * np.cos(angles)
+    middle = shape[0, 1] / height * np.sin(angles)
+    below = (rows[:, None] - height * np.sin(angles)) / spread_px
+    by_row = np.exp(-(below**2) / 2) * (height * np.cos(angles) * np.sqrt(np.pi / 2) / count / spread_px)
+    ends = [((middle + sign * chord)[:, None] - columns) / spread_px for sign in (1.0, -1.0)]
+    (right, left), densities = ends, [np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in ends]
+    by_column = special.ndtr(right) - special.ndtr(left)
+    aside = by_row @ ((densities[0] - densities[1]) / spread_px)
+    along = (by_row * below / spread_px) @ by_column
+    wider = (by_row * (below**2 - 1)) @ by_column - by_row @ (right * densities[0] - left * densities[1])
+    return by_row @ by_column, aside, along, columns * aside + rows[:, None] * along - wider, wider
 
 
 # ArUco markers: they identify the table plan and hint where its discs are; the discs alone determine the

@@ -243,7 +243,9 @@ def zoom_and_turn(displacement_px: Sequence[float] | Array, registration: Regist
 def fiducial_displacement(temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
     """Displacement of the fiducials of one frame, each located near its registered place."""
     listed = list(registration.fiducials.values())
-    located, _ = locate_fiducials(temperature, listed, registration.projection, grid=grid, reach_px=_REACH_PX)
+    located, _ = locate_fiducials(
+        temperature, listed, registration.projection, grid=grid, reach_px=_REACH_PX, optics=registration.optics
+    )
     before = registration.located
     least = max(3, int(np.ceil(_LEAST_SHARE * len(before))))
     if len(located) < least:

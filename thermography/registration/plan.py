@@ -135,6 +135,8 @@ class Fiducial:
     column_px, row_px : float or None, px
         Hint where the disc appears in the frame; it may be wrong by tens of pixels. None: no hint. Of a point, its place itself.
     marker : number in the dictionary of 4 x 4 ArUco markers, 0 to 49; None for a disc
+    u_mm : float, mm
+        Standard uncertainty of x_mm and of y_mm in the list; 0 takes the list as exact but for the scatter that its places show.
     """
 
     name: str
@@ -144,6 +146,7 @@ class Fiducial:
     column_px: float | None = None
     row_px: float | None = None
     marker: int | None = None
+    u_mm: float = 0.0
 
     @property
     def is_point(self) -> bool:
@@ -191,7 +194,7 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     >>> lines = ["name,x_mm,y_mm,diameter_mm", "F1,40,20,16", "F2,660,20,16", "F3,40,160,16", "F4,660,160,16"]
     >>> _ = path.write_text("\n".join(lines))
     >>> read_fiducials(path)[1]
-    Fiducial(name='F2', x_mm=660.0, y_mm=20.0, diameter_mm=16.0, column_px=None, row_px=None, marker=None)
+    Fiducial(name='F2', x_mm=660.0, y_mm=20.0, diameter_mm=16.0, column_px=None, row_px=None, marker=None, u_mm=0.0)
     """
     path = Path(path)
     lines = read_lines(path, _REQUIRED_COLUMNS, FiducialError, optional=_HINT_COLUMNS)

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from scipy import special
 
 from thermography.common import Array, ThermographyError
-from thermography.registration.discs import SPOT_U_PX, LocatedDisc, detect_discs, identify_plan, locate_disc
+from thermography.registration.discs import (
+    SPOT_U_PX,
+    UNKNOWN_OPTICS,
+    DiscOptics,
+    LocatedDisc,
+    detect_discs,
+    identify_plan,
+    locate_disc,
+    pooled_optics,
+)
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import (
     LENS_MODELS,
@@ -265,12 +274,12 @@ def refuse_chance(
 
 def refuse_scatter(scatter_mm: float, missed_mm: Mapping[str, float], fiducials: Sequence[Fiducial]) -> None:
     """Refuse discs whose places contradict one another by more than a list that was measured on them could."""
-    limit = _LARGEST_SCATTER * float(np.median([disc.diameter_mm for disc in fiducials]))
+    limit = float(np.median([max(_LARGEST_SCATTER * disc.diameter_mm, 2 * disc.u_mm) for disc in fiducials]))
     if scatter_mm > limit:
         raise RegistrationError(
             f"the places of the fiducials contradict one another by {scatter_mm:.1f} mm (standard deviation; up to {limit:.1f} mm, a tenth "
-            f"of their diameter, are measuring errors, more means another list): {_worst(missed_mm)}; check x_mm, y_mm of these and of "
-            "their neighbours"
+            f"of their diameter or twice fiducials_u, are measuring errors, more means another list): {_worst(missed_mm)}; "
+            "check x_mm, y_mm of these and of their neighbours"
         )
 
 
@@ -575,8 +584,10 @@ def _pairs(matched: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> tu
 
 _MODEL_NAMES = {count: name for name, count in LENS_MODELS}
 
-#: Standard uncertainty of a centroid beyond noise (pixel response, cut of the disc), px; 0.006 px are observed without noise.
-_CENTROID_FLOOR_PX = 0.01
+#: Standard uncertainty of a centroid beyond noise (pixel response, curvature of the field), px; 0.003 px are observed without noise.
+_CENTROID_FLOOR_PX = 0.004
+#: Least margin around discs and along the plan's edge, px: the registration's own error, and a lens that is not quite Gaussian.
+_LEAST_MARGIN_PX = 2.0
 #: Standard uncertainty of a point picked by hand, px.
 _PICKED_U_PX = 0.5
 #: Standard uncertainty, in diameters, with which the others must predict a disc for its place to be checked by them: a place that is
@@ -615,6 +626,8 @@ class Registration:
     masked : every fiducial on the table, used or not: their pixels do not show the table's temperature
     shape : (rows, columns) of the frames
     lens : the calibrated lens that was given
+    optics : edge spread of lens and pixel that the discs show, px, see `thermography.registration.discs.DiscOptics`; for points that
+        of a focused lens
     covariance
         (p, p), of the homography and of the distortion, p = 8 with a calibrated lens, else 12: coefficients that were not fitted are
         not known to be zero. See `thermography.registration.projection.DiscFit.covariance`.
@@ -638,6 +651,7 @@ class Registration:
     left_out: dict[str, str] = field(default_factory=dict)
     masked: tuple[Fiducial, ...] = ()
     lens: Lens | None = None
+    optics: DiscOptics = UNKNOWN_OPTICS
 
     def __str__(self) -> str:
         """Return in one line how well the plan was located."""
@@ -648,6 +662,12 @@ class Registration:
     def is_picture(self) -> bool:
         """Whether the picture itself is the plan, with lengths in px: see `thermography.registration.register`."""
         return not self.fiducials
+
+    @property
+    def margin_px(self) -> float:
+        """Distance from discs and from the plan's edge within which a pixel does not show the table alone, px: three edge spreads."""
+        # The edge of a picture that is its own plan is the edge of nothing that could be blurred into it.
+        return 0.0 if self.is_picture else max(_LEAST_MARGIN_PX, 3.0 * self.optics.spread_px)
 
     @property
     def mirrored(self) -> bool:
@@ -682,7 +702,12 @@ class Registration:
         (a, b), (c, d) = np.moveaxis(self.projection.jacobian(flat), 0, -1)
         inverse = np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), -1, 0)
         plan = np.ascontiguousarray(inverse) @ sensor
-        return (plan @ self.covariance @ np.swapaxes(plan, 1, 2)).reshape(*points_mm.shape[:-1], 2, 2)
+        # No residual shows a scale that all places of the list share: it moves the typical disc by the u of its place.
+        off = flat - centres.mean(axis=0)
+        squares = np.mean([disc.u_mm**2 for disc in self.fiducials.values()])
+        scale2 = squares / np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1))
+        covariance = plan @ self.covariance @ np.swapaxes(plan, 1, 2) + scale2 * off[:, :, None] * off[:, None, :]
+        return np.asarray(covariance.reshape(*points_mm.shape[:-1], 2, 2))
 
     def position_u(self, points_mm: Array) -> Array:
         """Standard uncertainty of plan positions, (...) mm, for points (..., 2) mm: root of the summed variances along x and y."""
@@ -762,17 +787,20 @@ def register(
 
     def by_spots(matched: dict[str, LocatedDisc], hypotheses: int) -> Registration:
         """Locate all discs from those that are matched with spots, fit those that agree, and refuse what may be chance."""
-        located = matched
+        located, optics = matched, UNKNOWN_OPTICS
         for _ in range(2):
             discs = [disc for disc in listed if disc.name in located]
             fit, _ = _fit(_observations(located, discs), shape, lens)
-            located, missed = locate_fiducials(frame, listed, fit.projection, grid=grid, reach_px=_REACH_PX)
+            located, missed = locate_fiducials(
+                frame, listed, fit.projection, grid=grid, reach_px=_REACH_PX, optics=optics
+            )
             if len(located) < 4:
                 raise RegistrationError(
                     f"only {len(located)} of {len(listed)} fiducials are located, a plan needs 4: {_reasons(missed)}"
                 )
+            optics = pooled_optics(located.values())
         apart = {name: place for name, place in matched.items() if name not in located}
-        registration = _registration(located, listed, left_out | missed, shape, lens, apart=apart)
+        registration = _registration(located, listed, left_out | missed, shape, lens, apart=apart, optics=optics)
         judge(registration, listed, spots, hypotheses)
         wrong_hints = contradicted_hints(registration.located, list(registration.fiducials.values()))
         return replace(registration, left_out=registration.left_out | wrong_hints)
@@ -848,6 +876,7 @@ def locate_fiducials(
     *,
     grid: PlanGrid | None = None,
     reach_px: float = 3.0,
+    optics: DiscOptics = UNKNOWN_OPTICS,
 ) -> tuple[dict[str, LocatedDisc], dict[str, str]]:
     """Locate every fiducial near its projection."""
     # Without a plan, the discs are moved to the middle of one of a square kilometre.
@@ -862,7 +891,7 @@ def locate_fiducials(
             missed[disc.name] = "is a point without a disc"
             continue
         moved = replace(disc, x_mm=disc.x_mm + shift[0], y_mm=disc.y_mm + shift[1])
-        result = locate_disc(temperature, moved, bounds, place, jacobian, reach_px=reach_px)
+        result = locate_disc(temperature, moved, bounds, place, jacobian, reach_px=reach_px, optics=optics)
         if isinstance(result, str):
             missed[disc.name] = result
         else:
@@ -878,6 +907,7 @@ def _registration(
     lens: Lens | None,
     *,
     apart: Mapping[str, LocatedDisc] | None = None,
+    optics: DiscOptics = UNKNOWN_OPTICS,
 ) -> Registration:
     """Fit the fiducials that agree; leave out the others, with where they are (`apart`: those that were detected but not located)."""
     discs = [disc for disc in listed if disc.name in located]
@@ -900,11 +930,9 @@ def _registration(
     # Half-width of Student's t that holds 68 %: few residuals tell their scatter badly (JCGM 100:2008, annex G).
     factor_u = factor * (float(special.stdtrit(freedom, special.ndtr(1.0))) ** 2 if freedom >= 1.0 else 1.0)
     px_per_mm = projection.px_per_mm(observations.centres_mm)
-    unchecked = _unchecked(fit, discs, factor)
-    # The place of an unchecked disc may err unnoticed by up to its diameter, rectangular (JCGM 100:2008, 4.3.7).
-    reach_mm = np.array([disc.diameter_mm if disc.name in unchecked else 0.0 for disc in discs])
-    hidden_px = reach_mm * px_per_mm / np.sqrt(3.0 * factor_u)
-    hidden = replace(observations, u_px=np.hypot(observations.u_px, hidden_px))
+    # Four places have nothing that checks them: each may err unnoticed by up to its diameter, rectangular (JCGM 100:2008, 4.3.7).
+    reach_mm = np.array([disc.diameter_mm if len(discs) == 4 else 0.0 for disc in discs])
+    hidden = replace(observations, u_px=np.hypot(observations.u_px, reach_mm * px_per_mm / np.sqrt(3.0 * factor_u)))
     return Registration(
         homography=np.linalg.inv(projection.plan_to_sensor),
         distortion=projection.distortion,
@@ -918,11 +946,12 @@ def _registration(
         scatter_mm=float(np.sqrt(factor) * np.median(observations.u_px / px_per_mm)),
         scatter_px=float(np.sqrt(factor) * np.median(observations.u_px)),
         area_ratio=area_ratio(located, discs, projection),
-        unchecked=unchecked,
+        unchecked=_unchecked(fit, discs, factor),
         left_out=left_out,
         masked=tuple(observed.get(disc.name, disc) for disc in listed),
         shape=shape,
         lens=lens,
+        optics=optics,
         covariance=DiscFit(hidden, projection, len(LENS_SPREAD) if lens is None else 0).covariance(factor_u),
     )
 
@@ -964,9 +993,14 @@ def _fit(
 
 def _observations(located: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> DiscObservations:
     places = [located[disc.name] for disc in fiducials]
-    u_px = np.hypot([place.u_px for place in places], _CENTROID_FLOOR_PX)
     points_px = np.array([(place.column_px, place.row_px) for place in places])
-    return DiscObservations(points_px, *_geometry(fiducials), u_px)
+    centres_mm, radii_mm = _geometry(fiducials)
+    px_per_mm = np.linalg.norm(points_px - points_px.mean(axis=0)) / np.linalg.norm(
+        centres_mm - centres_mm.mean(axis=0)
+    )
+    listed_px = px_per_mm * np.array([disc.u_mm for disc in fiducials])
+    u_px = np.sqrt(np.array([place.u_px for place in places]) ** 2 + _CENTROID_FLOOR_PX**2 + listed_px**2)
+    return DiscObservations(points_px, centres_mm, radii_mm, u_px)
 
 
 def _without_duplicates(fiducials: Sequence[Fiducial]) -> tuple[list[Fiducial], dict[str, str]]:

@@ -58,6 +58,20 @@ def test_stated_uncertainty_is_the_scatter_of_the_centroid(rng):
     assert np.mean([place.u_px for place in located]) == pytest.approx(scatter, rel=0.3)
 
 
+@pytest.mark.parametrize("blur_px", [0.6, 2.5])
+def test_the_blur_is_measured_and_moves_no_centroid_nor_does_an_edge_of_the_table_beside_the_disc(blur_px):
+    disc, centre = Fiducial("F1", 50.13, 9.6, 16.0), np.array([100.26, 19.2])
+    image = draw(centre, 16.0)
+    # The table ends 1.6 mm from the disc, and what lies beyond is warmer.
+    image = cv2.GaussianBlur(np.pad(image, ((20, 0), (0, 0)), constant_values=27.0), (0, 0), blur_px)
+    located = locate_disc(image, disc, SMALL_GRID, centre + np.array([0.4, 20.3]), JACOBIAN)
+    assert isinstance(located, LocatedDisc)
+    assert (located.column_px, located.row_px) == pytest.approx((100.26, 39.2), abs=0.02)
+    # A pixel is a square, of variance 1/12; the blur was drawn in whole pixels, too.
+    assert located.spread_px == pytest.approx(np.hypot(blur_px, 12**-0.5), rel=0.05)
+    assert located.area_px == pytest.approx(np.pi * 16**2, rel=0.01)
+
+
 def test_reasons_why_a_disc_is_not_located(rng):
     disc, centre = Fiducial("F1", 50.0, 30.0, 16.0), np.array([100.0, 60.0])
     plain = 22.0 + rng.normal(0, 0.05, (120, 200))

@@ -449,3 +449,23 @@ def test_places_diameters_and_hints_that_contradict_are_named():
     assert list(contradicted_hints(places, hinted_at(places, [spacing_px] * 4))) == [
         f"F{n} (hint)" for n in (1, 2, 3, 4)
     ]
+
+
+@pytest.mark.parametrize("u_mm", [0.0, 2.0])
+def test_a_scale_of_the_list_is_in_the_uncertainty_where_that_of_the_list_is_stated(rng, u_mm):
+    scene = Scene(disc_K=-4.0)
+    listed = [replace(disc, x_mm=1.01 * disc.x_mm, y_mm=1.01 * disc.y_mm, u_mm=u_mm) for disc in hinted(scene, rng, 5)]
+    registration = register(scene.render(rng), listed, grid=GRID)
+    u = np.sqrt(np.mean(registration.position_u(GRID.centres_mm) ** 2))
+    assert bool(scene.registration_rms_mm(registration) < 2 * u) is bool(u_mm)
+    # Three edge spreads, and two pixels at least.
+    assert registration.margin_px == max(2.0, 3 * registration.optics.spread_px)
+
+
+def test_five_discs_whose_places_are_right_are_located_within_an_uncertainty_below_a_diameter(rng):
+    scene = Scene(disc_K=-4.0)
+    five = [disc for disc in hinted(scene, rng, 5) if disc.name in ("F1", "F3", "F5", "F6", "F10")]
+    registration = register(scene.render(rng), five, grid=GRID)
+    u = np.sqrt(np.mean(registration.position_u(GRID.centres_mm) ** 2))
+    assert scene.registration_rms_mm(registration) < 2.5 * u < 5.0
+    assert registration.unchecked
