@@ -70,7 +70,7 @@ class DiscOptics:
 
 
 #: Before any disc is measured: a focused lens, and a slope between that of the table and none.
-UNKNOWN_OPTICS = DiscOptics(0.8, 0.6, -0.5, 1.0)
+UNKNOWN_OPTICS = DiscOptics(2 / 3, 0.5, -0.5, 1.0)
 
 
 def pooled_optics(discs: Collection[LocatedDisc]) -> DiscOptics:
@@ -265,7 +265,7 @@ def _fit_disc(
     design = np.concatenate([basis, contrast * np.stack(derivatives, axis=-1)], axis=-1)[seen]
     prior = np.array([0.0, 0.0, 0.0, np.log(optics.spread_px)])
     spread_u = max(optics.spread_u_px / optics.spread_px, _LEAST_SPREAD_U)
-    slope_u = max(max(optics.slope_share_u, _LEAST_SHARE_U) * slope, 1e-12)
+    slope_u = max(max(optics.slope_share_u, _LEAST_SHARE_U) * slope, 1e-4 * abs(contrast))
     prior_u = np.array([np.inf] * 4 + [slope_u] * 2 + [np.inf, np.inf, _SIZE_U, spread_u])
     off = np.concatenate([np.zeros(4), optics.slope_share * slopes, prior - state])
     information = design.T @ design
