@@ -57,6 +57,10 @@ class LocatedDisc:
     slope_share_u: float = np.nan
 
 
+#: A disc of less than two pixels is a spot of the lens, px.
+_LEAST_RADIUS_PX = 1.0
+
+
 @dataclass(frozen=True)
 class DiscOptics:
     """How discs are imaged: edge spread of lens and pixel (standard deviation), px, and by how much the slope of the temperature on a disc
@@ -243,7 +247,11 @@ def _fit_disc(
     coverage, *derivatives = _blurred_ellipse(columns, rows, size**2 * shape, spread)
     across, down = np.meshgrid(columns, rows)
     ring = seen & (coverage < 0.01)
-    if ring.sum() < 12 or (seen & (coverage > 0.1)).sum() < 6:
+    if (
+        ring.sum() < 12
+        or (seen & (coverage > 0.1)).sum() < 6
+        or np.linalg.eigvalsh(size**2 * shape)[0] < _LEAST_RADIUS_PX**2
+    ):
         return "is too small in the frame or too near the plan's edge"
     plane = np.stack([np.ones_like(across), across, down], axis=-1)
     # Outliers are looked for where there is only table or only disc: near the rim the residuals are those of the parameters.
