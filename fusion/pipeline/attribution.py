@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -76,11 +77,16 @@ def describe_hotspots(fields: xr.Dataset) -> tuple[schema.HotspotPart, ...]:
 
 
 def _find_hotspots(fields: xr.Dataset) -> list[Hotspot]:
-    """The hotspots of all cycles, but objects on the table, and those whose height the emissivity of a named surface may have made."""
+    """The hotspots of all cycles, but objects, unnamed surfaces, and those whose height the emissivity of a named surface may have made."""
     flags, attrs = fields["quality_flag"].values, fields["quality_flag"].attrs
     bits = dict(zip(attrs.get("flag_meanings", "").split(), attrs.get("flag_masks", ()), strict=True))
     rise = fields["temperature_rise"].where((flags & bits.get("object", 0)) == 0)
-    spots = detect_hotspots(rise, noise_u=fields["temperature_rise_noise_u"])
+    unnamed = json.loads(fields.attrs.get("unnamed_surfaces", "[]"))
+    spots = [
+        spot
+        for spot in detect_hotspots(rise, noise_u=fields["temperature_rise_noise_u"])
+        if all(np.hypot(spot.x_mm - one["x_mm"], spot.y_mm - one["y_mm"]) > one["size_mm"][0] / 2 for one in unnamed)
+    ]
     if "rise_scale_u" not in fields:
         return spots
     border = scipy.ndimage.binary_dilation((flags & SURFACE_EDGE).any(axis=0), np.ones((3, 3)))

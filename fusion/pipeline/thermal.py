@@ -40,7 +40,7 @@ from fusion.results.store import check
 from thermography.common import FIELDS, ZERO_CELSIUS_K, ThermographyError
 from thermography.fields.cycle_fields import CLIPPED, cycles_with_field, reference_cycle
 from thermography.fields.moving import reduce_moving_frames
-from thermography.fields.objects import leave_out_objects
+from thermography.fields.objects import describe_unnamed_surfaces, leave_out_objects
 from thermography.fields.still import reduce_frames
 from thermography.fields.survey import (
     LEAST_SURROUNDING_BLOCKS,
@@ -677,6 +677,9 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
     fields = fields.assign_coords(cycle=source.cycles.number)
     completed = complete_fields(source, fields, override, offset_s=offset_s)
     fields = check(completed.dataset, FIELDS, name="the fields")
+    if source.thermography.table == "still":
+        unnamed = describe_unnamed_surfaces(fields, override(first[0]))
+        fields = fields.assign_attrs(unnamed_surfaces=json.dumps(unnamed))
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:

@@ -1,4 +1,4 @@
-"""Parts of a still table that change abruptly: objects that are laid on it or taken away, and the cells that show them."""
+"""Parts of a still table that are not the table: objects laid on it or taken away, with their cells, and surfaces of another emissivity."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import scipy
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography.common import MAD_TO_SIGMA, Array
-from thermography.fields.cycle_fields import OBJECT
+from thermography.common import MAD_TO_SIGMA, ZERO_CELSIUS_K, Array
+from thermography.fields.cycle_fields import OBJECT, reference_cycle
+from thermography.io.frame import CameraParameters
 from thermography.large_arrays import median_of_pieces, piece_slices
+from thermography.radiometry.planck import black_body_signal
 
 #: A cell jumps if its change from one frame to the next exceeds its changes before and after by more than this, K, ...
 JUMP_K = 0.3
@@ -30,6 +32,10 @@ _EDGE_MM, _SHARP = 10.0, 0.5
 _LEAST_SHARE = 0.02
 #: Largest share of the table that is left out; beyond it no field would remain.
 _LARGEST_SHARE = 0.25
+#: Smaller width, mm, up to which a surface is told from the table around it.
+_WIDEST_MM = 150.0
+#: Fewest standard deviations of the noise of its step, and those by which noise alone makes neighbouring cells differ.
+_SURFACE_SIGMAS, _RANGE_SIGMAS = 12.0, 4.0
 _EIGHT = np.ones((3, 3), bool)
 
 
@@ -84,12 +90,17 @@ def find_abrupt_parts(frames: xr.DataArray) -> list[AbruptPart]:
 
 def _stood_before(pair: Array, cells: NDArray[np.bool_]) -> bool:
     """Whether cells differ from those around them more in the first of two frames than in the second: something was taken away."""
-    inner = scipy.ndimage.binary_dilation(cells, _EIGHT, iterations=2)
-    around = scipy.ndimage.binary_dilation(inner, _EIGHT, iterations=2) & ~inner
+    around = _ring(cells, 2)
     if not np.isfinite(pair[:, around]).any(axis=1).all():
         return False
     before, after = (abs(np.nanmedian(frame[cells]) - np.nanmedian(frame[around])) for frame in pair)
     return bool(before > after)
+
+
+def _ring(cells: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+    """The cells around some, beyond as many between them as the ring is wide."""
+    inner = scipy.ndimage.binary_dilation(cells, _EIGHT, iterations=width)
+    return np.asarray(scipy.ndimage.binary_dilation(inner, _EIGHT, iterations=width) & ~inner)
 
 
 def _is_sharp(changed: Array, cells: NDArray[np.bool_], cell_mm: float) -> bool:
@@ -173,17 +184,60 @@ _LEFT_EMPTY = (
 
 def describe_part(part: AbruptPart, fields: xr.Dataset) -> dict[str, Any]:
     """Place, length and width, mm, step, K, share of the table, and times of a part."""
-    rows, columns = np.nonzero(part.cells)
-    x, y, times = (fields[name].values for name in ("x", "y", "time"))
+    times = fields["time"].values
     until = None if part.stop is None else np.datetime_as_string(times[part.stop], unit="s")
-    return {
-        "x_mm": float(x[columns].mean()),
-        "y_mm": float(y[rows].mean()),
-        # Of an ellipse with the same second moments.
-        "size_mm": sorted(4.0 * np.sqrt(np.linalg.eigvalsh(np.cov(x[columns], y[rows])).clip(0.0)), reverse=True),
+    return _describe_place(part.cells, fields) | {
         "step_K": part.step_K,
-        "share": len(rows) / max(int(np.isfinite(fields["frame_temperature"][part.first].values).sum()), 1),
+        "share": np.count_nonzero(part.cells)
+        / max(int(np.isfinite(fields["frame_temperature"][part.first].values).sum()), 1),
         "sharp": part.sharp,
         "since": np.datetime_as_string(times[part.first], unit="s"),
         "until": until,
     }
+
+
+def _describe_place(cells: NDArray[np.bool_], fields: xr.Dataset) -> dict[str, Any]:
+    """Centre, length and width of cells, mm."""
+    rows, columns = np.nonzero(cells)
+    x, y = fields["x"].values[columns], fields["y"].values[rows]
+    # Of an ellipse with the same second moments.
+    size_mm = sorted(4.0 * np.sqrt(np.linalg.eigvalsh(np.cov(x, y)).clip(0.0)), reverse=True)
+    return {"x_mm": float(x.mean()), "y_mm": float(y.mean()), "size_mm": size_mm}
+
+
+def describe_unnamed_surfaces(fields: xr.Dataset, parameters: CameraParameters) -> list[dict[str, Any]]:
+    """Places that differ in the first cycle from the table around them with an edge that no heat has: centre, length and width, mm,
+    step, K, and the emissivity that explains it, None if none does.
+    """
+    first = fields.isel(cycle=reference_cycle(fields["temperature"]))
+    celsius, cell_mm = first["temperature"].values.astype(float), abs(float(fields["x"][1] - fields["x"][0]))
+    empty, far = np.isnan(celsius), max(round(_EDGE_MM / cell_mm), 1)
+    nearest = scipy.ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    filled, size = celsius[tuple(nearest)], 2 * round(_WIDEST_MM / cell_mm / 2) + 1
+    # Beside empty cells, as those of discs, objects and edges of named surfaces, the lens mixes what they show into the table.
+    beside = scipy.ndimage.binary_dilation(empty, _EIGHT, iterations=far)
+    noise_K = float(first["temperature_noise_u"].median())
+    within = scipy.ndimage.maximum_filter(filled, far + 1) - scipy.ndimage.minimum_filter(filled, far + 1)
+    reflected = black_body_signal(parameters.reflected_temperature_K, parameters)
+    found = []
+    for sign, smooth in ((1.0, scipy.ndimage.grey_opening), (-1.0, scipy.ndimage.grey_closing)):
+        step_K = np.where(beside, 0.0, sign * (filled - smooth(filled, size=(size, size), mode="nearest")))
+        labels, count = scipy.ndimage.label(step_K > max(JUMP_K, _SURFACE_SIGMAS * noise_K), _EIGHT)
+        for label in range(1, count + 1):
+            height = np.where(labels == label, step_K, 0.0)
+            # The edge of a blurred surface is where half of its step is.
+            parts, _ = scipy.ndimage.label(height > height.max() / 2, _EIGHT)
+            cells = parts == parts.ravel()[height.argmax()]
+            rim, ring = cells & ~scipy.ndimage.binary_erosion(cells, _EIGHT), _ring(cells, far) & ~empty
+            sharp = within[rim] > _SHARP * height.max() + _RANGE_SIGMAS * noise_K
+            if np.count_nonzero(cells) < _LEAST_CELLS or not ring.any() or sharp.mean() < 0.5:
+                continue
+            core = cells & (height >= np.median(height[cells]))
+            shown, around = np.median(celsius[core]), np.median(celsius[ring])
+            if sign * (shown - around) < _SHARP * height.max():
+                continue
+            surface, table = black_body_signal(np.array([shown, around]) + ZERO_CELSIUS_K, parameters)
+            explained = parameters.emissivity * (surface - reflected) / (table - reflected)
+            emissivity = float(explained) if 0.0 < explained <= 1.0 else None
+            found.append(_describe_place(cells, fields) | {"step_K": float(shown - around), "emissivity": emissivity})
+    return found

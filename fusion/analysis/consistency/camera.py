@@ -404,6 +404,17 @@ def scene_change(fields: xr.Dataset) -> Found | None:
     return judge(max((part["share"] for part in parts), default=0.0), 0.0, parts=parts)
 
 
+@check("fields", CAMERA)
+def unnamed_surface(fields: xr.Dataset) -> Found | None:
+    """Largest step of connected cells of a still table against those around them in the first cycle, from 0.3 K and 12 standard deviations
+    on, most of it within 10 mm round most of their edge: none; in steel heat has no such edge, another emissivity or an object has.
+    """
+    if "unnamed_surfaces" not in fields.attrs:
+        return None
+    surfaces = json.loads(fields.attrs["unnamed_surfaces"])
+    return judge(max((abs(one["step_K"]) for one in surfaces), default=0.0), 0.0, surfaces=surfaces)
+
+
 #: Change of the picture that only some discs show, and of its level that all show, beyond which it is named, K: as large as the steps of
 #: many cameras. Discs of 20 pixels show them to 0.01 K.
 _PICTURE_K = 0.1

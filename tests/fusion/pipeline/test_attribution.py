@@ -62,13 +62,15 @@ def test_regions_and_hotspots_are_tested_by_name(outcome):
     assert len(parts.hotspots) >= len(names) - 1
 
 
-def test_what_is_flagged_as_an_object_is_no_hotspot(results_folder):
+def test_an_object_and_an_unnamed_surface_are_no_hotspots(results_folder):
     fields = read_dataset(results_folder / "fields.nc").load()
     before = describe_hotspots(fields)
     assert before[0].x_u_mm > 0 and before[0].onset_time is not None and before[0].end_cycle is None
     near = np.hypot(fields["x"] - 60.0, fields["y"] - 130.0) < 15.0
     fields["temperature_rise"] = fields["temperature_rise"] + 5.0 * near * (fields["cycle"] > 6)
     assert any(abs(spot.x_mm - 60.0) < 20.0 and abs(spot.y_mm - 130.0) < 20.0 for spot in describe_hotspots(fields))
+    unnamed = fields.assign_attrs(unnamed_surfaces='[{"x_mm": 60.0, "y_mm": 130.0, "size_mm": [50.0, 40.0]}]')
+    assert not any(np.hypot(spot.x_mm - 60.0, spot.y_mm - 130.0) < 25.0 for spot in describe_hotspots(unnamed))
     attrs = {"flag_meanings": "object", "flag_masks": np.array([64], np.uint8)}
     hidden = xr.where(near & (fields["cycle"] > 6), 64, 0).transpose("cycle", "y", "x").astype(np.uint8)
     fields["quality_flag"] = hidden.assign_attrs(attrs)

@@ -148,7 +148,14 @@ def with_discs(fields: xr.Dataset, **shown: float) -> xr.Dataset:
     discs = {"pattern_K": 0.02, "zero_K": 0.02, "warming_K": 2.0, "disc": "F3", **shown}
     rise = np.ones((5, fields.sizes["y"], fields.sizes["x"]))
     known = fields.assign(temperature_rise=(("cycle", "y", "x"), rise), camera_correction_u=("cycle", np.full(5, 0.8)))
-    return known.assign_attrs(discs=json.dumps(discs))
+    return known.assign_attrs(discs=json.dumps(discs), unnamed_surfaces="[]")
+
+
+def patched(inputs: Inputs) -> Inputs:
+    """A bare patch that nobody named."""
+    patch = {"x_mm": 300.0, "y_mm": 60.0, "size_mm": [42.0, 38.0], "step_K": -2.5, "emissivity": 0.354}
+    assert inputs.fields is not None
+    return replace(inputs, fields=inputs.fields.assign_attrs(unnamed_surfaces=json.dumps([patch])))
 
 
 def lit() -> np.ndarray:
@@ -231,6 +238,7 @@ LIES: dict[str, Lie] = {
     "frames_left_out": pictures(frames_obstructed=["a.jpg#0"] * 40),
     "frames_repeated": pictures(frames_repeated=["a.jpg#0"] * 10),
     "scene_change": pictures(lit()),
+    "unnamed_surface": patched,
     "camera_picture": lambda inputs: replace(inputs, fields=with_discs(inputs.fields, pattern_K=0.4)),
     "camera_zero": lambda inputs: replace(inputs, fields=with_discs(inputs.fields, zero_K=0.6)),
     "frames_gaps": lambda inputs: replace(inputs, frame_time=np.delete(inputs.frame_time, np.arange(14, 23))),
@@ -257,6 +265,7 @@ SAID = {
     "fiducial_diameters": "1.060 times the area that diameter_mm of fiducials.csv says",
     "fiducials_span": "The fiducials in use span 24 % of the plan",
     "plan_mirrored": "appears mirrored",
+    "unnamed_surface": "Around x = 300 mm, y = 60 mm (42 x 38 mm) the first cycle shows -2.5 K against the table beside it",
 }
 
 
