@@ -86,7 +86,7 @@ KINDS = {
         silent=4,
     ),
     "person": Kind(tuple(Person(FRAME, frames) for frames in (1, 3)), frozenset({"frames_obstructed"})),
-    "blur": Kind(tuple(Blur(sigma) for sigma in (1.0, 1.8, 2.5)), frozenset({"frames_blurred"}), silent=2),
+    "blur": Kind(tuple(Blur(sigma) for sigma in (1.0, 1.8, 2.5)), frozenset({"frames_blurred"})),
     "blur in mid-test": Kind((Blur(1.8, first=FRAME),), frozenset({"frames_blurred"}), silent=2),
     "clipped": Kind(tuple(Clipped(celsius) for celsius in (25.2, 26.0)), frozenset({"counts_clipped"})),
     "bad pixels": Kind(tuple(BadPixels(count, 3) for count in (60, 300)), frozenset({"bad_pixels"})),
@@ -95,6 +95,7 @@ KINDS = {
     "zero": Kind(
         tuple(ZeroDrift(lambda share, size=size: size * share) for size in (0.3, 1.0)),
         frozenset({"camera_zero", "camera_drift_corrected", "camera_drift_undetermined"}),
+        silent=1,
     ),
     "knock": Kind(tuple(Knock(FRAME, (shift, -shift / 2)) for shift in (0.6, 4.0)), frozenset({"knocks"})),
 }
