@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from fusion.results import axis as schema
 from fusion.results.parts import AreaPart, Quantity, Sensitivity
 from fusion.results.progress import Report
 from fusion.results.results import Outcome, Parts
-from thermography.fields.cycle_fields import SURFACE_EDGE
+from thermography.fields.cycle_fields import CLIPPED, OBJECT, SURFACE_EDGE
 from thermography.fields.hotspots import Hotspot, detect_hotspots
 
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
@@ -78,19 +79,20 @@ def describe_hotspots(fields: xr.Dataset) -> tuple[schema.HotspotPart, ...]:
 
 def _find_hotspots(fields: xr.Dataset) -> list[Hotspot]:
     """The hotspots of all cycles, but objects, unnamed surfaces, and those whose height the emissivity of a named surface may have made."""
-    flags, attrs = fields["quality_flag"].values, fields["quality_flag"].attrs
-    bits = dict(zip(attrs.get("flag_meanings", "").split(), attrs.get("flag_masks", ()), strict=True))
-    rise = fields["temperature_rise"].where((flags & bits.get("object", 0)) == 0)
+    flags, x, y = fields["quality_flag"].values, fields["x"].values, fields["y"].values
+    rise = fields["temperature_rise"].where((flags & OBJECT) == 0)
     unnamed = json.loads(fields.attrs.get("unnamed_surfaces", "[]"))
-    spots = [
-        spot
-        for spot in detect_hotspots(rise, noise_u=fields["temperature_rise_noise_u"])
-        if all(np.hypot(spot.x_mm - one["x_mm"], spot.y_mm - one["y_mm"]) > one["size_mm"][0] / 2 for one in unnamed)
-    ]
+    # By an object cells show a part of it, by clipped ones the source is hotter than any that is seen.
+    hidden = scipy.ndimage.binary_dilation((flags & (OBJECT | CLIPPED)) > 0, np.ones((1, 5, 5)))
+    spots = []
+    for spot in detect_hotspots(rise, noise_u=fields["temperature_rise_noise_u"]):
+        if all(np.hypot(spot.x_mm - one["x_mm"], spot.y_mm - one["y_mm"]) > one["size_mm"][0] / 2 for one in unnamed):
+            at = spot.cycle, np.abs(y - spot.y_mm).argmin(), np.abs(x - spot.x_mm).argmin()
+            spots.append(replace(spot, masked=spot.masked or bool(hidden[at])))
     if "rise_scale_u" not in fields:
         return spots
     border = scipy.ndimage.binary_dilation((flags & SURFACE_EDGE).any(axis=0), np.ones((3, 3)))
-    x, y, kept = fields["x"].values, fields["y"].values, []
+    kept = []
     for spot in spots:
         left, right, low, high = spot.extent_mm
         zone = np.ix_((y > low) & (y < high), (x > left) & (x < right))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from skimage import measure, morphology
 
+from thermofuse.compiled import njit
 from thermography.common import MAD_TO_SIGMA, Array, ThermographyError
 from thermography.fields.cycle_fields import pixel_noise
 from thermography.registration.plan import Polygon, PolygonError
@@ -148,59 +147,58 @@ def _peaks(values: Array, noise: Array, cycle: int, least_prominence_K: float) -
     seen = np.isfinite(values)
     if not seen.any():
         return []
-    smooth = _smooth_seen(values, _SMOOTHING_CELLS)
-    # An empty cell is as warm as the nearest seen one: it neither cuts a zone off nor counts as the lowest.
-    nearest = scipy.ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    field = smooth[tuple(nearest)]
-    # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise; what it takes away shows how large that is.
+    smooth, weight = _smooth_seen(values, _SMOOTHING_CELLS)
+    # An empty cell is as warm as the nearest seen one, less a hair: it neither cuts a zone off nor counts as the lowest or the highest.
+    field = smooth
+    if not seen.all():
+        nearest = scipy.ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+        field = np.where(seen, smooth, np.nextafter(smooth[tuple(nearest)], -np.inf))
+    # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise; what it takes away shows how large that is. Where a part
+    # of its weight falls on no cell it leaves as much more.
     left = 1 / (4 * np.pi * _SMOOTHING_CELLS**2)
     noise_K = MAD_TO_SIGMA * float(np.median(np.abs((values - smooth)[seen]))) / np.sqrt(1 - left)
-    least = max(least_prominence_K, _LEAST_SIGNIFICANCE * noise_K * np.sqrt(left))
+    cells_K = np.maximum(noise, noise_K)
+    smoothed_K = cells_K * np.sqrt(left / np.maximum(weight, left))
+    least = np.maximum(least_prominence_K, _LEAST_SIGNIFICANCE * smoothed_K)
+    prominences = _prominences(field, np.argsort(field, axis=None)[::-1])
     floor, middle = float(field.min()), float(np.median(smooth[seen]))
-    maxima = measure.label(morphology.h_maxima(field, _FOLLOWED * least), connectivity=2)
     peaks = []
-    for label in range(1, maxima.max() + 1):
-        inside = (maxima == label) & seen
-        place = np.unravel_index(int(np.argmax(np.where(inside, field, -np.inf))), field.shape)
-        top = float(field[place])
-        if inside.any() and top >= _FOLLOWED * least:
-            prominence = top - _saddle(field, place, floor)
-            # The lowest of many cells is low by noise alone: the highest one must stand out from the middle one.
-            stands = min(top, top - middle if prominence == top - floor else prominence)
-            own_K = max(noise_K, float(noise[place]))
-            stands_out = stands >= max(least, _LEAST_SIGNIFICANCE * own_K * np.sqrt(left))
-            level = top - max(prominence / 2, _EQUAL_RISE * own_K * np.sqrt(left))
-            zones = measure.label(field >= level, connectivity=1)
-            at = (int(place[0]), int(place[1]))
-            peaks.append(_Peak(cycle, at, top, prominence, stands_out, own_K, zones == zones[place]))
+    for at in zip(*np.nonzero(seen & (prominences >= _FOLLOWED * least) & (field >= _FOLLOWED * least)), strict=True):
+        place = (int(at[0]), int(at[1]))
+        top, prominence = float(field[place]), float(prominences[place])
+        # The lowest of many cells is low by noise alone: the highest one must stand out from the middle one.
+        stands_out = min(top, top - middle if prominence == top - floor else prominence) >= least[place]
+        level = top - max(prominence / 2, _LEAST_SIGNIFICANCE * smoothed_K[place])
+        zones, _ = scipy.ndimage.label(field >= level)
+        peaks.append(_Peak(cycle, place, top, prominence, stands_out, float(cells_K[place]), zones == zones[place]))
     return peaks
 
 
 def _sources(peaks: Sequence[_Peak]) -> list[list[_Peak]]:
     """The peaks, most prominent first, of every source: of each cycle the one that lies in the zone of its most prominent and it in its."""
-    sources: list[list[_Peak]] = []
+    sources: list[dict[int, _Peak]] = []
+    firsts: list[_Peak] = []
     for peak in peaks:
         homes = [
-            source
-            for source in sources
-            if source[0].zone[peak.place]
-            and peak.zone[source[0].place]
-            and all(one.cycle != peak.cycle for one in source)
+            (float(np.hypot(first.place[0] - peak.place[0], first.place[1] - peak.place[1])), k)
+            for k, first in enumerate(firsts)
+            if first.zone[peak.place] and peak.zone[first.place] and peak.cycle not in sources[k]
         ]
         if homes:
-            min(homes, key=lambda source: np.hypot(*np.subtract(source[0].place, peak.place))).append(peak)
+            sources[min(homes)[1]][peak.cycle] = peak
         elif peak.stands_out:
-            sources.append([peak])
-    return sources
+            sources.append({peak.cycle: peak})
+            firsts.append(peak)
+    return [list(source.values()) for source in sources]
 
 
-def _smooth_seen(values: Array, width_cells: float) -> Array:
-    """Gaussian mean over seen cells, (y, x); NaN cells have no weight and remain NaN (normalised convolution)."""
+def _smooth_seen(values: Array, width_cells: float) -> tuple[Array, Array]:
+    """Gaussian mean over seen cells, (y, x), and the share of the weight on them; NaN cells remain NaN (normalised convolution)."""
     seen = np.isfinite(values)
     total = scipy.ndimage.gaussian_filter(np.where(seen, values, 0.0), width_cells, mode="constant")
     weight = scipy.ndimage.gaussian_filter(seen.astype(float), width_cells, mode="constant")
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(seen, total / weight, np.nan)
+        return np.where(seen, total / weight, np.nan), weight
 
 
 def _hotspot(rise: xr.DataArray, stack: Array, source: Sequence[_Peak], last: int) -> Hotspot:
@@ -212,7 +210,7 @@ def _hotspot(rise: xr.DataArray, stack: Array, source: Sequence[_Peak], last: in
     values, seen = stack[peak.cycle], np.isfinite(stack[peak.cycle])
     x, y = rise["x"].values, rise["y"].values
     cell = float(x[1] - x[0])
-    field = np.where(seen, _smooth_seen(values, _SMOOTHING_CELLS), -np.inf)
+    field = np.where(seen, _smooth_seen(values, _SMOOTHING_CELLS)[0], -np.inf)
     zone = peak.zone & (field >= peak.rise_K - peak.prominence_K / 2)
     rows, columns = np.nonzero(zone)
     whole = scipy.ndimage.binary_fill_holes(seen)
@@ -246,45 +244,82 @@ def _hotspot(rise: xr.DataArray, stack: Array, source: Sequence[_Peak], last: in
     )
 
 
-def _saddle(field: Array, place: tuple[Any, ...], floor: float) -> float:
-    """Highest level at which a peak is connected to a higher one, by bisection; the floor for the highest peak."""
-    top = float(field[place])
-    levels = np.unique(field[field < top])
-    low, high = -1, len(levels) - 1
-    # The peak is connected to a higher one at levels[low] and below, and not above.
-    while low < high:
-        middle = (low + high + 1) // 2
-        zones = measure.label(field >= levels[middle], connectivity=2)
-        if field[zones == zones[place]].max() > top:
-            low = middle
-        else:
-            high = middle - 1
-    return float(levels[low]) if low >= 0 else floor
+@njit()
+def _prominences(field: Array, order: NDArray[np.int64]) -> Array:
+    """Height of every maximum of (y, x) above the highest level at which it is connected to a higher one, or above the lowest cell; 0
+    elsewhere: zones grow in the order of the cells, highest first, and the lower of two that meet ends.
+    """
+    rows, columns = field.shape
+    values = field.copy().ravel()
+    above, prominence = np.full(values.size, -1), np.zeros(values.size)
+    for cell in order:
+        above[cell] = cell
+        for row in range(max(cell // columns - 1, 0), min(cell // columns + 2, rows)):
+            for column in range(max(cell % columns - 1, 0), min(cell % columns + 2, columns)):
+                low, high = cell, row * columns + column
+                if above[high] < 0:
+                    continue
+                while above[high] != high:
+                    high = above[high]
+                while above[low] != low:
+                    low = above[low]
+                if values[low] > values[high]:
+                    low, high = high, low
+                if low != high:
+                    prominence[low] = values[low] - values[cell]
+                    above[low] = high
+        # Later searches start at the top.
+        top = cell
+        while above[top] != top:
+            top = above[top]
+        above[cell] = top
+    prominence[order[0]] = values[order[0]] - values[order[-1]]
+    return prominence.reshape(rows, columns)
 
 
 def _vertex(values: Array, peak: _Peak) -> tuple[float, float, float, Array]:
     """Column, row and rise of the top of the shape around a peak, and their standard uncertainties, cells and K."""
     row, column = peak.place
-    tops, us = [], []
+    tops, us, beyond, models, misfits = [], [], [], [], np.zeros((2, 3))
+    least, most = np.array([-column, -row]) - 0.5, np.array([values.shape[1] - column, values.shape[0] - row]) - 0.5
     for sloping in (False, True):
+        smaller = None
         for radius in _RADII:
             fitted = _fit_shape(values, peak, radius, sloping)
-            if fitted is not None and fitted[2] > 1.0:
+            if fitted is None:
+                continue
+            top, u, misfit = fitted
+            at = np.clip(top[:2], least, most)
+            if misfit > 1.0:
+                if smaller is not None:
+                    # What the next larger disc says beyond its noise, carried on to a disc of no size: the top depends on the shape.
+                    change = (top - tops[-1]) ** 2 - np.maximum(us[-1] ** 2 - u**2, 0.0)
+                    misfits[int(sloping)] = np.maximum(change, 0.0) * (smaller / (radius - smaller)) ** 2
                 break
-            if fitted is not None:
-                tops.append(fitted[0])
-                us.append(fitted[1])
+            if (at != top[:2]).any():
+                beyond.append(at)
+            else:
+                tops.append(top)
+                us.append(u)
+                models.append(int(sloping))
+                smaller = radius
     if not tops:
         # No shape: the cells that the noise does not tell from the warmest.
         rows, columns = np.nonzero(peak.zone)
-        u = [max(float(np.std(each)), np.sqrt(_OF_CELL)) for each in (columns, rows)]
-        return float(column), float(row), peak.rise_K, np.array([*u, np.hypot(peak.noise_K, peak.prominence_K / 4)])
+        u = np.maximum([columns.std(), rows.std()], np.sqrt(_OF_CELL))
+        height_u = np.hypot(peak.noise_K, peak.prominence_K / 4)
+        return float(column), float(row), peak.rise_K, np.array([*u, height_u])
     top, each_u = np.array(tops), np.array(us)
     best = int(np.argmin(each_u.prod(axis=1)))
     weight = 1.0 / each_u**2
-    scatter = (weight * (top - top[best]) ** 2).sum(axis=0) / weight.sum(axis=0)
+    # Scatter beyond that of the noise: the smaller disc is a part of the larger one.
+    excess = (top - top[best]) ** 2 - np.maximum(each_u**2 - each_u[best] ** 2, 0.0)
+    scatter = np.maximum((weight * excess).sum(axis=0) / weight.sum(axis=0), 0.0)
+    beside = misfits[models[best]]
+    for at in beyond:  # the place is known to the edge
+        beside[:2] = np.maximum(beside[:2], (at - top[best, :2]) ** 2)
     x, y, height = top[best].tolist()
-    return column + x, row + y, height, np.sqrt(each_u[best] ** 2 + scatter)
+    return column + x, row + y, height, np.sqrt(each_u[best] ** 2 + scatter + beside)
 
 
 def _fit_shape(values: Array, peak: _Peak, radius: int, sloping: bool) -> tuple[Array, Array, float] | None:
@@ -327,9 +362,6 @@ def _fit_shape(values: Array, peak: _Peak, radius: int, sloping: bool) -> tuple[
     top = _top_of(found.x)
     freedom = len(z) - count
     if top is None or np.abs(top[:2]).max() > radius:
-        return None
-    column, row = np.array(peak.place[::-1]) + top[:2]
-    if not (-0.5 <= column <= values.shape[1] - 0.5 and -0.5 <= row <= values.shape[0] - 0.5):
         return None
     # Derivatives of the top by the parameters.
     by = np.empty((3, count))

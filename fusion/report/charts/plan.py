@@ -150,7 +150,9 @@ def plot_registration(
     for spot in hotspots:
         at = _to_frame(fields, np.array([spot.x_mm]), np.array([spot.y_mm]))
         add_marks(drawn, *at, "circle", 19)
-        add_names(drawn, *at, [spot.name], y_offset=-13, text_align="right" if at[0] > columns / 2 else "left")
+        add_names(
+            drawn, *at, [spot.name + _span(spot)], y_offset=-13, text_align="right" if at[0] > columns / 2 else "left"
+        )
     add_hover(drawn, [("fiducial", "@name"), ("residual", "@residual{0.000} mm")], [rings])
     seen = (
         f"Frame of {columns} by {rows} pixels with {len(names)} located fiducials; their residuals are up to "
@@ -491,13 +493,18 @@ def _ring_targets(drawn: figure, fields: xr.Dataset, targets: Set[int]) -> None:
     add_names(drawn, x, y, names, y_offset=12, text_align="center", text_baseline="top")
 
 
+def _span(spot: HotspotPart) -> str:
+    """The cycles of a hotspot that has ended, which a map of a later one does not show."""
+    return "" if spot.end_cycle is None else f" (cycle {spot.onset_cycle} to {spot.end_cycle})"
+
+
 def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart]) -> None:
     """Ring the peak of every hotspot and write its name."""
     if not hotspots:
         return
     x, y = ([getattr(spot, f"{axis}_mm") for spot in hotspots] for axis in "xy")
     add_marks(drawn, x, y, "circle", 19)
-    names = [spot.name or f"hotspot {place}" for place, spot in enumerate(hotspots, start=1)]
+    names = [(spot.name or f"hotspot {place}") + _span(spot) for place, spot in enumerate(hotspots, start=1)]
     middle = np.mean([drawn.x_range.start, drawn.x_range.end])
     add_names(drawn, x, y, names, y_offset=-13, text_align=["right" if at > middle else "left" for at in x])
 
@@ -531,6 +538,8 @@ def _seen(
     row, column = np.unravel_index(np.nanargmax(last), last.shape)
     count = len(hotspots)
     marked = f"; {count} {'hotspot is' if count == 1 else 'hotspots are'} ringed" if count else ""
+    ended = sum(spot.end_cycle is not None for spot in hotspots)
+    marked += f", {ended} of which ended in an earlier cycle" if ended else ""
     marked += "".join(f"; position {target} is ringed" for target in sorted(standing_out))
     return (
         f"Plan of the table: in cycle {cycle} the rise is {number(float(np.nanmin(last)))} to {number(float(np.nanmax(last)))} K, largest "

@@ -71,11 +71,17 @@ def test_an_object_and_an_unnamed_surface_are_no_hotspots(results_folder):
     assert any(abs(spot.x_mm - 60.0) < 20.0 and abs(spot.y_mm - 130.0) < 20.0 for spot in describe_hotspots(fields))
     unnamed = fields.assign_attrs(unnamed_surfaces='[{"x_mm": 60.0, "y_mm": 130.0, "size_mm": [50.0, 40.0]}]')
     assert not any(np.hypot(spot.x_mm - 60.0, spot.y_mm - 130.0) < 25.0 for spot in describe_hotspots(unnamed))
-    attrs = {"flag_meanings": "object", "flag_masks": np.array([64], np.uint8)}
     hidden = xr.where(near & (fields["cycle"] > 6), 64, 0).transpose("cycle", "y", "x").astype(np.uint8)
-    fields["quality_flag"] = hidden.assign_attrs(attrs)
+    fields["quality_flag"] = hidden
     after = describe_hotspots(fields)
     assert not any(abs(spot.x_mm - 60.0) < 20.0 and abs(spot.y_mm - 130.0) < 20.0 for spot in after)
+    # Cells by clipped ones: the source may be hotter there.
+    late = fields["cycle"] > 6
+    around = np.hypot(fields["x"] - 60.0, fields["y"] - 130.0) < 45.0
+    fields["temperature_rise"] = (fields["temperature_rise"] + 5.0 * around * late).where(~(near & late))
+    fields["quality_flag"] = xr.where(near & late, 128, 0).transpose("cycle", "y", "x").astype(np.uint8)
+    beside = [spot for spot in describe_hotspots(fields) if np.hypot(spot.x_mm - 60.0, spot.y_mm - 130.0) < 45.0]
+    assert beside and all(spot.masked for spot in beside)
 
 
 def test_the_switched_load_gets_its_own_verdict(outcome):

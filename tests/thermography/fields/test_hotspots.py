@@ -36,6 +36,22 @@ def test_two_peaks_are_found_where_they_are(rng):
     assert (first.centroid_x_mm, first.centroid_y_mm) == pytest.approx((203.0, 91.0), abs=3)
 
 
+def test_two_peaks_50_mm_apart_and_a_low_one_are_found(rng):
+    noise = rng.normal(0, 0.014, (36, 140))
+    spots = detect_hotspots(plane((300.0, 90.0, 2.0, 15.0), (350.0, 90.0, 1.6, 15.0)) + noise)
+    assert [spot.x_mm for spot in spots] == pytest.approx([300, 350], abs=2)
+    (low,) = detect_hotspots(plane((300.0, 90.0, 0.16, 30.0)) + noise)
+    assert low.peak_rise_K == pytest.approx(0.16, abs=3 * low.peak_rise_u_K)
+
+
+@pytest.mark.parametrize("x0", [685.0, 700.0, 710.0])
+def test_a_peak_at_the_edge_is_known_to_the_edge(rng, x0):
+    """What lies beyond the edge is not seen: the warmest place is the edge itself."""
+    for width in (15.0, 30.0, 60.0):
+        (spot,) = detect_hotspots(plane((x0, 90.0, 2.0, width)) + rng.normal(0, 0.03, (36, 140)))
+        assert spot.at_edge and abs(spot.x_mm - min(x0, 700.0)) < 3 * spot.x_u_mm
+
+
 def test_noise_and_flat_fields_hold_no_hotspot(rng):
     flat = plane()
     assert detect_hotspots(flat) == []
@@ -72,15 +88,15 @@ def test_the_zone_of_a_peak_is_that_above_half_its_height_to_the_edges_of_its_ce
     assert spot.x_mm == pytest.approx(202.5) and spot.y_mm == pytest.approx(92.5)
 
 
-def test_saddle_is_exact():
+def test_prominences_are_exact():
     field = np.zeros((3, 9))
     field[1] = [0.0, 2.0, 5.0, 3.0, 4.0, 9.0, 6.0, 8.0, 1.0]
-    assert module._saddle(field, (1, 2), 0.0) == 3.0
-    assert module._saddle(field, (1, 7), 0.0) == 6.0
-    assert module._saddle(field, (1, 5), 0.0) == 0.0
+    expected = np.zeros((3, 9))
+    expected[1, [2, 5, 7]] = [5.0 - 3.0, 9.0, 8.0 - 6.0]
+    np.testing.assert_array_equal(module._prominences(field, np.argsort(field, axis=None)[::-1]), expected)
     # Cells that touch at a corner are connected.
     corner = np.array([[7.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 6.0]])
-    assert module._saddle(corner, (2, 2), 0.0) == 4.0
+    assert module._prominences(corner, np.argsort(corner, axis=None)[::-1])[2, 2] == 2.0
 
 
 def test_prominence_limits_ranks_and_edges():

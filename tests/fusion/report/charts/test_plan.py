@@ -200,6 +200,13 @@ def test_line_and_hotspots_are_drawn_whole(fields):
     assert np.sign(arrow.x_end - arrow.x_start) == np.sign(line[-1] - line[-2])
     assert "1 hotspots are ringed" not in chart.seen and "1 hotspot is ringed" in chart.seen
     assert f"in cycle {int(fields['cycle'][-1])} the rise is" in chart.seen
+    ended = spot.model_copy(update={"onset_cycle": 2, "end_cycle": 3})
+    chart, _ = thermal_map.plot_thermal_map(fields, [ended], position)
+    assert "1 of which ended" in chart.seen
+    texts = [
+        one.data_source.data.get("text", ()) for one in chart.figure.renderers if type(one.glyph).__name__ == "Text"
+    ]
+    assert any("hotspot 1 (cycle 2 to 3)" in names for names in texts)
 
 
 def test_a_target_that_stands_out_is_ringed_where_it_is(fields):
