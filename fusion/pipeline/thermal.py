@@ -820,11 +820,9 @@ def pixel_notices(flags: np.ndarray, treatment: str) -> Iterator[Notice]:
         kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
         counts_by_kind = {name: int(np.count_nonzero(flags & flag)) for name, flag in kinds.items()}
         named = ", ".join(f"{count} {name}" for name, count in counts_by_kind.items() if count)
-        bad = int(np.count_nonzero(flags))
-        pixels = f"{counted(bad, 'pixel')} {'does' if bad == 1 else 'do'}"
         yield Notice(
             "bad_pixels",
-            f"{pixels} not follow their neighbours ({named}); they {treatment}.",
+            f"Pixels that do not follow their neighbours: {np.count_nonzero(flags)} ({named}); they {treatment}.",
             "Have the camera replace them (a one-point correction, or its maker's service).",
         )
 
