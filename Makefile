@@ -24,7 +24,7 @@ $(VENV)/.docs: $(VENV)/.run
 
 # The main job on a campaign of the twin: simulate, run, print the summary and the path of report.html.
 demo: $(VENV)/.run
-	rm -rf build/demo
+	rm -rf build/demo build/demo-truth
 	$(BIN)/thermofuse demo build/demo
 
 lint: $(VENV)/.test

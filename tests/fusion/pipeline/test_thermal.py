@@ -49,7 +49,7 @@ def test_bad_pixels_are_counted_by_kind(rng):
     counts[:, 10, 70] = 16140 + np.round(rng.normal(0, 400, 24)).astype(np.int64)
     (notice,) = pixel_notices(find_bad_pixels(counts), "are left out of the fields")
     assert notice.code == "bad_pixels"
-    assert notice.message.startswith("3 pixels do not follow their neighbours (1 dead, ")
+    assert notice.message.startswith("Pixels that do not follow their neighbours: 3 (1 dead, ")
     assert "off its neighbours" in notice.message
     assert notice.message.endswith("1 noisy); they are left out of the fields.")
 
