@@ -244,7 +244,8 @@ def propose_table(path: Path) -> TableProposal:
     else:
         times = (keys["time"],) if "time" in keys else () if "every" in keys else _times(rows, keys, asked)
         columns, marks = _columns({str(name): frame[name] for name in frame.columns if name not in times}, rows.units)
-        remark = _UNIT_NOT_KNOWN if asked.get("time_unit", "").endswith(_UNIT_NOT_KNOWN) else ""
+        not_known = "time_unit" in asked and any(_stated_units(rows, name) for name in times)
+        remark = _UNIT_NOT_KNOWN if not_known else ""
         timed = (Column(name, "time", keys.get("time_unit", ""), _first(frame[name]), remark=remark) for name in times)
         columns = [*timed, *columns]
     steps = [match[1] for _, text, _ in head if (match := _STEP.match(text))]
@@ -427,7 +428,7 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
             if not _grows(frame[name]):
                 continue
             keys["time"] = name
-            stated = [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name)) if unit.strip("- ")]
+            stated = _stated_units(rows, name)
             if not {*stated} & {*TIME_UNITS}:
                 _place_times(_finite(frame[name]), keys, asked)
                 if stated and "time_unit" in asked:
@@ -441,6 +442,11 @@ def _times(rows: Rows, keys: dict[str, Any], asked: dict[str, str]) -> tuple[str
                 return tuple(columns)
     asked["every"] = ""
     return ()
+
+
+def _stated_units(rows: Rows, name: str) -> list[str]:
+    """Return the units that the row of units and the heading state of a column."""
+    return [unit_name(unit) for unit in (rows.units.get(name, ""), column_unit(name)) if unit.strip("- ")]
 
 
 def _is_time_name(heading: str, unit: str) -> bool:
