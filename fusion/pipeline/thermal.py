@@ -667,8 +667,8 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         shown = {"untested": "the discs move through the picture with the table"}
     else:
         fields = leave_out_objects(fields)
-    if source.thermography.table == "still" and not json.loads(fields.attrs.get("knocks", "[]")):
-        camera, shown = _held_against_discs(camera, registration, detector)
+        if not json.loads(fields.attrs.get("knocks", "[]")):
+            camera, shown = _held_against_discs(camera, registration, detector)
     fields = fields.assign_attrs(discs=json.dumps(shown))
     fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     damaged = [f"{Path(one.file).name}#{one.index}" for one in camera.part.frames_damaged]
@@ -790,9 +790,8 @@ def _clipped_notices(fields: xr.Dataset, detector: Detector, parameters: CameraP
     """Return a notice for clipped counts; refuse frames of which no field is left."""
     if not detector.clips:
         return
-    count = detector.highest if detector.highest <= 65535 else detector.lowest
+    end, count = ("highest", detector.highest) if detector.highest <= 65535 else ("lowest", detector.lowest)
     celsius = float(calibrate(np.array([count], np.uint16), parameters)[0])
-    end = "highest" if detector.highest <= 65535 else "lowest"
     where = f"at their {end} value, {count} ({celsius:.1f} °C)"
     empty = (fields["quality_flag"].values & CLIPPED) > 0
     if not cycles_with_field(fields["temperature"]).any():

@@ -41,6 +41,7 @@ from thermography.io.flir import index_sequence
 from thermography.io.frame import FrameReference, RejectedFrame
 from thermography.io.other_cameras import StackOptions, index_recordings
 from thermography.io.sequence import order_by_time
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import Overrides, calibrate
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.plan import read_fiducials
@@ -107,7 +108,7 @@ class FieldsOfCycles:
             registration = register_picture(reference.shape)
         else:
             registration = register(reference, self._fiducials, grid=grid, lens=self._lens)
-        self._registered = Registrations([RegistrationSpan(0, registration)], grid)
+        self._registered = Registrations([RegistrationSpan(0, registration)], grid, Detector.sound(registration.shape))
         return self._registered
 
     def _reduce_still(

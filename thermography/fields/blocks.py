@@ -52,7 +52,7 @@ class FrameSeries:
     cycles: NDArray[np.int64]
     correction_K: Array
     override: Override
-    detector: Detector | None = None
+    detector: Detector
 
     def __len__(self) -> int:
         return len(self.references)
@@ -68,8 +68,7 @@ class FrameSeries:
     def temperature(self, index: int) -> Array:
         """Read and calibrate a frame: (row, column) degC, without its correction."""
         reference = self.references[index]
-        counts = reference.read_counts() if self.detector is None else self.detector.read(reference)
-        return calibrate(counts, self.override(reference))
+        return calibrate(self.detector.read(reference), self.override(reference))
 
     def outside_cycles(self, what: str) -> ReductionError:
         """Return the error where `what` ("no frame", ...) lies within a cycle."""
@@ -109,6 +108,7 @@ def make_frame_series(
         raise ReductionError(f"correction_K has shape {correction.shape}; give a finite value per frame, {len(times)}")
     index = np.searchsorted(bounds[:, 0], times, side="right") - 1
     inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
+    detector = detector or Detector.sound(shape)
     return FrameSeries(references, times, bounds, np.where(inside, index, NO_CYCLE), correction, override, detector)
 
 
@@ -161,7 +161,7 @@ class RegisteredSensor:
 
     weights: PlanWeights
     monitor: FiducialMonitor
-    detector: Detector | None = None
+    detector: Detector
 
     @cached_property
     def sampled(self) -> NDArray[np.int64]:
@@ -225,8 +225,7 @@ def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, s
     displacements, samples, noise, detector = [], [], np.nan, sensor.detector
     with WindowReader(weights.window) as reader:
         for counts in reader.read_in_chunks(frames, CHUNK_FRAMES):
-            if detector is not None:
-                detector.repair(counts, weights.window)
+            detector.repair(counts, weights.window)
             sums.add(counts)
             noise = noise_of_differences(counts[0], weights.interior) if np.isnan(noise) else noise
             displacements.append(sensor.monitor.displacements(counts, noise))
@@ -240,7 +239,7 @@ def reduce_block(frames: Sequence[StoredPixels], parameters: CameraParameters, s
         varying = ~(mean.bound_K <= AVERAGING_LIMIT_K) & weights.used
         if varying.any():
             _calibrate_per_frame(mean, varying, frames, parameters, weights.window)
-    if detector is not None:
+    if detector.clips:
         clipped = (sums.lowest <= detector.lowest) | (sums.highest >= detector.highest)
         mean.mean[clipped.reshape(mean.mean.shape) & weights.used] = np.nan
         mean.variance[clipped.reshape(mean.mean.shape) & weights.used] = np.inf

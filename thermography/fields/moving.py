@@ -326,7 +326,9 @@ def reduce_moving_frames(
         kept = Checkpoint(checkpoint, {**description, "axis": axis.tolist(), "reach_mm": reach_mm})
     tracker = make_tracker(registration, grid, -axis, reach_mm=reach_mm)
     samples = sample_points(registration, grid)
-    results = _reduce_blocks(blocks, frames, (tracker, samples, detector), kept, scheduler=scheduler, progress=progress)
+    results = _reduce_blocks(
+        blocks, frames, (tracker, samples, frames.detector), kept, scheduler=scheduler, progress=progress
+    )
     return _assemble(frames, results, samples, registration, axis)
 
 
@@ -364,7 +366,7 @@ def _load(checkpoint: Checkpoint, blocks: Sequence[Block]) -> list[_BlockResult]
 def _reduce_blocks(
     blocks: Sequence[Block],
     frames: FrameSeries,
-    prepared: tuple[TableTracker, Samples, Detector | None],
+    prepared: tuple[TableTracker, Samples, Detector],
     checkpoint: Checkpoint | None,
     *,
     scheduler: str | None,
@@ -393,7 +395,7 @@ def _reduce_blocks(
 
 
 def _reduce_stretch(
-    blocks: Sequence[BlockFrames], prepared: tuple[TableTracker, Samples, Detector | None]
+    blocks: Sequence[BlockFrames], prepared: tuple[TableTracker, Samples, Detector]
 ) -> list[_BlockResult]:
     """Locate the table in every frame of some blocks and add the frame to their cells: the task of a thread or of a worker."""
     tracker, samples, detector = prepared
@@ -402,17 +404,15 @@ def _reduce_stretch(
     with WindowReader((slice(0, shape[0]), slice(0, shape[1]))) as reader:
         for block, frames, _, correction_K in blocks:
             calibration = temperature_from_counts(np.arange(65536.0), block.parameters)
-            if detector is not None:
-                # A cell with a clipped pixel in one of the frames has no mean.
-                calibration[detector.clipped(np.arange(65536))] = np.nan
+            # A cell with a clipped pixel in one of the frames has no mean.
+            calibration[detector.clipped(np.arange(65536))] = np.nan
             sums = CellSums(np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells))
             shift_mm, u_mm = np.full((len(frames), 2), np.nan), np.full(len(frames), np.nan)
             discs = np.zeros(len(frames), np.int64)
             previous, sampled_mm = None, np.full(2, np.nan)
             chunks = reader.read_in_chunks(frames, CHUNK_FRAMES)
             for i, counts in enumerate(counts for chunk in chunks for counts in chunk):
-                if detector is not None:
-                    detector.repair(counts[None])
+                detector.repair(counts[None])
                 position = locate_table(counts, tracker, previous)
                 previous = None if position is None else position.shift_mm
                 if position is None:

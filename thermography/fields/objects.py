@@ -36,7 +36,12 @@ _LARGEST_SHARE = 0.25
 _WIDEST_MM = 150.0
 #: Fewest standard deviations of the noise of its step, and those by which noise alone makes neighbouring cells differ.
 _SURFACE_SIGMAS, _RANGE_SIGMAS = 12.0, 4.0
+#: Neighbours of a cell, corner to corner too.
 _EIGHT = np.ones((3, 3), bool)
+#: What is empty where an object lies.
+_LEFT_EMPTY = (
+    "temperature", "temperature_noise_u", "temperature_rise", "temperature_rise_noise_u", "temperature_rate", "temperature_spread"
+)  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -175,11 +180,6 @@ def leave_out_objects(fields: xr.Dataset) -> xr.Dataset:
     flags = fields["quality_flag"]
     changed["quality_flag"] = flags.copy(data=flags.values | np.where(hidden, OBJECT, 0).astype(np.uint8))
     return fields.assign(changed)
-
-
-_LEFT_EMPTY = (
-    "temperature", "temperature_noise_u", "temperature_rise", "temperature_rise_noise_u", "temperature_rate", "temperature_spread"
-)  # fmt: skip
 
 
 def describe_part(part: AbruptPart, fields: xr.Dataset) -> dict[str, Any]:

@@ -116,8 +116,7 @@ def describe_reduction(
             texts[camera] = str(camera)
         digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{texts[camera]}".encode())
     digest.update(np.ascontiguousarray(frames.correction_K, float).tobytes())
-    if frames.detector is not None:
-        digest.update(frames.detector.flags.tobytes() + f"{frames.detector.lowest} {frames.detector.highest}".encode())
+    digest.update(frames.detector.flags.tobytes() + f"{frames.detector.lowest} {frames.detector.highest}".encode())
     matrices = [(span.first_frame, span.registration.projection.plan_to_sensor.tolist()) for span in spans]
     return {
         "frames": digest.hexdigest(),
@@ -166,7 +165,7 @@ class Registrations:
     the position of every cell (y, x, 2, 2), mm2.
     """
 
-    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid, detector: Detector | None = None) -> None:
+    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid, detector: Detector) -> None:
         self.grid, self.detector = grid, detector
         self.spans: list[RegistrationSpan] = []
         self.sensors: list[RegisteredSensor] = []
@@ -181,8 +180,7 @@ class Registrations:
         with ThreadPoolExecutor(1) as executor:
             monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
             covariance = executor.submit(registration.position_covariance, grid.centres_mm)
-            bad = None if self.detector is None else self.detector.bad
-            weights = plan_weights(registration, grid, bad=bad)
+            weights = plan_weights(registration, grid, bad=self.detector.bad)
             sensor = RegisteredSensor(weights, monitor.result(), self.detector)
         self.spans.insert(index, span)
         self.sensors.insert(index, sensor)
@@ -359,8 +357,7 @@ class Obstructions:
         buffer = np.empty((1, *sensor.weights.used.shape), np.uint16)
         with WindowReader(sensor.weights.window) as reader:
             counts = reader.read([reference], buffer)
-        if sensor.detector is not None:
-            sensor.detector.repair(counts, sensor.weights.window)
+        sensor.detector.repair(counts, sensor.weights.window)
         return calibrate(counts.ravel()[sensor.sampled], self.frames.override(reference))
 
 

@@ -129,9 +129,7 @@ def survey_frames(
         outside=np.array(outside, np.int64),
         off=neighbours.off,
         damaged=damaged,
-        detector=examine_detector(np.stack(representative))
-        if representative
-        else Detector(np.zeros((rows, columns), np.uint8)),
+        detector=examine_detector(np.stack(representative)) if representative else Detector.sound((rows, columns)),
     )
 
 
@@ -370,7 +368,7 @@ def compare_discs(
     index = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _COMPARED)).round().astype(np.intp))
     if len(masks) < _LEAST_DISCS or index.size < _LEAST_FRAMES:
         return None
-    detector = detector or Detector(np.zeros(registration.shape, np.uint8))
+    detector = detector or Detector.sound(registration.shape)
     if detector.clips:
         clipped = np.any([detector.clipped(frames[i].read_counts()) for i in index], axis=0) & ~detector.bad
         masks = {name: pair for name, pair in masks.items() if not any(clipped[mask].any() for mask in pair)}

@@ -19,6 +19,7 @@ from thermography.fields.blocks import (
 )
 from thermography.fields.resampling import plan_weights
 from thermography.io.sequence import WindowReader
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import calibrate, override
 from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
 
@@ -71,7 +72,9 @@ def test_a_block_is_the_mean_of_its_calibrated_frames(registration, rng, tmp_pat
     images[4][220, 300] += 40.0
     frames = record(tmp_path / "a.seq", images)
     weights = plan_weights(registration, GRID)
-    sensor = RegisteredSensor(weights, monitor_fiducials(registration, GRID, weights.window))
+    sensor = RegisteredSensor(
+        weights, monitor_fiducials(registration, GRID, weights.window), Detector.sound(registration.shape)
+    )
     result = reduce_block(frames, SC660, sensor)
     each = np.stack([calibrate(frame.read().counts, SC660)[weights.window] for frame in frames]).astype(float)
     used = weights.used

@@ -40,6 +40,7 @@ from thermography.fields.still import (
 from thermography.fields.total_uncertainty import evaluate_uncertainty
 from thermography.io.frame import PlainSamples
 from thermography.radiometry.averaging import Accumulator, mean_temperature
+from thermography.radiometry.camera import Detector
 from thermography.radiometry.planck import calibrate, override
 from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
 from thermography.registration.plan import mask_discs
@@ -473,7 +474,9 @@ def short_film(tmp_path_factory):
     images = [image + 0.2 * i + rng.normal(0, 0.05, image.shape) for i in range(9)]
     frames = record(tmp_path_factory.mktemp("stretches") / "a.seq", images)
     weights = plan_weights(registration, GRID)
-    sensor = RegisteredSensor(weights, monitor_fiducials(registration, GRID, weights.window))
+    sensor = RegisteredSensor(
+        weights, monitor_fiducials(registration, GRID, weights.window), Detector.sound(registration.shape)
+    )
     return frames, sensor
 
 
