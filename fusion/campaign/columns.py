@@ -18,6 +18,7 @@ from pandas.tseries.api import guess_datetime_format
 
 from fusion.campaign.config import HeaderRows, LoggedTable
 from fusion.campaign.logs import (
+    MONITORED,
     Rows,
     numbers_in,
     read_rows,
@@ -65,7 +66,6 @@ _HEAD = 200
 _ROWS_OF_VALUES = 3
 #: Rows that may stand between them: an empty one, a remark, a header that is repeated.
 _ROWS_BETWEEN = 2
-_MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?\s+\S")
 #: Years in which days that are counted from a date are told by their numbers: 2000 to 2040.
 _DAYS_FROM, _DAYS_TO = 10957.0, 25568.0
 _TIME = re.compile(r"(time|t$|ts$|elapsed|seconds$|sec$|minutes$|min$|hours$|datetime|last_changed$|时间|時間)", re.I)
@@ -346,7 +346,7 @@ def _of_campbell(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 
 def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return the layout of what EPICS' camonitor prints: channel, date, time, value, state of the alarm."""
-    matching = [line for line, text, _ in head if _MONITORED.match(text)]
+    matching = [line for line, text, _ in head if MONITORED.match(text)]
     if len(matching) < max(_ROWS_OF_VALUES, len(head) / 2):
         return {}
     return {"header_rows": {"values": 1}, "long": {"time": ["2", "3"], "channel": "1", "value": "4"}}

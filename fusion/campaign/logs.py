@@ -28,12 +28,13 @@ from fusion.campaign.values import (
     TIME_UNITS,
     QuantityError,
     column_conversion,
+    is_unit,
     name_and_unit,
     role_of_unit,
     unit_name,
 )
 from fusion.common import Array, FusionError
-from interferometry.io.faults import Numerals, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.faults import LaserFormatError, Numerals, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     NO_ZONE,
@@ -71,6 +72,19 @@ _DECIMAL_COMMA = re.compile(r"\d,\d")
 #: A heading in quotes that goes on in the next line, as Excel's Alt+Enter writes it, and the most lines of such headings.
 _OPEN_HEADING = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
 _LONGEST_HEADER = 20
+#: Comma as a decimal mark, words, words with one space between them, and words up to a unit in brackets.
+_COMMA_NUMBER = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_WORDS, _APART, _TO_UNIT = (re.compile(one) for one in (r"\S+", r"\S+(?: \S+)*", r"[^\s\[(][^\[(]*[\[(][^\])]*[\])]"))
+#: How names may be parted by spaces, and values: words, those with AM or PM behind a time of day, and with the date before it.
+_NAMES = (_WORDS, _APART, _TO_UNIT)
+_HALF = r"\d+:\d\d\S*(?: [AaPp]\.?[Mm]\.?)?|\S+"
+_VALUES = (_WORDS, re.compile(_HALF), re.compile(rf"(?:\d+[-/.]\d+[-/.]\d+ )?{_HALF}"))
+#: Lines with nothing but a rule.
+_RULED = re.compile(r"[\s=_+-]*")
+#: Lines of values by which the columns of a text are found.
+_SAMPLE = 200
+#: Channel, date, time and value as EPICS' camonitor prints them.
+MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d\s\d\d:\d\d:\d\d(\.\d+)?\s+\S")
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: Where seconds count from in a table whose start is not stated.
@@ -346,29 +360,102 @@ def _read_sheet(path: Path, sheet: str | None, header: HeaderRows | None, missin
     return _named(frame, by_line.get(header.units or 0, []), [])
 
 
-def text_lines(path: Path) -> list[str]:
-    """Return the lines of a text, each with its end; the rest of a line of headings that one of them breaks is empty."""
+def text_lines(path: Path, header: HeaderRows | None = None) -> list[str]:
+    """Return the lines of a text, each with its end, and tabs between fields that spaces part; the rest of a line of headings that one of
+    them breaks is empty.
+    """
     lines = list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
-    first, header = find_header(lines)
-    if _OPEN_HEADING.search(header):
+    first, heading = find_header(lines)
+    if _OPEN_HEADING.search(heading):
         quotes = accumulate(line.count('"') for line in lines[first : first + _LONGEST_HEADER])
         end = next((k for k, number in enumerate(quotes, first + 1) if number % 2 == 0), first + 1)
         headings = " ".join(line.strip("\n ") for line in lines[first:end])
         # Lines are counted in the file.
         lines[first:end] = [f"{headings}\n", *["\n"] * (end - first - 1)]
-    return lines
+    middle = [line for line in lines[len(lines) // 2 :] if line.strip() and not line.startswith("#")][:_SAMPLE]
+    spaced = [line for line in middle if _is_spaced(line)]
+    return _tabulated(path, lines, spaced, header) if len(spaced) > len(middle) / 2 else lines
+
+
+# Text in aligned columns: a name of several words and an empty cell are told by what stands above and below them.
+
+
+def _is_spaced(line: str) -> bool:
+    """Whether the values of a line are parted by spaces alone, its commas decimal ones."""
+    words = line.split()
+    return (
+        not any(mark in line for mark in ";\t|")
+        and sum(word.lstrip("+-.")[:1].isdigit() for word in words) > 1
+        and all(_COMMA_NUMBER.fullmatch(word) for word in words if "," in word)
+    )
+
+
+def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRows | None) -> list[str]:
+    """Return the lines of a text in columns of spaces with tabs between their fields; what fits no columns stays whole."""
+    if sum(MONITORED.match(line) is not None for line in sample) > len(sample) / 2:
+        return ["\t".join(line.split()) + "\n" for line in lines]
+    usual = {one: Counter(len(one.findall(line)) for line in sample).most_common(1)[0][0] for one in _VALUES}
+    first = next(k for k, line in enumerate(lines) if _is_spaced(line) and len(line.split()) == usual[_WORDS])
+    above = [k for k in range(header.values - 1 if header else first) if not _RULED.fullmatch(lines[k])]
+    above = [k for k in above if not lines[k].startswith("#")]
+    asked = [k for k in above if len(lines[k].split()) > 1][-1:]
+    if header is not None:
+        asked = [line - 1 for line in (header.units, header.names) if line]
+    parts = next(
+        (one for one in _VALUES for k in asked if any(len(names.findall(lines[k])) == usual[one] for names in _NAMES)),
+        _WORDS,
+    )
+    width = usual[parts]
+    places = [row for line in sample if len(row := [part.span() for part in parts.finditer(line)]) == width]
+    spans = [(min(start for start, _ in column), max(end for _, end in column)) for column in zip(*places, strict=True)]
+
+    def placed(line: str, pattern: re.Pattern[str]) -> list[str] | None:
+        """Return each part in the column below or above which it stands alone; None where one stands elsewhere."""
+        fields = [""] * width
+        for part in pattern.finditer(line):
+            over = [k for k, (a, b) in enumerate(spans) if part.start() < b and a < part.end()]
+            if len(over) != 1 or fields[over[0]]:
+                return None
+            fields[over[0]] = part[0]
+        return fields
+
+    def named(line: str) -> list[str] | None:
+        """Return the fields of a line of names or units; None where nothing tells to which columns they belong."""
+        in_order = next((found for one in _NAMES if len(found := one.findall(line)) == width), None)
+        by_place = placed(line, _APART) if len(_APART.findall(line)) > 1 else None
+        return None if in_order and by_place not in (None, in_order) else in_order or by_place
+
+    told = {k: named(lines[k]) for k in above}
+    units = [text for text in told.get(next(iter(asked), -1)) or () if text]
+    if header is None and sum(map(is_unit, units)) > len(units) / 2:
+        asked += [k for k in above if k < asked[0]][-1:]
+    for k in asked:
+        if told[k] is None:
+            raise LaserFormatError(
+                f"{path}, line {k + 1}: {lines[k].strip()!r} does not name the {width} columns of values below it, one by one; part names "
+                "and values by tabs or semicolons and give every name on this line, or write header_rows = "
+                f"{{values = {first + 1}}} in the campaign file, with which the columns are called by their numbers"
+            )
+    tabulated = []
+    for k, line in enumerate(lines):
+        fields = told[k] if k in told else parts.findall(line)
+        if fields is not None and len(fields) < width:
+            fields = placed(line, _WORDS)
+        tabulated.append("\t".join(fields) + "\n" if fields else "\n" if _RULED.fullmatch(line) else line)
+    return tabulated
 
 
 def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]) -> Rows:
     """Read delimited text with the dialect that its header line, or without one its first line of values, shows."""
-    lines = text_lines(path)
+    lines = text_lines(path, header)
     if header is None:
         before, _ = find_header(lines)
         header = HeaderRows(names=before + 1, values=before + 2)
     below = lines[header.values - 1 :]
     if header.names:
         names = "".join(lines[header.names - 1 : header.names])
-        delimiter = delimiter_of(names)
+        values = max(below[:_SAMPLE], key=len, default="")
+        delimiter = next((mark for mark in "\t;," if mark in values and mark in names), delimiter_of(names))
     else:
         delimiter = delimiter_of_values("".join(below[:1]))
         width = max((len(fields_of(line, delimiter)) for line in below), default=0)

@@ -533,3 +533,59 @@ def test_elapsed_times_count_their_hours_beyond_a_day(tmp_path: Path, kind: str)
     path, _ = write_campaign(tmp_path, Asker(None))
     time = read_record(load_campaign(path))["time"].values
     np.testing.assert_array_equal((time - time[0]) / np.timedelta64(1, "h"), hours)
+
+
+#: Names, and units where they have a row of their own, above aligned columns of a counter, seconds, two temperatures and a displacement.
+ALIGNED = {
+    "units in brackets": (("No.", "Time [s]", "T bed [degC]", "T2 (degC)", "X pos [um]"), None),
+    "a row of units with blanks": (("No.", "Time", "T bed", "T2 (air)", "X"), ("", "s", "degC", "degC", "um")),
+    "a blank name": (("", "Time [s]", "T1 [degC]", "T2 [degC]", "X [um]"), None),
+}
+
+
+@pytest.mark.parametrize("align", ["<", ">"])
+@pytest.mark.parametrize("layout", ALIGNED)
+def test_names_and_units_stand_above_their_columns(tmp_path: Path, layout: str, align: str) -> None:
+    names, units = ALIGNED[layout]
+    values = [
+        (str(k), str(60 * k), f"{20 + k / 100:.2f}", "" if k == 7 else f"{21 + k / 90:.2f}", f"{k}.5")
+        for k in range(60)
+    ]
+    lines = ["".join(f"{cell:{align}15}" for cell in row) for row in [names, *([units] if units else []), *values]]
+    (tmp_path / "log.txt").write_text("\n".join(["Spindle test", *lines, "End of test"]) + "\n")
+    table = propose_table(tmp_path / "log.txt")
+    expected = {"T bed [degC]", "T2 (degC)", "T bed", "T2 (air)", "T1 [degC]", "T2 [degC]"} & set(names)
+    assert {one.heading for one in table.of("temperature")} == expected
+    assert [one.heading for one in table.of("displacement")] == [names[4]]
+    assert table.keys["time"] == names[1] and {one.unit for one in table.of("temperature")} == {"degC"}
+    (tmp_path / "log.txt").rename(tmp_path / "log.log")
+    data = read_record(load_campaign(write_campaign(tmp_path, Asker(None))[0]))
+    # An empty cell stays that of its column.
+    assert np.flatnonzero(np.isnan(data["temperature"].values).any(axis=1)).tolist() == [7]
+    np.testing.assert_allclose(data["displacement"].values[:, 0], np.arange(60) + 0.5)
+    assert [one["line"] for one in json.loads(data.attrs["left_out"])] == [63 + bool(units)]
+
+
+@pytest.mark.parametrize(
+    ("heading", "stamp", "time"),
+    [("Date Time T1 X", "2026-03-09 22:30:00", ["Date", "Time"]), ("Timestamp T1 X", "2026-03-09 22:30:00", "Timestamp"),
+     ("Time T1 X", "10:30:00 PM", "Time")],
+)  # fmt: skip
+def test_a_date_and_a_time_of_day_may_stand_below_one_name(
+    tmp_path: Path, heading: str, stamp: str, time: object
+) -> None:
+    lines = [f"{stamp.replace(':30:', f':{k:02d}:')} {20 + k / 100:.2f} {k / 1000:.4f}" for k in range(60)]
+    (tmp_path / "log.txt").write_text("\n".join([heading, *lines]) + "\n")
+    assert propose_table(tmp_path / "log.txt").keys["time"] == time
+
+
+@pytest.mark.parametrize("heading", ["Time [s] T bed X", "Time T1", "Time T bed T air X\ns degC degC um"])
+def test_names_that_differ_in_number_from_their_values_are_refused(tmp_path: Path, heading: str) -> None:
+    lines = [f"{60 * k} {20 + k / 100:.2f} {21 + k / 90:.2f} {k}.5" for k in range(60)]
+    path = tmp_path / "log.txt"
+    path.write_text("\n".join([heading, *lines]) + "\n")
+    with pytest.raises(LaserFormatError, match=r"line 1: .* does not name the 4 columns"):
+        propose_table(path)
+    # A row with an empty cell in columns that are not aligned is left out.
+    path.write_text("\n".join(["Time [s] T1 T2 X", *lines[:30], "1800 20.3 30.5", *lines[31:]]) + "\n")
+    assert [one["line"] for one in json.loads(propose_table(path).attrs["left_out"])] == [32]
