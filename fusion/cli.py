@@ -72,7 +72,6 @@ class ExportFormat(StrEnum):
     siemens840d = "siemens840d"
     siemens840d_temperature = "siemens840d-temperature"
     heidenhain = "heidenhain"
-    renishaw = "renishaw"
     model_json = "model-json"
     model_c = "model-c"
     model_st = "model-st"
@@ -685,10 +684,18 @@ def export(
     out: Annotated[Path | None, Option(help="Folder for the files; left out: RESULTS/export.")] = None,
     axis: Annotated[str | None, Option(help="Name of the axis in the control; left out: the campaign's axis.")] = None,
     spacing: Annotated[
-        str | None, Option(help='Distance of the points of the table, "25 mm"; left out: the targets.')
+        str | None, Option(help='Largest distance of equally spaced points, "25 mm"; left out: the targets.')
     ] = None,
     reference: Annotated[
-        str | None, Option(help='Position at which the correction is zero, "0 mm"; left out: the first target.')
+        str | None,
+        Option(help='Position at which the correction is zero; left out: "0 mm" or the target nearest to it.'),
+    ] = None,
+    active: Annotated[
+        str | None,
+        Option(
+            metavar="TABLE|none",
+            help="The control's table that was active during the test, to which what was measured is added; left out: as stated.",
+        ),
     ] = None,
     sampling: Annotated[str, Option(help="With model-...: time from step to step of the control.")] = "1 s",
     reduced: Annotated[bool, Option("--reduced", help="With model-...: the fewest sensors that suffice.")] = False,
@@ -715,6 +722,7 @@ def export(
             axis=axis,
             spacing_mm=None if spacing is None else read_option("--spacing", spacing, "mm"),
             reference_mm=None if reference is None else read_option("--reference", reference, "mm"),
+            active=active,
             sampling_s=read_option("--sampling", sampling, "s"),
             reduced=reduced,
             fields=fields,

@@ -231,7 +231,9 @@ class ReportTable(Table, title="Machine, people and conditions, as the sheet to 
     feed_mm_per_min: Feed | None = key(None, example="5000 mm/min", ask=True, of=_AXIS)
     dwell_s: PositiveSeconds | None = key(None, "Dwell at a target", example="3 s", ask=True, of=_AXIS)
     warm_up: str = key("", "Warm-up", ask=True, of=_TEST)
-    machine_compensation: str = key("", "Compensation of the machine", ask=True, of=_TEST)
+    machine_compensation: str = key(
+        "", "Compensation of the machine", about='"none", or the file of the table that was active', ask=True, of=_TEST
+    )
     air_temperature_before_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
     air_temperature_after_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)
     material_temperature_before_degC: Celsius | None = key(None, absent="as logged", show=True, of=_AXIS)

@@ -527,7 +527,7 @@ class TablePredictionError(FusionError):
 class TablePrediction(ResultPart):
     """Values by ISO 230-2 that a test of the same axis with an active table is predicted to show."""
 
-    schema_version: Literal[1] = 1
+    schema_version: Literal[2] = 2
     """Version of this layout."""
     table: str
     """Name of the file of the table."""
@@ -537,6 +537,10 @@ class TablePrediction(ResultPart):
     """SHA-256 of its results.json."""
     cycles: int
     """Cycles of the test that is predicted."""
+    position_mm: tuple[float, ...]
+    """Points of the table, mm."""
+    correction_um: ByDirection
+    """What the table takes out of the deviations at its points, beyond one that was active during the test of the campaign, um."""
     predicted_um: Mapping[str, Quantity]
     """A, E, M and B of ISO 230-2, um; their uncertainty is that of table and readings, without what both tests have in common."""
 

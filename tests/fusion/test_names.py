@@ -264,7 +264,7 @@ def test_sheet_exports_fleet_and_comparison_of_an_axis(axis: Path, tmp_path: Pat
         run("iso230", axis, "--out", tmp_path / name)
     assert TITLE.strip() in words_of(tmp_path / "sheet.docx")
     assert TITLE.strip() in Page.of(tmp_path / "sheet.html").text
-    for format in ("csv", "xlsx", "linuxcnc", "siemens840d", "heidenhain", "renishaw"):
+    for format in ("csv", "xlsx", "linuxcnc", "siemens840d", "heidenhain"):
         run("export", axis, "--format", format, "--out", tmp_path / format, "--force", "--spacing", "40 mm")
     assert not [cell for cell in cells(tmp_path / "xlsx" / "results.xlsx") if cell.data_type == "f"]
     other = shutil.copytree(axis, tmp_path / "other")

@@ -4,13 +4,14 @@ Positions are in mm from the machine's zero as the laser file gives them. The va
 minus programmed, relative to the reference; what the control does with it is stated per layout.
 
 Sources: LinuxCNC, ``src/emc/motion/usrmotintf.cc`` (function ``usrmotLoadComp``); Siemens, SINUMERIK 840D sl Function Manual Extended
-Functions, K3; HEIDENHAIN, Technical Manual MANUALplus 620, "Entering compensation values"; Renishaw, error compensation reports.
+Functions, K3; HEIDENHAIN, Technical Manual MANUALplus 620, "Entering compensation values", and TNC 407 (256 entries at most).
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -62,6 +63,26 @@ class Profile:
 
 
 @dataclass(frozen=True)
+class ActiveTable:
+    """The table that was active during a test.
+
+    Attributes
+    ----------
+    name : name of its file
+    position_mm : (m,), its points, increasing
+    deviation_um : (2, m), what it takes for the deviation by the approach in positive and in negative direction
+    """
+
+    name: str
+    position_mm: Array
+    deviation_um: Array
+
+    def at(self, position_mm: Array) -> Array:
+        """Return what it takes for the deviation (2, n), on straight lines, held beyond its ends as controls hold it."""
+        return _on_lines(position_mm, self.position_mm, self.deviation_um)
+
+
+@dataclass(frozen=True)
 class ErrorTable:
     """What a compensation table corrects: deviations at its points, relative to the reference position.
 
@@ -69,11 +90,13 @@ class ErrorTable:
     ----------
     position_mm : (m,), points of the table, increasing
     deviation_um : (2, m) ndarray
-        Approach in positive and in negative direction; zero at the reference position approached in positive direction.
+        Approach in positive and in negative direction; zero at the reference position approached in positive direction, but for what an
+        active table holds there.
     u_um : (2, m), standard uncertainty, that of the interpolation included
-    reference_mm : position at which the correction is zero
+    reference_mm : position at which the correction, or what is added to an active table, is zero
     widest_gap_mm : largest distance of two neighbouring targets
     resampled : whether the points are others than the targets
+    active : the table that was active during the test, which this one contains and replaces
     """
 
     position_mm: Array
@@ -82,6 +105,7 @@ class ErrorTable:
     reference_mm: float
     widest_gap_mm: float
     resampled: bool = False
+    active: ActiveTable | None = None
 
     def spacing_mm(self) -> float | None:
         """Return the distance of the points; None where they are not equally spaced."""
@@ -89,13 +113,29 @@ class ErrorTable:
         return float(steps.mean()) if np.ptp(steps) <= _SPACING_TOLERANCE_MM else None
 
     def mean_um(self) -> Array:
-        """Return the mean of both approaches (m,), relative to the reference, for a control that knows one table."""
-        mean = self.deviation_um.mean(axis=0)
-        return mean - np.interp(self.reference_mm, self.position_mm, mean)
+        """Return the mean of both approaches (m,) for a control that knows one table; what is added is zero at the reference."""
+        added = self.added_um(np.array([self.reference_mm]), one_table=False).mean()
+        return self.deviation_um.mean(axis=0) - added
 
     def reversal_um(self) -> float:
-        """Return the mean reversal error (positive minus negative approach)."""
-        return float((self.deviation_um[0] - self.deviation_um[1]).mean())
+        """Return the mean reversal error (positive minus negative approach), less what an active table takes out."""
+        added = self.added_um(self.position_mm, one_table=False)
+        return float((added[0] - added[1]).mean())
+
+    def added_um(self, position_mm: Array, *, one_table: bool) -> Array:
+        """Return what the table takes out of the deviations (2, n) beyond an active one; of one table, the mean reversal is added."""
+        added = _on_lines(position_mm, self.position_mm, self.deviation_um)
+        if self.active is not None:
+            added = added - self.active.at(position_mm)
+        if not one_table:
+            return added
+        half = self.reversal_um() / 2.0
+        return added.mean(axis=0) + np.array([[half], [-half]])
+
+
+def _on_lines(at_mm: Array, position_mm: Array, values: Array) -> Array:
+    """Return the values (2, m) of both approaches at other positions (2, n), on straight lines."""
+    return np.array([np.interp(at_mm, position_mm, one) for one in values])
 
 
 def read_profile(deviations: xr.Dataset) -> Profile:
@@ -129,30 +169,41 @@ def read_scatter_and_drift(deviations: xr.Dataset) -> tuple[Array, Array]:
     return scatter.values.astype(float), course.values.astype(float)
 
 
-def tabulate(profile: Profile, *, spacing_mm: float | None = None, reference_mm: float | None = None) -> ErrorTable:
-    """Return the deviations at the points of a table, relative to the reference."""
+def tabulate(
+    profile: Profile,
+    *,
+    spacing_mm: float | None = None,
+    reference_mm: float | None = None,
+    active: ActiveTable | None = None,
+) -> ErrorTable:
+    """Return the deviations at the points of a table, relative to the reference, in sum with a table that was active during the test."""
     targets = profile.position_mm
-    reference = targets[0] if reference_mm is None else reference_mm
+    # Axes are referenced at their zero where they reach it.
+    reference = float(np.clip(0.0, targets[0], targets[-1])) if reference_mm is None else reference_mm
     if not targets[0] <= reference <= targets[-1]:
         raise ExportError(
             f"the reference {reference:g} mm is outside the measured {targets[0]:g} to {targets[-1]:g} mm; "
             "name a position between them with --reference"
         )
-    points = targets if spacing_mm is None else _grid(targets, spacing_mm)
-    weights = _weights(targets, points)
+    points = targets if active is None else np.union1d(targets, active.position_mm)
+    points = points if spacing_mm is None else _grid(points, spacing_mm)
+    # Beyond the targets nothing is known: what the ends show is held.
+    inside = np.clip(points, targets[0], targets[-1])
+    weights = _weights(targets, inside)
     # Of the table itself, not of the profile: where the axis is referenced, nothing may jump.
     at_reference = (_weights(points, np.array([reference])) @ weights)[0]
     deviation = profile.deviation_um @ weights.T - profile.deviation_um[0] @ at_reference
-    _, since, until = _segments(targets, points)
+    _, since, until = _segments(targets, inside)
     # The variance between the targets.
     bridge = path_variance(profile) * np.abs(since * until) / (since + until)
     return ErrorTable(
         points,
-        deviation,
+        deviation if active is None else deviation + active.at(points),
         np.sqrt(_relative_variance(profile, weights, at_reference) + bridge),
-        float(reference),
+        reference,
         float(np.diff(targets).max()),
         resampled=spacing_mm is not None,
+        active=active,
     )
 
 
@@ -172,19 +223,18 @@ def path_variance(profile: Profile) -> float:
 
 
 def _grid(targets: Array, spacing_mm: float) -> Array:
-    """Return equally spaced points from the first target to the last or just behind it."""
+    """Return equally spaced points from the first target to the last, so far apart at most."""
     length = float(targets[-1] - targets[0])
     if not 0.0 < spacing_mm <= length:
         raise ExportError(
             f"--spacing {spacing_mm:g} mm does not suit targets from {targets[0]:g} to {targets[-1]:g} mm; "
             f"write a spacing above 0 and up to {length:g} mm"
         )
-    steps = math.ceil(length / spacing_mm - 1e-9)
-    return targets[0] + spacing_mm * np.arange(steps + 1)
+    return np.asarray(np.linspace(targets[0], targets[-1], math.ceil(length / spacing_mm - 1e-9) + 1), float)
 
 
 def _segments(targets: Array, points: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """Return the target before each point, the distance from it, and the distance to the target behind; the last segment has no end."""
+    """Return the target before each point, the distance from it, and the distance to the target behind."""
     before = np.clip(np.searchsorted(targets, points, side="right") - 1, 0, targets.size - 2)
     return before, points - targets[before], targets[before + 1] - points
 
@@ -212,10 +262,6 @@ def _relative_variance(profile: Profile, weights: Array, at_reference: Array) ->
     return np.maximum(np.array(variances), 0.0)
 
 
-#: Maximum number of points per joint that LinuxCNC reads.
-_LINUXCNC_POINTS = 256
-
-
 @dataclass(frozen=True)
 class Control:
     """A control, or a program that loads tables into controls.
@@ -227,6 +273,9 @@ class Control:
     file_name : name of the file; ``{axis}`` is replaced by the axis
     sign : sign convention, a sentence
     comment : what begins a comment; empty where its dialect has none, so that the header goes into a file of its own
+    loading : what the control needs besides the file, a sentence
+    read : returns the points (m,), mm, and deviations (2, m), mm, of a table's text; a ValueError says why it is none
+    most_points : maximum number of points
     equal_spacing : whether the points must be equally spaced
     names_axis : whether the axis is named in the table
     one_table : whether it knows one table for both approaches
@@ -236,7 +285,10 @@ class Control:
     write: Callable[[ErrorTable, str, Sequence[str]], str]
     file_name: str
     sign: str
+    loading: str
+    read: Callable[[str], tuple[Array, Array]]
     comment: str = ""
+    most_points: int | None = None
     equal_spacing: bool = False
     names_axis: bool = True
     one_table: bool = False
@@ -244,12 +296,30 @@ class Control:
 
 def linuxcnc(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
     """Return a COMP_FILE of type 0: triplets of nominal, and true position by the forward and by the reverse approach, in mm."""
-    if table.position_mm.size > _LINUXCNC_POINTS:
-        raise ExportError(
-            f"{table.position_mm.size} points; LinuxCNC reads at most {_LINUXCNC_POINTS} per joint, choose a wider --spacing"
-        )
-    rows = [f"{at:.4f} {at + forward:.6f} {at + reverse:.6f}" for at, forward, reverse in _rows_mm(table)]
+    rows = [f"{at:.6f} {at + forward:.6f} {at + reverse:.6f}" for at, forward, reverse in _rows_mm(table)]
     return "\n".join(rows) + "\n"
+
+
+def read_linuxcnc(text: str) -> tuple[Array, Array]:
+    """Read a COMP_FILE of type 0 up to the first line that is no triplet, as the control does."""
+    rows: list[list[float]] = []
+    for line in text.splitlines():
+        try:
+            rows.append([float(word) for word in line.split()[:3]])
+        except ValueError:
+            break
+        if len(rows[-1]) < 3:
+            rows.pop()
+            break
+    if not rows:
+        raise ValueError("its first line holds no three numbers")
+    at, forward, reverse = np.array(rows).T
+    # Type 1 holds corrections, which are small, in place of positions.
+    if np.abs(forward - at).max() > np.abs(forward).max():
+        raise ValueError(
+            "it is of COMP_FILE_TYPE 1; write position, position - correction forward and backward (type 0)"
+        )
+    return at, np.array([forward - at, reverse - at])
 
 
 def siemens840d(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
@@ -261,9 +331,8 @@ def siemens840d(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
         *(f"; {line}" for line in header),
         f"; the mean reversal error belongs into MD32450 $MA_BACKLASH: {-table.reversal_um() * 1e-3:+.6f} mm on top of the value that was "
         "active (positive: the encoder leads the machine part)",
-        "; the table can be loaded while MD32700 $MA_ENC_COMP_ENABLE is 0",
         "CHANDATA(1)",
-        f"$AA_ENC_COMP_STEP[0,{axis}]={_spacing(table):.4f}",
+        f"$AA_ENC_COMP_STEP[0,{axis}]={_spacing(table):.6f}",
         f"$AA_ENC_COMP_MIN[0,{axis}]={table.position_mm[0]:.4f}",
         f"$AA_ENC_COMP_MAX[0,{axis}]={table.position_mm[-1]:.4f}",
         f"$AA_ENC_COMP_IS_MODULO[0,{axis}]=0",
@@ -271,6 +340,20 @@ def siemens840d(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
         "M17",
     ]
     return "\n".join(lines) + "\n"
+
+
+def read_siemens840d(text: str) -> tuple[Array, Array]:
+    """Read $AA_ENC_COMP of one axis, the same for both approaches; the backlash is no part of it."""
+    values = {
+        int(at): float(value) for at, value in re.findall(r"^\$AA_ENC_COMP\[\d+,(\d+),\w+\]\s*=\s*(\S+)", text, re.M)
+    }
+    step, low = (re.search(rf"^\$AA_ENC_COMP_{name}\[[^]]*\]\s*=\s*(\S+)", text, re.M) for name in ("STEP", "MIN"))
+    if not values or step is None or low is None:
+        raise ValueError("it holds no $AA_ENC_COMP with $AA_ENC_COMP_STEP and $AA_ENC_COMP_MIN")
+    at = np.asarray(float(low[1]) + float(step[1]) * np.arange(max(values) + 1), float)
+    # What is not written is zero in the control.
+    one = np.array([values.get(k, 0.0) for k in range(at.size)])
+    return at, np.array([one, one])
 
 
 def heidenhain(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
@@ -283,19 +366,16 @@ def heidenhain(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
     return "\n".join([f"BEGIN AXIS_{axis}.COM MM", head, *rows, "[END]"]) + "\n"
 
 
-def renishaw(table: ErrorTable, axis: str, header: Sequence[str]) -> str:
-    """Return a table of deviations (um) with spacing, start and end (mm), forward and reverse."""
-    lines = [
-        f"Compensation start {table.position_mm[0]:.4f}",
-        f"Compensation end {table.position_mm[-1]:.4f}",
-        f"Compensation spacing {_spacing(table):.4f}",
-        "No. Position Forward Reverse",
-        *(
-            f"{number} {at:.4f} {forward * 1e3:.3f} {reverse * 1e3:.3f}"
-            for number, (at, forward, reverse) in enumerate(_rows_mm(table), start=1)
-        ),
-    ]
-    return "\n".join(lines) + "\n"
+def read_heidenhain(text: str) -> tuple[Array, Array]:
+    """Read a table with AXISPOS and BACKLASH: the column of the axis forwards, BACKLASH backwards."""
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    head = next((line for line in lines if "AXISPOS" in line), [])
+    axis = [k for k, name in enumerate(head) if name not in ("NR", "AXISPOS", "BACKLASH")]
+    if len(axis) != 1 or "BACKLASH" not in head:
+        raise ValueError("it has no line NR AXISPOS BACKLASH and one axis")
+    rows = [line for line in lines[lines.index(head) + 1 :] if len(line) == len(head)]
+    table = np.array([[float(word) for word in line] for line in rows]).reshape(-1, len(head)).T
+    return table[head.index("AXISPOS")], table[[axis[0], head.index("BACKLASH")]]
 
 
 #: Controls by the name of their format.
@@ -306,6 +386,9 @@ CONTROLS = {
         "compensation_{axis}.comp",
         "columns are the programmed position and the position really reached by the forward and by the reverse approach; the control "
         "subtracts really reached minus programmed from the command",
+        "[JOINT_n] of the ini file names it as COMP_FILE with COMP_FILE_TYPE = 0",
+        read_linuxcnc,
+        most_points=256,
         names_axis=False,
     ),
     "siemens840d": Control(
@@ -314,6 +397,10 @@ CONTROLS = {
         "compensation_{axis}.MPF",
         "a value is the measured deviation and is added to the actual position, so that a positive value moves the axis in negative "
         "direction",
+        "the axis is the machine axis (MD10000, such as X1); index 0 is its first measuring system, an axis on its second one (as often a "
+        "linear scale) needs 1 in place of 0; MD38000 $MA_MM_ENC_COMP_MAX_POINTS has to allow all points before; the table can be loaded "
+        "while MD32700 $MA_ENC_COMP_ENABLE is 0",
+        read_siemens840d,
         comment=";",
         equal_spacing=True,
         one_table=True,
@@ -323,14 +410,10 @@ CONTROLS = {
         heidenhain,
         "AXIS_{axis}.COM",
         "a value is the measured deviation, in the column of the axis by the positive approach and in BACKLASH by the negative approach",
-    ),
-    "renishaw": Control(
-        "Renishaw error compensation, absolute values",
-        renishaw,
-        "compensation_{axis}.ren",
-        "a value is the measured deviation (error, not correction), absolute from the start",
-        equal_spacing=True,
-        names_axis=False,
+        "the control uses it where its table of active corrections (.CMA) names it for the axis; columns are those of the MANUALplus 620, "
+        "controls up to the iTNC 530 expect others (DATUM, DISTANCE)",
+        read_heidenhain,
+        most_points=256,
     ),
 }  # fmt: skip
 
@@ -398,6 +481,7 @@ class Origin:
     Attributes
     ----------
     active : the compensation during the test
+    campaign_file : the campaign file as seen from the results folder; empty where it is not noted
     verdict : verdict of the closed loop
     """
 
@@ -408,11 +492,13 @@ class Origin:
     verdict: str
     state: ThermalState
     results_sha256: str
+    campaign_file: str = ""
 
 
 def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
     """Return where a table comes from."""
-    stated = _parameters(folder / "provenance.json")
+    provenance = _provenance(folder / "provenance.json")
+    stated = {name: table for name, table in provenance["parameters"].items() if isinstance(table, dict)}
     report = stated.get("report", {})
     serial = report.get("machine_serial_number")
     return Origin(
@@ -423,7 +509,45 @@ def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
         verdict=say("verdict_word", results.loop) if results.loop is not None else "",
         state=state,
         results_sha256=file_sha256(folder / "results.json"),
+        campaign_file=str(provenance.get("campaign_file") or ""),
     )
+
+
+#: What a campaign states where no table was active.
+_NOT_ACTIVE = ("none", "no", "off", "inactive", "not active")
+
+
+def read_active(
+    folder: Path, control: Control, origin: Origin, given: str | None
+) -> tuple[ActiveTable | None, list[str]]:
+    """Return the table that was active during a test, and why it is not known.
+
+    `given` is "none", or the file in the format of the control; None: what the campaign states, of which a file lies beside it.
+    """
+    stated = (origin.active if given is None else given).strip()
+    if stated.casefold() in _NOT_ACTIVE:
+        return None, []
+    beside = (folder / origin.campaign_file).parent / stated if origin.campaign_file else None
+    path = Path(stated) if given is not None else beside
+    if not stated or path is None or not os.path.isfile(path):  # noqa: PTH113 - words are too long a name for a file
+        if given is not None:
+            raise ExportError(
+                f'--active: there is no file {stated}; name the table that was active during the test, or write "none"'
+            )
+        said = f'[report] machine_compensation is "{stated}"' if stated else "the campaign does not say it"
+        return None, [
+            f"it is not known whether a table was active during the test ({said}): add --active none, or --active FILE with the table that "
+            f"was active, in the format of {control.words}, to which what was measured is added"
+        ]
+    try:
+        position, deviation = control.read(path.read_text(encoding="utf-8"))
+        if position.size < 2 or not (np.isfinite(deviation).all() and (np.diff(position) > 0.0).all()):
+            raise ValueError("it needs two points or more, positions that increase, and numbers")
+    except (OSError, ValueError) as reason:
+        raise ExportError(
+            f"{path}: is no table of {control.words} ({reason}); name the table as the control reads it"
+        ) from None
+    return ActiveTable(path.name, position, deviation * 1e3), []
 
 
 def header_lines(origin: Origin, **facts: Any) -> list[str]:
@@ -434,13 +558,13 @@ def header_lines(origin: Origin, **facts: Any) -> list[str]:
     return [one_line(line) for line in text.splitlines() if line]
 
 
-def _parameters(path: Path) -> Mapping[str, Any]:
-    """Return the tables of the campaign as the provenance of a run states it; empty where the file is absent."""
+def _provenance(path: Path) -> dict[str, Any]:
+    """Return the provenance of a run; without a campaign where the file is absent."""
     if not path.is_file():
-        return {}
+        return {"parameters": {}}
     try:
-        stated = json.loads(path.read_text(encoding="utf-8")).get("parameters", {})
-        return {name: table for name, table in stated.items() if isinstance(table, dict)}
+        stated = json.loads(path.read_text(encoding="utf-8"))
+        return {**stated, "parameters": dict(stated.get("parameters", {}))}
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedProductError(
             f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"

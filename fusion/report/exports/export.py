@@ -31,6 +31,7 @@ from fusion.report.exports.controls import (
     header_lines,
     objections_to_model,
     path_variance,
+    read_active,
     read_origin,
     read_profile,
     read_scatter_and_drift,
@@ -41,7 +42,7 @@ from fusion.report.exports.controls import (
 from fusion.report.wording import sentences
 from fusion.results.axis import AnomalyPart
 from fusion.results.loop import RecordLoop
-from fusion.results.parts import PREDICTION_ENDING, Quantity, TablePrediction
+from fusion.results.parts import PREDICTION_ENDING, ByDirection, Quantity, TablePrediction
 from fusion.results.results import Results, read_results
 from fusion.results.store import file_sha256, has, read_product, write_atomically
 from interferometry.iso230 import STANDARD_CYCLES
@@ -92,7 +93,6 @@ class Prediction:
 
 def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Prediction:
     """Predict what a control leaves that interpolates linearly between the points of a table."""
-    inside = table.position_mm <= profile.position_mm[-1]
     relative = profile.deviation_um - np.interp(table.reference_mm, profile.position_mm, profile.deviation_um[0])
     left = remainder_um(profile, table, one_table=one_table)
     size = left.size
@@ -103,8 +103,8 @@ def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Predicti
         before_um=float(np.ptp(profile.deviation_um)),
         after_um=float(np.median(np.ptp(draws, axis=1))),
         own_um=float(np.ptp(left)),
-        resampling_um=float(np.abs(relative - _at_targets(profile, table)).max()),
-        value_u_um=float(table.u_um[:, inside].max()),
+        resampling_um=float(np.abs(relative - table.added_um(profile.position_mm, one_table=False)).max()),
+        value_u_um=float(table.u_um.max()),
     )
 
 
@@ -141,16 +141,7 @@ def predict_test(
 
 def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Array:
     """Return what a table leaves of a profile at the targets (2, n), up to a constant."""
-    applied = _at_targets(profile, table)
-    if one_table:
-        half = table.reversal_um() / 2.0
-        applied = applied.mean(axis=0) + np.array([[half], [-half]])
-    return profile.deviation_um - applied
-
-
-def _at_targets(profile: Profile, table: ErrorTable) -> Array:
-    """Return what a table corrects at the targets (2, n), on straight lines between its points."""
-    return np.array([np.interp(profile.position_mm, table.position_mm, values) for values in table.deviation_um])
+    return profile.deviation_um - table.added_um(profile.position_mm, one_table=one_table)
 
 
 #: Setting data that follow a temperature.
@@ -185,6 +176,7 @@ def export_results(
     axis: str | None = None,
     spacing_mm: float | None = None,
     reference_mm: float | None = None,
+    active: str | None = None,
     sampling_s: float = 1.0,
     reduced: bool = False,
     fields: bool = False,
@@ -197,7 +189,7 @@ def export_results(
     ----------
     results : str or Path
         Folder of a finished run.
-    format : {"csv", "xlsx", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw", "model-json", "model-c", \
+    format : {"csv", "xlsx", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "model-json", "model-c", \
 "model-st", "model-linuxcnc"}
         Tables, a workbook, or a control; ``siemens840d-temperature`` is the part of the drift that follows the material temperature. The
         model of a record's drift as JSON, as a header in C, in Structured Text, or as a HAL component.
@@ -206,9 +198,12 @@ def export_results(
     axis : str, optional
         Name of the axis in the control. None: the axis of the campaign.
     spacing_mm : float, optional
-        Distance of the table's points. None: the targets themselves.
+        Largest distance of the table's equally spaced points. None: the targets themselves, and the points of an active table.
     reference_mm : float, optional
-        Position at which the correction is zero. None: the first target.
+        Position at which the correction is zero. None: 0 mm, or the target nearest to it.
+    active : str, optional
+        The table that was active during the test, a file in the format of the control, or "none": what was measured is added to it. None:
+        as the campaign states it as ``machine_compensation`` of ``[report]``.
     sampling_s : float
         Time from one step of a model to the next, s.
     reduced : bool
@@ -230,7 +225,8 @@ def export_results(
     ------
     ExportError
         If the folder holds no results, a file exists, the positions do not suit the control, or something speaks against a compensation
-        table: a verdict other than complete or explained, a doubted input, a position that moves unlike the others.
+        table: a verdict other than complete or explained, a doubted input, a position that moves unlike the others, or that it is not
+        known whether a table was active during the test.
 
     Notes
     -----
@@ -265,7 +261,7 @@ def export_results(
             texts, notes = (
                 _temperature_text(run, axis, reference_mm, force=force)
                 if format == TEMPERATURE_FORMAT
-                else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, force=force)
+                else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, active, force=force)
             )
         content = {name: partial(Path.write_text, data=text, encoding="ascii") for name, text in texts.items()}
     return Exported(_write(Path(out), content, overwrite=overwrite), tuple(notes))
@@ -293,12 +289,24 @@ def _read_run(folder: Path, results: Results) -> _Run:
 
 
 def _table_texts(
-    run: _Run, control: Control, axis: str | None, spacing_mm: float | None, reference_mm: float | None, *, force: bool
+    run: _Run,
+    control: Control,
+    axis: str | None,
+    spacing_mm: float | None,
+    reference_mm: float | None,
+    given: str | None,
+    *,
+    force: bool,
 ) -> tuple[dict[str, str], list[str]]:
     """Return the files of a control's table by name, and what to tell the user."""
-    against = _judge(objections(run.results), force=force)
+    active, unknown = read_active(run.folder, control, run.origin, given)
+    against = _judge([*objections(run.results), *unknown], force=force)
     profile = read_profile(run.deviations)
-    table = tabulate(profile, spacing_mm=spacing_mm, reference_mm=reference_mm)
+    table = tabulate(profile, spacing_mm=spacing_mm, reference_mm=reference_mm, active=active)
+    if control.most_points is not None and table.position_mm.size > control.most_points:
+        raise ExportError(
+            f"{table.position_mm.size} points; {control.words} reads at most {control.most_points}, choose a wider --spacing"
+        )
     if control.equal_spacing and table.spacing_mm() is None:
         distances = sorted({round(float(step), 4) for step in table.position_mm[1:] - table.position_mm[:-1]})
         raise ExportError(
@@ -307,6 +315,7 @@ def _table_texts(
         )
     name = _axis_name(run, axis, needed=control.names_axis)
     facts: dict[str, Any] = {"words": control.words, "axis": name, "table": table, "sign": control.sign}
+    facts |= {"loading": control.loading, "unknown": unknown}
     facts["prediction"] = predict(profile, table, one_table=control.one_table)
     facts["with_table"] = run.results.iso230.with_table if run.results.iso230 else None
     facts["between_um"] = (path_variance(profile) * table.widest_gap_mm / 4.0) ** 0.5
@@ -323,11 +332,14 @@ def _prediction_text(run: _Run, profile: Profile, table: ErrorTable, control: Co
     """Return what a test with the table is predicted to show, for ``thermofuse compare --applied``."""
     iso = run.results.iso230
     cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
+    forward, reverse = table.added_um(table.position_mm, one_table=control.one_table).tolist()
     prediction = TablePrediction(
         table=file,
         campaign=run.results.campaign,
         results_sha256=run.origin.results_sha256,
         cycles=cycles,
+        position_mm=tuple(table.position_mm.tolist()),
+        correction_um=ByDirection(positive=tuple(forward), negative=tuple(reverse)),
         predicted_um=predict_test(
             profile,
             table,
@@ -349,7 +361,8 @@ def _temperature_text(
         raise ExportError(
             f"{run.folder}: no material temperature was logged; a temperature line needs one ([interferometry] environment)"
         )
-    reference = float(run.deviations["position"].min()) if reference_mm is None else reference_mm
+    targets = run.deviations["position"].values
+    reference = float(np.clip(0.0, targets.min(), targets.max())) if reference_mm is None else reference_mm
     line = fit_temperature_line(run.deviations, material, reference_mm=reference)
     against = _judge([*objections(run.results), *line.objections()], force=force)
     name = _axis_name(run, axis, needed=True)

@@ -19,7 +19,7 @@ from fusion.analysis.comparison import (
     compare_scatters,
 )
 from fusion.pipeline.compare import compare_campaigns
-from fusion.results.parts import PREDICTION_ENDING, Quantity, TablePrediction
+from fusion.results.parts import PREDICTION_ENDING, ByDirection, Quantity, TablePrediction
 from fusion.results.results import ResultsError
 from fusion.results.store import file_sha256
 from tests.fusion.compared_tests import REPAIRED_MM, drift_of, readings_of, repaired, write_results
@@ -396,6 +396,7 @@ def test_achieved_is_held_against_what_a_table_was_predicted_to_leave(tmp_path: 
     def predict(folder: Path) -> None:
         prediction = TablePrediction(
             table=table.name, campaign="", results_sha256=file_sha256(folder / "results.json"), cycles=5,
+            position_mm=(0.0, 400.0), correction_um=ByDirection(positive=(0.0, 0.0), negative=(0.0, 0.0)),
             predicted_um={"A": Quantity(value=2.0, u=1.0)},
         )  # fmt: skip
         table.with_name(table.name + PREDICTION_ENDING).write_text(prediction.model_dump_json())

@@ -59,6 +59,7 @@ def write_run(folder: Path, deviations: xr.Dataset, *, axis: str = "X", **change
     provenance = {
         "parameters": {"campaign": {"axis": axis}, "report": {"machine": "Mill 5", "machine_serial_number": "77"}}
     }
+    provenance["parameters"]["report"]["machine_compensation"] = "none"
     (folder / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
     return folder
 

@@ -8,11 +8,14 @@ import pytest
 
 from fusion.report.exports.controls import (
     CONTROLS,
+    ErrorTable,
     ExportError,
+    Origin,
     Profile,
+    ThermalState,
     fit_temperature_line,
-    linuxcnc,
     path_variance,
+    read_active,
     read_profile,
     siemens840d,
     siemens_temperature,
@@ -64,21 +67,10 @@ def heidenhain_corrects(text: str) -> Corrector:
     return lambda approach, at: -1e3 * np.interp(at, table[:, 1], table[:, 3 - approach])
 
 
-def renishaw_corrects(text: str) -> Corrector:
-    """The error is taken off."""
-    start, end, spacing, _, *rows = text.splitlines()
-    table = np.array([[float(word) for word in row.split()] for row in rows])
-    first, last, step = (float(line.split()[-1]) for line in (start, end, spacing))
-    points = np.arange(first, last + step / 2, step)
-    np.testing.assert_allclose(table[:, 1], points)
-    return lambda approach, at: -np.interp(at, points, table[:, 2 + approach])
-
-
 READERS = {
     "linuxcnc": linuxcnc_corrects,
     "siemens840d": siemens_corrects,
     "heidenhain": heidenhain_corrects,
-    "renishaw": renishaw_corrects,
 }
 
 
@@ -104,14 +96,73 @@ def test_the_control_leaves_what_is_predicted(name, spacing, reference):
     assert at_reference == pytest.approx(0.0, abs=ROUNDING_UM if not control.one_table else 0.6)
 
 
-def test_comments_and_areas_of_siemens_and_the_most_points_of_linuxcnc():
+def test_comments_and_areas_of_siemens():
     table = tabulate(PROFILE, spacing_mm=15.0)
     text = siemens840d(table, "AX3", ["first", "second"])
     assert text.splitlines()[:3] == ["%_N_AX3_EEC_INI", "; first", "; second"]
     code = [line for line in text.splitlines()[1:] if not line.startswith(";")]
     assert code[0] == "CHANDATA(1)" and all(line.startswith("$AA_ENC_COMP") for line in code[1:-1])
-    with pytest.raises(ExportError, match="1051 points; LinuxCNC reads at most 256 per joint, choose a wider"):
-        linuxcnc(tabulate(PROFILE, spacing_mm=0.1), "", [])
+
+
+def origin_of(active: str, campaign_file: str = "") -> Origin:
+    state = ThermalState(None, None, (1, 5), {})
+    return Origin("X axis", "", "X", active, "complete", state, "0" * 64, campaign_file)
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("spacing", [None, 15.0])
+def test_what_was_measured_under_a_table_is_added_to_it(tmp_path, name, spacing):
+    """The axis errs by ERROR; a table of other points and range takes out something else; the sum brings it to zero."""
+    control, old = CONTROLS[name], np.arange(-35.0, 101.0, 15.0)
+    taken = np.array([np.sin(old / 17.0) + old / 40.0, np.sin(old / 17.0) + old / 40.0])
+    if not control.one_table:
+        taken[1] -= 0.4 * np.cos(old / 30.0)
+    if control.equal_spacing and spacing is None:
+        pytest.skip("this control needs equally spaced points")
+    before = ErrorTable(old, taken, np.zeros((2, old.size)), 0.0, 15.0)
+    (tmp_path / "old.txt").write_text(control.write(before, "X1", []), encoding="ascii")
+    active, unknown = read_active(tmp_path, control, origin_of("old table"), str(tmp_path / "old.txt"))
+    assert unknown == []
+    np.testing.assert_allclose(np.diff(active.at(old)), np.diff(taken), atol=2 * ROUNDING_UM)
+    correct_before = READERS[name](control.write(before, "X1", []))
+    measured = ERROR + np.array([correct_before(approach, POSITION) for approach in range(2)])
+    if control.one_table:  # the backlash of the old table is not in the file
+        measured = ERROR + np.array([correct_before(0, POSITION)] * 2)
+    profile = Profile(POSITION, measured, np.zeros((2, 5, 2, 5)))
+    table = tabulate(profile, spacing_mm=spacing, active=active)
+    correct = READERS[name](control.write(table, "X1", []))
+    left = ERROR + np.array([correct(approach, POSITION) for approach in range(2)])
+    predicted = np.ptp(remainder_um(profile, table, one_table=control.one_table))
+    assert np.ptp(left) == pytest.approx(predicted, abs=2 * ROUNDING_UM)
+    if spacing is None:
+        # Every point of the old table is kept, also beyond the targets, where what the ends show is held.
+        assert np.ptp(left) < 2 * ROUNDING_UM and set(old) < set(table.position_mm)
+        beyond = correct(0, np.array([100.0])) - correct_before(0, np.array([100.0]))
+        assert beyond == pytest.approx(correct(0, POSITION[-1:]) - correct_before(0, POSITION[-1:]), abs=ROUNDING_UM)
+
+
+def test_a_table_that_may_have_been_active_is_asked_for(tmp_path):
+    control = CONTROLS["linuxcnc"]
+    for active, given in (("none", None), ("COMP_FILE x.comp", "none"), ("", " None ")):
+        assert read_active(tmp_path, control, origin_of(active), given) == (None, [])
+    for active, said in (("", "the campaign does not say it"), ("old one", 'machine_compensation is "old one"')):
+        none, (unknown,) = read_active(tmp_path, control, origin_of(active, "../c.toml"), None)
+        assert none is None and said in unknown and "--active FILE" in unknown
+    (tmp_path / "r").mkdir()
+    (tmp_path / "x.comp").write_text("0 0.001 0.002\n10 10.003 10.001\n[comment]\n20 99 99\n")
+    found, unknown = read_active(tmp_path / "r", control, origin_of("x.comp", "../c.toml"), None)
+    assert unknown == [] and found.name == "x.comp"
+    np.testing.assert_allclose(found.at(np.array([0.0, 5.0, 15.0])), [[1.0, 2.0, 3.0], [2.0, 1.5, 1.0]])
+    with pytest.raises(ExportError, match=r"there is no file y.comp; name the table"):
+        read_active(tmp_path, control, origin_of("none"), "y.comp")
+    for text, why in (
+        ("a", "no three numbers"),
+        ("0 0.1 0.1\n90 0.2 0.2", "COMP_FILE_TYPE 1"),
+        ("1 1 1", "two points"),
+    ):
+        (tmp_path / "bad").write_text(text)
+        with pytest.raises(ExportError, match=f"bad: is no table of LinuxCNC.*{why}"):
+            read_active(tmp_path, control, origin_of("none"), str(tmp_path / "bad"))
 
 
 def profile_of(position_mm: np.ndarray, values_um: np.ndarray, u_um: float = 0.0) -> Profile:
@@ -140,16 +191,16 @@ def test_targets_in_any_order_are_sorted(small_run):
     np.testing.assert_array_equal(found.covariance_um2, expected.covariance_um2)
 
 
-def test_resampling_is_linear_and_covers_the_last_target():
+def test_resampling_is_linear_and_ends_at_the_last_target():
     position = np.array([0.0, 26.0, 48.0, 77.0])
     profile = profile_of(position, np.array([0.0, 2.0, 5.0, 4.0]))
     table = tabulate(profile, spacing_mm=20.0, reference_mm=40.0)
-    at_zero = np.interp(40.0, position, [0, 2, 5, 4])
-    np.testing.assert_allclose(table.position_mm, [0, 20, 40, 60, 80])
-    assert table.spacing_mm() == pytest.approx(20.0) and table.resampled
-    np.testing.assert_allclose(table.deviation_um[0, :4], np.interp([0, 20, 40, 60], position, [0, 2, 5, 4]) - at_zero)
-    # Behind the last target the last straight line goes on, so that the table meets the profile there.
-    assert np.interp(77.0, table.position_mm, table.deviation_um[0]) == pytest.approx(4.0 - at_zero)
+    at_zero = np.interp(40.0, table.position_mm, np.interp(table.position_mm, position, [0, 2, 5, 4]))
+    # 20 mm do not divide 77 mm: four equal parts, and nothing beyond what was measured.
+    np.testing.assert_allclose(table.position_mm, [0, 19.25, 38.5, 57.75, 77])
+    assert table.spacing_mm() == pytest.approx(19.25) and table.resampled
+    expected = np.interp(table.position_mm, position, [0, 2, 5, 4]) - at_zero
+    np.testing.assert_allclose(table.deviation_um[0], expected, atol=1e-12)
     np.testing.assert_allclose(table.deviation_um[0] - table.deviation_um[1], 1.0)
     # Where the axis is referenced nothing jumps, also between two points of the table.
     between = tabulate(profile, spacing_mm=20.0, reference_mm=48.0)

@@ -66,11 +66,10 @@ def test_csv_holds_every_number_as_it_was_computed(small_run, tmp_path):
         ("siemens840d", ["compensation_X.MPF", "compensation_X.MPF.prediction.json"]),
         ("siemens840d-temperature", ["temperature_X.MPF"]),
         ("heidenhain", ["AXIS_X.COM.README.txt", "AXIS_X.COM", "AXIS_X.COM.prediction.json"]),
-        ("renishaw", ["compensation_X.ren.README.txt", "compensation_X.ren", "compensation_X.ren.prediction.json"]),
     ],
 )
 def test_nothing_is_overwritten_in_silence(small_run, tmp_path, format, names):
-    options = {"spacing_mm": 20.0} if format in ("siemens840d", "renishaw") else {}
+    options = {"spacing_mm": 20.0} if format == "siemens840d" else {}
     written = export_results(small_run, format, tmp_path, **options)
     assert sorted(path.name for path in written.files) == sorted(names)
     if format != "xlsx":
@@ -91,7 +90,10 @@ def test_unequal_targets_need_a_spacing(small_run, tmp_path):
     assert not list(tmp_path.iterdir())
     table = export_results(small_run, "siemens840d", tmp_path, spacing_mm=20.0, axis="X1").files[0]
     text = table.read_text(encoding="ascii")
-    assert "[0,X1]=20.0000" in text and "resampled every 20 mm" in text and "; axis: X1" in text
+    # 20 mm do not divide 175 mm: nine equal parts.
+    assert "[0,X1]=19.444444" in text and "resampled every 19.4444 mm" in text and "; axis: X1" in text
+    with pytest.raises(ExportError, match="701 points; LinuxCNC, COMP_FILE_TYPE 0 reads at most 256, choose a wider"):
+        export_results(small_run, "linuxcnc", tmp_path / "fine", spacing_mm=0.25)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,7 @@ def unexplained(tmp_path_factory):
     return write_run(tmp_path_factory.mktemp("unexplained"), even, axis="X axis; M30", loop=loop)
 
 
-@pytest.mark.parametrize("format", ["linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "renishaw"])
+@pytest.mark.parametrize("format", ["linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain"])
 def test_the_guard_refuses_and_a_forced_table_says_why(unexplained, tmp_path, format):
     with pytest.raises(ExportError, match=r"no compensation is written: the verdict is unexplained: .* add"):
         export_results(unexplained, format, tmp_path, axis="X")
@@ -136,6 +138,32 @@ def test_what_a_table_is_predicted_to_leave_is_stored_beside_it(small_run, tmp_p
     assert 0.3 < values["E"] < 3.0 and values["M"] < values["E"] and values["B"] < 0.2
     assert values["A"] > values["E"] + 4 * 0.05
     assert 0.2 < prediction.predicted_um["E"].u < 2.0
+
+
+def test_what_was_measured_is_added_to_the_table_that_was_active(small_run, tmp_path):
+    """The table of the test, loaded before another one with the same readings: the second is twice the first, and adds once."""
+    first = export_results(small_run, "linuxcnc", tmp_path / "a").files[0]
+    second = export_results(small_run, "linuxcnc", tmp_path / "b", active=str(first)).files[0]
+    one, two = (np.loadtxt(path) for path in (first, second))
+    np.testing.assert_allclose(two[:, 1:] - two[:, :1], 2.0 * (one[:, 1:] - one[:, :1]), atol=2e-6)
+    readme = second.with_name(f"{second.name}.README.txt").read_text()
+    assert "sum of compensation_X.comp, which was active" in readme and "No table was active" not in readme
+    assert "No table was active during the test" in first.with_name(f"{first.name}.README.txt").read_text()
+    added, alone = (read_table_prediction(path) for path in (second, first))
+    np.testing.assert_allclose(added.correction_um.positive, alone.correction_um.positive, atol=2e-3)
+    assert added.predicted_um["E"].value == pytest.approx(alone.predicted_um["E"].value, abs=5e-3)
+    with pytest.raises(ExportError, match=r"--active: there is no file other.comp"):
+        export_results(small_run, "linuxcnc", tmp_path / "c", active="other.comp")
+
+
+def test_a_table_is_refused_where_one_may_have_been_active(small_run, tmp_path):
+    run = shutil.copytree(small_run, tmp_path / "run")
+    (run / "provenance.json").write_text('{"parameters": {"campaign": {"axis": "X"}, "report": {}}}')
+    with pytest.raises(ExportError, match=r"not known whether a table was active during the test .* add --active none"):
+        export_results(run, "linuxcnc", tmp_path / "a")
+    forced = export_results(run, "linuxcnc", tmp_path / "a", force=True)
+    assert "load this one alone only if none was" in forced.files[-1].read_text() + forced.files[1].read_text()
+    assert len(export_results(run, "linuxcnc", tmp_path / "b", active="none").files) == 3
 
 
 def test_a_prediction_that_is_missing_or_damaged_says_what_to_do(tmp_path):
