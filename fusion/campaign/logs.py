@@ -72,11 +72,12 @@ _DECIMAL_COMMA = re.compile(r"\d,\d")
 #: A heading in quotes that goes on in the next line, as Excel's Alt+Enter writes it, and the most lines of such headings.
 _OPEN_HEADING = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
 _LONGEST_HEADER = 20
-#: Comma as a decimal mark, words, words with one space between them, and words up to a unit in brackets.
+#: Comma as a decimal mark, words, and words with one space between them.
 _COMMA_NUMBER = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-_WORDS, _APART, _TO_UNIT = (re.compile(one) for one in (r"\S+", r"\S+(?: \S+)*", r"[^\s\[(][^\[(]*[\[(][^\])]*[\])]"))
-#: How names may be parted by spaces, and values: words, those with AM or PM behind a time of day, and with the date before it.
-_NAMES = (_WORDS, _APART, _TO_UNIT)
+_WORDS, _APART = re.compile(r"\S+"), re.compile(r"\S+(?: \S+)*")
+#: How spaces part names (words, with a unit in brackets, up to one), and values (words, with AM or PM, and with the date before it).
+_UNIT = r"[\[(][^\])]*[\])]"
+_NAMES = (_WORDS, _APART, re.compile(rf"\S+(?: {_UNIT})?"), re.compile(rf"[^\s\[(][^\[(]*{_UNIT}"))
 _HALF = r"\d+:\d\d\S*(?: [AaPp]\.?[Mm]\.?)?|\S+"
 _VALUES = (_WORDS, re.compile(_HALF), re.compile(rf"(?:\d+[-/.]\d+[-/.]\d+ )?{_HALF}"))
 #: Lines with nothing but a rule.
@@ -440,7 +441,8 @@ def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRo
     for k, line in enumerate(lines):
         fields = told[k] if k in told else parts.findall(line)
         if fields is not None and len(fields) < width:
-            fields = placed(line, _WORDS)
+            # A line that ends before the last column may have lost any of its values.
+            fields = placed(line, _WORDS) if len(line.strip("\n")) > spans[-1][0] else None
         tabulated.append("\t".join(fields) + "\n" if fields else "\n" if _RULED.fullmatch(line) else line)
     return tabulated
 

@@ -579,7 +579,7 @@ def test_a_date_and_a_time_of_day_may_stand_below_one_name(
     assert propose_table(tmp_path / "log.txt").keys["time"] == time
 
 
-@pytest.mark.parametrize("heading", ["Time [s] T bed X", "Time T1", "Time T bed T air X\ns degC degC um"])
+@pytest.mark.parametrize("heading", ["Time [s] T bed T2 X", "Time T1", "Time T bed T air X\ns degC degC um"])
 def test_names_that_differ_in_number_from_their_values_are_refused(tmp_path: Path, heading: str) -> None:
     lines = [f"{60 * k} {20 + k / 100:.2f} {21 + k / 90:.2f} {k}.5" for k in range(60)]
     path = tmp_path / "log.txt"
