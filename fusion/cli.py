@@ -68,6 +68,9 @@ class ExportFormat(StrEnum):
 
     csv = "csv"
     xlsx = "xlsx"
+    png = "png"
+    gif = "gif"
+    mp4 = "mp4"
     linuxcnc = "linuxcnc"
     siemens840d = "siemens840d"
     siemens840d_temperature = "siemens840d-temperature"
@@ -705,7 +708,7 @@ def export(
     ] = False,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Export tables, a workbook, or a control's compensation.
+    """Export tables, a workbook, maps of every cycle as pictures or as a film, or a control's compensation.
 
     A compensation table is written where the drift is explained and the inputs are sound, with a header that says in which thermal
     state it holds and how to try it.

@@ -215,16 +215,18 @@ def _write_csv(path: Path, picture: xr.Dataset, low: float, high: float) -> None
     np.savetxt(path, within_range(picture).values, "%.3f", delimiter=",", header=head, encoding="utf-8")
 
 
-def _write_gif(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
+def write_gif(path: Path, pictures: Iterable[NDArray[np.uint8]], *, rate_Hz: float = _FILM_HZ) -> None:
+    """Write pictures (row, column, 3) of one size as an animated GIF."""
     first, *others = (Image.fromarray(each).quantize(dither=Image.Dither.NONE) for each in pictures)
-    first.save(path, save_all=True, append_images=others, duration=round(1000 / _FILM_HZ), loop=0)
+    first.save(path, save_all=True, append_images=others, duration=round(1000 / rate_Hz), loop=0)
 
 
-def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
+def write_mp4(path: Path, pictures: Iterable[NDArray[np.uint8]], *, rate_Hz: float = _FILM_HZ) -> None:
+    """Write pictures (row, column, 3) of one size as a film in VP9, which browsers and players show."""
     film: cv2.VideoWriter | None = None
     for each in pictures:
         if film is None:
-            film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), _FILM_HZ, (each.shape[1], each.shape[0]))
+            film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), rate_Hz, (each.shape[1], each.shape[0]))
             if not film.isOpened():
                 raise ThermographyError(f"{path}: this OpenCV writes no MP4; write gif")
         film.write(each[..., ::-1])
@@ -233,4 +235,4 @@ def _write_mp4(path: Path, pictures: Iterator[NDArray[np.uint8]]) -> None:
 
 
 _OF_FRAME: dict[str, Callable[..., None]] = {"png": _write_png, "tiff": _write_tiff, "csv": _write_csv}
-_OF_SERIES: dict[str, Callable[..., None]] = {"gif": _write_gif, "mp4": _write_mp4}
+_OF_SERIES: dict[str, Callable[..., None]] = {"gif": write_gif, "mp4": write_mp4}

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import xarray as xr
 
 from thermography.common import ThermographyError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
 
 #: Quantity of the fields -> label with its unit, and colour map.
 _QUANTITIES = {
@@ -25,7 +27,9 @@ _QUANTITIES = {
 def plot_field(
     fields: xr.Dataset, ax: Axes | None = None, *, cycle: int | None = None, quantity: str = "temperature_rise"
 ) -> Axes:
-    """Plot the field of one cycle on the table plan.
+    """Plot the field of one cycle on the table plan as the camera sees it, y downwards, with the measured line.
+
+    The colour scale is that of all cycles, so that pictures of several cycles can be compared.
 
     Parameters
     ----------
@@ -64,16 +68,36 @@ def plot_field(
     if number not in fields["cycle"].values:
         first, last = fields["cycle"].values[[0, -1]].tolist()
         raise ThermographyError(f"cycle={number} is none of the cycles {first} to {last}")
-    import matplotlib.pyplot as plt
-
     if ax is None:
+        import matplotlib.pyplot as plt
+
         ax = plt.subplots(figsize=(7.0, 2.8), layout="constrained")[1]
-    label, colours = _QUANTITIES[quantity]
-    field = fields[quantity].sel(cycle=number)
-    image = ax.pcolormesh(field["x"], field["y"], field, cmap=colours, shading="nearest")
-    ax.figure.colorbar(image, ax=ax, label=label, shrink=0.8)
-    unit = field["x"].attrs.get("units", "mm")
-    ax.set(xlabel=f"x / {unit}", ylabel=f"y / {unit}", title=f"cycle {number}", aspect="equal")
-    if unit == "px":  # a picture without a plan begins at its top
-        ax.invert_yaxis()
+    image = draw_field(fields, ax, number, quantity, field_scale(fields, quantity))
+    ax.figure.colorbar(image, ax=ax, label=_QUANTITIES[quantity][0], shrink=0.8)
+    unit = fields["x"].attrs.get("units", "mm")
+    ax.set(xlabel=f"x / {unit}", ylabel=f"y / {unit}", title=f"cycle {number}")
     return ax
+
+
+def field_scale(fields: xr.Dataset, quantity: str) -> tuple[float, float]:
+    """Return the values between which the colours of all cycles change, so that a single cell does not set them."""
+    values = fields[quantity].values
+    if not np.isfinite(values).any():
+        return 0.0, 1.0
+    low, high = np.nanquantile(values, (0.001, 0.999))
+    return float(low), float(high)
+
+
+def draw_field(fields: xr.Dataset, ax: Axes, cycle: int, quantity: str, scale: tuple[float, float]) -> AxesImage:
+    """Draw the field of a cycle without its scale, y downwards as the camera sees it, with the measured line and its targets."""
+    x, y = fields["x"].values, fields["y"].values
+    half = float(np.median(np.diff(x))) / 2 if x.size > 1 else 0.5
+    image = ax.imshow(
+        fields[quantity].sel(cycle=cycle), cmap=_QUANTITIES[quantity][1], vmin=scale[0], vmax=scale[1], interpolation="nearest",
+        extent=(x[0] - half, x[-1] + half, y[-1] + half, y[0] - half),
+    )  # fmt: skip
+    ax.set_facecolor("#e1e5e7")  # cells without a value are transparent
+    if "target_x" in fields:
+        for colour, width in (("black", 2.4), ("white", 1.0)):  # dark under light reads on every colour
+            ax.plot(fields["target_x"], fields["target_y"], "o-", color=colour, linewidth=width, markersize=2.0 * width)
+    return image

@@ -93,7 +93,7 @@ _PLACES = ("pixels", "fiducials")
 #: Heading of the files that the campaign file does not name.
 _NOT_USED = "# Files in this folder that are not used:"
 #: Kinds that no campaign reads.
-_NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE)
+_NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE, Kind.PRODUCT)
 #: Values above this are kelvins and no temperatures of a machine table in degC.
 _WARMEST_DEGC = 150.0
 #: The name of an axis as a word of its own, and the line of a header that holds it: its heading, or the channel of an ecmc log's targets.

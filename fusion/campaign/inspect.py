@@ -7,7 +7,7 @@ import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from errno import EINVAL, ENOENT
 from functools import cached_property
@@ -23,6 +23,7 @@ from fusion.campaign.values import column_unit, in_order, is_time
 from fusion.common import FusionError, TomlError, read_toml
 from fusion.messages import unforeseen
 from fusion.results.folder import MANIFEST
+from fusion.results.inspection import describe_product, is_product
 from fusion.results.numbers import duration, join, moment, print_unit
 from fusion.results.progress import Read, clock_notices, counted, left_out_notices, listed
 from interferometry.common import InterferometryError
@@ -376,6 +377,10 @@ def _warnings(table: Read) -> list[str]:
 class Kind(Enum):
     """Kinds of files, in the order in which a file is held against them."""
 
+    PRODUCT = FileKind(
+        "product of a run", lambda found: is_product(found.path), lambda path: path, lambda found: describe_product(found.path),
+        unused=", no input of a campaign",
+    )  # fmt: skip
     # A name of a package, as fusion.load_campaign, loads what it needs when it is called: pydantic, xarray.
     RECIPE = FileKind("recipe of a simulation", _is_recipe, lambda path: read_toml(path)[0], _describe_recipe)
     CAMPAIGN = FileKind("campaign file", _is_campaign, lambda path: fusion.load_campaign(path), _describe_campaign)
@@ -601,9 +606,8 @@ def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
         if path.is_dir() and not any(True for _ in input_files(path)):
             fault = "contains no file to inspect (hidden files and results are skipped); name the folder of the measured files"
             yield Inspected(str(path), Kind.UNKNOWN, fault=fault, named=True)
-    summed_up = {
-        path: members for members in thermal_series(files).values() if len(members) > _ONE_BY_ONE for path in members
-    }
+    series = thermal_series(files) | _by_series(path for path in files if path.suffix == ".exr")
+    summed_up = {path: members for members in series.values() if len(members) > _ONE_BY_ONE for path in members}
     for path in files:
         members = summed_up.get(path, [])
         if not members:
@@ -640,7 +644,12 @@ def _inspect(path: Path, *, named: bool) -> Inspected:
 
 
 def _inspect_series(paths: Sequence[Path], *, label: str) -> Inspected:
-    """Sum up a series of thermal files."""
+    """Sum up a series of thermal files, or of maps, by its first file."""
+    if paths[0].suffix == ".exr":
+        first = _inspect(paths[0], named=False)
+        return replace(
+            first, label=label, lines=(f"{counted(len(paths), 'file')}, the first: {first.lines[0]}", *first.lines[1:])
+        )
     try:
         return Inspected(label, Kind.FRAMES, tuple(describe_series(paths, label=label)))
     except Exception as error:

@@ -84,6 +84,7 @@ def plot_correlation(maps: xr.DataTree, ax: Axes | None = None, *, channel: str 
     if float(ratio.max()) > 1.0:
         ax.contour(ratio["x"], ratio["y"], ratio, levels=[1.0], colors="white", linewidths=1.2)
     ax.set(xlabel="x / mm", ylabel="y / mm", title=f"{channel} drift: {maps.attrs['verdict']}", aspect="equal")
+    ax.yaxis.set_inverted(True)  # as the camera sees it, like every map
     ax.grid(visible=False)
     return ax
 

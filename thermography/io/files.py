@@ -127,6 +127,12 @@ def read_maps(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
     return maps
 
 
+def read_header(path: str | os.PathLike[str]) -> dict[str, object]:
+    """Return the attributes of an OpenEXR file, and the unit of every part by its name."""
+    parts = OpenEXR.File(str(path), header_only=True).parts
+    return {**parts[0].header, **{part.name(): part.header.get("unit", "") for part in parts}}
+
+
 def _as_float32(path: Path, name: str, values: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return a map as contiguous float32; raise an ExrError where it is no map or a value overflows."""
     values = np.asarray(values)

@@ -46,7 +46,7 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fuse
     """Draw what was measured and evaluated before anything is modelled."""
     charts: dict[str, Chart] = {}
     if fields is not None:
-        charts["rise_history"] = plan.plot_rise_history(fields)
+        charts |= {"rise_history": plan.plot_rise_history(fields), "contact_sheet": plan.plot_contact_sheet(fields)}
     if deviations is not None:
         charts |= _reading_charts(deviations)
         charts |= _drift_charts(deviations) if has(deviations, "drift") else {}

@@ -231,6 +231,42 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     return Chart(drawn, seen, columns)
 
 
+#: Cycles of the contact sheet, spread over the test, in so many columns, and its cells in a row of one of them.
+_ON_SHEET, _SHEET_COLUMNS, _SHEET_CELLS = 12, 3, 80
+
+
+def plot_contact_sheet(fields: xr.Dataset) -> Chart:
+    """Draw the rise of the table in cycles spread over the test beside each other, on one scale: what paper shows of the map."""
+    count = fields.sizes["cycle"]
+    chosen = np.unique(np.linspace(0, count - 1, min(_ON_SHEET, count)).round().astype(int))
+    block = max(1, -(-fields.sizes["x"] // _SHEET_CELLS))
+    rise = fields["temperature_rise"].isel(cycle=chosen).load()
+    rise = rise.coarsen(x=block, y=block, boundary="trim").mean() if block < min(rise.shape[1:]) else rise
+    left, right, bottom, top = extent_of(fields)
+    width, height, cycles = right - left, top - bottom, rise["cycle"].values.tolist()
+    down, across = np.divmod(np.arange(chosen.size), _SHEET_COLUMNS)
+    label = 0.13 * width  # a name of 11 px above a map, on a narrow screen too
+    x, y = across * 1.06 * width, down * (height + label) + label
+    rows = int(down[-1]) + 1
+    sheet = (-0.01 * width, 1.06 * width * _SHEET_COLUMNS, rows * (height + label), 0.0)
+    scale = scale_of(rise.values, LAYERS[0])
+    pixels = round(min(640.0, 520 * sheet[2] / sheet[1])) + 70
+    drawn = new_figure(x="", y="", height=pixels, x_range=sheet[:2], y_range=sheet[2:])
+    drawn.name = "plan"
+    drawn.axis.visible = drawn.grid.visible = False
+    mapper = LinearColorMapper(palette(SEQUENTIAL), low=scale["low"], high=scale["high"], nan_color="#e1e5e7")
+    names = [f"cycle {cycle}" for cycle in cycles]
+    source = {"image": list(rise.values.astype(np.float32)), "x": x, "y": y, "cycle": names}
+    maps = drawn.image("image", x="x", y="y", dw=width, dh=height, color_mapper=mapper, source=source, level="image")
+    add_hover(drawn, [("", "@cycle"), LAYERS[0].tip], [maps])
+    drawn.text(x, y - 0.01 * width, names, text_font_size="11px", text_color=INK)
+    add_colour_bar(drawn, mapper, "rise / K")
+    seen = f"Rise of the table in {len(cycles)} of {count} cycles on one scale: {span_words(rise.values, 'K')}."
+    cells = rise.stack(cell=("cycle", "y", "x"))
+    columns = {"cycle": cells["cycle"].values, "x / mm": cells["x"].values, "y / mm": cells["y"].values}
+    return Chart(drawn, seen, {**columns, "rise / K": cells.values})
+
+
 def plot_axis_temperature(fused: xr.Dataset) -> Chart:
     """Draw the rise of the table along the measured line, one line for every cycle."""
     order = np.argsort(fused["position"].values, kind="stable")

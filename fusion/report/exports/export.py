@@ -17,7 +17,7 @@ import xarray as xr
 from fusion.analysis.drift_model.recursion import make_recursion
 from fusion.common import Array
 from fusion.messages import naming
-from fusion.report.exports import tables
+from fusion.report.exports import maps, tables
 from fusion.report.exports.controls import (
     CONTROLS,
     MODELS,
@@ -146,10 +146,15 @@ def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Arr
 
 #: Setting data that follow a temperature.
 TEMPERATURE_FORMAT = "siemens840d-temperature"
-FORMATS = ("csv", "xlsx", *CONTROLS, TEMPERATURE_FORMAT, *MODELS)
+FORMATS = ("csv", "xlsx", *maps.FORMATS, *CONTROLS, TEMPERATURE_FORMAT, *MODELS)
 _NO_LASER = "this campaign has no laser, so there is neither drift nor profile to write; --format csv and xlsx write its temperatures"
 #: Name of an axis that every control accepts.
 _AXIS = re.compile(r"[A-Za-z][A-Za-z0-9]{0,9}")
+
+_NO_PLAN = (
+    "it holds no temperatures on a plan of the table, so that there is no map to draw; thermofuse inspect FRAMES --export FOLDER "
+    "--format png draws the frames of a camera"
+)
 
 Writer = Callable[[Path], object]
 
@@ -189,10 +194,11 @@ def export_results(
     ----------
     results : str or Path
         Folder of a finished run.
-    format : {"csv", "xlsx", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "model-json", "model-c", \
-"model-st", "model-linuxcnc"}
-        Tables, a workbook, or a control; ``siemens840d-temperature`` is the part of the drift that follows the material temperature. The
-        model of a record's drift as JSON, as a header in C, in Structured Text, or as a HAL component.
+    format : {"csv", "xlsx", "png", "gif", "mp4", "linuxcnc", "siemens840d", "siemens840d-temperature", "heidenhain", "model-json", \
+"model-c", "model-st", "model-linuxcnc"}
+        Tables, a workbook, maps of the table (every cycle as PNG with a contact sheet, or a film of all), or a control;
+        ``siemens840d-temperature`` is the part of the drift that follows the material temperature. The model of a record's
+        drift as JSON, as a header in C, in Structured Text, or as a HAL component.
     out : str or Path
         Folder for the files; created where it is absent.
     axis : str, optional
@@ -219,7 +225,8 @@ def export_results(
     -------
     Exported
         ``csv``: ``drift.csv``, ``profile.csv``, ``iso230.csv``, ``iso230_positions.csv``, and ``fields.csv`` where it was asked for;
-        ``xlsx``: ``results.xlsx``; a control: one table, with a README where its dialect has no comments.
+        ``xlsx``: ``results.xlsx``; ``png``: ``contact_sheet.png``, ``cycle_0001.png`` ...; ``gif``, ``mp4``: ``cycles.gif``,
+        ``cycles.mp4``; a control: one table, with a README where its dialect has no comments.
 
     Raises
     ------
@@ -243,6 +250,11 @@ def export_results(
     folder, found = Path(results), read_results(Path(results))
     if format in MODELS:
         content, notes = _model_text(folder, found, format, sampling_s=sampling_s, reduced=reduced, force=force)
+    elif format in maps.FORMATS:
+        if not (folder / "fields.nc").is_file():
+            raise ExportError(f"{folder}: {_NO_PLAN}")
+        content = maps.draw_maps(read_product(folder, "fields"), found.hotspots or (), found.campaign, format)
+        notes = []
     elif not (folder / "deviations.nc").is_file():
         content, notes = _written(_tables_without_laser(folder, found, format), format), []
     elif format in ("csv", "xlsx"):

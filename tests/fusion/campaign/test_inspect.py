@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from fusion.campaign.inspect import (
     Kind,
@@ -28,6 +29,7 @@ from interferometry.io.readings import FILES, TABLES
 from tests.thermography.flir_mutations import PARAMETERS, frame
 from thermography.common import ThermographyError
 from thermography.io import other_cameras as frame_readers
+from thermography.io.files import write_maps
 from thermography.io.flir import FlirReader
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CameraIdentity
@@ -105,6 +107,10 @@ def write_sheet(columns: dict[str, list[float]]) -> Callable[[Path], None]:
     return partial(pd.DataFrame(columns).to_excel, index=False)
 
 
+def write_map(path: Path) -> None:
+    write_maps(path, {"temperature": np.full((2, 3), 20.5)}, units={"temperature": "degC"}, attributes={"cycle": 7})
+
+
 def write_flir(path: Path) -> None:
     write_sequence(path, [frame(6, 8, seconds=0)])
 
@@ -119,6 +125,8 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
      ["NumPy array, 1 frame of 9 x 8", "  values of the first frame 20 to 20"]),
     (Kind.STACK, "a.csv", "\n".join(";".join(["20,1"] * 9) for _ in range(8)), ["text with one temperature per pixel, 1 frame of 9 x 8"]),
     (Kind.STACK, "a.txt", "\n".join("\t".join(["20.1"] * 32) for _ in range(32)), []),
+    (Kind.PRODUCT, "a.exr", write_map, ["OpenEXR maps of 3 x 2 cells: cycle 7", "  temperature 20.5 to 20.5 °C"]),
+    (Kind.PRODUCT, "results.json", '{"campaign": "A"}', ["results of a run: thermofuse report FOLDER writes its page; campaign A"]),
     (Kind.LENS, "a.json", LENS, ["lens, focal length 900.0 px, centre 320.0, 240.0 px"]),
     (Kind.LENS, "a.yml", "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
      "   data: [ 900., 0., 320., 0., 900., 240., 0., 0., 1. ]\ndistortion_coefficients: [ 0.1, 0., 0., 0. ]\n", ["lens, focal"]),
@@ -200,7 +208,7 @@ def test_a_damaged_file_of_every_kind_stops_no_other(tmp_path, rng, kind, name, 
 def test_every_kind_has_a_sample_and_a_key_of_the_campaign_file():
     assert {kind for kind, *_ in SAMPLES} == set(Kind) - {Kind.UNKNOWN, Kind.UNREADABLE}
     keys = {f"{table}.{key}" for table, names in FILE_KEYS.items() for key in names}
-    named = {kind for kind, *_ in SAMPLES} - {Kind.RECIPE, Kind.CAMPAIGN}
+    named = {kind for kind, *_ in SAMPLES} - {Kind.RECIPE, Kind.CAMPAIGN, Kind.PRODUCT}
     assert {kind.value.key for kind in named} <= keys and named == {kind for kind in Kind if kind.value.key}
 
 
@@ -338,6 +346,16 @@ def test_photos_results_and_hidden_files_are_no_input(copied):
     content = scan_folder(copied)
     assert content.frames == ("thermal/*.jpg",)
     assert [content.relative(one.path) for one in content.unknown] == [f"photos/{name}.jpg" for name in "abcd"]
+
+
+def test_products_of_a_run_are_told_for_what_they_are(results_folder):
+    told = {one.label.removeprefix(f"{results_folder}/"): one for one in inspect_paths([results_folder])}
+    assert {one.kind for one in told.values()} == {Kind.PRODUCT} and not any(one.fails for one in told.values())
+    fields = xr.open_dataset(results_folder / "fields.nc")
+    low, high = float(fields["temperature"].min()), float(fields["temperature"].max())
+    assert f"temperature {low:.4g} to {high:.4g} °C" in told["fields.nc"].lines
+    maps = told["maps/*.exr"].lines
+    assert f"{fields.sizes['cycle']} files" in maps[0] and "rise 0 to 0 K" in maps
 
 
 def test_links_to_folders_above_are_not_followed_for_ever(tmp_path):

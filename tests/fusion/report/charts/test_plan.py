@@ -34,6 +34,17 @@ def test_a_cycle_without_a_field_is_a_gap(fields):
     np.testing.assert_allclose(chart.columns["warmest cell / K"][-1], rise[-1].max())
 
 
+def test_the_contact_sheet_spreads_cycles_over_the_test_on_one_scale(fields):
+    chart = plan.plot_contact_sheet(fields)
+    (maps,) = [one for one in chart.figure.renderers if type(one.glyph).__name__ == "Image"]
+    data, cycles = maps.data_source.data, fields["cycle"].values
+    names = [f"cycle {cycles[0]}", f"cycle {cycles[-1]}"]
+    assert [data["cycle"][0], data["cycle"][-1]] == names and len(data["cycle"]) == min(12, cycles.size)
+    np.testing.assert_array_equal(data["image"][-1], fields["temperature_rise"].values[-1].astype(np.float32))
+    assert maps.glyph.color_mapper.high == pytest.approx(float(fields["temperature_rise"].max()))
+    assert np.unique(data["x"]).size == 3 and (np.diff(data["y"]) >= 0).all()
+
+
 def test_rise_along_the_axis_and_drift_against_it(fused, deviations):
     root = fused.to_dataset()
     along = plan.plot_axis_temperature(root)

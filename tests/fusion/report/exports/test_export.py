@@ -189,7 +189,7 @@ def test_a_run_of_the_camera_alone_has_its_fields(tmp_path):
 def test_a_folder_without_results_is_refused(tmp_path):
     with pytest.raises(ResultsError, match=r"there is no results.json in it; name the results folder of a finished"):
         export_results(tmp_path, "csv", tmp_path)
-    with pytest.raises(ExportError, match=r'there is no format "mazak"; write one of csv, xlsx, linuxcnc'):
+    with pytest.raises(ExportError, match=r'there is no format "mazak"; write one of csv, xlsx, png'):
         export_results(tmp_path, "mazak", tmp_path)
 
 
