@@ -31,7 +31,7 @@ from interferometry.iso230.thermal import (
     evaluate_distortion,
     scatter,
     tilt,
-    with_start,
+    with_ends,
 )
 
 #: Standard uncertainty of the sensitivity of a displacement sensor where none is stated: one percent of the reading.
@@ -84,8 +84,8 @@ def _of_run(table: xr.Dataset, name: str, stated: ThermalTestTable) -> ThermalTe
     # A clock that was set back gives readings of one time.
     between = np.diff(np.unique(elapsed))
     per_piece = max(1.0, AVERAGED_S / float(np.median(between))) if between.size else 1.0
-    seconds, displacement = with_start(*average(elapsed, raw))
-    temperature = with_start(*average(elapsed, table["temperature"].values))[1]
+    seconds, displacement = with_ends(*average(elapsed, raw), elapsed[-1])
+    temperature = with_ends(*average(elapsed, table["temperature"].values), elapsed[-1])[1]
     share = (
         (ASSUMED_CALIBRATION, "assumed, 1 % of the reading")
         if stated.sensor_calibration is None

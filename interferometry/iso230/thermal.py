@@ -7,7 +7,8 @@ ISO 230-3:2020 (iso.org). The text of the standard is not open. What is computed
   Precision, M017-7500, "total drift per axis").
 * Over the first 60 min, over the whole test and over its last 60 min: no open text was found that states these periods.
 * Readings are averaged over one minute before, so that the range is not that of their noise: no open text. A mean is that of the middle of
-  its minute; the value at the start is on the line through the first two.
+  its minute; start and end of the test are on the lines through the first and the last two means, the end of the first hour and the start
+  of the last on those between their neighbours.
 * The tilt is the difference of two displacements over the distance of their sensors: geometry, for angles this small.
 * The settling time is the time after which a displacement stays within a tenth of its whole range about its mean of the last 60 min, for
   two hours at least: no open text.
@@ -62,12 +63,16 @@ def average(seconds: Array, values: Array) -> tuple[Array, Array]:
     return time, np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def with_start(seconds: Array, values: Array) -> tuple[Array, Array]:
-    """Return times (n + 1,) and means (n + 1, k) with the value at the start, s = 0, on the line through the first two means."""
-    if seconds.size < 2 or seconds[0] <= 0.0:
-        return seconds, values
-    slope = (values[1] - values[0]) / (seconds[1] - seconds[0])
-    return np.r_[0.0, seconds], np.vstack([values[0] - slope * seconds[0], values])
+def with_ends(seconds: Array, values: Array, end_s: float) -> tuple[Array, Array]:
+    """Return times and means (n, k) with the values at the start, s = 0, and at the end, on lines through the two nearest means."""
+    for at_s, near, other in ((0.0, 0, 1), (end_s, -1, -2)):
+        if seconds.size < 2 or seconds[0] <= at_s <= seconds[-1]:
+            continue
+        slope = (values[near] - values[other]) / (seconds[near] - seconds[other])
+        place = 0 if near == 0 else seconds.size
+        values = np.insert(values, place, values[near] + slope * (at_s - seconds[near]), axis=0)
+        seconds = np.insert(seconds, place, at_s)
+    return seconds, values
 
 
 def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
@@ -89,17 +94,17 @@ def evaluate_distortion(seconds: Array, values: Array) -> Distortion:
         if after < since.size and since[after] <= end_s - SETTLED_FOR_S:
             settling = float(since[after])
     return Distortion(
-        first_hour=_range(values[first]) if is_long else np.nan,
+        first_hour=_range(values[first], np.interp(HOUR_S, since, values)) if is_long else np.nan,
         whole=whole,
-        last_hour=_range(values[last]) if is_long else np.nan,
+        last_hour=_range(values[last], np.interp(end_s - HOUR_S, since, values)) if is_long else np.nan,
         change=float(values[-1] - values[0]),
         settling_s=settling,
     )
 
 
-def _range(values: Array) -> float:
-    """Return the largest less the smallest value, NaN of fewer than two."""
-    return float(np.ptp(values)) if values.size > 1 else np.nan
+def _range(values: Array, edge: float) -> float:
+    """Return the largest less the smallest value of an hour, with that at its edge, NaN of fewer than two."""
+    return float(np.ptp(np.r_[values, edge])) if values.size > 1 else np.nan
 
 
 def scatter(values: Array) -> float:

@@ -10,7 +10,7 @@ from interferometry.iso230.thermal import (
     evaluate_distortion,
     scatter,
     tilt,
-    with_start,
+    with_ends,
 )
 
 MINUTES = 60.0 * np.arange(6 * 60 + 1)
@@ -61,11 +61,27 @@ def test_a_quick_start_within_the_first_minute_is_not_lost():
     """
     seconds = np.arange(0.0, 3601.0, 1.0)
     rise = 20.0 * (1.0 - np.exp(-seconds / 300.0))
-    time, mean = with_start(*average(seconds, rise[:, None]))
+    time, mean = with_ends(*average(seconds, rise[:, None]), seconds[-1])
     assert time[0] == 0.0 and mean[0, 0] == pytest.approx(0.0, abs=0.3)
     found = evaluate_distortion(time, mean[:, 0])
     # A test of exactly 60 min has a first hour, which is the whole of it.
     assert found.first_hour == found.whole == pytest.approx(20.0, abs=0.3)
+
+
+@pytest.mark.parametrize("sampling_s", [1.0, 10.0, 30.0, 60.0, 300.0])
+@pytest.mark.parametrize("hours", [1.0, 3.0])
+def test_the_hours_have_their_whole_length_whatever_the_sampling(sampling_s, hours):
+    """40 um with a time constant of 1 h: 40 (1 - 1/e) in the first hour, 40 (e^(1-h) - e^-h) in the last of h hours.
+
+    The line to either end misses half the product of 30 and 90 s times the curvature, 0.004 um.
+    """
+    seconds = np.arange(0.0, 3600.0 * hours + 1.0, sampling_s)
+    rise = 40.0 * (1.0 - np.exp(-seconds / 3600.0))
+    time, mean = with_ends(*average(seconds, rise[:, None]), seconds[-1])
+    found = evaluate_distortion(time, mean[:, 0])
+    assert found.first_hour == pytest.approx(40.0 * (1.0 - np.exp(-1.0)), abs=0.006)
+    assert found.last_hour == pytest.approx(40.0 * (np.exp(1.0 - hours) - np.exp(-hours)), abs=0.006)
+    assert found.whole == pytest.approx(40.0 * (1.0 - np.exp(-hours)), abs=0.006)
 
 
 def test_the_last_hour_is_that_of_the_test_and_not_of_the_channel():
