@@ -119,6 +119,12 @@ def _refuse(why: str) -> NoReturn:
     raise typer.Exit(ExitCode.BAD_INPUT)
 
 
+def _end_unless(equal: bool) -> None:
+    """End a command whose answer is that something differs from what it should be."""
+    if not equal:
+        raise typer.Exit(ExitCode.DIFFERENT)
+
+
 def _kept(folders: Sequence[Path]) -> str:
     """Say what a stopped run leaves in its folders, and how to go on."""
     if not folders:
@@ -472,8 +478,7 @@ def reproduce(
         with _progress(quiet=False) as report:
             found = compute_again(results, campaign=None if campaign is None else _place(campaign), report=report)
         _print_lines(found.lines)
-        if not found.equal:
-            raise typer.Exit(ExitCode.DIFFERENT)
+        _end_unless(found.equal)
 
 
 @app.command()
@@ -611,7 +616,8 @@ def verify(
 ) -> None:
     """Compare the test after a compensation with what was predicted.
 
-    What was predicted with its interval, what was achieved, and why not: wrong sign or scale, other coefficients, a dead sensor.
+    What was predicted with its interval, what was achieved, and why not: wrong sign or scale, other coefficients, a dead sensor. Exit code
+    0 where every displacement is as predicted, else 1.
     """
     from dataclasses import asdict
 
@@ -629,6 +635,7 @@ def verify(
             _print_lines(
                 [*(f"{one.name}: {one.fault}: {one.reason}" for one in found.channels if one.fault), *found.remarks]
             )
+        _end_unless(all(one.is_kept for one in found.channels))
 
 
 @app.command("iso230-3")
@@ -787,7 +794,8 @@ def compare(
 ) -> None:
     """Compare campaigns of one machine: what changed by more than the uncertainties.
 
-    Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first.
+    Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first. With --applied the
+    exit code is 0 where the table acted as it states and left what was predicted, else 1.
     """
     from fusion.pipeline.compare import compare_campaigns
     from fusion.report.charts.comparison import follow_trends
@@ -814,6 +822,7 @@ def compare(
             errors.print(f"page: {out.resolve()}")
         if as_json:
             print_json(comparison_json(pairs))
+            _end_unless(pairs[0].is_kept)
             return
         wide, names = _wide(), campaign_names(pairs)
         wide.print(print_table(side_by_side(pairs), "; ".join(names)))
@@ -825,8 +834,9 @@ def compare(
             found = describe_places(pairs, pair)
             if found and found["table"].rows:
                 wide.print(print_table(found["table"], "Places that the drift follows"))
-            _print_lines([conclude_comparison(pair), *conclude_table(pair), *found.get("said", ())])
+            _print_lines([*conclude_table(pair), conclude_comparison(pair), *found.get("said", ())])
         _print_lines([*trend_sentences(follow_trends(pairs)), *comparison_notes(pairs)])
+        _end_unless(pairs[0].is_kept)
 
 
 @app.command()

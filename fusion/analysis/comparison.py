@@ -13,6 +13,7 @@ import xarray as xr
 from scipy import special
 
 from fusion.analysis.attribution.places import ComparisonError, PlaceComparison, compare_places
+from fusion.analysis.drift_model.verification import EXPLAINS, LESS_PROBABLE, NAMED_GAINS, NAMED_U, SCALE_U, name_faults
 from fusion.analysis.levels import CHANGE_LEVEL
 from fusion.common import Array
 from fusion.results.axis import Iso230Part
@@ -197,6 +198,81 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     )
     remaining, remaining_u = _remaining(difference, state, positions)
     return ProfileChange(positions, left_out, remaining, remaining_u, tuple(shapes), made, untold)
+
+
+# What a table that was loaded between two tests did to the profile, and how that differs from what it states.
+
+#: Standard deviation of a shape of the thermal state, um, as good as unknown beside what a table corrects.
+_STATE_U_UM = 1000.0
+#: Shifts of a table that are tried, over the range of its points, and how many.
+_SHIFTS = np.linspace(-0.5, 0.5, 101)
+
+
+@dataclass(frozen=True)
+class TableFault:
+    """How a table acted by the profiles of two tests.
+
+    Attributes
+    ----------
+    names : faults under which the difference is most probable, the most probable first; empty where none is shown
+    gain, gain_u : with which the table acted; 1 where all is well
+    told : whether the tests tell that from a table that is not active
+    """
+
+    names: tuple[str, ...]
+    gain: float
+    gain_u: float
+    told: bool
+
+
+def take_out(drift: xr.Dataset, table: TablePrediction) -> xr.Dataset:
+    """Return a test as its axis would have shown it with a table."""
+    sides = {"positive": 0, "negative": 1}
+    position = drift["position"].values.astype(float)
+    taken = xr.DataArray(
+        [table.correction_at(position)[sides[str(side)]] for side in drift["direction"].values],
+        dims=("direction", "target"),
+    )
+    return drift.assign(profile=drift["profile"] - taken)
+
+
+def find_table_fault(before: xr.Dataset, after: xr.Dataset, table: TablePrediction) -> TableFault:
+    """Find how a table that was loaded between two tests acted: as it states, or with a fault."""
+    difference, _ = _profile_difference(before, after)
+    shapes = _state_shapes(difference, (before, after))
+    covariance = np.sum(difference.beside(shapes).covariances, axis=0)
+    covariance = covariance + sum(_STATE_U_UM**2 * np.outer(shape.column, shape.column) for shape in shapes)
+    low, high = min(table.position_mm), max(table.position_mm)
+
+    def taken(position_mm: Array, *, swapped: bool = False) -> Array:
+        forward, reverse = table.correction_at(position_mm)
+        return np.where((difference.sign > 0.0) != swapped, forward, reverse)
+
+    def judge(change: Array, spread: Array | None = None) -> tuple[float, float]:
+        """Return the log-likelihood of a change of the profile, and how much is left of it beside the shapes."""
+        wider = covariance if spread is None else covariance + np.outer(spread, spread)
+        root = np.linalg.cholesky(wider)
+        left = np.linalg.solve(root, difference.value - change)
+        return float(-0.5 * left @ left - np.log(np.diag(root)).sum()), float(left @ left)
+
+    stated = taken(difference.position_mm)
+    well, misfit = judge(-stated)
+    faults = {name: judge(-gain * stated, NAMED_U * stated) for name, gain in NAMED_GAINS.items()}
+    faults["wrong scale"] = judge(0.0 * stated, SCALE_U * stated)
+    faults["approaches swapped"] = judge(-taken(difference.position_mm, swapped=True))
+    faults["mirrored"] = judge(-taken(low + high - difference.position_mm))
+    shifted = [judge(-taken(difference.position_mm - share * (high - low))) for share in _SHIFTS]
+    logs = np.array([one for one, _ in shifted])
+    faults["shifted"] = float(special.logsumexp(logs)) - math.log(logs.size), shifted[int(np.argmax(logs))][1]
+    judged = {name: (likelihood, 1.0 - left / max(misfit, 1e-12)) for name, (likelihood, left) in faults.items()}
+    names = name_faults(judged, well, EXPLAINS)
+    if "shifted" in names:
+        by = float(_SHIFTS[int(np.argmax(logs))]) * (high - low)
+        names[names.index("shifted")] = f"shifted by {by:+.3g} mm"
+    precision = max(float(stated @ np.linalg.solve(covariance, stated)), 1e-12)
+    gain = -stated @ np.linalg.solve(covariance, difference.value) / precision
+    told = bool(names) or well - judged["not active"][0] > math.log(LESS_PROBABLE)
+    return TableFault(tuple(names), float(gain), 1.0 / math.sqrt(precision), told)
 
 
 def _profile_difference(before: xr.Dataset, after: xr.Dataset) -> tuple[_Difference, int]:
@@ -460,6 +536,11 @@ class Achieved:
         """Whether it differs from what was predicted by no more than its expanded uncertainty (k = 2)."""
         return abs(self.difference.value or 0.0) <= 2.0 * (self.difference.u or 0.0)
 
+    @property
+    def told(self) -> bool:
+        """Whether the value before the table would differ from what was predicted by more than that uncertainty."""
+        return abs((self.before.value or 0.0) - (self.predicted.value or 0.0)) > 2.0 * (self.difference.u or 0.0)
+
 
 @dataclass(frozen=True, eq=False)
 class PairComparison:
@@ -473,6 +554,8 @@ class PairComparison:
     places : what both say of the places that the drift follows; None where that was not tested in both
     common : inputs of both budgets of ISO 230-2 whose error is the same in both tests
     achieved : values with a table that was loaded between the tests, beside what was predicted of it
+    table : how a table that was loaded between the tests acted; the profile, and with it every change of the machine, is held against the
+        first test less that table
     """
 
     before: ComparedCampaign
@@ -484,6 +567,12 @@ class PairComparison:
     places: PlaceComparison | None = None
     common: tuple[str, ...] = ()
     achieved: tuple[Achieved, ...] = ()
+    table: TableFault | None = None
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether a table that was loaded between the tests acted as it states, and left what was predicted."""
+        return not (self.table and self.table.names) and all(one.as_predicted for one in self.achieved)
 
 
 def compare_tests(
@@ -491,6 +580,17 @@ def compare_tests(
 ) -> list[PairComparison]:
     """Compare tests with one of the same machine; `same_setup` where laser and sensors stood untouched between them."""
     return [_compare(reference, other, pairs=len(others), same_setup=same_setup) for other in others]
+
+
+def compare_with_table(
+    before: ComparedCampaign, after: ComparedCampaign, table: TablePrediction, *, same_setup: bool = False
+) -> PairComparison:
+    """Compare two tests of a machine between which a table was loaded: only what differs from its effect is a change of the machine."""
+    expected = before if before.drift is None else replace(before, drift=take_out(before.drift, table))
+    pair = replace(_compare(expected, after, pairs=1, same_setup=same_setup), before=before)
+    if pair.profile is not None and before.drift is not None and after.drift is not None:
+        pair = replace(pair, table=find_table_fault(before.drift, after.drift, table))
+    return replace(pair, achieved=hold_against(pair, table))
 
 
 def hold_against(pair: PairComparison, prediction: TablePrediction) -> tuple[Achieved, ...]:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import xarray as xr
 
-from fusion.analysis.comparison import ComparedCampaign, ComparisonError, PairComparison, compare_tests, hold_against
+from fusion.analysis.comparison import (
+    ComparedCampaign,
+    ComparisonError,
+    PairComparison,
+    compare_tests,
+    compare_with_table,
+)
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.messages import naming
 from fusion.report.comparison import (
@@ -59,16 +64,15 @@ def compare_campaigns(
             f"{applied.name}: a table stands between two tests; name the one before it and the one after it"
         )
     reference, *others = [read_campaign(folder) for folder in folders]
-    pairs = compare_tests(reference, others, same_setup=same_setup)
     if applied is None:
-        return pairs
+        return compare_tests(reference, others, same_setup=same_setup)
     prediction = read_table_prediction(applied)
     if prediction.results_sha256 != reference.sha256:
         raise ComparisonError(
             f"{applied.name} was not made from the results in {folders[0]}: name first the results that the table was exported from"
         )
     with naming(Path(applied.name)):
-        return [replace(pair, achieved=hold_against(pair, prediction)) for pair in pairs]
+        return [compare_with_table(reference, others[0], prediction, same_setup=same_setup)]
 
 
 def read_campaign(folder: Path) -> ComparedCampaign:

@@ -76,10 +76,14 @@ def short_names(pairs: Sequence[PairComparison]) -> list[str]:
 def conclude_comparison(pair: PairComparison) -> str:
     """Return what a comparison shows."""
     machine, state = (
-        [_change_words(change) for change in pair.changes if change.significant and change.machine is machine]
+        [
+            _change_words(change)
+            for change in pair.changes
+            if change.significant and change.machine is machine and not (pair.achieved and change.group == "ISO 230-2")
+        ]
         for machine in (True, False)
     )
-    text = say("comparison_outcome", bool(pair.changes), machine, state)
+    text = say("comparison_outcome", bool(pair.changes), machine, state, pair.table)
     for campaign in (pair.before, pair.after) if pair.changes else ():
         text = conditional(text, campaign.results.inputs, "positions")
     return text
@@ -88,7 +92,9 @@ def conclude_comparison(pair: PairComparison) -> str:
 def conclude_table(pair: PairComparison) -> list[str]:
     """Return whether a table that was loaded did what was predicted of it; nothing where none was named."""
     missed = [one.quantity for one in pair.achieved if not one.as_predicted]
-    return sentences("table_outcome", [one.quantity for one in pair.achieved], missed)
+    blind = [one.quantity for one in pair.achieved if one.as_predicted and not one.told]
+    kept = [one.quantity for one in pair.achieved if one.as_predicted and one.told]
+    return sentences("table_outcome", pair.table, kept, missed, blind)
 
 
 def achieved_table(pair: PairComparison) -> Table:
@@ -96,7 +102,8 @@ def achieved_table(pair: PairComparison) -> Table:
     rows = []
     for one in pair.achieved:
         values = [quantity(value) for value in (one.before, one.predicted, one.achieved, one.difference)]
-        verdict = "within the uncertainty" if one.as_predicted else "beyond the uncertainty"
+        within = "within the uncertainty" if one.told else "not told: the uncertainty covers the value as found, too"
+        verdict = within if one.as_predicted else "beyond the uncertainty"
         rows.append(Row([ISO230_TERMS[one.quantity], *values, verdict], marked=not one.as_predicted))
     heads = ("as found / µm", "predicted / µm", "achieved / µm", "achieved − predicted / µm")
     return table([Words("Quantity (k = 2)"), *heads, Words("Verdict")], rows)
@@ -159,7 +166,7 @@ def changes_table(pairs: Sequence[PairComparison], pair: PairComparison, *, shor
             continue
         both = [_value(found, change.unit) for found in (change.before, change.after)]
         p = "> 0.99" if change.p_value > 0.99 else p_cell(change.p_value)
-        cells = [change_name(change).rstrip(","), *both, _size(change), p, _verdict(change)]
+        cells = [change_name(change).rstrip(","), *both, _size(change), p, _verdict(change, loaded=bool(pair.achieved))]
         rows.append(Row(cells, marked=change.significant))
     figures = (names[0], names[1 + list(pairs).index(pair)], "change (k = 2)", "p (family-wise)")
     return table([Words("Quantity"), *figures, Words("Verdict")], rows)
@@ -169,7 +176,9 @@ def _value(found: Quantity | None, unit: str) -> str:
     return "–" if found is None else quantity(found, print_unit(unit))
 
 
-def _verdict(change: Change) -> str:
+def _verdict(change: Change, *, loaded: bool = False) -> str:
+    if change.significant and loaded and change.group == "ISO 230-2":
+        return "differs; held against the prediction of the table"
     if change.significant:
         return "changed" if change.machine else _STATE
     if change.change.u and abs(change.change.value or 0.0) > 2 * change.change.u:
@@ -423,10 +432,14 @@ def comparison_json(pairs: Sequence[PairComparison]) -> dict[str, Any]:
     for pair in pairs:
         about: dict[str, Any] = {"campaign": pair.after.name, "tests": pair.tests}
         if pair.achieved:
-            about["achieved"] = [{**asdict(one), "as_predicted": one.as_predicted} for one in pair.achieved]
+            about["achieved"] = [
+                {**asdict(one), "as_predicted": one.as_predicted, "told": one.told} for one in pair.achieved
+            ]
+        if pair.table is not None:
+            about["table"] = {**asdict(pair.table), "is_kept": pair.is_kept}
         if pair.places is not None:
             about["places"] = places_json(pairs, pair)
-        about["conclusions"] = [conclude_comparison(pair), *comparison_notes([pair])]
+        about["conclusions"] = [*conclude_table(pair), conclude_comparison(pair), *comparison_notes([pair])]
         about["changes"] = [{**asdict(change), "significant": change.significant} for change in pair.changes]
         compared.append({**about, "not_compared": lacks_in_words(pair)})
     return {"reference": pairs[0].before.name, "compared": plain(compared)}

@@ -18,6 +18,7 @@ from textwrap import dedent
 from typing import Annotated, Literal, TypeGuard
 from zoneinfo import ZoneInfo
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
@@ -543,6 +544,12 @@ class TablePrediction(ResultPart):
     """What the table takes out of the deviations at its points, beyond one that was active during the test of the campaign, um."""
     predicted_um: Mapping[str, Quantity]
     """A, E, M and B of ISO 230-2, um; their uncertainty is that of table and readings, without what both tests have in common."""
+
+    def correction_at(self, position_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the table takes out by the positive and by the negative approach, um, at positions (n,), mm."""
+        sides = (self.correction_um.positive, self.correction_um.negative)
+        forward, reverse = (np.interp(position_mm, self.position_mm, np.array(one, float)) for one in sides)
+        return forward, reverse
 
 
 def read_table_prediction(path: Path) -> TablePrediction:

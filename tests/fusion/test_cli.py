@@ -264,7 +264,7 @@ def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
     assert invoke("simulate", tmp_path / "second.toml", "--out", tmp_path / "after").exit_code == 0
     after = tmp_path / "after" / "campaign.toml"
     verified = invoke("verify", tmp_path / "out", after, "--applied", model, "--json")
-    assert verified.exit_code == 0, verified.output
+    assert verified.exit_code == 1, verified.output
     faults = [one["fault"] for one in json.loads(verified.stdout)["channels"]]
     assert faults == ["wrong sign"] * len(faults) and faults
     planned = invoke("plan", tmp_path / "out")
@@ -350,8 +350,10 @@ def test_a_table_that_was_loaded_is_held_against_its_prediction(tmp_path: Path) 
     assert exported.exit_code == 0, exported.output
     table = tmp_path / "t/compensation_X.comp"
     told = invoke("compare", before, after, "--applied", table)
-    assert told.exit_code == 0, told.output
-    assert "as found" in told.stdout and "Predicted and achieved" in told.stdout and "With the table " in told.stdout
+    # Nobody loaded it.
+    assert told.exit_code == 1, told.output
+    assert "as found" in told.stdout and "Predicted and achieved" in told.stdout
+    assert "The table did not act as it states: not active" in told.stdout
     (table.parent / "compensation_X.comp.prediction.json").unlink()
     missing = invoke("compare", before, after, "--applied", table)
     assert missing.exit_code == 2 and "prediction.json is missing; name the table" in missing.output.replace("\n", " ")

@@ -35,13 +35,26 @@ _COVERAGE = 0.95
 #: all and half of it.
 _OTHER_GAIN = 0.25
 #: Share of the variance of what is left that an explanation must take away.
-_EXPLAINS = 0.5
+EXPLAINS = 0.5
 #: Faults under which the test is less probable by more than this factor are told from the most probable one.
-_LESS_PROBABLE = 20.0
+LESS_PROBABLE = 20.0
 #: Gains that have a name, with the standard deviation within which they have it; another one is a scale, of any size up to inches.
-_NAMED_GAINS = {"wrong sign": -1.0, "half the gain": 0.5, "not active": 0.0}
-_NAMED_U, _SCALE_U = 0.1, 30.0
+NAMED_GAINS = {"wrong sign": -1.0, "half the gain": 0.5, "not active": 0.0}
+NAMED_U, SCALE_U = 0.1, 30.0
 _STALE, _UNKNOWN = "stale table", "not explained"
+
+
+def name_faults(judged: Mapping[str, tuple[float, float]], well: float, least_share: float) -> list[str]:
+    """Return the faults under which a test is most probable, the most probable first.
+
+    `judged` holds the log-likelihood of each and the share of what is left that it explains; `well` is the log-likelihood without one.
+    """
+    best = max(judged, key=lambda name: judged[name][0])
+    likelihood, share = judged[best]
+    alike = np.log(LESS_PROBABLE)
+    if share < least_share or likelihood < well + alike:
+        return []
+    return sorted((name for name in judged if judged[name][0] > likelihood - alike), key=lambda name: -judged[name][0])
 
 
 @dataclass(frozen=True)
@@ -127,7 +140,7 @@ def verify(
             fault = "outside its range"
             reason = "a reading was so far outside that the control took its sensor for failed"
         elif not is_kept or abs(gain - 1.0) > max(_OTHER_GAIN, 3.0 * gain_u):
-            fault, reason = second.explain(0.0 if is_kept else _EXPLAINS)
+            fault, reason = second.explain(0.0 if is_kept else EXPLAINS)
             fault, reason = ("", "") if is_kept and fault == _UNKNOWN else (fault, reason)
         acted = 1.0 if fault in {"", "outside its range", _UNKNOWN, _STALE} else gain
         verdicts.append(
@@ -213,9 +226,9 @@ class _Second:
     def gain(self) -> tuple[float, float]:
         """Return the gain with which the correction acted and its standard uncertainty."""
         _, coefficients, covariance = self._judge(
-            self._bare, np.column_stack([self._left_open, _SCALE_U * self.correction])
+            self._bare, np.column_stack([self._left_open, SCALE_U * self.correction])
         )
-        return float(_SCALE_U * coefficients[-1]), float(_SCALE_U * np.sqrt(covariance[-1, -1]))
+        return float(SCALE_U * coefficients[-1]), float(SCALE_U * np.sqrt(covariance[-1, -1]))
 
     def _judge(self, left: Array, columns: Array) -> tuple[float, Array, Array]:
         """Return the log-likelihood of a course that follows columns, and their coefficients with covariance."""
@@ -226,10 +239,10 @@ class _Second:
 
     def _faults(self) -> Iterator[tuple[str, Array, Array]]:
         """Yield every fault with what is left beside what the control added then, and the columns of what is not known."""
-        for name, gain in _NAMED_GAINS.items():
-            columns = np.column_stack([self._left_open, _NAMED_U * self.correction])
+        for name, gain in NAMED_GAINS.items():
+            columns = np.column_stack([self._left_open, NAMED_U * self.correction])
             yield name, self._bare - gain * self.correction, columns
-        yield "wrong scale", self._bare, np.column_stack([self._left_open, _SCALE_U * self.correction])
+        yield "wrong scale", self._bare, np.column_stack([self._left_open, SCALE_U * self.correction])
         # Any table of such states, which need not know the machine.
         yield _STALE, self._bare, np.column_stack([self._left_open, self.columns * self.response.prior_u])
 
@@ -241,15 +254,11 @@ class _Second:
             likelihood, coefficients, _ = self._judge(left, columns)
             share = 1.0 - float(np.var(left - columns @ coefficients)) / max(float(np.var(self.course)), 1e-12)
             judged[name] = likelihood, share
-        best = max(judged, key=lambda name: judged[name][0])
-        alike = np.log(_LESS_PROBABLE)
         gain, gain_u = self.gain()
         told = f"by its course the correction acted with a gain of {gain:.2f} ± {2.0 * gain_u:.2f} (k = 2)"
-        if judged[best][1] < least_share or judged[best][0] < well + alike:
+        named = name_faults(judged, well, least_share)
+        if not named:
             return _UNKNOWN, f"{told}; no fault of the compensation explains half of what is left"
-        named = sorted(
-            (name for name in judged if judged[name][0] > judged[best][0] - alike), key=lambda name: -judged[name][0]
-        )
         words = f"{told}; {named[0]} explains {100 * judged[named[0]][1]:.0f} % of what is left"
         if _STALE in named:
             words += "; the control runs other coefficients than the stated ones, or the machine has changed since"

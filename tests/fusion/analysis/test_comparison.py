@@ -17,6 +17,8 @@ from fusion.analysis.comparison import (
     ProfileChange,
     compare_profiles,
     compare_scatters,
+    find_table_fault,
+    take_out,
 )
 from fusion.pipeline.compare import compare_campaigns
 from fusion.results.parts import PREDICTION_ENDING, ByDirection, Quantity, TablePrediction
@@ -371,6 +373,51 @@ def test_an_error_that_both_tests_have_in_common_cancels_as_far_as_it_is_equal(t
     assert u_of([one, other]) == pytest.approx((34.0 - 21.6) ** 0.5)
     assert u_of([one, other], same_setup=True) == pytest.approx((34.0 - 21.6 - 6.0) ** 0.5)
     assert u_of([one, steel]) == pytest.approx(34.0**0.5)
+
+
+def table_of(size_um: float) -> TablePrediction:
+    """A table of steps and of a reversal that grows along the axis, which no thermal state looks like."""
+    at = np.arange(0.0, 301.0, 20.0)
+    mean = size_um * np.where((at > 90.0) & (at < 210.0), 1.0, -1.0) * np.where(at < 160.0, 1.0, 0.3)
+    sides = ByDirection(positive=tuple(mean + at / 300.0), negative=tuple(mean - at / 300.0))
+    return TablePrediction(
+        table="x.comp", campaign="", results_sha256="0" * 64, cycles=5, predicted_um={}, position_mm=tuple(at), correction_um=sides
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("act", "name"),
+    [
+        (lambda at, table: table(at), None),
+        (lambda at, table: 0.0 * table(at), "not active"),
+        (lambda at, table: -table(at), "wrong sign"),
+        (lambda at, table: 0.5 * table(at), "half the gain"),
+        (lambda at, table: 3.0 * table(at), "wrong scale"),
+        (lambda at, table: table(at)[::-1], "approaches swapped"),
+        (lambda at, table: table(300.0 - at), "mirrored"),
+        (lambda at, table: table(at - 40.0), "shifted by +39 mm"),
+    ],
+)
+def test_what_a_table_did_is_named_and_a_right_one_is_no_change(act, name) -> None:
+    """Shifts are tried in hundredths of the range, 3 mm."""
+    table, before, after = table_of(3.0), drift_of(readings_of(31)), drift_of(readings_of(32))
+    at = after["position"].values.astype(float)
+    taken = act(at, lambda place: np.array(table.correction_at(place)))
+    after = after.assign(profile=after["profile"] - xr.DataArray(taken, dims=("direction", "target")))
+    found = find_table_fault(before, after, table)
+    assert found.told and found.names[:1] == (() if name is None else (name,))
+    changed = compare_profiles(take_out(before, table), after, level=0.05)
+    moved = any(shape.machine and shape.p_value * changed.tests <= 0.05 for shape in changed.shapes)
+    assert moved == (name is not None)
+
+
+def test_a_table_of_what_a_thermal_state_changes_is_not_told() -> None:
+    """A table that corrects a slope alone: without it the axis looks as with it, in another thermal state."""
+    at = (0.0, 300.0)
+    sides = ByDirection(positive=(0.0, 4.0), negative=(0.0, 4.0))
+    table = table_of(0.0).model_copy(update={"position_mm": at, "correction_um": sides})
+    found = find_table_fault(drift_of(readings_of(31)), drift_of(readings_of(32)), table)
+    assert not found.told and found.names == ()
 
 
 def test_achieved_is_held_against_what_a_table_was_predicted_to_leave(tmp_path: Path) -> None:

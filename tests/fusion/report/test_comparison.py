@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from fusion.analysis.attribution.places import ChannelAgreement, PlaceComparison, SourceAgreement
-from fusion.analysis.comparison import Achieved
+from fusion.analysis.comparison import Achieved, TableFault
 from fusion.pipeline.compare import compare_campaigns
 from fusion.report.charts.comparison import control_limits, draw_trend, follow, follow_trends, plot_profiles
 from fusion.report.comparison import (
@@ -82,10 +82,20 @@ def test_predicted_and_achieved_stand_beside_each_other(pairs):
     pair = replace(pairs[0], achieved=(one("A", 3.0), one("E", 1.5)))
     a, e = achieved_table(pair).rows
     assert a.cells[1:] == ["9.0 ± 2.0", "1.00 ± 0.20", "3.00 ± 0.80", "2.0 ± 1.0", "beyond the uncertainty"]
-    assert a.marked and not e.marked
+    assert a.marked and not e.marked and not pair.is_kept
     assert conclude_table(pair)[0].startswith("With the table A differs from the prediction")
-    as_said = conclude_table(replace(pair, achieved=(one("E", 1.5),)))
-    assert as_said == ["With the table E is as predicted within the uncertainty."]
+    kept = replace(pair, achieved=(one("E", 1.5),))
+    assert conclude_table(kept) == ["With the table E is as predicted within the uncertainty."] and kept.is_kept
+    # As large an uncertainty as the table's effect tells nothing.
+    wide = replace(kept.achieved[0], difference=Quantity(value=0.5, u=5.0))
+    assert conclude_table(replace(pair, achieved=(wide,)))[0].startswith("Of E the uncertainty is so large")
+    assert achieved_table(replace(pair, achieved=(wide,))).rows[0].cells[-1].startswith("not told")
+    acted = TableFault(("not active", "half the gain"), 0.2, 0.15, told=True)
+    faulty = replace(kept, table=acted)
+    assert conclude_table(faulty)[0].startswith("The table did not act as it states: not active or half the gain (")
+    assert "cannot be told while the table" in conclude_comparison(faulty) and not faulty.is_kept
+    assert conclude_table(replace(kept, table=replace(acted, names=(), told=False)))[0].endswith("changes as well.")
+    assert comparison_json([faulty])["compared"][0]["table"]["names"] == ["not active", "half the gain"]
     assert conclude_table(pairs[0]) == []
     page = render_comparison([pair])
     assert page.index("With the table A differs") < page.index("figure-profiles") < page.index("Predicted and achieved")

@@ -1,0 +1,109 @@
+"""Tables of own axes between two tests: right ones are no change of the machine, planted faults are named: docs/method/comparison.md.
+
+THERMOFUSE_RUNS sets the number of axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusion.analysis.comparison import compare_profiles, find_table_fault, take_out
+from fusion.report.exports.controls import ErrorTable, read_profile, read_scatter_and_drift, tabulate
+from fusion.report.exports.export import predict_test
+from fusion.results.parts import ByDirection, TablePrediction
+from fusion.results.store import joined
+from interferometry.drift.estimate import estimate_drift
+from tests.soak.rates import campaigns, first_seed, rate
+from tests.soak.simulator import Array, deviations_of
+
+pytestmark = pytest.mark.slow
+RUNS = campaigns(40)
+LEVEL = 0.05
+POSITION = np.array(
+    [0.0, 21.0, 43.0, 61.0, 82.0, 103.0, 121.0, 140.0, 163.0, 182.0, 199.0, 223.0, 241.0, 262.0, 279.0, 300.0]
+)
+#: Noise of a reading and smallest difference of two tables that are called different, um.
+NOISE_UM = 0.3
+
+
+def axis(rng: np.random.Generator) -> Array:
+    """Deviations (2, n), um: a pitch error, a screw's period, a bow and a reversal that varies along the axis."""
+    share = POSITION / 300.0
+    mean = 8.0 * rng.standard_normal() * share + 6.0 * rng.standard_normal() * share * (1.0 - share)
+    mean = mean + np.cumsum(rng.normal(0.0, 0.9, POSITION.size)) + 0.6 * np.sin(POSITION / 1.3 + rng.uniform(0, 6))
+    reversal = rng.normal(0.0, 0.8) + 0.4 * np.cumsum(rng.normal(0.0, 0.5, POSITION.size))
+    return np.array([mean + reversal / 2.0, mean - reversal / 2.0])
+
+
+def measure(rng: np.random.Generator, profile: Array, *, cycles: int, drift_um: float):
+    """A test: both approaches of every cycle; shift and stretch of its own warm-up."""
+    order = np.concatenate([np.arange(16), np.arange(31, 15, -1)]).reshape(2, -1)
+    order[1] = 31 - np.arange(16)
+    seconds = 300.0 * np.arange(cycles)[:, None, None] + 8.0 * order
+    state = 1.0 - np.exp(-seconds / rng.uniform(1500.0, 6000.0))
+    shift, stretch = drift_um * rng.standard_normal(2)
+    drift = state * (shift + stretch * POSITION / 300.0)
+    return deviations_of(seconds, POSITION, profile + drift + NOISE_UM * rng.standard_normal(seconds.shape))
+
+
+FAULTS = {
+    "not active": lambda table: 0.0 * table(POSITION),
+    "wrong sign": lambda table: -table(POSITION),
+    "half the gain": lambda table: 0.5 * table(POSITION),
+    "wrong scale": lambda table: 2.0 * table(POSITION),
+    "shifted": lambda table: table(POSITION - 40.0),
+    "mirrored": lambda table: table(300.0 - POSITION),
+    "approaches swapped": lambda table: table(POSITION)[::-1],
+}
+
+
+def made(table: ErrorTable, predicted) -> TablePrediction:
+    forward, reverse = table.added_um(table.position_mm, one_table=False).tolist()
+    return TablePrediction(
+        table="x.comp", campaign="", results_sha256="0" * 64, cycles=5, predicted_um=predicted,
+        position_mm=tuple(table.position_mm.tolist()), correction_um=ByDirection(positive=tuple(forward), negative=tuple(reverse)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("cycles", "drift_um"), [(5, 0.3), (10, 2.0), (20, 6.0)])
+def test_right_tables_and_planted_faults(cycles: int, drift_um: float) -> None:
+    counts = dict.fromkeys(("changed", "fault", "not told"), 0)
+    named, wrong = dict.fromkeys(FAULTS, 0), []
+    for run in range(RUNS):
+        rng = np.random.default_rng(first_seed(5300) + run)
+        profile = axis(rng)
+        first = measure(rng, profile, cycles=cycles, drift_um=drift_um)
+        drift = estimate_drift(first)
+        whole = joined(first, drift=drift)
+        before = drift.assign(position=first["position"])
+        table = tabulate(read_profile(whole))
+        found = predict_test(read_profile(whole), table, *read_scatter_and_drift(whole), cycles=5, one_table=False)
+        stated = made(table, found)
+
+        def taken(at: Array, table=table) -> Array:
+            return table.added_um(at, one_table=False)
+
+        def second(correction: Array, rng=rng, profile=profile):
+            readings = measure(rng, profile - correction, cycles=cycles, drift_um=drift_um)
+            return estimate_drift(readings).assign(position=readings["position"])
+
+        after = second(taken(POSITION))
+        change = compare_profiles(take_out(before, stated), after, level=LEVEL)
+        counts["changed"] += any(one.machine and one.p_value * change.tests <= LEVEL for one in change.shapes)
+        right = find_table_fault(before, after, stated)
+        counts["fault"] += bool(right.names)
+        counts["not told"] += not right.told
+        for name, act in FAULTS.items():
+            names = find_table_fault(before, second(act(taken)), stated).names
+            hit = any(one.startswith(name) for one in names)
+            named[name] += hit
+            if not hit:
+                wrong.append((run, name, names))
+    print(
+        f"\n{cycles} cycles, drift {drift_um} um: right tables",
+        {name: rate(count, RUNS) for name, count in counts.items()},
+    )
+    print("named", named, "of", RUNS, wrong[:12])
+    assert counts["fault"] <= 0.02 * RUNS
+    assert sum(named.values()) >= 0.95 * RUNS * len(FAULTS)
