@@ -692,6 +692,17 @@ class InterferometryTable(_Measured, title="Laser"):
         ..., "Table of the deviations", about="cycle,direction,target,position_mm,time,deviation_um"
     )
     sheet: str | None = key(None, "Sheet of the workbook")
+    directions: Literal["positive first", "negative first", "positive", "negative"] | None = key(
+        None,
+        "Directions of successive runs",
+        about="of a table that names none and whose order of positions does not tell it",
+        choices={
+            "positive first": "runs alternate, the first towards larger positions",
+            "negative first": "runs alternate, the first towards smaller positions",
+            "positive": "every run towards larger positions",
+            "negative": "every run towards smaller positions",
+        },
+    )
     environment: ExistingFile | None = key(
         None, "Log of air and material", example="environment.csv", about="and of what else the drift may follow"
     )

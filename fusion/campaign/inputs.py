@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path, PurePath
 from typing import Any
@@ -392,16 +393,24 @@ def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
     return source
 
 
+def reader_of_deviations(campaign: Campaign) -> Callable[[Path], xr.Dataset]:
+    """Return what reads the file of readings as the campaign states it."""
+    laser = campaign.interferometry
+    stated: dict[str, Any] = {
+        name: getattr(laser, name, None) for name in ("feed_mm_per_min", "dwell_s", "sheet", "directions")
+    }
+    return partial(read_deviations, rotary=campaign.thermography is None, **stated)
+
+
 def read_laser(campaign: Campaign) -> dict[str, Any]:
     """Read what `LaserInputs` holds: readings, compensated where the campaign asks for it, and the environment log."""
     interferometry = campaign.interferometry
     assert interferometry is not None
     laser = campaign.resolve(interferometry.deviations)
-    how = {name: getattr(interferometry, name) for name in ("feed_mm_per_min", "dwell_s", "sheet")}
     zone = campaign.zone_of("interferometry")
     late_s = interferometry.clock_offset_s
     alone = campaign.thermography is None
-    deviations = read_deviations(laser, rotary=alone, **how)
+    deviations = reader_of_deviations(campaign)(laser)
     deviations = bring_to_utc(deviations, zone, file=interferometry.deviations, late_s=late_s)
     if not is_rotary(deviations):
         check(deviations, DEVIATIONS, name=laser.name)

@@ -56,11 +56,13 @@ class Key(NamedTuple):
         return f"{self.label} ({print_unit(self.unit)})" if self.unit else self.label
 
     def check(self, text: str) -> str:
-        """Return a text that is a quantity of its unit, a range of cycles or a day, where it has to be."""
+        """Return a text that is a quantity of its unit, a range of cycles, a day or one of several words, where it has to be."""
         if self.kind == "quantity":
             read_quantity(text, canonical_unit(self.unit))
         elif self.kind == "cycles":
             read_cycles(text)
+        elif self.options and text not in self.options:
+            raise QuantityError(f'"{text}" is none of {", ".join(filter(None, self.options))}')
         elif self.kind == "date":
             try:
                 return date.fromisoformat(text).isoformat()

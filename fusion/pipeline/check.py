@@ -14,7 +14,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source
+from fusion.campaign.inputs import CameraInputs, Inputs, LaserInputs, is_rotary, read_source, reader_of_deviations
 from fusion.campaign.inspect import Kind, Recording, time_bars
 from fusion.campaign.logs import NO_START, read_drivers
 from fusion.messages import BAD_INPUT
@@ -28,7 +28,6 @@ from fusion.pipeline.consistency import (
 )
 from fusion.results.progress import counted
 from fusion.results.results import Notice
-from interferometry.io.readings import read_deviations
 from thermography.io.sequence import camera_names
 
 #: Bars of runs that are drawn.
@@ -190,7 +189,7 @@ def _recordings(source: Inputs) -> Iterator[Recording]:
 def _faults_of_files(campaign: Campaign) -> Iterator[str]:
     """Read every file of a campaign by itself, and yield why it cannot be used."""
     stated: dict[Kind, Callable[[Path], object]] = {
-        Kind.DEVIATIONS: partial(read_deviations, rotary=campaign.thermography is None),
+        Kind.DEVIATIONS: reader_of_deviations(campaign),
         Kind.DRIVERS: partial(read_drivers, layout=campaign.drivers and campaign.drivers.layout),
     }
     for kind in reversed(Kind):

@@ -10,7 +10,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import xarray as xr
 
 from fusion.analysis.alignment.align import AlignmentError, cycle_bounds
 from fusion.campaign.config import Campaign, CampaignError
-from fusion.campaign.inputs import overridden_parameters, plan_grid, stack_options
+from fusion.campaign.inputs import overridden_parameters, plan_grid, reader_of_deviations, stack_options
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.common import Array
 from fusion.pipeline.positioning import insufficient_for_model
@@ -314,7 +313,7 @@ class ArrivingReadings:
         if not content.strip():
             return Arrived()
         table = None if content.startswith(_NO_LINES) else self._find_table(content)
-        if table is None or "cycle" not in table.columns:
+        if table is None or not {"cycle", "direction"} <= table.columns.keys():
             return self._poll_whole(final=final)
         if not table.rows:
             return Arrived()
@@ -688,10 +687,7 @@ class _RunningTest:
             if offset_s is None and laser is not None:
                 self._warnings.append("the clock offset is not given: 0 s is taken while the test runs")
         if laser is not None:
-            read = partial(
-                read_deviations, feed_mm_per_min=laser.feed_mm_per_min, dwell_s=laser.dwell_s, sheet=laser.sheet
-            )
-            self._laser = ArrivingReadings(campaign.resolve(laser.deviations), read, clock)
+            self._laser = ArrivingReadings(campaign.resolve(laser.deviations), reader_of_deviations(campaign), clock)
             if laser.compensation == "redo" or laser.dead_path_mm or laser.material_temperature == "camera":
                 self._warnings.append("readings are shown as they were written; the full run compensates them")
 

@@ -7,10 +7,10 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import xarray as xr
@@ -27,7 +27,14 @@ from interferometry.deviations import (
     set_flag,
 )
 from interferometry.io.faults import BadReading, LaserFormatError, LeftOut, Numerals, raise_if_mostly_invalid
-from interferometry.io.renishaw import START_BYTES, is_ecmc_log, read_ecmc_log, read_rtl
+from interferometry.io.renishaw import (
+    START_BYTES,
+    is_ecmc_log,
+    is_ecmc_report,
+    read_ecmc_log,
+    read_ecmc_report,
+    read_rtl,
+)
 from interferometry.io.tables import (
     UNIT_WORDS,
     UNITS,
@@ -35,10 +42,12 @@ from interferometry.io.tables import (
     DelimitedTable,
     Grid,
     Heading,
+    by_direction_letter,
     describe_time_zone,
     find_direction,
     find_unit,
     fold,
+    is_direction_letter,
     parse_time,
     read_grids,
     read_heading,
@@ -53,6 +62,8 @@ POSITION_TOLERANCE = 1e-4
 #: From mm to um, and from deg to arcsec.
 FINE = {"length": 1e3, "angle": 3600.0}
 Kind = Literal["length", "angle"]
+#: Directions of successive runs, of a table that names none.
+Directions = Literal["positive first", "negative first", "positive", "negative"]
 Cell = tuple[int, str, int]
 
 
@@ -149,6 +160,63 @@ def turn_by_travel(given: Readings) -> None:
         given.notes.append("the forward runs lead to smaller positions: they are the negative direction")
     elif votes == 0:
         given.notes.append("forward was taken as the positive direction: the file gives no times that tell the travel")
+
+
+class DirectionsMissing(LaserFormatError):
+    """A table of which neither words nor the order of the positions tell from which side the targets were approached."""
+
+    def __init__(self, place: str, why: str) -> None:
+        super().__init__(
+            f"{place}: {why}; name the direction of each run in the table ('positive', 'negative'), or state directions as one of "
+            f"{', '.join(map(repr, get_args(Directions)))}, under [interferometry] in a campaign file or to read_deviations"
+        )
+
+
+def _state_directions(directions: Directions, runs: int) -> list[str]:
+    """Return the direction of each of so many successive runs."""
+    first = DIRECTIONS.index(directions.split()[0])
+    return [DIRECTIONS[(first + (run if directions.endswith("first") else 0)) % 2] for run in range(runs)]
+
+
+def passes_by_order(positions: Sequence[float], runs: Sequence[int]) -> list[tuple[int, str]] | None:
+    """Return number from 1 and direction of the pass of each reading, in measuring order; None where the order does not tell both.
+
+    A pass ends where the axis turns, where a target is read again from the other side, and where another run begins.
+    """
+    passes: list[list[int]] = []
+    signs: list[int] = []
+    for i, position in enumerate(positions):
+        step = position - positions[i - 1] if i and runs[i] == runs[i - 1] else np.nan
+        sign = 0 if abs(step) <= POSITION_TOLERANCE else int(np.sign(np.nan_to_num(step)))
+        if not passes or np.isnan(step):
+            passes.append([i])
+            signs.append(0)
+        elif sign == 0:
+            if not signs[-1]:
+                return None
+            passes.append([i])
+            signs.append(-signs[-1])
+        elif sign == signs[-1] or (len(passes[-1]) == 1 and not signs[-1]):
+            passes[-1].append(i)
+            signs[-1] = sign
+        elif len(passes[-1]) == 1:
+            # A target that is read twice on the way was not approached from the other side.
+            return None
+        else:
+            passes.append([i])
+            signs.append(sign)
+    targets = len(set(number_targets(positions)))
+    whole = [len(rows) >= targets / 2 for rows in passes[:-1]]
+    if set(signs) != {-1, 1} or targets < 3 or not all(whole):
+        return None
+    return [
+        (number, DIRECTIONS[0] if sign > 0 else DIRECTIONS[1])
+        for number, (rows, sign) in enumerate(zip(passes, signs, strict=True), start=1)
+        for _ in rows
+    ]
+
+
+_BY_ORDER = "the direction of each run follows from the order of its positions"
 
 
 def number_targets(positions: Sequence[float]) -> list[int]:
@@ -298,13 +366,24 @@ class LongTable:
 
 
 def find_long_table(grid: Grid) -> LongTable | None:
-    """Return the table of a grid whose header names at least cycle or run, direction, position and deviation; None without one."""
+    """Return the table of a grid whose header names position and deviation, and cycle or run unless the order of the positions tells it."""
     for at, (line, fields) in enumerate(grid.rows):
         headings = [read_heading(text) for text in fields]
-        roles = {heading.role for heading in headings}
-        if {"position", "direction"} <= roles and roles & {"cycle", "run"} and roles & {"deviation", "measured"}:
-            return _understand(grid, at, line, headings)
+        roles = [heading.role for heading in headings]
+        if "position" in roles and {"deviation", "measured"} & {*roles}:
+            numbered = {"cycle", "run"} & {*roles} or (
+                "direction" not in roles and _turns(grid, at, roles.index("position"))
+            )
+            if numbered:
+                return _understand(grid, at, line, headings)
     return None
+
+
+def _turns(grid: Grid, at: int, column: int) -> bool:
+    """Return whether the positions below a row tell the direction of each reading by their order."""
+    below = [_cell(fields, column) for _, fields in grid.rows[at + 1 :]]
+    positions = [grid.numerals.number(text) for text in below if _is_number(text, grid.numerals)]
+    return passes_by_order(positions, [0] * len(positions)) is not None
 
 
 def what_is_missing(grid: Grid) -> str:
@@ -341,8 +420,6 @@ def _understand(grid: Grid, at: int, line: int, headings: list[Heading]) -> Long
             both = f"the columns {first!r} and {heading.text!r} both name the {heading.role}"
             raise LaserFormatError(f"{grid.place}, line {line}: {same if first == heading.text else both}; keep one")
         columns[heading.role] = index
-    if "deviation" in columns:
-        columns.pop("measured", None)
     rows = grid.rows[at + 1 :]
     units = {
         role: heading.unit for heading in headings if (role := heading.role) in ("position", "measured", "deviation")
@@ -352,23 +429,42 @@ def _understand(grid: Grid, at: int, line: int, headings: list[Heading]) -> Long
         rows = rows[1:]
     for role in ("position", "deviation" if "deviation" in columns else "measured"):
         if units[role] is None:
-            text = headings[columns[role]].text
+            heading = headings[columns[role]]
+            _refuse_unknown_unit(grid, line, heading)
             raise LaserFormatError(
-                f"{grid.place}, line {line}: the column {text!r} has no unit; write it in the heading, for example "
-                f'"{text} [{"um" if role == "deviation" else "mm"}]"'
+                f"{grid.place}, line {line}: the column {heading.text!r} has no unit; write it in the heading, for example "
+                f'"{heading.text} [{"um" if role == "deviation" else "mm"}]"'
             )
-    rows = _with_signs(rows, columns["direction"])
+    if "deviation" in columns and units.get("measured") is None:
+        columns.pop("measured", None)
+    if "direction" in columns:
+        rows = _with_words(rows, columns["direction"])
+        if rows and not any(find_direction(_cell(row, columns["direction"])) for _, row in rows):
+            del columns["direction"]
     ignored = [heading.text for i, heading in enumerate(headings) if heading.text and i not in columns.values()]
     width = max(i for i, heading in enumerate(headings) if heading.text) + 1
     return LongTable(grid, line, columns, {role: unit for role, unit in units.items() if unit}, width, rows, ignored)
 
 
-def _with_signs(rows: list[tuple[int, list[str]]], column: int) -> list[tuple[int, list[str]]]:
-    """Return rows in which the direction "1" is "+1" where others are "-1": a 1 beside a 2 would only number them."""
-    if not any(row[column : column + 1] == ["-1"] for _, row in rows):
-        return rows
+def _refuse_unknown_unit(grid: Grid, line: int, heading: Heading) -> None:
+    """Refuse a heading whose brackets hold what may be a unit and is none that is known."""
+    if heading.unknown:
+        raise LaserFormatError(
+            f"{grid.place}, line {line}: {heading.unknown!r} in {heading.text!r} is no unit of a position or deviation; write nm, um, "
+            "mm, m, in, mil or uin, of a rotary axis deg, arcmin or arcsec, and convert what is a share of a length"
+        )
+
+
+def _with_words(rows: list[tuple[int, list[str]]], column: int) -> list[tuple[int, list[str]]]:
+    """Return rows in which a direction is a word that stands for itself: a 1 beside a -1 is +1, beside a 2 it only numbers them; F beside R
+    is forward.
+    """
+    found = {row[column] for _, row in rows if len(row) > column}
+    words = by_direction_letter({text for text in found if is_direction_letter(text)}) | (
+        {"1": "+1"} if "-1" in found else {}
+    )
     return [
-        (line, [*row[:column], "+1", *row[column + 1 :]] if row[column : column + 1] == ["1"] else row)
+        (line, [*row[:column], *(words.get(text, text) for text in row[column : column + 1]), *row[column + 1 :]])
         for line, row in rows
     ]
 
@@ -395,8 +491,8 @@ class _Label:
     position: float
 
 
-def read_long_table(table: LongTable) -> Readings:
-    """Read the lines of a table."""
+def read_long_table(table: LongTable, directions: Directions | None = None) -> Readings:
+    """Read the lines of a table, with the directions of its runs where it names none."""
     path, numerals, columns = table.grid.path, table.grid.numerals, table.columns
     stated = ", ".join(f"{role} in {unit}" for role, unit in table.units.items())
     kind = _kind_of(table.units.values(), f"{table.grid.place}, line {table.line}: {stated}")
@@ -407,8 +503,13 @@ def read_long_table(table: LongTable) -> Readings:
     for line, fields in table.rows:
         with given.left_out.collect(line):
             labels.append(_label(table, line, fields, numerals))
-    labels = _renumber(table, labels, given)
     order = DateOrder.of(path, [(label.line, _time_text(table, label.fields)) for label in labels])
+    if labels and "direction" not in columns:
+        labels = _with_directions(table, labels, order, directions, given.notes)
+    elif directions is not None and "direction" in columns:
+        raise _named_already(table.grid)
+    labels = _renumber(table, labels, given)
+    measured: list[float] = []
     for label in labels:
         cell = label.number, label.direction, label.target
         with given.collect(label.line, cell):
@@ -419,6 +520,8 @@ def read_long_table(table: LongTable) -> Readings:
             value = numerals.reading(label.fields[columns[role]]) * unit.factor
             if role == "measured":
                 value -= label.position
+            elif "measured" in columns:
+                measured.append(_measured(table, label, numerals) - label.position)
             if zone is not None:
                 given.zones.setdefault(zone, label.line)
             # Rounded to a thousandth of a nanometre: the factors of the units have no exact binary value.
@@ -427,7 +530,66 @@ def read_long_table(table: LongTable) -> Readings:
     given.left_out.lines.sort(key=lambda each: each.line)
     if not all(label.signed for label in labels):
         turn_by_travel(given)
+    _compare_signs(given, np.array(measured) * FINE[unit.kind])
     return given
+
+
+def _measured(table: LongTable, label: _Label, numerals: Numerals) -> float:
+    """Return the measured position of a line that has a deviation too, NaN where it has none."""
+    text = label.fields[table.columns["measured"]]
+    return numerals.number(text) * UNITS[table.units["measured"]].factor if _is_number(text, numerals) else np.nan
+
+
+def _compare_signs(given: Readings, differences: np.ndarray) -> None:
+    """Turn deviations that are target minus measured, as the measured positions beside them tell."""
+    stated = np.array([reading.deviation for reading in given.readings])
+    if differences.size != stated.size or not np.isfinite(differences).any():
+        return
+
+    def apart(factor: float) -> float:
+        return float(np.nanmedian(np.abs(differences - factor * stated)))
+
+    if apart(-1) < 0.3 * min(apart(1), apart(0)):
+        given.readings = [replace(reading, deviation=-reading.deviation) for reading in given.readings]
+        given.notes.append(
+            "warning: the deviations of the file are target minus measured; their sign was turned (ISO 230-2)"
+        )
+    elif (factor := min((1, 1e-3, 1e3, 1 / 25.4, 25.4), key=apart)) != 1 and apart(factor) < 0.1 * apart(0):
+        raise LaserFormatError(
+            f"{given.path}: in the units of the headings the deviations are {1 / factor:g} times the difference of measured and target "
+            "position of the same lines; correct the unit in one heading"
+        )
+
+
+def _named_already(grid: Grid) -> LaserFormatError:
+    return LaserFormatError(f"{grid.place}: the table names the direction of its runs; remove directions")
+
+
+def _with_directions(
+    table: LongTable, labels: list[_Label], order: DateOrder, directions: Directions | None, notes: list[str]
+) -> list[_Label]:
+    """Return the labels of a table without a known direction with theirs: as stated, else by the order of the positions in time."""
+    with suppress(BadReading):
+        times = [parse_time(_time_text(table, label.fields), order)[0] for label in labels]
+        labels = [labels[at] for at in np.argsort(times, kind="stable")]
+    positions, runs = [label.position for label in labels], [label.number for label in labels]
+    passes = passes_by_order(positions, runs)
+    repeated = len({*zip(runs, number_targets(positions), strict=True)}) < len(labels)
+    if passes is None and (directions is None or repeated):
+        raise DirectionsMissing(
+            f"{table.grid.place}, line {table.line}",
+            "no column names a direction, and the order of the positions does not tell it",
+        )
+    if passes is None and directions is not None:
+        numbers = list(dict.fromkeys(runs))
+        of_run = dict(zip(numbers, _state_directions(directions, len(numbers)), strict=True))
+        return [replace(label, direction=of_run[label.number]) for label in labels]
+    notes.append(_BY_ORDER)
+    numbered = {"cycle", "run"} & table.columns.keys()
+    return [
+        replace(label, number=label.number if numbered else number, direction=direction)
+        for label, (number, direction) in zip(labels, passes or [], strict=True)
+    ]
 
 
 def _kind_of(units: Iterable[str], given: str) -> Kind:
@@ -444,10 +606,13 @@ def _label(table: LongTable, line: int, fields: list[str], numerals: Numerals) -
     columns = table.columns
     if len(fields) <= max(columns.values()) or any(fields[table.width :]):
         raise BadReading("", f"does not have {table.width} fields")
-    direction = find_direction(fields[columns["direction"]])
+    direction: tuple[str, bool] | None = ("", True)
+    if "direction" in columns:
+        direction = find_direction(fields[columns["direction"]])
     if direction is None:
         raise BadReading(fields[columns["direction"]], "is neither 'positive' nor 'negative'")
-    number = _count(fields[columns["cycle" if "cycle" in columns else "run"]], numerals)
+    numbers = next((columns[role] for role in ("cycle", "run") if role in columns), None)
+    number = 0 if numbers is None else _count(fields[numbers], numerals)
     target = _count(fields[columns["target"]], numerals) if "target" in columns else 0
     position = numerals.reading(fields[columns["position"]]) * UNITS[table.units["position"]].factor
     return _Label(line, fields, number, *direction, target, position)
@@ -518,14 +683,20 @@ def _time_text(table: LongTable, fields: list[str]) -> str:
 _ROWS_ABOVE, _ROWS_BELOW = 2, 3
 #: Fewest targets and runs by which a table is recognised.
 _FEWEST_TARGETS = 2
+#: Values closer to their targets than this share of the travel are measured positions.
+_NEAR = 0.02
+#: Largest deviation, um, of a test whose unit nobody states: beyond, it may be mm or nm.
+_PLAUSIBLE_UM = (0.5, 200.0)
+#: Words beside the number of a run: axis and "number".
+_BESIDE_NUMBERS = ("no", "nr", "x", "y", "z", "u", "w", "c")
 #: More than any table of positions by run has; rows are given the width of the widest one, which must not fill the memory.
 _MOST_CELLS = 5_000_000
 
 
 @dataclass(frozen=True)
 class Run:
-    """A column (or row) of deviations: its headings joined, number of the run or cycle, whether the word for the direction names the sign
-    of the travel, unit (a key of `UNITS`), and line and text of each reading in the order of the positions.
+    """A column (or row) of deviations: its headings joined, number of the run or cycle, direction ("" where nothing names it), whether the
+    word for it names the sign of the travel, unit (a key of `UNITS`), and line and text of each reading in the order of the positions.
     """
 
     text: str
@@ -552,7 +723,49 @@ class WideTable:
 
 
 def find_wide_table(grid: Grid) -> WideTable | None:
-    """Return the table of position by run in a grid, None without one."""
+    """Return the table of position by run in a grid, blocks under titles such as "Forward" and "Reverse" joined; None without one."""
+    titles = [
+        at for at, (_, fields) in enumerate(grid.rows) if _titles_direction(" ".join(filter(None, fields)), fields)
+    ]
+    blocks = [
+        replace(grid, rows=grid.rows[: titles[0]] + grid.rows[at + 1 : end], title=" ".join(grid.rows[at][1]))
+        for at, end in itertools.pairwise([*titles, len(grid.rows)])
+    ]
+    tables = [table for block in blocks if block.rows and (table := _find_block(block)) is not None]
+    return join_tables(tables) if len(tables) > 1 else _find_block(grid)
+
+
+def _titles_direction(title: str, fields: Sequence[str] = ()) -> bool:
+    """Return whether a line, or the name of a sheet, is a title such as "Forward" or "Run 2, reverse" above the runs of one direction."""
+    label = _wide_label(title) if title and sum(map(bool, fields)) < 3 else None
+    return label is not None and label[1] is not None and find_direction(label[1][0]) is not None
+
+
+def join_tables(tables: Sequence[WideTable]) -> WideTable:
+    """Return one table of the runs of several, whose positions are those of the first."""
+    first = tables[0]
+    known = np.array([first.grid.numerals.number(text) for _, text in first.positions])
+    runs = list(first.runs)
+    for table in tables[1:]:
+        values: dict[int, int] = {}
+        for row, (line, text) in enumerate(table.positions):
+            apart = np.abs(known - table.grid.numerals.number(text))
+            if apart.min() > POSITION_TOLERANCE:
+                raise LaserFormatError(
+                    f"{table.grid.place}, line {line}: position {text} of {table.grid.title!r} does not occur in {first.grid.title!r}; "
+                    "give every run the same positions"
+                )
+            values[int(apart.argmin())] = row
+        for run in table.runs:
+            there = [run.values[values[i]] if i in values else (table.line, "") for i in range(known.size)]
+            runs.append(replace(run, values=there))
+    unit = next((table.deviation_unit for table in tables if table.deviation_unit), None)
+    ignored = list(dict.fromkeys(text for table in tables for text in table.ignored))
+    return replace(first, runs=runs, ignored=ignored, deviation_unit=unit)
+
+
+def _find_block(grid: Grid) -> WideTable | None:
+    """Return the table of position by run in a grid with one title."""
     width = max(len(fields) for _, fields in grid.rows)
     if width * len(grid.rows) > _MOST_CELLS:
         return None
@@ -600,7 +813,7 @@ def _positions_below(
         ([row[j] for row in block if row[j]], [(lines[i], cells[i][j]) for i in data], f"column {j + 1}")
         for j in range(column + 1, len(cells[at]))
     ]
-    runs, ignored = _read_runs([one for one in candidates if one[0] or any(text for _, text in one[1])])
+    runs, ignored = _read_runs(grid, [one for one in candidates if one[0] or any(text for _, text in one[1])])
     titles = [text for row in cells[:first] for text in row]
     unit = heading.unit or find_unit(cells[first - 1][column].strip("[]() "))
     positions = [(lines[i], cells[i][column]) for i in data]
@@ -620,11 +833,12 @@ def _positions_in_one_row(grid: Grid, cells: list[list[str]], lines: list[int], 
     places = [j for j in range(after, len(row)) if _is_number(split[j][0], grid.numerals)]
     if len(places) < _FEWEST_TARGETS:
         return None
-    runs, ignored = _read_runs(
+    candidates = [
         ([cells[i][j] for j in labels if cells[i][j]], [(lines[i], cells[i][j]) for j in places], f"line {lines[i]}")
         for i in range(at + 1, len(cells))
         if any(cells[i])
-    )
+    ]
+    runs, ignored = _read_runs(grid, candidates)
     ignored = [row[j] for j in range(after, len(row)) if row[j] and j not in places] + ignored
     titles = [text for fields in cells[: at + 1] for text in fields]
     unit = next((split[j][1] for j in places if split[j][1]), None) or _position_unit(titles)
@@ -647,7 +861,7 @@ def _names_runs(texts: Sequence[str]) -> bool:
 
 
 def _wide_label(text: str) -> tuple[int | None, tuple[str, bool] | None, str | None] | None:
-    """Return number, direction and unit that a heading of a run holds; None where it holds anything else."""
+    """Return number, direction (a letter, where it has one) and unit that a heading of a run holds; None where it holds anything else."""
     name, unit = split_unit(text)
     if unit is None and find_unit(text.strip("[]() ")) is not None:
         return None, None, find_unit(text.strip("[]() "))
@@ -656,41 +870,54 @@ def _wide_label(text: str) -> tuple[int | None, tuple[str, bool] | None, str | N
         return None
     rest = re.sub(r"\d+", " ", name).replace("第", " ").replace("次", " ").replace("#", " ").strip()
     direction: tuple[str, bool] | None = None
-    for word in re.findall(r"[+\-−–↑↓]|[^\s+\-−–↑↓,;:/().\[\]]+", rest):
-        found = find_direction(word)
+    for word in re.findall(
+        r"[+\-−–↑↓→←]|[^\s+\-−–↑↓→←,;:/().\[\]]+", re.sub("<-+(?!>)", "←", re.sub("(?<!<)-+>", "→", rest))
+    ):
+        found = find_direction(word) or ((fold(word), False) if is_direction_letter(word) else None)
         if found is not None and direction in (None, found):
             direction = found
-        elif not (read_heading(word).role in ("run", "cycle", "deviation", "direction") or fold(word) in ("no", "nr")):
+        elif not (
+            read_heading(word).role in ("run", "cycle", "deviation", "direction") or fold(word) in _BESIDE_NUMBERS
+        ):
             return None
     return (int(next(iter(numbers))) if numbers else None), direction, unit
 
 
-def _read_run(texts: list[str], values: list[tuple[int, str]]) -> Run | None:
-    """Return a run from its headings; None where they hold anything but number, direction and unit, as "mean +" does."""
+def _read_run(texts: list[str], values: list[tuple[int, str]], title: str) -> Run | None:
+    """Return a run from its headings, and from the title above what they lack; None where they hold anything but number, direction and
+    unit, as "mean +" does, or neither number nor direction.
+    """
     labels = [_wide_label(text) for text in texts]
     if not texts or None in labels or not any(text for _, text in values):
         return None
     found = [label for label in labels if label is not None]
     directions = {label[1] for label in found if label[1] is not None}
     numbers = {label[0] for label in found if label[0] is not None}
-    if len(directions) != 1 or len(numbers) > 1:
+    if not directions and _titles_direction(title) and (above := _wide_label(title)) and above[1]:
+        directions, numbers = {above[1]}, numbers or {one for one in above[:1] if one is not None}
+    if len(directions) > 1 or len(numbers) > 1 or not (directions or numbers):
         return None
-    direction, signed = next(iter(directions))
+    direction, signed = next(iter(directions), ("", True))
     unit = next((label[2] for label in found if label[2] is not None), None)
     return Run(" ".join(texts), next(iter(numbers), None), direction, signed, unit, values)
 
 
-def _read_runs(candidates: Iterable[tuple[list[str], list[tuple[int, str]], str]]) -> tuple[list[Run], list[str]]:
+def _read_runs(
+    grid: Grid, candidates: Iterable[tuple[list[str], list[tuple[int, str]], str]]
+) -> tuple[list[Run], list[str]]:
     """Return the runs among columns or rows of headings and values, and what the others are called, by their headings or their place."""
-    runs: list[Run] = []
-    ignored: list[str] = []
-    for texts, values, place in candidates:
-        run = _read_run(texts, values)
-        if run is None:
-            ignored.append(" ".join(texts) or place)
-        else:
-            runs.append(run)
-    return runs, ignored
+    read = [(" ".join(texts) or place, _read_run(texts, values, grid.title)) for texts, values, place in candidates]
+    letters = {run.direction for _, run in read if run is not None and is_direction_letter(run.direction)}
+    words = {letter: find_direction(word) for letter, word in by_direction_letter(letters).items()}
+    for at, (text, run) in enumerate(read):
+        if run is not None and run.direction in letters:
+            direction, signed = words.get(run.direction) or ("", True)
+            read[at] = text, replace(run, direction=direction, signed=signed)
+    # Beside runs whose direction is named, others are none.
+    directed = any(run is not None and run.direction for _, run in read)
+    kept = [run is not None and bool(run.direction if directed else run.number is not None) for _, run in read]
+    runs = [run for (_, run), keep in zip(read, kept, strict=True) if run is not None and keep]
+    return runs, [text for (text, _), keep in zip(read, kept, strict=True) if not keep]
 
 
 def _deviation_unit(titles: Sequence[str]) -> str | None:
@@ -711,8 +938,8 @@ def _position_unit(titles: Sequence[str]) -> str | None:
     return next((heading.unit for heading in parts if heading.role == "position" and heading.unit), None)
 
 
-def read_wide_table(table: WideTable) -> Readings:
-    """Read the readings of a table of position by run."""
+def read_wide_table(table: WideTable, directions: Directions | None = None) -> Readings:
+    """Read the readings of a table of position by run, with the directions of its runs where it names none."""
     path, numerals = table.grid.path, table.grid.numerals
     notes: list[str] = []
     kind, position_unit, fine_unit = _wide_units(table, notes)
@@ -720,6 +947,7 @@ def read_wide_table(table: WideTable) -> Readings:
     factor = UNITS[position_unit].factor
     positions = [numerals.number(text) * factor for _, text in table.positions]
     targets = number_targets(positions)
+    table = replace(table, runs=_directed_runs(table, positions, directions, notes))
     for run, cycle in zip(table.runs, _cycles(table), strict=True):
         fine = UNITS[run.unit or fine_unit].factor * FINE[kind]
         for (line, text), target, position in zip(run.values, targets, positions, strict=True):
@@ -731,18 +959,91 @@ def read_wide_table(table: WideTable) -> Readings:
                 given.readings.append(Reading(line, *cell, position, np.datetime64("NaT", "ns"), deviation))
     if not all(run.signed for run in table.runs):
         turn_by_travel(given)
+    _judge_values(given, table, position_unit)
     return given
+
+
+def _judge_values(given: Readings, table: WideTable, position_unit: str) -> None:
+    """Subtract the targets where the values are measured positions; note the unit that values without one were given, unless they show
+    that it is none of theirs.
+    """
+    unstated = _stated_unit(table) is None
+    fine = FINE[given.kind]
+    values = np.array([one.deviation for one in given.readings]) * (
+        UNITS[position_unit].factor if unstated else 1 / fine
+    )
+    positions = np.array([one.position for one in given.readings])
+    largest = float(np.abs(values).max(initial=0.0))
+    if len(positions) and np.abs(values - positions).max() < _NEAR * np.ptp(positions):
+        differences = np.round((values - positions) * fine, 6)
+        given.readings = [
+            replace(one, deviation=float(value)) for one, value in zip(given.readings, differences, strict=True)
+        ]
+        given.notes.append("the values are measured positions: the target positions were subtracted")
+    elif unstated and given.kind == "length" and not _PLAUSIBLE_UM[0] <= largest <= _PLAUSIBLE_UM[1]:
+        raise LaserFormatError(
+            f"{table.grid.place}, line {table.line}: no heading states the unit of the deviations, whose largest is {largest:g}; write it "
+            'above the table ("Unit: um") or in the headings ("1+ [um]")'
+        )
+    elif unstated:
+        unit = "um" if given.kind == "length" else "arcsec"
+        given.notes.append(f"warning: no heading states the unit of the deviations: taken as {unit}")
+
+
+def _stated_unit(table: WideTable) -> str | None:
+    return table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
+
+
+def _directed_runs(
+    table: WideTable, positions: Sequence[float], directions: Directions | None, notes: list[str]
+) -> list[Run]:
+    """Return the runs with their directions: as the table names them, as the order of the positions tells, or as stated."""
+    if all(run.direction for run in table.runs):
+        if directions is not None:
+            raise _named_already(table.grid)
+        return table.runs
+    passes = passes_by_order(positions, [0] * len(positions))
+    if passes is not None:
+        notes.append(_BY_ORDER)
+        there_and_back = max(number for number, _ in passes) == 2
+        return [
+            replace(
+                run,
+                number=run.number if there_and_back else None,
+                direction=direction,
+                values=[
+                    (line, text if at == one else "") for (line, text), (at, _) in zip(run.values, passes, strict=True)
+                ],
+            )
+            for run in table.runs
+            for one, direction in dict(passes).items()
+        ]
+    if directions is None or len(set(number_targets(positions))) < len(positions):
+        raise DirectionsMissing(
+            f"{table.grid.place}, line {table.line}",
+            f"the runs {table.runs[0].text!r} to {table.runs[-1].text!r} name no direction",
+        )
+    stated = _state_directions(directions, len(table.runs))
+    return [replace(run, number=None, direction=one) for run, one in zip(table.runs, stated, strict=True)]
 
 
 def _wide_units(table: WideTable, notes: list[str]) -> tuple[Kind, str, str]:
     """Return the kind of axis, the unit of the positions, and that of runs without one; what no heading states is noted as taken."""
-    stated = table.deviation_unit or next((run.unit for run in table.runs if run.unit), None)
+    stated = _stated_unit(table)
+    lacking = {role for role, unit in (("deviation", stated), ("position", table.position_unit)) if unit is None}
+    for line, fields in table.grid.rows:
+        for text, following in itertools.pairwise([*fields, ""] if line <= table.line + _ROWS_BELOW else ()):
+            word, _, rest = re.sub(r"\s*[:=]\s*", " ", text).partition(" ")
+            heading = (
+                Heading(text, "deviation", None, rest or following) if fold(word) in UNIT_WORDS else read_heading(text)
+            )
+            if heading.role in lacking:
+                _refuse_unknown_unit(table.grid, line, heading)
     known = table.position_unit or stated
     usual = ("deg", "arcsec") if known and UNITS[known].kind == "angle" else ("mm", "um")
     position, deviation = table.position_unit or usual[0], stated or usual[1]
-    for name, unit, taken in (("positions", table.position_unit, position), ("deviations", stated, deviation)):
-        if unit is None:
-            notes.append(f"warning: no heading states the unit of the {name}: taken as {taken}")
+    if table.position_unit is None:
+        notes.append(f"warning: no heading states the unit of the positions: taken as {position}")
     units = sorted({run.unit or deviation for run in table.runs})
     told = f"positions in {position}, deviations in {', '.join(units)}"
     return _kind_of([*units, position], f"{table.grid.place}, line {table.line}: {told}"), position, deviation
@@ -771,7 +1072,7 @@ def _cycles(table: WideTable) -> list[int]:
 class Layout(NamedTuple):
     """A layout of deviations: its row in docs/formats.md, what finds it in the first bytes of a file or in a grid, and what reads it.
 
-    A file is read by its path and what was stated of feed (mm/min) and dwell (s), a table by what was found.
+    A file is read by its path and what was stated of feed (mm/min) and dwell (s), a table by what was found and the stated directions.
     """
 
     name: str
@@ -781,8 +1082,9 @@ class Layout(NamedTuple):
 
 #: What `read_deviations` reads, in the order in which a file is held against it: files of laser programs, and tables.
 FILES = (
-    Layout("Renishaw linear test, .rtl", lambda start: b"HEADER::" in start, read_rtl),
+    Layout("Renishaw linear test, .rtl", lambda start: b"HEADER::" in start.upper(), read_rtl),
     Layout("logs of the ecmc test tools, .dat", is_ecmc_log, lambda path, feed, dwell: read_ecmc_log(path)),
+    Layout("reports of the ecmc test tools, .md", is_ecmc_report, lambda path, feed, dwell: read_ecmc_report(path)),
 )
 TABLES = (
     Layout("table, one reading per line", find_long_table, read_long_table),
@@ -814,6 +1116,7 @@ def read_deviations(
     feed_mm_per_min: float | None = None,
     dwell_s: float | None = None,
     sheet: str | None = None,
+    directions: Directions | None = None,
     rotary: bool = False,
 ) -> xr.Dataset:
     r"""Read positioning deviations from a file.
@@ -822,7 +1125,8 @@ def read_deviations(
     ----------
     path : str or pathlib.Path
         Delimited text or a spreadsheet (.xlsx, .xls, .ods) with one reading per line (columns cycle, direction, target, position_mm,
-        time, deviation_um) or with one column or row per run; a Renishaw linear test (.rtl); or a log of the ecmc test tools (.dat).
+        time, deviation_um) or with one column or row per run; a Renishaw linear test (.rtl); or a log or report of the ecmc test tools
+        (.dat, .md).
         The kind of file is recognised from its content; headings may be English, German, French, Spanish or Chinese and carry their
         unit (docs/formats.md).
     feed_mm_per_min : float, optional
@@ -831,7 +1135,10 @@ def read_deviations(
         Time at rest at each target, s. With both, the times of readings, which a .rtl does not hold, are reconstructed more closely.
         Ignored where every reading has its own time.
     sheet : str, optional
-        Name of the sheet of a spreadsheet; None: the only one that holds a table of deviations.
+        Name of the sheet of a spreadsheet; None: the only one that holds a table of deviations, or one for each direction.
+    directions : {"positive first", "negative first", "positive", "negative"}, optional
+        From which side the targets were approached, of a table that names no direction and whose order of positions does not tell it: in
+        alternating runs, of which the first is named, or always from the same side.
     rotary : bool, optional
         Whether a rotary axis is accepted: its positions are in deg and its deviations in arcsec, as the units of the variables say.
 
@@ -847,7 +1154,8 @@ def read_deviations(
     Raises
     ------
     LaserFormatError
-        The file cannot be used as a whole, or it is of a rotary axis and `rotary` is False.
+        The file cannot be used as a whole, it is of a rotary axis and `rotary` is False, or `directions` is needed and not given, or given
+        and not needed.
     OSError
         The file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
@@ -868,6 +1176,8 @@ def read_deviations(
     [[0.12, 1.48]]
     """
     path = Path(path)
+    if directions not in (None, *get_args(Directions)):
+        raise LaserFormatError(f"directions={directions!r} is none of {', '.join(map(repr, get_args(Directions)))}")
     start = _start_of(path)
     if (program := _of_a_program(start)) is not None:
         return program.read(path, feed_mm_per_min, dwell_s)
@@ -875,7 +1185,7 @@ def read_deviations(
         raise LaserFormatError(
             f"{path}: a report of averages over runs holds no single reading; export the readings of every run"
         )
-    deviations = _read_table_of_deviations(path, sheet)
+    deviations = _read_table_of_deviations(path, sheet, directions)
     if deviations["deviation"].attrs["units"] != "um" and not rotary:
         raise LaserFormatError(
             f"{path}: the positions are angles; a rotary axis is evaluated by ISO 230-2 alone, without a camera and not while it is "
@@ -885,9 +1195,9 @@ def read_deviations(
 
 
 def _start_of(path: Path) -> bytes:
-    """Return the beginning of a file, by which the files of laser programs are known."""
+    """Return the beginning of a file, by which the files of laser programs are known, as ASCII where it is UTF-16."""
     with path.open("rb") as stream:
-        return stream.read(START_BYTES)
+        return stream.read(START_BYTES).replace(b"\0", b"")
 
 
 def _of_a_program(start: bytes) -> Layout | None:
@@ -895,15 +1205,19 @@ def _of_a_program(start: bytes) -> Layout | None:
     return next((one for one in FILES if one.find(start)), None)
 
 
-def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
+def _read_table_of_deviations(path: Path, sheet: str | None, directions: Directions | None) -> xr.Dataset:
     """Read delimited text or a spreadsheet: one reading per line, or position by run."""
     grids = read_grids(path, sheet=sheet)
-    found: dict[str, Readings] = {}
+    found: dict[str, tuple[Layout, Any]] = {}
     for grid in grids:
         for one in TABLES:
             if (table := one.find(grid)) is not None:
-                found.setdefault(grid.sheet, one.read(table))
+                found.setdefault(grid.sheet, (one, table))
                 break
+    if len(found) > 1 and all(
+        isinstance(table, WideTable) and _titles_direction(name) for name, (_, table) in found.items()
+    ):
+        found = {"": (TABLES[1], join_tables([table for _, table in found.values()]))}
     if len(found) > 1:
         raise LaserFormatError(
             f"{path}: the sheets {', '.join(map(repr, found))} each hold a table of deviations; name one of them (sheet = ...), or save it "
@@ -914,7 +1228,8 @@ def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
             f"{grids[0].place}: no table of deviations; {what_is_missing(grids[0])}; expected one reading per line with the "
             f"columns {','.join(DEVIATION_COLUMNS)}, or a table of position by run such as 'Position [mm],1+ [um],1- [um],2+ [um]'"
         )
-    return check_and_assemble(next(iter(found.values())))
+    layout, table = next(iter(found.values()))
+    return check_and_assemble(layout.read(table, directions))
 
 
 def holds_deviations(path: Path) -> bool:

@@ -1,10 +1,11 @@
-"""Reader of Renishaw linear tests (.rtl)."""
+"""Readers of Renishaw linear tests (.rtl), and of logs (.dat) and reports (.md) of the ecmc test tools."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import xarray as xr
 
 from interferometry.deviations import DIRECTIONS, build_deviations
 from interferometry.io.faults import SENTINEL_MAGNITUDE, BadReading, LaserFormatError, LeftOut, parse_number
-from interferometry.io.tables import NO_ZONE, decode_text
+from interferometry.io.tables import NO_ZONE, decode_text, encoding_of, read_heading
 
 #: Bytes by which the file of a laser program is told.
 START_BYTES = 4096
@@ -26,6 +27,10 @@ _UM_PER_UNIT = {"mm": 1e3, "um": 1.0, "m": 1e6}
 #: Digits of the number of a target or cycle; a damaged file may name the billionth.
 _MOST_DIGITS = 5
 _DIRECTION = {"REF_DATA_FWD": 0, "REF_DATA_BWD": 1}
+#: Words of the heading above a table of a report, and what an assignment of its values is called in a log.
+_REPORTED = {"Data forward direction": "REF_DATA_FWD", "Data backward direction": "REF_DATA_BWD"}
+#: Line and its text; name, target and cycle of a value (the numbers as text, None of what is stated of the test), and the value.
+_Entry = tuple[int, str, str, str | None, str | None, str]
 
 
 def is_ecmc_log(start: bytes) -> bool:
@@ -35,15 +40,50 @@ def is_ecmc_log(start: bytes) -> bool:
 
 def read_ecmc_log(path: Path) -> xr.Dataset:
     """Read a log that holds target and measured positions, but no times."""
+    lines = enumerate(decode_text(path, path.read_bytes()).splitlines(), start=1)
+    found = [(line, text, match) for line, text in lines if (match := _ASSIGNMENT.match(text.strip()))]
+    return _assemble_ecmc(path, ((line, text, one[1], one[2], one[3], one[4]) for line, text, one in found))
+
+
+def is_ecmc_report(start: bytes) -> bool:
+    """Return whether a file is a report with the targets and measured positions in tables of Markdown."""
+    return b"tgt_pos(i)" in start
+
+
+def read_ecmc_report(path: Path) -> xr.Dataset:
+    """Read the first two tables of a report, forward and backward, with one line per target and one column per cycle."""
+    name, units = "", list[str | None]()
+    found: list[_Entry] = []
+    for line, text in enumerate(decode_text(path, path.read_bytes()).splitlines(), start=1):
+        fields = [field.strip() for field in text.strip().strip("|").split("|")]
+        if text.startswith("#"):
+            name, units = next((name for word, name in _REPORTED.items() if word in text), ""), []
+        elif text.startswith("i ") and "tgt_pos" in text and "ref_pos" in text:
+            units = [read_heading(field).unit for field in fields[1:]]
+            found.append((line, text, "UNIT", None, None, units[0] or "none"))
+        elif name and units and fields[0].isdecimal():
+            if len(fields) != len(units) + 1 or len(set(units)) > 1:
+                raise LaserFormatError(
+                    f"{path}, line {line}: {text!r} is no line of a target and {len(units)} positions in one unit"
+                )
+            found.append((line, text, "TGT_DATA", fields[0], None, fields[1]))
+            found += [
+                (line, text, name, fields[0], str(cycle), value) for cycle, value in enumerate(fields[2:], start=1)
+            ]
+    note = (
+        "warning: forward and backward are those of the report, and the public programs that write it exchange them; take the log (.dat) "
+        "where the sign of the reversal matters"
+    )
+    return _assemble_ecmc(path, found).assign_attrs(notes=json.dumps([note]))
+
+
+def _assemble_ecmc(path: Path, entries: Iterable[_Entry]) -> xr.Dataset:
+    """Return the deviations that what was stated of a test gives."""
     stated: dict[str, str] = {}
     target_at: dict[int, float] = {}
     readings: dict[tuple[int, int, int], float] = {}
     left_out = LeftOut(path)
-    for line, text in enumerate(decode_text(path, path.read_bytes()).splitlines(), start=1):
-        match = _ASSIGNMENT.match(text.strip())
-        if match is None:
-            continue
-        name, target, cycle, value = match.groups()
+    for line, text, name, target, cycle, value in entries:
         if target is None:
             stated[name] = value.strip()
             continue
@@ -55,7 +95,7 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
             if name == "TGT_DATA":
                 stated_before = target_at.setdefault(int(target), number)
             else:
-                stated_before = readings.setdefault((int(cycle) - 1, _DIRECTION[name], int(target) - 1), number)
+                stated_before = readings.setdefault((int(cycle or 0) - 1, _DIRECTION[name], int(target) - 1), number)
             if stated_before != number:
                 raise BadReading(text, f"is stated before as {stated_before:g}; the first is kept")
     unit = stated.get("UNIT", "mm")
@@ -128,11 +168,12 @@ class _Run:
 def read_rtl(path: Path, feed_mm_per_min: float | None = None, dwell_s: float | None = None) -> xr.Dataset:
     """Read a Renishaw linear test."""
     content = path.read_bytes()
-    if b"\nData:" in content[:START_BYTES]:
+    text = content.decode(encoding_of(content) or "latin-1", "replace")
+    if "\ndata:" in text[:START_BYTES].lower():
         raise LaserFormatError(
             f"{path}: a dynamic capture (.rtx) has no target positions; name the file of a linear test (.rtl)"
         )
-    sections = _split_sections(path, content.decode("latin-1"))
+    sections = _split_sections(path, text)
     kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
     if kind.lower() != "rtl":
         raise LaserFormatError(
@@ -188,7 +229,7 @@ def _split_sections(path: Path, text: str) -> _Sections:
     current: list[tuple[int, str]] = []
     for line, content in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
         if content.rstrip().endswith("::") and content[:1].isalpha():
-            current = sections.setdefault(content.strip().removesuffix("::"), [])
+            current = sections.setdefault(" ".join(content.upper().strip(" :\t").split()), [])
         elif content.strip():
             current.append((line, content))
     for name in ("TARGET DATA", "DEVIATIONS", "EOF"):
@@ -232,7 +273,9 @@ def _key(name: str) -> str:
 def _parse_targets(path: Path, sections: _Sections) -> np.ndarray:
     section = sections["TARGET DATA"]
     count = _whole(path, section, "Target-count", 0)
-    begin = next((i for i, (_, content) in enumerate(section) if re.match(r"Targets\s*:", content)), None)
+    begin = next(
+        (i for i, (_, content) in enumerate(section) if re.match(r"targets\s*:", content, re.IGNORECASE)), None
+    )
     numbers: list[float] = []
     for line, content in section[begin + 1 :] if begin is not None else []:
         if ":" in content:
@@ -276,7 +319,7 @@ def _parse_runs(path: Path, sections: _Sections, targets: int) -> tuple[list[_Ru
     left_out = LeftOut(path)
     for line, content in sections["DEVIATIONS"]:
         words = content.replace(",", ".").split()
-        if words[0] == "Run":
+        if words[0].lower() == "run":
             continue
         try:
             run, target, value = int(words[0]), int(words[1]), _decimal(words[2])

@@ -8,7 +8,7 @@ import json
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
@@ -182,18 +182,37 @@ UNIT_WORDS = frozenset(_VOCABULARY["unit_words"])
 UNITS = {
     word: Unit(unit["kind"], unit["factor"], unit["offset"]) for unit in _VOCABULARY["units"] for word in unit["words"]
 }
+_SHARES = [(word, float(share)) for share, words in _VOCABULARY["shares"].items() for word in words]
+UNITS |= {
+    f"{share}{gap}{word}": Unit(unit.kind, factor * unit.factor, 0.0)
+    for word, unit in UNITS.items()
+    for share, factor in _SHARES
+    for gap in ("", " ")
+    if unit.kind == "length"
+}
 
-_IN_BRACKETS = re.compile(r"(.*?)\s*[(\[（【{]\s*([^()\[\]（）【】{}]*?)\s*[)\]）】}]\s*(.*)")
-_AFTER_MARK = re.compile(r"(.*\S)\s*(?:/|,|;|\sin\s|_|\s)\s*(\S+)")
+_BRACKETS = re.compile(r"\s*[(\[（【{]\s*([^()\[\]（）【】{}]*?)\s*[)\]）】}]\s*")
+_MARK = r"(.*\S)\s*(?:/|,|;|\sin\s|_|\s)\s*"
+_AFTER_MARK = (
+    re.compile(rf"{_MARK}((?:{'|'.join(re.escape(share) for share, _ in _SHARES)})\s*\S+)"),
+    re.compile(rf"{_MARK}(\S+)"),
+)
+#: End of a name that makes a share of the unit behind it, as in "1/8 um".
+_SHARE = re.compile(r"\d[/.,^]-?\d+$")
+#: What may be a unit behind a word: "(tenths)", "in counts", "um/m", "1/8 um".
+_UNKNOWN = re.compile(
+    r"(.*?\S)\s*(?:[(\[]\s*([^()\[\]]+?)\s*[)\]]|(?:\sin\s|/)\s*(\S+|\S+/\S+\s\S+)|\s(\S+/\S+|\d[\d.,/^-]*\s*[^\W\d]\w*))"
+)
 
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading as it was understood: its role, None where the words are not known, and its unit, a key of `UNITS`."""
+    """A heading as it was understood: its role, None where the words are not known, its unit, a key of `UNITS`, or what is none."""
 
     text: str
     role: str | None
     unit: str | None
+    unknown: str = ""
 
 
 def fold(text: str) -> str:
@@ -217,17 +236,25 @@ def read_heading(text: str) -> Heading:
     if role == "target" and unit is not None:
         # "Target [mm]" is the position of a target and not its number.
         role = "position"
+    if role is None and unit is None and (match := _UNKNOWN.fullmatch(text.strip())):
+        of_unknown = _ROLES.get(fold(match[1]).replace(" ", ""))
+        if of_unknown in ("position", "measured", "deviation"):
+            return Heading(text, of_unknown, None, match[2] or match[3] or match[4])
     return Heading(text, role, unit)
 
 
 def split_unit(text: str) -> tuple[str, str | None]:
     """Split a heading into name and unit."""
-    match = _IN_BRACKETS.fullmatch(text.strip())
-    if match is not None and (unit := find_unit(match[2])) is not None:
-        return f"{match[1]} {match[3]}".strip(), unit
-    match = _AFTER_MARK.fullmatch(text.strip())
-    if match is not None and (unit := find_unit(match[2])) is not None:
-        return re.sub(r"(\s+in|\s*[/,;])$", "", match[1]), unit
+    for match in _BRACKETS.finditer(text):
+        if (unit := find_unit(match[1])) is not None:
+            return f"{text[: match.start()]} {text[match.end() :]}".strip(), unit
+    for pattern in _AFTER_MARK:
+        found = pattern.fullmatch(text.strip())
+        if found is not None and (unit := find_unit(found[2])) is not None:
+            name = re.sub(r"(\s+in|\s*[/,;])$", "", found[1])
+            if _SHARE.search(name) or find_unit(name.split()[-1]) is not None:
+                break
+            return name, unit
     return text.strip(), None
 
 
@@ -237,11 +264,23 @@ def find_direction(text: str) -> tuple[str, bool] | None:
     return _DIRECTIONS.get(_key(signs))
 
 
+def is_direction_letter(word: str) -> bool:
+    """Return whether a word is a letter that names a direction where the other one of its pair does."""
+    return word.casefold() in _LETTERS
+
+
+def by_direction_letter(letters: Collection[str]) -> dict[str, str]:
+    """Return the word for the direction of each letter, where two letters are a pair; nothing else."""
+    pairs = [pair for pair in _VOCABULARY["direction_letters"] if {*map(str.casefold, letters)} == {*pair}]
+    return {letter: ("forward", "reverse")[pairs[0].index(letter.casefold())] for letter in letters if pairs}
+
+
 def _key(word: str) -> str:
     return word if word in _SIGNS else fold(word)
 
 
-_SIGNS = ("+", "-", "+1", "-1", "↑", "↓")
+_SIGNS = ("+", "-", "+1", "-1", "↑", "↓", "→", "←")
+_LETTERS = frozenset("".join(_VOCABULARY["direction_letters"]))
 _ROLES = {fold(word).replace(" ", ""): role for role, words in _VOCABULARY["headings"].items() for word in words}
 _DIRECTIONS = {_key(word): (one["name"], one["signed"]) for one in _VOCABULARY["direction"] for word in one["words"]}
 #: By these, text in the Chinese code page is recognised.
@@ -255,13 +294,18 @@ CHINESE_WORDS = tuple(
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
 
+def encoding_of(content: bytes) -> str | None:
+    """Return the encoding that the beginning of a text shows: its mark, or zeros in every other byte; None where nothing does."""
+    return next((name for mark, name in _MARKS if content.startswith(mark)), None) or _unmarked_utf16(content)
+
+
 def decode_text(path: Path, content: bytes) -> str:
     """Return the text of a file without byte-order mark, whatever a spreadsheet program of the last thirty years saved it as.
 
     >>> decode_text(Path("a.csv"), "Abweichung [µm]".encode("cp1252"))
     'Abweichung [µm]'
     """
-    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), None) or _unmarked_utf16(content)
+    encoding = encoding_of(content)
     try:
         text = content.decode(encoding or "utf-8")
     except UnicodeDecodeError as fault:
@@ -321,11 +365,15 @@ _SHOWN = 160
 
 @dataclass(frozen=True)
 class Grid:
-    """Rows of fields with their numbers from 1, without empty ones and comments; ``sheet`` is "" for a text file."""
+    """Rows of fields with their numbers from 1, without empty ones and comments; ``sheet`` is "" for a text file.
+
+    ``title`` stands above the rows, of a sheet it is its name.
+    """
 
     path: Path
     sheet: str
     rows: list[tuple[int, list[str]]]
+    title: str = ""
 
     @property
     def place(self) -> str:
@@ -362,7 +410,7 @@ def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
             raise LaserFormatError(
                 f"{path}: there is no sheet {sheet!r}; the sheets are {', '.join(map(repr, sheets))}"
             )
-        return [Grid(path, name, rows) for name, rows in sheets.items() if sheet in (None, name)]
+        return [Grid(path, name, rows, name) for name, rows in sheets.items() if sheet in (None, name)]
     text = decode_text(path, content)
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     short = sum(len(line) < _SHORT_LINE for line in lines) if len(lines) > _MOST_SHORT_LINES else 0

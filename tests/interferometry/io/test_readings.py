@@ -3,6 +3,7 @@
 import json
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openpyxl
@@ -17,6 +18,7 @@ from interferometry.io.readings import (
     check_and_assemble,
     find_wide_table,
     is_environment_log,
+    passes_by_order,
     read_deviations,
     read_environment,
     turn_by_travel,
@@ -337,6 +339,8 @@ def table(header: str, line: str, *, minus: str = "-", plus: str = "+", decimal:
                 clock=clock,
                 e=str(deviation).replace(".", decimal),
                 nm=deviation * 1e3,
+                negative=-deviation,
+                tenths=deviation * 10,
                 mm=f"{deviation / 1e3:.6f}",
                 measured=f"{position + deviation / 1e3:.6f}",
                 inch=f"{position / 25.4:.9f}",
@@ -392,6 +396,12 @@ DIALECTS = {
     "millimetres": table(HEADER.replace("_um", "_mm"), LINE.replace("{e}", "{mm}")),
     "inches": table(HEADER.replace("position_mm", "position (inch)"), LINE.replace("{p}", "{inch}")),
     "measured": table(HEADER.replace("deviation_um", "measured (mm)"), LINE.replace("{e}", "{measured}")),
+    "letters": table(HEADER, LINE, plus="F", minus="B"),
+    "arrows": table(HEADER, LINE, plus="→", minus="←"),
+    "order of the positions": table(HEADER.replace("direction,", ""), LINE.replace("{d},", "")),
+    "directions that only number": table(HEADER, LINE, plus="0", minus="1"),
+    "target minus measured": table(f"{HEADER},measured (mm)", LINE.replace("{e}", "{negative},{measured}")),
+    "shares of a unit": table(HEADER.replace("deviation_um", "Abweichung / 0.1 µm"), LINE.replace("{e}", "{tenths}")),
     "no targets": table(HEADER.replace("target,", ""), LINE.replace("{t},", "")),
     "from 0": table(HEADER, LINE.replace("{c}", "{zero}").replace("{t}", "{tz}")),
     "runs": table(HEADER.replace("cycle", "run"), LINE.replace("{c}", "{run}")),
@@ -490,7 +500,11 @@ def test_a_mark_for_no_reading_is_no_value(tmp_path, mark):
         ("cycle,direction,position_mm,deviation_degC", "{c},{d},{p},{e}", "position in mm, deviation in degc; give"),
         (f"{HEADER},error_um", f"{LINE},{{e}}", "'deviation_um' and 'error_um' both name the deviation"),
         (HEADER, LINE.replace("2026-03-09T", "3/9/2026 "), "line 2: '3/9/2026 .* the day or the month first"),
-        ("cycle,position_mm,deviation_um", "{c},{p},{e}", "cycle, position, deviation, but no column of a direction"),
+        (
+            "cycle,position_mm,deviation_um",
+            "{c},{p},{e}",
+            "line 1: no column names a direction, and the order of .* 'positive first'",
+        ),
         ("a,b,c,d", "{c},{d},{p},{e}", "no table of deviations; line 1 is 'a,b,c,d'; expected one reading per line"),
     ],
 )
@@ -502,11 +516,17 @@ def test_what_a_table_lacks_is_named(tmp_path, header, line, message):
 WIDE_EXPECTED = np.array([[[1.25, 1.5, 1.75], [0.75, 0.5, 0.25]], [[2.25, 2.5, 2.75], [1.75, 1.5, 1.25]]])
 ROWS = [(0, 1.25, 0.75, 2.25, 1.75), (20, 1.5, 0.5, 2.5, 1.5), (40, 1.75, 0.25, 2.75, 1.25)]
 DATA = "\n".join(",".join(map(str, row)) for row in ROWS)
+#: The runs of each direction below their title, those back as they were measured.
+BLOCK = {
+    "Forward": "\n".join(f"{row[0]},{row[1]},{row[3]},9" for row in ROWS) + "\n",
+    "Reverse": "\n".join(f"{row[0]},{row[2]},{row[4]},9" for row in ROWS[::-1]),
+}
 BY_DIRECTION = "\n".join(",".join(str(row[i]) for i in (0, 1, 3, 2, 4)) for row in ROWS)
+RUNS_SORTED = "".join(f"{run},{row[0]},{row[run]}\n" for run in (1, 2, 3, 4) for row in ROWS)
 BESIDE = "{0},{1},1.25,1.5,1.75\n{0},{2},.75,.5,.25\n{3},{1},2.25,2.5,2.75\n{3},{2},1.75,1.5,1.25\n"
 
 
-def read_wide(folder: Path, text: str, **options: bool) -> xr.Dataset:
+def read_wide(folder: Path, text: str, **options: Any) -> xr.Dataset:
     path = folder / "wide.csv"
     path.write_text(text, encoding="utf-8")
     return read_deviations(path, **options)
@@ -517,6 +537,19 @@ WIDE_DIALECTS = {
     "signs first": f"Position [mm],+1 [um],-1 [um],+2 [um],-2 [um]\n{DATA}",
     "words": f"Unit: µm\nPosition (mm),Run 1 forward,Run 1 reverse,Run 2 forward,Run 2 reverse\n{DATA}",
     "alternating runs": f"Position (mm),Run 1 + (µm),Run 2 - (µm),Run 3 + (µm),Run 4 - (µm)\n{DATA}",
+    "letters": f"Unit: µm\nPosition (mm),X1f,X1b,X2f,X2b\n{DATA}",
+    "arrows": f"Unit: µm\nPosition (mm),→ 1,← 1,-> 2,<- 2\n{DATA}",
+    "measured": "Position (mm),F1,R1,F2,R2\n"
+    + "\n".join(f"{p}," + ",".join(f"{p + d / 1e3:.5f}" for d in row) for p, *row in ROWS),
+    "blocks": "Unit: um\n" + "\n".join(f"{way}\nPosition (mm),1,2,Mean\n{BLOCK[way]}" for way in BLOCK),
+    "a block for each run": "\n".join(
+        f"Run {k} {way}\nPosition (mm),Error (um)\n"
+        + "\n".join(f"{row[0]},{row[2 * k - (way == 'forward')]}" for row in ROWS)
+        for k in (1, 2)
+        for way in ("forward", "reverse")
+    ),
+    "there and back": "Position (mm),Cycle 1 [um],Cycle 2 [um]\n"
+    + "\n".join([*(f"{p},{a},{c}" for p, a, _, c, _ in ROWS), *(f"{p},{b},{d}" for p, _, b, _, d in ROWS[::-1])]),
     "two rows": f"Deviations in µm\nPosition (mm),Cycle 1,,Cycle 2,\n,+,-,+,-\n{DATA}",
     "rows above": f"Abweichungen [µm]\n,Zyklus 1,,Zyklus 2,\nSollposition [mm],+,-,+,-\n{DATA}",
     "by direction": f"Écarts (µm),,,,\n,Aller,,Retour,\nPosition cible (mm),1,2,1,2\n{BY_DIRECTION}",
@@ -539,6 +572,68 @@ def test_every_dialect_of_a_wide_table_gives_the_same_test(tmp_path, dialect):
     assert test["deviation"].values.tolist() == WIDE_EXPECTED.tolist()
     assert test["time"].attrs["origin"] == "none"
     assert test.attrs["missing"] == 0
+
+
+@pytest.mark.parametrize(
+    "text", [f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}", "run,position_mm,deviation_um\n" + RUNS_SORTED]
+)
+def test_stated_directions_are_used_where_the_table_names_none(tmp_path, text):
+    stated = {"positive first": WIDE_EXPECTED, "negative first": WIDE_EXPECTED[:, ::-1]}
+    for directions, expected in stated.items():
+        assert read_wide(tmp_path, text, directions=directions)["deviation"].values.tolist() == expected.tolist()
+    one_way = read_wide(tmp_path, text, directions="negative")["deviation"]
+    assert one_way.shape == (4, 2, 3)
+    assert np.isnan(one_way.values[:, 0]).all()
+    assert one_way.values[:, 1].tolist() == WIDE_EXPECTED.reshape(4, 3).tolist()
+    for refused in ({"directions": "both"}, {}):
+        with pytest.raises(LaserFormatError, match="'positive first'"):
+            read_wide(tmp_path, text, **refused)
+    with pytest.raises(LaserFormatError, match="the table names the direction of its runs; remove directions"):
+        read_wide(tmp_path, WIDE_DIALECTS["signs"], directions="positive")
+
+
+def test_a_sheet_for_each_direction_and_positions_that_only_one_of_them_has(tmp_path):
+    book = openpyxl.Workbook()
+    for way, rows in BLOCK.items():
+        sheet = book.create_sheet(way)
+        sheet.append(["Position [mm]", "1 [um]", "2 [um]", "Mean"])
+        for row in rows.split():
+            sheet.append([float(text) for text in row.split(",")])
+    book.save(tmp_path / "a.xlsx")
+    assert read_deviations(tmp_path / "a.xlsx")["deviation"].values.tolist() == WIDE_EXPECTED.tolist()
+    sheet["A3"] = 21.0
+    book.save(tmp_path / "a.xlsx")
+    with pytest.raises(LaserFormatError, match="line 3: position 21 of 'Reverse' does not occur in 'Forward'"):
+        read_deviations(tmp_path / "a.xlsx")
+
+
+@pytest.mark.parametrize("unit", ["tenths", "um/m", "1/8 um", "counts", "cm"])
+@pytest.mark.parametrize("heading", ["Deviations [{}]", "Deviations in {}", "Unit: {}", "Unit,{}", "Abweichung / {}"])
+def test_a_unit_that_is_none_is_named(tmp_path, unit, heading):
+    with pytest.raises(LaserFormatError, match=f"line 1: '{unit}' in .* is no unit of a position or deviation"):
+        read_wide(tmp_path, f"{heading.format(unit)}\nPosition [mm],1+,1-,2+,2-\n{DATA}")
+    if not heading.startswith("Unit"):
+        with pytest.raises(LaserFormatError, match=f"line 1: '{unit}' in .* is no unit of a position or deviation"):
+            read(tmp_path, SIGNS.replace("deviation_um", heading.format(unit)))
+
+
+def test_the_order_of_positions_tells_the_direction_only_of_a_test_in_both(tmp_path):
+    there, back = [0.0, 10.0, 20.0], [20.0, 10.0, 0.0]
+    assert passes_by_order([*there, *back], [0] * 6) == [(1, "positive")] * 3 + [(2, "negative")] * 3
+    # The last target is read once; a test that was broken off.
+    assert passes_by_order([*there, *back[1:], 10.0], [0] * 6) == [(1, "positive")] * 3 + [(2, "negative")] * 2 + [
+        (3, "positive")
+    ]
+    assert passes_by_order([*back, *there], [1] * 3 + [2] * 3) == [(1, "negative")] * 3 + [(2, "positive")] * 3
+    unknown = [
+        [*there, *there],
+        [0.0, 0.0, 10.0, 10.0, 20.0, 20.0],
+        [0.0, 10.0, 10.0, 20.0],
+        [0.0, 10.0, 0.0, 10.0, 20.0, 10.0],
+        there,
+    ]
+    for positions in unknown:
+        assert passes_by_order(positions, [0] * len(positions)) is None
 
 
 def test_columns_that_are_no_runs_empty_cells_and_words_are_named(tmp_path):
@@ -588,13 +683,23 @@ def test_a_rotary_axis_in_degrees_and_arcseconds(tmp_path):
         (f"Angle [deg],1+,1-,2+,2-\n{DATA}", ["deviations: taken as arcsec"]),
     ],
 )
-def test_units_that_no_heading_states_are_taken_and_noted(tmp_path, text, taken):
+def test_units_that_no_heading_states_are_taken_and_noted_where_the_values_allow_them(tmp_path, text, taken):
     semicolons = text.replace(",", ";").replace(".", ",")
     for one in (text, semicolons):
         test = read_wide(tmp_path, one, rotary=True)
         assert test["deviation"].values == pytest.approx(WIDE_EXPECTED, abs=1e-6)
         told = [note.rpartition("of the ")[2] for note in json.loads(test.attrs["notes"]) if "unit" in note]
         assert told == taken
+    if "deviations: taken as um" in taken:
+        for factor in ("e-2", "e+3"):
+            beyond = "\n".join(
+                ",".join([row[0], *(f"{one}{factor}" for one in row[1:])])
+                for row in (line.split(",") for line in DATA.split("\n"))
+            )
+            with pytest.raises(
+                LaserFormatError, match="no heading states the unit of the deviations, whose largest is"
+            ):
+                read_wide(tmp_path, text.replace(DATA, beyond))
 
 
 def test_numbers_of_targets_are_no_positions(tmp_path):
@@ -607,7 +712,10 @@ def test_numbers_of_targets_are_no_positions(tmp_path):
     [
         (f"Position [deg],1+ [um],1- [um],2+ [um],2- [um]\n{DATA}", "positions in deg, deviations in um; give both as"),
         (f"Position [mm],1+ [um],1- [um],2+ [um],- [um]\n{DATA}", "'- .um.' has no number, but other runs have"),
-        (f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}", "no table of deviations; line 1 has columns of"),
+        (
+            f"Position [mm],1 [um],2 [um],3 [um],4 [um]\n{DATA}",
+            "line 1: the runs '1 .um.' to '4 .um.' name no direction; .* state directions",
+        ),
     ],
 )
 def test_what_a_wide_table_lacks_is_named(tmp_path, text, message):

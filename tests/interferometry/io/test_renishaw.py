@@ -210,6 +210,32 @@ def test_of_an_assignment_that_is_repeated_the_first_is_kept_and_the_other_liste
     assert [one["line"] for one in json.loads(test.attrs["left_out"])] == [7, 8]
 
 
+def test_a_report_of_these_logs_is_read_with_its_directions_and_says_that_they_may_be_exchanged(tmp_path):
+    head = "i |tgt_pos(i) [mm]|ref_pos(i,1) [mm]|ref_pos(i,2) [mm]|\n--- |--- |--- |--- |\n"
+    blocks = [
+        f"### Data {way}ward direction\n\ntgt_pos(i) = Target position [mm]\n\n{head}1|10.0|10.00{k}|10.00{k + 1}|\n2|20.0|20.01|20.02|\n"
+        for way, k in (("for", 1), ("back", 3))
+    ]
+    means = "#### Positioning deviation forward direction\n\ni |x(i,1) [mm]|x(i,2) [mm]|\n--- |--- |--- |\n1|9|9|\n"
+    path = tmp_path / "report.md"
+    path.write_text("# ISO 230-2 motion test\n" + "\n".join([*blocks, means]))
+    test = read_deviations(path)
+    assert test["deviation"].values == pytest.approx(np.array([[[1, 10], [3, 10]], [[2, 20], [4, 20]]]))
+    assert test["position"].values.tolist() == [10.0, 20.0]
+    assert "public programs that write it exchange them" in test.attrs["notes"]
+    path.write_text(path.read_text().replace("|ref_pos(i,2) [mm]", "|ref_pos(i,2) [um]"))
+    with pytest.raises(LaserFormatError, match=r"line 8: .* is no line of a target and 3 positions in one unit"):
+        read_deviations(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le"])
+def test_a_linear_test_in_other_case_and_encoding_is_the_same(tmp_path, encoding):
+    path = rtl(tmp_path)
+    test = read_deviations(path)
+    path.write_bytes(path.read_bytes().decode("latin-1").upper().encode(encoding))
+    assert read_deviations(path).equals(test)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
