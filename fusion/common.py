@@ -26,7 +26,7 @@ Array: TypeAlias = "NDArray[np.float64]"
 #: Packages whose version can change a number in the results.
 _PACKAGES = (
     "thermofuse", "numpy", "scipy", "xarray", "opencv-python-headless", "scikit-image", "numba", "imagecodecs", "OpenEXR",
-    "GTC", "ref-index", "pandas", "h5netcdf", "netCDF4",
+    "ref-index", "pandas", "h5netcdf", "netCDF4",
 )  # fmt: skip
 
 

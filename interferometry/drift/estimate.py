@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import special
+from scipy import sparse, special
 
 from interferometry.common import DIRECTIONS, Array, InterferometryError, check_dataset, one_thread
 from interferometry.deviations import DIMS, OUTLIER, ROUNDING, set_flag, sort_readings
@@ -377,8 +377,7 @@ def _fit(
     if shapes is None:
         shapes = np.empty((np.unique(position).size, 0))
     loadings = _loadings(readings, components, shapes, readings["sign"].values.astype(float), position)
-    design = np.zeros((cell.size, len(cells)))
-    design[np.arange(cell.size), cell] = 1.0
+    design = sparse.csr_array((np.ones(cell.size), (np.arange(cell.size), cell)), shape=(cell.size, len(cells)))
     seconds, deviation = readings["seconds"].values, readings["deviation"].values
     fit = estimate(
         seconds,
@@ -467,49 +466,53 @@ class _StateDrift:
     with_drift: Array
 
 
-def _drift_at_state(joint: JointFit, columns: Array, weights: Array) -> _StateDrift:
-    system = joint.fit.system
-    average, covariance, with_drift = average_drift(system, weights, columns)
-    hours = np.array([weights @ (system.seconds / 3600.0)])
-    drift, per_coefficient = _with_start_rates(average[None], hours, joint)
-    return _StateDrift(drift[0], per_coefficient[0], covariance, with_drift)
-
-
-def _with_start_rates(levels: Array, hours: Array, joint: JointFit) -> tuple[Array, Array]:
-    """Return the whole drift (n, components) and its derivative by the coefficients (n, components, p)."""
-    per_coefficient = -levels[:, :, 1:]
-    first = len(joint.cells)
-    for component in range(joint.fit.coefficients.size - first):
-        per_coefficient[:, component, first + component] += hours
-    return levels[:, :, 0] + per_coefficient @ joint.fit.coefficients, per_coefficient
-
-
-def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift) -> tuple[Array, Array]:
-    """Return the drift from the thermal state (n, components) and its covariance (n, components, components) in um and um2."""
+def _drift_at_state(joint: JointFit, weights: Array) -> _StateDrift:
     fit = joint.fit
-    total, dependence = _with_start_rates(smoothed.levels, fit.system.seconds / 3600.0, joint)
-    drift = total - at_state.drift
-    dependence -= at_state.per_coefficient
+    columns = sparse.hstack([fit.residual()[:, None], fit.design], format="csr")
+    average, covariance, with_drift = average_drift(fit.system, weights, columns)
+    hours = float(weights @ (fit.system.seconds / 3600.0))
+    per_coefficient = hours * _rates(joint, np.eye(fit.coefficients.size)) - average[:, 1:]
+    return _StateDrift(average[:, 0] + hours * _rates(joint, fit.coefficients), per_coefficient, covariance, with_drift)
+
+
+def _rates(joint: JointFit, coefficients: Array) -> Array:
+    """Return the rates among coefficients (p, ...) at which the drift starts, um per hour (components, ...); zero of a random walk."""
+    rates = np.zeros((len(joint.components), *coefficients.shape[1:]))
+    of_drift = coefficients[len(joint.cells) :]
+    rates[: len(of_drift)] = of_drift
+    return rates
+
+
+def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift) -> tuple[Array, Array, Array]:
+    """Return the drift from the thermal state (n, components) and its covariance (n, components, components) in um and um2, and the
+    variance of the smoothing errors (n,) by the coefficients.
+    """
+    fit, hours = joint.fit, joint.fit.system.seconds[:, None] / 3600.0
+    drift = smoothed.levels[:, :, 0] + hours * _rates(joint, fit.coefficients) - at_state.drift
     joined = (
         smoothed.level_covariance + at_state.covariance - at_state.with_drift - at_state.with_drift.transpose(0, 2, 1)
     )
-    return drift, fit.sigma**2 * joined + fit.covariance_of(dependence)
+    covariance, by_coefficients = fit.sigma**2 * joined, np.zeros(hours.size)
+    for part, share in fit.shares():
+        moved = hours[:, :, None] * _rates(joint, part) - share.levels - at_state.per_coefficient @ part
+        covariance += np.einsum("nip,njp->nij", moved, moved)
+        by_coefficients += (share.u**2).sum(axis=1)
+    return drift, covariance, by_coefficients
 
 
 def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr.Dataset:
     """Return the joint estimate as a Dataset; see `estimate_drift`."""
     fit, grid = joint.fit, _Grid(deviations, joint)
-    columns = np.column_stack([fit.response, fit.design])
-    smoothed = fit.system.smooth(columns)
+    smoothed = fit.system.smooth(fit.residual()[:, None])
     weights = state_weights(fit.system.seconds, joint.readings["cycle"].values, state)
-    at_state = _drift_at_state(joint, columns, weights)
-    drift, covariance = _drift_from_state(joint, smoothed, at_state)
+    at_state = _drift_at_state(joint, weights)
+    drift, covariance, by_coefficients = _drift_from_state(joint, smoothed, at_state)
     resolution_um = float(joint.readings["resolution"])
     deletion = fit.deletion_residuals(ROUNDING * resolution_um)
-    scatter, freedom = _scatter(joint, smoothed, deletion)
+    scatter, freedom = _scatter(joint, smoothed, by_coefficients, deletion)
     standardised = grid.per_reading(deletion)
     standardised[grid.is_left_out(deviations)] = np.inf
-    noise = fit.system.independent * _smoothing_errors(joint, smoothed)
+    noise = fit.system.independent * smoothed.u[:, 0]
     excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
     loadings = fit.system.loadings
     drift_variance = np.einsum("kc,kce,ke->k", loadings, covariance, loadings)
@@ -574,20 +577,14 @@ def _reversal(cells: NDArray[np.int64], profile: Array, covariance: Array, targe
     return reversal, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _smoothing_errors(joint: JointFit, smoothed: Smoothed) -> Array:
-    """Return the smoothing errors u of the readings minus their fixed effects, (n,)."""
-    return np.asarray(smoothed.u[:, 0] - smoothed.u[:, 1:] @ joint.fit.coefficients)
-
-
-def _scatter(joint: JointFit, smoothed: Smoothed, standardised: Array) -> tuple[Array, Array]:
+def _scatter(joint: JointFit, smoothed: Smoothed, by_coefficients: Array, standardised: Array) -> tuple[Array, Array]:
     """Return the random standard deviation of each cell (um) and its degrees of freedom."""
-    fit, u, D = joint.fit, smoothed.u, smoothed.D
+    fit, D = joint.fit, smoothed.D
     cells = len(joint.cells)
-    unit = fit.covariance / fit.sigma**2
-    expected = D - np.einsum("kp,pq,kq->k", u[:, 1:], unit, u[:, 1:], optimize=True)
+    expected = D - by_coefficients / fit.sigma**2
     with np.errstate(divide="ignore", invalid="ignore"):
         remaining = expected / D
-        deletion = _smoothing_errors(joint, smoothed) / D
+        deletion = smoothed.u[:, 0] / D
         shared = fit.system.memory.share if fit.system.memory else 0.0
         square = deletion**2 / remaining - fit.sigma**2 * (1.0 / D - fit.system.independent - shared)
     # Median absolute deviation from zero, the expectation of a residual, as a normal standard deviation.

@@ -22,13 +22,15 @@ Biometrika 58, 545 (restricted likelihood).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import linalg, sparse, special
 from scipy.linalg import lapack
 
 from interferometry.common import Array
@@ -39,6 +41,7 @@ from interferometry.drift.kalman import (
     DriftSystem,
     Memory,
     Order,
+    Smoothed,
     drift_system,
     start_columns,
 )
@@ -62,6 +65,10 @@ _LARGEST_EXCESS = 1e6
 _DEPENDENCE_TOLERANCE = 1e-10
 #: Share of the whitened response's square that each degree of freedom loses to rounding in its sums.
 _ROUNDING = float(np.finfo(float).eps)
+#: Parts of the coefficients' uncertainty that are smoothed together: their states at all readings are held.
+_SHARES_AT_ONCE = 48
+#: Columns that fewer than this share of the readings have are few enough for their own recursion.
+_FEW_READINGS = 0.1
 #: So many fixed effects of single sites take part in the search for the variances of the drift at most.
 _MOST_SITES = 160
 #: The drift is taken as an integrated random walk only if that raises the restricted log-likelihood by this much: where both fit,
@@ -109,7 +116,7 @@ class DriftFit:
 
     system: DriftSystem
     response: Array
-    design: Array
+    design: Design
     coefficients: Array
     covariance: Array
     sigma: float
@@ -139,18 +146,19 @@ class DriftFit:
 
     def drift(self) -> tuple[Array, Array]:
         """Drift levels at every reading (n, components) and their covariance (n, components, components)."""
-        smoothed = self.system.smooth(np.column_stack([self.response, self.design]))
-        per_coefficient = smoothed.levels[:, :, 1:]
-        levels = smoothed.levels[:, :, 0] - per_coefficient @ self.coefficients
+        smoothed = self.system.smooth(self.residual()[:, None])
         covariance = self.sigma**2 * smoothed.level_covariance
-        return levels, covariance + self.covariance_of(per_coefficient)
+        for _, share in self.shares():
+            covariance += np.einsum("nip,njp->nij", share.levels, share.levels)
+        return smoothed.levels[:, :, 0], covariance
 
-    def covariance_of(self, per_coefficient: Array) -> Array:
-        """Covariance (n, k, k) of values whose derivatives by the coefficients are (n, k, p)."""
-        n, k, p = per_coefficient.shape
-        # One product of whole matrices: numpy takes n products of k rows many times slower.
-        through = (per_coefficient.reshape(n * k, p) @ self.covariance).reshape(n, k, p)
-        return np.einsum("nip,njp->nij", through, per_coefficient)
+    def shares(self) -> Iterator[tuple[Array, Smoothed]]:
+        """Parts (p, some) of the coefficients' uncertainty that are independent, of unit variance, and what is smoothed of each."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        for start in range(0, root.shape[1], _SHARES_AT_ONCE):
+            some = root[:, start : start + _SHARES_AT_ONCE]
+            yield some, self.system.smooth(self.design @ some)
 
     def noise(self) -> tuple[Array, Array]:
         """Each reading's estimated noise (n,) and its relative variance (n,): sum(noise^2) / sum(variance) estimates sigma^2."""
@@ -180,33 +188,73 @@ class DriftFit:
         return np.where(smoothed.D > 0, standardised, np.nan)
 
 
-def fit_fixed_effects(system: DriftSystem, response: Array, design: Array) -> DriftFit:
+def fit_fixed_effects(system: DriftSystem, response: Array, design: Design) -> DriftFit:
     """Fit fixed effects by generalised least squares, the system's variance ratios as given."""
     return _solve(system, _Problem.of(response, design))
 
 
+#: Columns of a design; those of very many sites are held by the readings that have them.
+Design: TypeAlias = "Array | sparse.csr_array"
+
+
+def _beside(design: Design, columns: Array) -> Design:
+    """Return a design with further columns."""
+    if sparse.issparse(design):
+        return sparse.csr_array(sparse.hstack([design, columns]))
+    return np.column_stack([design, columns])
+
+
+def _dense(design: Design) -> Array:
+    return design if isinstance(design, np.ndarray) else np.asarray(design.toarray())
+
+
 @dataclass(frozen=True)
 class _Problem:
-    """Response and design of a search, checked once; ``columns`` holds both, ``least`` (p,) the whitened length of a vanishing column."""
+    """Response and design of a search, checked once: ``columns`` holds both, or the dense ones of both where many columns are of ``few``
+    readings; by ``place`` (1 + p,) among dense and few. ``least`` (p,) is the whitened length of a vanishing column.
+    """
 
     response: Array
-    design: Array
+    design: Design
     columns: Array
+    few: sparse.csr_array | None
+    place: NDArray[np.int64]
     least: Array
 
     @classmethod
-    def of(cls, response: Array, design: Array) -> _Problem:
-        columns = np.column_stack([response, design])
-        if not np.isfinite(columns).all():
+    def of(cls, response: Array, design: Design) -> _Problem:
+        few, place = None, np.arange(1 + design.shape[1])
+        own = place[:0]
+        if design.shape[1] >= MANY_COLUMNS:
+            by_column = sparse.csc_array(design)
+            own = np.flatnonzero(np.diff(by_column.indptr) < _FEW_READINGS * design.shape[0])
+        if own.size >= MANY_COLUMNS:
+            others = np.setdiff1d(place[:-1], own)
+            columns = np.column_stack([response, by_column[:, others].toarray()])
+            few = sparse.csr_array(by_column[:, own])
+            place[np.r_[0, 1 + others, 1 + own]] = np.arange(place.size)
+        else:
+            columns = np.column_stack([response, _dense(design)])
+        if not (np.isfinite(columns).all() and (few is None or np.isfinite(few.data).all())):
             raise DriftModelError(
                 "response and design must be finite; leave readings without a value out before the fit"
             )
-        return cls(response, design, columns, 1e-12 * np.maximum(1.0, np.abs(design).max(axis=0, initial=0.0)))
+        largest = np.abs(columns).max(axis=0, initial=0.0)
+        if few is not None:
+            largest = np.concatenate([largest, np.abs(few).max(axis=0).toarray().ravel()])
+        return cls(response, design, columns, few, place, 1e-12 * np.maximum(1.0, largest[place][1:]))
+
+    def normal_equations(self, system: DriftSystem) -> tuple[Array, float]:
+        """Gram matrix of the whitened response and design, and the log-determinant of the readings' covariance."""
+        if self.few is None:
+            return system.normal_equations(self.columns)
+        gram, log_determinant = system.sparse_normal_equations(self.columns, self.few)
+        return gram[np.ix_(self.place, self.place)], log_determinant
 
 
 def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
     """Least squares on the swept Gram matrix, and the restricted log-likelihood with sigma^2 concentrated out."""
-    gram, log_determinant = system.normal_equations(problem.columns)
+    gram, log_determinant = problem.normal_equations(system)
     scale = np.sqrt(np.diag(gram)[1:])
     vanishing = np.flatnonzero(scale < problem.least)
     if vanishing.size:
@@ -253,7 +301,7 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
     return kalman.sweep(gram, _DEPENDENCE_TOLERANCE)
 
 
-def _maximise(system: DriftSystem, response: Array, design: Array, start: Array | None) -> DriftFit:
+def _maximise(system: DriftSystem, response: Array, design: Design, start: Array | None) -> DriftFit:
     """Restricted maximum likelihood of the variance ratios by a bounded simplex in their logarithm."""
     low, high = _LOG_RATIO_LIMITS[system.order]
     components = system.loadings.shape[1]
@@ -301,15 +349,21 @@ def _log_ratio_unit(system: DriftSystem) -> Array:
 
 def _for_search(system: DriftSystem, problem: _Problem) -> tuple[DriftSystem, _Problem]:
     """Return the readings by which the variances of the drift are searched for: all, or those of some of very many sites."""
-    own = (problem.design != 0).mean(axis=0) < 1.0 / _MOST_SITES
-    if own.sum() <= _MOST_SITES:
+    if problem.design.shape[1] <= _MOST_SITES:
         return system, problem
-    site = np.where((problem.design[:, own] != 0).any(axis=1), (problem.design[:, own] != 0).argmax(axis=1), -1)
+    by_column = sparse.csc_array(problem.design)
+    own = sparse.csr_array(by_column[:, np.diff(by_column.indptr) < problem.design.shape[0] / _MOST_SITES])
+    if own.shape[1] <= _MOST_SITES:
+        return system, problem
+    own.sort_indices()
+    site = np.full(own.shape[0], -1)
+    has_one = np.diff(own.indptr) > 0
+    site[has_one] = own.indices[own.indptr[:-1][has_one]]
     sites = np.unique(site)
     chosen = sites[np.round(np.linspace(0, sites.size - 1, _MOST_SITES)).astype(int)]
     rows = np.isin(site, chosen)
     design = problem.design[rows]
-    design = design[:, (design != 0).any(axis=0)]
+    design = design[:, abs(design).sum(axis=0) > 0]
     few = replace(
         system,
         seconds=system.seconds[rows],
@@ -439,7 +493,7 @@ def estimate(
     seconds: Array,
     loadings: Array,
     response: Array,
-    design: Array,
+    design: Design,
     *,
     order: Order | None = None,
     robust: bool = False,
@@ -454,7 +508,7 @@ def estimate(
     ``least_sigma`` lets it be.
     """
     trends = start_columns(seconds, loadings, 2)[:, loadings.shape[1] :]
-    with_trends = np.column_stack([design, trends])
+    with_trends = _beside(design, trends)
 
     def system(chosen: Order, ratios: Array) -> DriftSystem:
         return drift_system(seconds, loadings, order=chosen, ratios=ratios, variance=variance, observed=observed)
@@ -490,16 +544,19 @@ def estimate(
     return _fit_settling(fit) if settling else fit
 
 
-def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[Array, Array, Array]:
+def average_drift(system: DriftSystem, weights: Array, columns: Design) -> tuple[Array, Array, Array]:
     """Average the drift that columns imply over the readings, with the exact covariance of the average, in two passes."""
     weights = np.ascontiguousarray(weights, float)
-    columns = np.ascontiguousarray(columns, float)
-    state, covariance, predicted, gains = _filter_with_average(*system.arrays, weights, columns)
-    m = state.shape[0] - system.loadings.shape[1]
+    averages = []
+    for start in range(0, columns.shape[1], MANY_COLUMNS):
+        some = np.ascontiguousarray(_dense(columns[:, start : start + MANY_COLUMNS]), float)
+        state, covariance, predicted, gains = _filter_with_average(*system.arrays, weights, some)
+        averages.append(state[covariance.shape[0] - system.loadings.shape[1] :])
+    m = covariance.shape[0] - system.loadings.shape[1]
     with_drift = _covariance_with_average(
         system.seconds, system.loadings, system.order, system.memory_array, weights, predicted, gains
     )
-    return state[m:], covariance[m:, m:], with_drift
+    return np.hstack(averages), covariance[m:, m:], with_drift
 
 
 @njit()
@@ -684,9 +741,11 @@ def _lag_one_by_memory(series: int, cycles: int) -> Array:
 
 def _lag_one(values: Array) -> float:
     """Median correlation of successive values of series (series, cycles) beside their leading patterns; 0 where these are all there is."""
-    u, s, vt = np.linalg.svd(values - values.mean(axis=1, keepdims=True), full_matrices=False)
-    s[:_COMMON_PATTERNS] = 0.0
-    own = (u * s) @ vt
+    own = values - values.mean(axis=1, keepdims=True)
+    of_cycles = own.shape[1] <= own.shape[0]
+    gram = own.T @ own if of_cycles else own @ own.T
+    patterns = linalg.eigh(gram, subset_by_index=[len(gram) - _COMMON_PATTERNS, len(gram) - 1])[1]
+    own -= (own @ patterns) @ patterns.T if of_cycles else patterns @ (patterns.T @ own)
     squares = (own**2).sum(axis=1)
     own, squares = own[squares > 0], squares[squares > 0]
     return float(np.median((own[:, 1:] * own[:, :-1]).sum(axis=1) / squares)) if squares.size else 0.0

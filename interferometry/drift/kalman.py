@@ -24,6 +24,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from interferometry.common import Array, InterferometryError
 from thermofuse.compiled import njit
@@ -255,6 +256,154 @@ def whiten_rows(
 
 
 @njit()
+def carry_back(columns: Array, order: int, components: int, memory: Array, step: float) -> None:
+    """Take the columns of a matrix over the states back over a step, in place: T' times it."""
+    if memory.size:
+        kept = np.exp(-step / memory[1])
+        for j in range(columns.shape[1]):
+            columns[components * order, j] *= kept
+    if order == 2:
+        for c in range(components):
+            for j in range(columns.shape[1]):
+                columns[2 * c + 1, j] += step * columns[2 * c, j]
+
+
+@njit()
+def observe_back(
+    N: Array, order: int, loadings: Array, k: int, memory: Array, gain: Array, innovation_variance: float, NM: Array
+) -> float:
+    """Add a reading to the information N of those after it, in place; write N times its gain into ``NM`` and return the variance of its
+    smoothing error, D = 1 / F + K' N K (Durbin and Koopman 2012, eq. 4.69).
+    """
+    m, components = N.shape[0], loadings.shape[1]
+    D = 1.0 / innovation_variance
+    for i in range(m):
+        NM[i] = 0.0
+        for j in range(m):
+            NM[i] += N[i, j] * gain[j]
+        D += gain[i] * NM[i]
+    last = components * order
+    for c in range(components):
+        loading, level = loadings[k, c], c * order
+        for j in range(m):
+            N[level, j] -= loading * NM[j]
+            N[j, level] -= loading * NM[j]
+        for e in range(components):
+            N[level, e * order] += loading * loadings[k, e] * D
+    if memory.size:
+        for j in range(m):
+            N[last, j] -= NM[j]
+            N[j, last] -= NM[j]
+        N[last, last] += D
+        for c in range(components):
+            N[c * order, last] += loadings[k, c] * D
+            N[last, c * order] += loadings[k, c] * D
+    return D
+
+
+@njit()
+def smoothing_error(
+    r: Array,
+    order: int,
+    loadings: Array,
+    k: int,
+    memory: Array,
+    gain: Array,
+    innovation_variance: float,
+    observed: bool,
+    step: float,
+    innovation: Array,
+) -> None:
+    """Turn the innovations of one reading into its smoothing errors, and take r of the readings after it back to it, both in place."""
+    p, components = r.shape[1], loadings.shape[1]
+    carry_back(r, order, components, memory, step)
+    if not observed:
+        innovation[:] = 0.0
+        return
+    for j in range(p):
+        innovation[j] /= innovation_variance
+    for i in range(gain.size):
+        for j in range(p):
+            innovation[j] -= gain[i] * r[i, j]
+    for c in range(components):
+        loading, level = loadings[k, c], c * order
+        for j in range(p):
+            r[level, j] += loading * innovation[j]
+    if memory.size:
+        for j in range(p):
+            r[components * order, j] += innovation[j]
+
+
+@njit()
+def products_of_sparse(
+    seconds: Array,
+    loadings: Array,
+    order: int,
+    memory: Array,
+    gains: Array,
+    innovation_variances: Array,
+    observed: NDArray[np.bool_],
+    innovations: Array,
+    starts: NDArray[np.int32],
+    places: NDArray[np.int32],
+    values: Array,
+    columns: int,
+) -> tuple[Array, Array]:
+    """Products over V^-1 of columns that few readings have with one another and with dense ones, by the innovations of these.
+
+    The inverse of the readings' covariance is semiseparable: between a reading l and those before it, row l is h_l' times their gains
+    carried on to l, with h = N K - D Z', so that n p products in place of n p^2 suffice (Durbin and Koopman 2012, section 4.5).
+    """
+    n, components = loadings.shape
+    m = gains.shape[1]
+    D, h = np.zeros(n), np.zeros((n, m))
+    N, r = np.zeros((m, m)), np.zeros((m, innovations.shape[1]))
+    with_dense = np.zeros((columns, innovations.shape[1]))
+    for k in range(n - 1, -1, -1):
+        step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
+        carry_back(N, order, components, memory, step)
+        carry_back(N.T, order, components, memory, step)
+        if observed[k]:
+            D[k] = observe_back(N, order, loadings, k, memory, gains[k], innovation_variances[k], h[k])
+            for c in range(components):
+                h[k, c * order] -= D[k] * loadings[k, c]
+            if memory.size:
+                h[k, components * order] -= D[k]
+        u = innovations[k]
+        smoothing_error(r, order, loadings, k, memory, gains[k], innovation_variances[k], observed[k], step, u)
+        for at in range(starts[k], starts[k + 1]):
+            for j in range(u.size):
+                with_dense[places[at], j] += values[at] * u[j]
+    state, along, innovation = np.zeros((m, columns)), np.empty(columns), np.empty(columns)
+    products = np.zeros((columns, columns))
+    for k in range(n):
+        predict_state(state, components, order, memory, seconds[k] - seconds[k - 1] if k > 0 else 0.0)
+        if not observed[k]:
+            continue
+        for j in range(columns):
+            along[j] = 0.0
+            innovation[j] = -state[components * order, j] if memory.size else 0.0
+        for i in range(m):
+            for j in range(columns):
+                along[j] += h[k, i] * state[i, j]
+        for c in range(components):
+            for j in range(columns):
+                innovation[j] -= loadings[k, c] * state[c * order, j]
+        for at in range(starts[k], starts[k + 1]):
+            innovation[places[at]] += values[at]
+            row = products[places[at]]
+            for j in range(columns):
+                row[j] += values[at] * along[j]
+            for other in range(starts[k], starts[k + 1]):
+                row[places[other]] += 0.5 * D[k] * values[at] * values[other]
+        for i in range(m):
+            gain = gains[k, i]
+            for j in range(columns):
+                state[i, j] += gain * innovation[j]
+    return products + products.T, with_dense
+
+
+@njit()
 def smooth(
     seconds: Array,
     loadings: Array,
@@ -277,59 +426,13 @@ def smooth(
     r = np.zeros((m, p))
     N = np.zeros((m, m))
     NM = np.zeros(m)
-    last = components * order
     for k in range(n - 1, -1, -1):
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
-        if memory.size:
-            kept = np.exp(-step / memory[1])
-            for j in range(p):
-                r[last, j] *= kept
-            for j in range(m):
-                N[last, j] *= kept
-            for j in range(m):
-                N[j, last] *= kept
-        if order == 2:
-            for c in range(components):
-                for j in range(p):
-                    r[2 * c + 1, j] += step * r[2 * c, j]
-                for j in range(m):
-                    N[2 * c + 1, j] += step * N[2 * c, j]
-                for j in range(m):
-                    N[j, 2 * c + 1] += step * N[j, 2 * c]
+        carry_back(N, order, components, memory, step)
+        carry_back(N.T, order, components, memory, step)
         if observed[k]:
-            D[k] = 1.0 / innovation_variances[k]
-            for i in range(m):
-                NM[i] = 0.0
-                for j in range(m):
-                    NM[i] += N[i, j] * gains[k, j]
-                D[k] += gains[k, i] * NM[i]
-            for j in range(p):
-                u[k, j] /= innovation_variances[k]
-            for i in range(m):
-                for j in range(p):
-                    u[k, j] -= gains[k, i] * r[i, j]
-            for c in range(components):
-                loading, level = loadings[k, c], c * order
-                for j in range(p):
-                    r[level, j] += loading * u[k, j]
-                for j in range(m):
-                    N[level, j] -= loading * NM[j]
-                    N[j, level] -= loading * NM[j]
-                for e in range(components):
-                    N[level, e * order] += loading * loadings[k, e] * D[k]
-            if memory.size:
-                for j in range(p):
-                    r[last, j] += u[k, j]
-                for j in range(m):
-                    N[last, j] -= NM[j]
-                    N[j, last] -= NM[j]
-                N[last, last] += D[k]
-                for c in range(components):
-                    N[c * order, last] += loadings[k, c] * D[k]
-                    N[last, c * order] += loadings[k, c] * D[k]
-        else:
-            for j in range(p):
-                u[k, j] = 0.0
+            D[k] = observe_back(N, order, loadings, k, memory, gains[k], innovation_variances[k], NM)
+        smoothing_error(r, order, loadings, k, memory, gains[k], innovation_variances[k], observed[k], step, u[k])
         _smooth_levels(order, covariances[k], r, N, levels[k], level_covariance[k])
     return levels, level_covariance, u, D
 
@@ -495,6 +598,20 @@ class DriftSystem:
             whitened = whitening.whiten(columns[start : start + at_once].copy())
             gram += whitened.T @ whitened
         return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
+
+    def sparse_normal_equations(self, dense: Array, few: sparse.csr_array) -> tuple[Array, float]:
+        """The same of dense columns (n, q), and after them of columns (n, p) that few readings have, in less time and memory."""
+        whitening = self.whitening(dense.shape[1])
+        roots, q = whitening.roots, dense.shape[1]
+        innovations = whitening.whiten(dense.astype(float, order="C"))
+        own = innovations[self.observed]
+        before = self.seconds, self.loadings, self.order, self.memory_array, whitening.gains, roots**2, self.observed
+        innovations *= roots[:, None]
+        rows = few.indptr, few.indices, few.data, few.shape[1]
+        products, with_dense = products_of_sparse(*before, innovations, *rows)
+        gram = np.empty((q + products.shape[0], q + products.shape[0]))
+        gram[:q, :q], gram[q:, :q], gram[:q, q:], gram[q:, q:] = own.T @ own, with_dense, with_dense.T, products
+        return gram, 2.0 * float(np.log(roots[self.observed]).sum())
 
     def whiten(self, columns: Array) -> tuple[Array, float]:
         """Standardised innovations of the observed readings (n_observed, p), and the log-determinant of their covariance."""

@@ -26,6 +26,7 @@ from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
 from interferometry.deviations import DIRECTIONS
 from interferometry.iso230.budget import CONTRIBUTIONS, SCATTER_ALONE, Iso230Budget
 from interferometry.iso230.quantities import AXIS, ONE_WAY, axis_quantities, target_quantities
+from interferometry.iso230.uncertainty import uncertainties
 
 STANDARD_CYCLES = 5
 #: Windows of a long test that are evaluated before their results become one.
@@ -126,11 +127,8 @@ def evaluate_iso230(
             changes = _changes_within(without_drift, course)
     # Without a standard deviation no uncertainty is known either.
     known = 1.0 if len(numbers) > 1 else np.nan
-    # Its library loads for a tenth of a second, and most commands state no uncertainty.
-    from interferometry.iso230.uncertainty import UncertainTest
-
-    uncertain = UncertainTest(result * known, without_drift * known, changes, deviations["position"].values, used)
-    result = result.assign(uncertain.uncertainties()).assign(
+    uncertain = uncertainties(result * known, without_drift * known, changes, deviations["position"].values, used)
+    result = result.assign(uncertain).assign(
         environmental_variation=varied if stated is None else stated,
         drift_variation=varied,
         temperature_difference=used.difference_from_20_degC_K,

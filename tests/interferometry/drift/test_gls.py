@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from interferometry.drift import gls
 from interferometry.drift.gls import (
@@ -360,12 +361,43 @@ def test_many_columns_are_fitted_as_few_are(rng, monkeypatch):
         fit_fixed_effects(system, y, np.column_stack([x, x[:, 1]]))
 
 
-def test_the_covariance_of_values_follows_from_their_derivatives(rng):
+def test_the_covariance_of_the_drift_holds_that_of_the_coefficients(rng):
     system, y, x = drift_and_columns(rng)
     fit = fit_fixed_effects(system, y, x)
-    derivatives = rng.standard_normal((4, 2, 3))
-    expected = [one @ fit.covariance @ one.T for one in derivatives]
-    np.testing.assert_allclose(fit.covariance_of(derivatives), expected, rtol=1e-12)
+    levels, covariance = fit.drift()
+    smoothed = system.smooth(np.column_stack([y, x]))
+    by_coefficient = smoothed.levels[:, :, 1:]
+    np.testing.assert_allclose(levels, smoothed.levels[:, :, 0] - by_coefficient @ fit.coefficients, atol=1e-12)
+    expected = fit.sigma**2 * smoothed.level_covariance
+    expected += by_coefficient @ fit.covariance @ by_coefficient.transpose(0, 2, 1)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("memory", [None, Memory(0.6, 9.0)])
+@pytest.mark.parametrize(("order", "ratios"), [(1, [0.05, 0.02]), (2, [1e-4, 1e-5])])
+def test_columns_that_few_readings_have_are_fitted_alike_by_their_own_recursion(
+    rng, monkeypatch, order, ratios, memory
+):
+    n, sites = 600, 40
+    seconds, site = np.sort(rng.uniform(0, 900, n)), rng.integers(0, sites, n)
+    loadings = np.column_stack([np.ones(n), site / sites])
+    # A constant of the target and half a reversal, as one that few readings have and that has two values.
+    design = np.column_stack(
+        [np.eye(sites)[site], (site < 20)[:, None] * np.eye(20)[site % 20] * rng.choice([-0.5, 0.5], (n, 1))]
+    )
+    design = np.column_stack([design, rng.standard_normal(n)])
+    observed = rng.random(n) > 0.1
+    system = replace(drift_system(seconds, loadings, order=order, ratios=ratios, observed=observed), memory=memory)
+    system = replace(system, variance=rng.uniform(0.5, 2.0, n))
+    y = rng.standard_normal(n)
+    monkeypatch.setattr("interferometry.drift.gls._FEW_READINGS", 0.0)
+    whole = fit_fixed_effects(system, y, design)
+    monkeypatch.setattr("interferometry.drift.gls._FEW_READINGS", 0.1)
+    monkeypatch.setattr("interferometry.drift.gls.MANY_COLUMNS", 30)
+    for columns in (design, sparse.csr_array(design)):
+        parts = fit_fixed_effects(system, y, columns)
+        for name in ("coefficients", "covariance", "sigma", "log_likelihood", "rss"):
+            np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-8, atol=1e-10)
 
 
 def drift_and_columns(rng):
