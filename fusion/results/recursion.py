@@ -14,8 +14,13 @@ from pydantic import ValidationError
 from fusion.common import Array, FusionError
 from fusion.results.parts import ResultPart
 
-#: What a step found: all readings within their range; one held at the end of its range, or a correction at its limit; a failed reading.
-OK, SATURATED, FAILED = 0, 1, 2
+#: What a step found: all readings within their range; one held at the end of its range, or a correction at its limit; a failed reading; the
+#: state of the machine is not known (yet); steps come at other times than the model was made for. From `FAILED` on nothing is corrected.
+OK, SATURATED, FAILED, UNKNOWN, UNTIMELY = range(5)
+#: Time constants after which a state that was not known at the start is known to 5 %.
+_SETTLED = 3.0
+#: Memory (share from step to step) and limit (steps) of how late steps are: a period that is another one by a tenth.
+LATE_KEPT, LATE_STEPS = 0.99, 10.0
 
 
 class RecursionError(FusionError):
@@ -116,6 +121,16 @@ class Recursion(ResultPart):
     remarks: tuple[str, ...] = ()
     """What to know of it, one sentence each."""
 
+    @property
+    def settling_steps(self) -> int:
+        """Steps after which states that nobody knew at the start are known."""
+        return round(_SETTLED * max((one.time_constant_s for one in self.states), default=0.0) / self.sampling_s)
+
+    @property
+    def loads(self) -> tuple[bool, ...]:
+        """Which states follow a driver, which is off while the control is; a temperature goes on meanwhile."""
+        return tuple(self.inputs[one.input].unit != "degC" for one in self.states)
+
     def at_sampling(self, sampling_s: float) -> Recursion:
         """The same model with another time from step to step."""
         outputs = [
@@ -149,15 +164,35 @@ class Corrections:
     Attributes
     ----------
     correction : (steps, outputs), in the unit of each output
-    status : (steps,), `OK`, `SATURATED` or `FAILED`
+    status : (steps,), `OK`, `SATURATED`, `FAILED`, `UNKNOWN` or `UNTIMELY`
+    kept : what a restart needs; None where it never started
     """
 
     correction: Array
     status: NDArray[np.int64]
+    kept: Kept | None = None
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What survives a restart: signals and states (states,), the datum (outputs,), and steps until states that nobody knew are known."""
+
+    signal: Array
+    state: Array
+    zeroed: Array
+    resting: int
 
 
 def run_recursion(
-    model: Recursion, readings: Array, *, zero: NDArray[np.bool_] | None = None, reset: NDArray[np.bool_] | None = None
+    model: Recursion,
+    readings: Array,
+    *,
+    zero: NDArray[np.bool_] | None = None,
+    reset: NDArray[np.bool_] | None = None,
+    elapsed_s: Array | None = None,
+    cold: bool = True,
+    kept: Kept | None = None,
+    off_s: float = 0.0,
 ) -> Corrections:
     """Run a recursion over readings (steps, inputs), as the emitted programs do, operation by operation.
 
@@ -171,12 +206,21 @@ def run_recursion(
         Steps that take the present state of the machine as the one without a correction.
     reset : (steps,) ndarray of bool, optional
         Steps that end the rest after a failed reading.
+    elapsed_s : (steps,) ndarray, optional
+        Time since the step before, as the control measures it. None: `sampling_s`.
+    cold : bool
+        Whether the machine has rested so long before the start that it is cold.
+    kept : Kept, optional
+        What was kept of the run before, which replaces `cold`.
+    off_s : float
+        Time since its last step, in which drivers rested and temperatures went straight to the first reading.
 
     Returns
     -------
     Corrections
-        A reading outside its range is held at the end of it. After a failed reading the corrections go to zero, within one minute from
-        their limit, and stay there until a reset.
+        Nothing starts before all readings are there. A reading outside its range is held at the end of it. After a failed reading the
+        corrections go to zero, within one minute from their limit, and stay there until a reset. A machine that is neither cold nor known
+        is not corrected for three of the longest time constants; what is left then is taken as the state without a correction.
     """
     columns = {name: np.array([getattr(one, name) for one in model.inputs]) for name in RecursionInput.model_fields}
     readings = np.asarray(readings, float)
@@ -188,28 +232,48 @@ def run_recursion(
     )
     coefficients = np.array([one.coefficients for one in model.outputs])
     limit, most = (np.array([getattr(one, name) for one in model.outputs]) for name in ("limit", "max_step"))
+    elapsed = np.full(len(readings), model.sampling_s) if elapsed_s is None else elapsed_s
     held, signal, state = columns["reference"].copy(), np.zeros(of.size), np.zeros(of.size)
     zeroed, out = np.zeros(limit.size), np.zeros(limit.size)
-    latched = False
-    correction, status = np.zeros((len(readings), limit.size)), np.zeros(len(readings), np.int64)
+    resting = 0 if cold else model.settling_steps
+    if kept is not None:
+        steps = max(1, int(off_s / model.sampling_s))
+        signal, state, zeroed, resting = kept.signal, kept.state, kept.zeroed, max(0, kept.resting - steps)
+        over = [first_order_weights(one.time_constant_s, steps * model.sampling_s) for one in model.states]
+        off, risen, fallen = (
+            np.where(np.array(model.loads) & (decay > 0.0), [[1.0], [0.0], [0.0]], 1.0) * np.array(over).T
+        )
+    latched, started, late = False, False, 0.0
+    correction, status = np.zeros((len(readings), limit.size)), np.full(len(readings), UNKNOWN, np.int64)
     for step, row in enumerate(readings):
         good = (row >= columns["failed_below"]) & (row <= columns["failed_above"])
+        if not started and not good.all():
+            continue
         held = np.where(good, np.clip(row, columns["low"], columns["high"]), held)
         latched = not good.all() or (latched and not (reset is not None and reset[step]))
         last = signal
         signal = (held[of] - columns["reference"][of]) / size
         signal = np.where(exponent == 2, signal * signal, signal)
-        state = start * signal if step == 0 else decay * state + now * signal + before * last
+        if started:
+            state = decay * state + now * signal + before * last
+            late = LATE_KEPT * late + (elapsed[step] - model.sampling_s)
+        else:
+            state = start * signal if kept is None else off * state + risen * signal + fallen * last
+        started = True
+        untimely = abs(late) > LATE_STEPS * model.sampling_s
         wanted = -(coefficients @ state)
-        if zero is not None and zero[step]:
+        if resting > 0 or (zero is not None and zero[step]):
             zeroed = wanted
         wanted = wanted - zeroed
-        bounded = np.zeros(limit.size) if latched else np.clip(wanted, -limit, limit)
+        idle = latched or untimely or resting > 0
+        bounded = np.zeros(limit.size) if idle else np.clip(wanted, -limit, limit)
         out = out + np.clip(bounded - out, -most, most)
-        saturated = (good & (held != row)).any() or (not latched and bool((bounded != wanted).any()))
-        status[step] = FAILED if latched else SATURATED if saturated else OK
+        saturated = (good & (held != row)).any() or (not idle and bool((bounded != wanted).any()))
+        found = SATURATED if saturated else OK
+        status[step] = FAILED if latched else UNTIMELY if untimely else UNKNOWN if resting > 0 else found
+        resting = max(0, resting - 1)
         correction[step] = out
-    return Corrections(correction, status)
+    return Corrections(correction, status, Kept(signal, state, zeroed, resting) if started else None)
 
 
 def read_recursion(path: str | Path) -> Recursion:

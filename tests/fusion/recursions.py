@@ -62,14 +62,15 @@ def some_model(*, sampling_s: float = 5.0, campaign: str = "Spindle", seed: int 
 
 
 def some_readings(seed: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Readings (steps, 3) that leave their range now and then; a wire off, then a missing reading; where a datum is set, where reset."""
+    """Readings (steps, 3) that leave their range now and then; none at first; later one off, one missing; datums, resets."""
     rng = np.random.default_rng(seed)
     walk = np.cumsum(rng.normal(0.0, 0.06, (STEPS, 2)), axis=0)
     speed = 6000.0 * rng.uniform(0.0, 1.02, STEPS // 200).repeat(200)
     readings = np.column_stack([24.0 + 4.0 * np.sin(walk[:, 0]), 22.0 + 2.5 * np.sin(walk[:, 1]), speed])
+    readings[:3, 1] = 0.0
     readings[1500:1510, 0] = 0.0
     readings[3000, 1] = np.nan
     zero, reset = np.zeros((2, STEPS), bool)
-    zero[[0, 900, 2500]] = True
+    zero[[3, 900, 2500]] = True
     reset[[1505, 2000, 3500]] = True
     return readings, zero, reset

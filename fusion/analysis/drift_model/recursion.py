@@ -339,6 +339,12 @@ def make_recursion(
     ]
     whole = np.column_stack([one.coefficients for one in respond(record, values, events, everything)])
     inputs = _inputs(record, columns)
+    told += [
+        f"{one.name} was never negative in the test: hand over its magnitude, also for the other sense of rotation; a negative value "
+        "counts as a failed reading"
+        for one in inputs
+        if one.name in record.drivers and one.low == one.failed_below
+    ]
     names = [one.name for one in inputs]
     states = [_state(one, names.index(one.input), record.driver_sizes, sampling_s) for one in columns]
     # Counted from any state of the test that is made the zero.
@@ -501,8 +507,11 @@ def _inputs(record: Record, columns: Sequence[Signal]) -> list[RecursionInput]:
         if name in used:
             size, unit = record.driver_sizes[name]
             values = size * powers[1]
-            # A load may be larger than in the test without being wrong.
-            inputs.append(_input(name, unit, 0.0, values, failed=float(np.ptp(values))))
+            # A load may be larger than in the test without being wrong. One that never was negative is a magnitude, but for noise at rest.
+            one = _input(name, unit, 0.0, values, failed=float(np.ptp(values)))
+            least = -_AT_REST * size
+            bounded = {"low": max(one.low, least), "failed_below": max(one.failed_below, least)}
+            inputs.append(one if values.min() < least else one.model_copy(update=bounded))
     return inputs
 
 

@@ -26,7 +26,7 @@ from fusion.analysis.drift_model.recursion import (
 )
 from fusion.common import Array
 from fusion.results.loop import RecordLoop
-from fusion.results.recursion import FAILED, Recursion, RecursionError, run_recursion
+from fusion.results.recursion import FAILED, UNKNOWN, Recursion, RecursionError, run_recursion
 
 _DRAWS = 1000
 #: Probability within the predicted interval.
@@ -113,7 +113,7 @@ def verify(
     zero = np.arange(after.seconds.size) == 0
     replayed = run_recursion(model, _readings(after, model, faulty_sensors), zero=zero)
     dead = sorted({one.name for one in model.inputs} & set(faulty_sensors))
-    failed = bool((replayed.status == FAILED).any())
+    failed = bool(np.isin(replayed.status, (FAILED, UNKNOWN)).any())
     verdicts = []
     for k, output in enumerate(model.outputs):
         if output.name not in after.channels or output.name not in before.channels:

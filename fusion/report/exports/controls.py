@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -27,7 +28,7 @@ from scipy import special
 from fusion.common import Array, FusionError
 from fusion.report.wording import environment, say, sentences
 from fusion.results.loop import RecordLoop
-from fusion.results.recursion import Recursion, RecursionInput
+from fusion.results.recursion import LATE_KEPT, LATE_STEPS, Recursion, RecursionInput
 from fusion.results.results import Results
 from fusion.results.store import DamagedProductError, file_sha256, group, read_product
 
@@ -737,8 +738,9 @@ def emit(model: Recursion, format: str) -> tuple[str, str]:
     made.filters["plain"] = _plain
     columns = {name: [getattr(one, name) for one in model.inputs] for name in RecursionInput.model_fields}
     arrays = {name: columns[name] for name in ("reference", "low", "high", "failed_below", "failed_above")}
-    for name in ("input", "size", "exponent", "decay", "now", "before", "start"):
+    for name in ("input", "size", "exponent", "decay", "now", "before", "start", "time_constant_s"):
         arrays[name] = [getattr(one, name) for one in model.states]
+    arrays["load"] = [int(one) for one in model.loads]
     for name in ("limit", "max_step"):
         arrays[name] = [getattr(one, name) for one in model.outputs]
     text = made.get_template(template).render(
@@ -747,7 +749,12 @@ def emit(model: Recursion, format: str) -> tuple[str, str]:
         sampling=_number(model.sampling_s),
         header=[_plain(line) for line in sentences("model_header", model)],
         arrays={name: [_number(one) for one in values] for name, values in arrays.items()},
-        whole=("input", "exponent"),
+        whole=("input", "exponent", "load"),
+        # States are those of this model only.
+        made_for=zlib.crc32(model.model_dump_json().encode()) >> 1,
+        settling=f"{model.settling_steps * model.sampling_s / 3600.0:.2g}",
+        late_kept=_number(LATE_KEPT),
+        late_s=_number(LATE_STEPS * model.sampling_s),
         coefficients=[[_number(value) for value in one.coefficients] for one in model.outputs],
     )
     return file, text

@@ -24,7 +24,7 @@ from fusion.analysis.drift_model.recursion import (
 )
 from fusion.pipeline.record import record_variables
 from fusion.results.loop import RecordLoop
-from fusion.results.recursion import Recursion, RecursionError, run_recursion
+from fusion.results.recursion import FAILED, OK, SATURATED, Recursion, RecursionError, run_recursion
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import runs_table, table_of, twin_table
 
@@ -98,10 +98,28 @@ def test_a_temperature_far_outside_the_test_is_that_of_a_failed_sensor_and_a_lar
     record, product, loop = driven
     for one in make_recursion(product, loop, sampling_s=record.block_s, **FROM).inputs:
         # Readings are followed to half the range of the test beyond it.
-        extent = (one.high - one.low) / 2.0
         beyond = one.failed_above - one.high
-        assert beyond == pytest.approx(max(10.0 - 0.5 * extent, 0.0) if one.unit == "degC" else 0.5 * extent)
-        assert one.low - one.failed_below == pytest.approx(beyond)
+        if one.unit == "degC":
+            extent = (one.high - one.low) / 2.0
+            assert beyond == pytest.approx(max(10.0 - 0.5 * extent, 0.0))
+            assert one.low - one.failed_below == pytest.approx(beyond)
+        else:
+            # The spindle rested and turned in one sense: to 1.5 times its speed, to twice, and not backwards.
+            assert (one.high, one.failed_above) == pytest.approx((3.0 * beyond, 4.0 * beyond))
+            assert one.low == one.failed_below == pytest.approx(-0.02 * 2.0 * beyond)
+
+
+def test_a_spindle_that_turns_the_other_way_than_in_the_test_is_a_failed_reading(driven):
+    record, product, loop = driven
+    model = make_recursion(product, loop, sampling_s=record.block_s, **FROM)
+    assert any("hand over its magnitude" in remark for remark in model.remarks)
+    readings = np.tile(readings_of(model, record)[0], (20, 1))
+    speed = [one.name for one in model.inputs].index("speed")
+    readings[:, speed] = -1.0
+    assert set(run_recursion(model, readings).status) <= {OK, SATURATED}
+    readings[10:, speed] = -3000.0
+    found = run_recursion(model, readings)
+    assert (found.status[10:] == FAILED).all() and not found.correction[-1].any()
 
 
 def test_the_likelihood_is_that_of_the_dense_covariance():

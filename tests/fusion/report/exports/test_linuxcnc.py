@@ -82,7 +82,8 @@ def test_a_model_moves_the_axis_and_a_failed_sensor_brings_it_to_rest(capsys):
     model = model.model_copy(update={"outputs": tuple(fast)})
     name, text = emit(model, "model-linuxcnc")
     readings = [[20.5, 21.0, 0.0], [22.0, 21.5, 0.0], [24.0, 22.0, 1500.0], [26.0, 21.0, 3000.0], [26.0, 0.0, 3000.0]]
-    hal = f"loadusr -Wn thermofuse ./{name}\nsetp axis.x.eoffset-scale 0.0001\nnet counts thermofuse.counts-0 => axis.x.eoffset-counts\n"
+    hal = f"loadusr -Wn thermofuse ./{name}\nsetp thermofuse.cold 1\nsetp axis.x.eoffset-scale 0.0001\n"
+    hal += "net counts thermofuse.counts-0 => axis.x.eoffset-counts\n"
     found = control(
         {name: text, "x.comp": "0 0 0\n300 300 300\n"}, hal, {"moves": [50.0], "readings": readings, "settle_s": 3.0}
     )
