@@ -75,6 +75,8 @@ Place = Callable[[tuple[str, ...]], str]
 
 #: More than any campaign or recipe that a person writes, with thousands of file names listed one by one, bytes.
 _MAX_BYTES = 1_000_000
+#: A key of more parts than any has, whose parts the parser copies once for each of them.
+_TOO_DEEP = re.compile(r"""(?<![\w.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){64}""")
 #: Whole numbers of TOML have 64 bits.
 _INTEGERS = range(-(2**63), 2**63)
 #: Faults of one file that are listed one by one.
@@ -108,6 +110,8 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     # Line ends become one character, as of any text file; a byte order mark, with which editors of Windows begin UTF-8, is no text.
     text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     try:
+        if _TOO_DEEP.search(text):
+            raise RecursionError
         tables = tomllib.loads(text)
         beyond = any(number not in _INTEGERS for number in _whole_numbers(tables))
     except RecursionError:

@@ -37,6 +37,7 @@ from fusion.common import Array, FusionError
 from interferometry.io.faults import LaserFormatError, Numerals, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
+    DELIMITERS,
     NO_ZONE,
     BadReading,
     DateOrder,
@@ -49,6 +50,7 @@ from interferometry.io.tables import (
     find_header,
     parse_time,
     raise_if_clock_restarts,
+    raise_if_too_wide,
     read_table,
     read_timed_rows,
     where_clock_goes_back,
@@ -366,6 +368,8 @@ def text_lines(path: Path, header: HeaderRows | None = None) -> list[str]:
     them breaks is empty.
     """
     lines = list(io.StringIO(decode_text(path, path.read_bytes()), newline=None))
+    for delimiter in (*DELIMITERS, None):
+        raise_if_too_wide(path, lines, delimiter)
     first, heading = find_header(lines)
     if _OPEN_HEADING.search(heading):
         quotes = accumulate(line.count('"') for line in lines[first : first + _LONGEST_HEADER])

@@ -39,6 +39,8 @@ _STAMPS = ".origin.json"
 _TRIALS, _PAUSE_S = 4, 0.5
 #: Files that are fetched at a time: many small ones wait for the answer, not for the line.
 _AT_A_TIME = 8
+#: Bytes of a file whose server does not state its length, at most: more than a recording of a day.
+_MOST_UNSTATED = 20_000_000_000
 _GLOB = re.compile(r"[*?\[]")
 
 
@@ -271,8 +273,16 @@ class _Store:
         """Fetch a file whole or not at all; return its size."""
         wanted = stamp["bytes"]
 
+        def watch(size: int | None, done: int, **_: Any) -> None:
+            if done > (_MOST_UNSTATED if wanted is None else wanted):
+                raise RemoteError(
+                    f"{self._address(name)}: goes on after {done} bytes, more than the server states or a recording has; fetch it by hand"
+                )
+
         def fetch(temporary: Path) -> None:
-            self.system.get_file(self._address(name), str(temporary))
+            from fsspec.callbacks import Callback  # of the extra remote
+
+            self.system.get_file(self._address(name), str(temporary), callback=Callback(hooks={"length": watch}))
             size = temporary.stat().st_size
             if wanted is not None and size != wanted:
                 raise ConnectionError(f"ended after {size} of {wanted} bytes")

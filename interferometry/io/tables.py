@@ -354,8 +354,8 @@ def _in_a_code_page(content: bytes) -> str:
 
 #: Marks that may stand between fields.
 DELIMITERS = ";\t,|"
-#: Columns of the widest sheet of a spreadsheet; a text with more is no table of readings, and takes long to be found none.
-_MOST_COLUMNS = 16_384
+#: More columns than any table of readings or log of channels has; what has more takes long to be found none.
+MOST_COLUMNS = 2_000
 #: A line with a reading has more characters; a text with more shorter lines than a spreadsheet has rows is damaged, and takes long to
 #: be found so.
 _SHORT_LINE, _MOST_SHORT_LINES = 4, 1_048_576
@@ -429,12 +429,7 @@ def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
 
 def split_lines(path: Path, lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
     """Split lines of text into fields."""
-    wide = next((number for number, line in enumerate(lines, start=1) if line.count(delimiter) >= _MOST_COLUMNS), None)
-    if wide is not None:
-        raise LaserFormatError(
-            f"{path}, line {wide}: more than {_MOST_COLUMNS} columns, which no spreadsheet has; the file is damaged or not a table, export "
-            "it again with a line for each reading"
-        )
+    raise_if_too_wide(path, lines, delimiter)
     reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [text.strip() for text in fields]) for fields in reader]
@@ -443,6 +438,19 @@ def split_lines(path: Path, lines: Sequence[str], delimiter: str) -> list[tuple[
             f"{path}, line {reader.line_num}: {fault}; the file is damaged or not a table, export it again"
         ) from None
     return [(line, fields) for line, fields in rows if any(fields)]
+
+
+def raise_if_too_wide(path: Path, lines: Sequence[str], delimiter: str | None) -> None:
+    """Raise where a line has more fields than a table has columns; without a delimiter, spaces part them."""
+    for number, line in enumerate(lines, start=1):
+        # A field takes a character at least, and its mark another.
+        if len(line) < 2 * MOST_COLUMNS:
+            continue
+        if (line.count(delimiter) + 1 if delimiter else len(line.split())) > MOST_COLUMNS:
+            raise LaserFormatError(
+                f"{path}, line {number}: more than {MOST_COLUMNS} columns; the file is damaged or no table: export it again with a line "
+                "for each time or reading"
+            )
 
 
 def shown(fields: Iterable[str]) -> str:

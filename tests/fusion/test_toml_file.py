@@ -28,11 +28,14 @@ def test_the_tables_and_the_text(tmp_path: Path, mark: bytes) -> None:
         ("x = " + "[" * 100_000, "nested too deep"),
         ("x = " + "{a=" * 20_000, "nested too deep"),
         ("[" + ".".join(["a"] * 5_000) + "]", "nested too deep"),
+        # Parsed, these take gigabytes.
+        ("a." * 400_000 + "a = 1", "nested too deep"),
+        ("x = {" + "'a' . " * 100_000 + "a = 1}", "nested too deep"),
         ("[x]\ny = [1, 0x" + "f" * 900_000 + "]", "a whole number beyond 64 bits"),
         ("x = " + "9" * 6_000, "Exceeds the limit"),
         ("#" * 2_000_000, "longer than 1 MB"),
     ],
-    ids=["no value", "lists", "tables", "header", "hexadecimal", "digits", "length"],
+    ids=["no value", "lists", "tables", "header", "key", "quoted key", "hexadecimal", "digits", "length"],
 )
 def test_whatever_stands_in_it_is_one_fault_with_the_file(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "a.toml"

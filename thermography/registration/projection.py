@@ -110,7 +110,12 @@ def _read_entries(path: Path) -> dict[str, Any]:
             entries = json.loads(text)
         else:
             # OpenCV writes the version of YAML as no other does.
-            entries = yaml.load(text.removeprefix("%YAML:1.0"), _MatrixLoader)
+            text = text.removeprefix("%YAML:1.0")
+            if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, _MatrixLoader)):
+                raise ValueError(
+                    "it repeats entries by aliases (*name), which may stand for any number of them; write them out"
+                )
+            entries = yaml.load(text, _MatrixLoader)
     except (ValueError, TypeError, RecursionError, yaml.YAMLError, ElementTree.ParseError) as error:
         raise LensError(f"{path}: cannot be parsed ({error}); write it as OpenCV's YAML, XML or JSON") from None
     if not isinstance(entries, dict):

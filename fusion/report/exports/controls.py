@@ -223,6 +223,10 @@ def path_variance(profile: Profile) -> float:
     return max(0.0, float(np.mean(estimates))) if estimates else 0.0
 
 
+#: Points of a resampled table at most: those of 10 m every millimetre.
+_MOST_POINTS = 10_000
+
+
 def _grid(targets: Array, spacing_mm: float) -> Array:
     """Return equally spaced points from the first target to the last, so far apart at most."""
     length = float(targets[-1] - targets[0])
@@ -230,6 +234,11 @@ def _grid(targets: Array, spacing_mm: float) -> Array:
         raise ExportError(
             f"--spacing {spacing_mm:g} mm does not suit targets from {targets[0]:g} to {targets[-1]:g} mm; "
             f"write a spacing above 0 and up to {length:g} mm"
+        )
+    if length / spacing_mm > _MOST_POINTS:
+        raise ExportError(
+            f"--spacing {spacing_mm:g} mm: more than {_MOST_POINTS} points from {targets[0]:g} to {targets[-1]:g} mm, more than a control "
+            f"reads; write {1.001 * length / _MOST_POINTS:.3g} mm or more"
         )
     return np.asarray(np.linspace(targets[0], targets[-1], math.ceil(length / spacing_mm - 1e-9) + 1), float)
 

@@ -589,3 +589,11 @@ def test_names_that_differ_in_number_from_their_values_are_refused(tmp_path: Pat
     # A row with an empty cell in columns that are not aligned is left out.
     path.write_text("\n".join(["Time [s] T1 T2 X", *lines[:30], "1800 20.3 30.5", *lines[31:]]) + "\n")
     assert [one["line"] for one in json.loads(propose_table(path).attrs["left_out"])] == [32]
+
+
+@pytest.mark.parametrize("mark", [",", " "])
+def test_a_log_of_more_columns_than_any_has_is_refused_before_it_is_looked_into(tmp_path, mark):
+    path = tmp_path / "log.csv"
+    path.write_text(f"time{mark}x\n" + f"1{mark}" * 100_000)
+    with pytest.raises(LaserFormatError, match=r"log\.csv, line 2: more than 2000 columns"):
+        propose_table(path)

@@ -278,6 +278,14 @@ def test_a_disk_that_is_too_small_is_refused_before_anything_is_fetched(shelf, m
         fetch_file(f"{server}/day%201/laser.csv")
 
 
+def test_a_file_of_no_stated_length_has_a_ceiling(shelf, monkeypatch):
+    server, _ = shelf
+    monkeypatch.setattr(remote, "_MOST_UNSTATED", 100)
+    monkeypatch.setattr(remote._Store, "stamp", lambda self, name: {"bytes": None, "stamp": ""})
+    with pytest.raises(RemoteError, match=r"laser\.csv: goes on after \d+ bytes, .* fetch it by hand"):
+        fetch_file(f"{server}/day%201/laser.csv")
+
+
 @pytest.fixture
 def bucket(campaign_folder, monkeypatch):
     """An S3 server of this machine with a campaign in a bucket; its address is in the environment, as users set it."""

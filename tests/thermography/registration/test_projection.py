@@ -186,7 +186,12 @@ def test_faults_are_named(tmp_path, changed, message):
         ("%YAML:1.0\n---\nK: [1,\n", "cannot be parsed"),
         ("<opencv_storage><K>1 2", "cannot be parsed"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><x/>', "not a calibration: plain text"),
-        ("K: &a [1, *a]\n", "recursive|is damaged|holds"),
+        ("K: &a [1, *a]\n", "repeats entries by aliases"),
+        (
+            "a: &a [1, 1]\n"
+            + "".join(f"{x}: &{x} [*{y}, *{y}]\n" for x, y in zip("bcdefghij", "abcdefghi", strict=True)),
+            "by aliases",
+        ),
         ('{"a": 1}', "no entry camera_matrix"),
         ("", r"not a calibration: plain text of at most 200000 bytes is expected"),
         ('{"K": "' + "A" * 600_000 + '"}', r"not a calibration: plain text of at most 200000 bytes is expected"),

@@ -244,6 +244,8 @@ def test_what_does_not_suit_is_refused(small_run):
     for spacing in (0.0, 500.0):
         with pytest.raises(ExportError, match="write a spacing above 0 and up to 175 mm"):
             tabulate(profile, spacing_mm=spacing)
+    with pytest.raises(ExportError, match=r"more than 10000 points .* write 0\.0175 mm or more"):
+        tabulate(profile, spacing_mm=1e-5)
 
 
 def test_a_table_at_the_targets_leaves_only_the_errors_of_measurement(small_run):
