@@ -277,14 +277,15 @@ def describe_stack(stack: Stack) -> list[str]:
     contents, values = stack.contents, np.asarray(stack.first, float)
     rows, columns = contents.shape
     count = f"{contents.frames} frames" if contents.frames > 1 else "1 frame"
-    finite = values[np.isfinite(values)]
+    finite = values[np.isfinite(values) & (values >= -ZERO_CELSIUS_K)]
     span = f"{finite.min():.6g} to {finite.max():.6g}" if finite.size else "no number"
     lines = [
         f"{stack.reader.name}, {count} of {columns} x {rows}",
         f"values of the first frame {span} {contents.unit}".rstrip(),
     ]
     if finite.size < values.size:
-        lines.append(f"{values.size - finite.size} of {values.size} pixels of the first frame are not numbers")
+        lines.append(f"{values.size - finite.size} of {values.size} pixels of the first frame hold no temperature")
+    lines += contents.notes
     if contents.emissivity is not None:
         lines.append(f"calculated with the emissivity {contents.emissivity:g}")
     if contents.times is not None:

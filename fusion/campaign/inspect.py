@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import itertools
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -58,8 +59,8 @@ if TYPE_CHECKING:
 
 # What kind of file something is: each kind declared once, with how it is recognised by its content, read and described.
 
-#: Bytes that are read to tell the kind of a text.
-_START = 65_536
+#: Bytes that are read to tell the kind of a text, and lines that tell a list of pixels.
+_START, _LOOKED_INTO_LINES = 65_536, 8
 #: Longest reason why a file is not understood, characters.
 _LONGEST_REASON = 160
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
@@ -196,8 +197,20 @@ def _holds_counts(found: Recognised) -> bool:
 
 def _holds_temperatures(found: Recognised) -> bool:
     if isinstance(found.reader, TextReader):
+        _refuse_list_of_pixels(found)
         return found.text is not None and found.reader.begins_a_frame(found.text)
     return isinstance(found.reader, TemperatureReader)
+
+
+def _refuse_list_of_pixels(found: Recognised) -> None:
+    """Refuse a picture as a list of x, y, temperature: its columns would pass for displacements along x and y."""
+    if tuple(name.lower() for name in found.first_line[:2]) in (("x", "y"), ("column", "row"), ("row", "column")):
+        places = re.findall(r"^\s*(\d+)\W+(\d+)(?![\d.])", found.text or "", re.MULTILINE)[:_LOOKED_INTO_LINES]
+        x, y = np.array(places or [(0, 0)], int).T
+        if len(places) > 2 and (np.ptp(x) == len(x) - 1) != (np.ptp(y) == len(y) - 1):
+            raise FusionError(
+                "a list of pixels; export the picture as a table of its temperatures alone, a line per row"
+            )
 
 
 def _is_lens(found: Recognised) -> bool:

@@ -55,8 +55,8 @@ class FlirReader:
     name = "FLIR radiometric JPEG, FFF, SEQ or CSQ"
 
     def recognises(self, path: Path, start: bytes) -> bool:
-        """Return whether a file starts as a JPEG or an FFF record."""
-        return start[:2] == b"\xff\xd8" or start[:4] == MAGIC
+        """Return whether a file starts as a JPEG or an FFF record, or holds one behind its first bytes."""
+        return start[:2] == b"\xff\xd8" or start[:4] == MAGIC or is_fff_header(start[start.find(MAGIC) :])
 
     def index(self, path: Path, options: object) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
         """Yield the frames of a file in its order; damaged ones as `RejectedFrame`, those of a long sequence together."""

@@ -9,6 +9,8 @@ from typing import Any
 _LARGE_BYTES, _MOST_PACKED = 1_000_000_000, 1_100
 #: Datasets and groups of a file: the products of a run have up to 150, and each costs a reader a millisecond whenever it opens the file.
 MOST_OBJECTS = 1_000
+#: Groups within one another; deeper ones take a reader minutes.
+_MOST_NESTED = 20
 
 
 def hdf5_fault(path: Path) -> str:
@@ -19,6 +21,8 @@ def hdf5_fault(path: Path) -> str:
     most_bytes, objects = max(_LARGE_BYTES, _MOST_PACKED * path.stat().st_size), []
 
     def of_link(name: str, found: Any) -> str | None:
+        if name.count("/") > _MOST_NESTED:
+            return f"it nests groups more than {_MOST_NESTED} deep"
         return f"{name} is in another file" if isinstance(found, h5py.ExternalLink) else None
 
     def of_object(name: str, found: Any) -> str | None:

@@ -9,18 +9,20 @@ camera's program used, another emissivity can be calculated exactly as for count
 from __future__ import annotations
 
 import codecs
+import csv
 import os
 import re
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from math import prod
 from pathlib import Path
 from textwrap import shorten
@@ -131,6 +133,7 @@ class StackContents:
     unit : "degC" or "K" where the file says it, else ""
     times : UTC or, without `zoned`, in the zone that `StackOptions` names; None where the file holds none
     emissivity, reflected_temperature_K : with which the temperatures were calculated, where the file says it
+    notes : what of the file was passed over
     """
 
     frames: int
@@ -140,6 +143,7 @@ class StackContents:
     zoned: bool = False
     emissivity: float | None = None
     reflected_temperature_K: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 class TemperatureReader(ABC):
@@ -185,6 +189,7 @@ class TemperatureReader(ABC):
                 parameters=options.parameters,
                 time=time.astype("datetime64[ms]"),
                 limits=CalibratedRange(raw_minimum=1, raw_maximum=65_534),
+                notes=contents.notes,
                 path=path,
                 index=index,
                 size=contents.shape,
@@ -209,7 +214,7 @@ class TemperatureFrame(FrameReference):
         return self.size
 
     def read_temperature(self) -> NDArray[np.float64]:
-        """Read the temperatures, (row, column) degC; raise a ThermographyError where the frame has another size than the first."""
+        """Read the temperatures, (row, column) degC, NaN for none; raise a ThermographyError where the size differs from the first one."""
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.asarray(self.reader.read_values(self.path, self.index, self.options), np.float64)
         if values.shape != self.size:
@@ -218,7 +223,9 @@ class TemperatureFrame(FrameReference):
             )
         # A damaged value may be beyond any temperature, or none; its counts say so.
         with np.errstate(over="ignore", invalid="ignore"):
-            return values * self.options.scale + self.options.offset - (ZERO_CELSIUS_K if self.unit == "K" else 0.0)
+            values = values * self.options.scale + self.options.offset - (ZERO_CELSIUS_K if self.unit == "K" else 0.0)
+            # Marks for no temperature, as -9999.
+            return np.where(values < -ZERO_CELSIUS_K, np.nan, values)
 
     def read_counts(self) -> NDArray[np.uint16]:
         """Read the temperatures as counts of the black-body scale, (row, column) uint16; 0 where there is none."""
@@ -339,31 +346,77 @@ class TiffReader(TemperatureReader):
     starts = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
-        """Return what a file holds."""
-        import tifffile
-
-        with _refused(f"{path}: damaged TIFF", "export it again"), tifffile.TiffFile(path) as file:
-            first: Any = file.pages[0]
-            shape, kind = first.shape, first.dtype
-            count = len(file.pages)
-            stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
-        if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
-            raise ThermographyError(f"{path}: pixels of shape {shape} hold no temperatures; export radiometric TIFF")
-        if kind is None or kind.kind not in _NUMBERS:
-            raise ThermographyError(f"{path}: values of type {kind} are not temperatures; export real numbers")
-        _require_scale(path, kind, options)
-        return StackContents(count, (shape[0], shape[1]), times=_stamp(stamp) if count == 1 else None)
+        """Return what a file holds; pages of other sizes, as those of a pyramid, and of colours are passed over by name."""
+        pages = _tiff_pages(path, *_state(path))
+        _require_scale(path, pages.kind, options)
+        times = _stamp(pages.stamp) if len(pages.chosen) == 1 else None
+        return StackContents(len(pages.chosen), pages.shape, times=times, notes=pages.notes)
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
-        """Return the values of a page, (row, column)."""
+        """Return the values of a page, (row, column); NaN where they are what the file marks as no data."""
         import tifffile
 
+        chosen = _tiff_pages(path, *_state(path)).chosen
         with _refused(f"{path}: page {index} is damaged", "export it again"), tifffile.TiffFile(path) as file:
-            page: Any = file.pages[index]
+            page: Any = file.pages[chosen[index]]
             # Read as they are, a million strips that the file does not hold take the memory of a million strips.
             if page.dtype is None or page.dtype.kind not in _NUMBERS or prod(page.chunked) != len(page.dataoffsets):
                 raise ValueError("its size, its kind of values and its list of strips contradict one another")
-            return np.asarray(page.asarray())
+            values = np.asarray(page.asarray())
+            return np.where(values == page.nodata, np.nan, values) if "GDAL_NODATA" in page.tags else values
+
+
+class _TiffPages(NamedTuple):
+    """Pages of a TIFF that are frames, by number, their shape and kind of values, DateTime of the first, and what was passed over."""
+
+    chosen: tuple[int, ...]
+    shape: tuple[int, int]
+    kind: np.dtype[Any]
+    stamp: str
+    notes: tuple[str, ...]
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """Return size and time of change of a file: what was kept of it holds as long as they are the same."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+@lru_cache(maxsize=64)
+def _tiff_pages(path: Path, size: int, changed_ns: int) -> _TiffPages:
+    """Return the pages of a TIFF that are frames: those with the size and the kind of values of its largest page of temperatures."""
+    import tifffile
+
+    with _refused(f"{path}: damaged TIFF", "export it again"), tifffile.TiffFile(path) as file:
+        pages: list[Any] = list(file.pages)
+        looks = [(page.shape, page.dtype, page.photometric, page.is_reduced) for page in pages]
+        stamps = [str(page.tags["DateTime"].value) if "DateTime" in page.tags else "" for page in pages]
+        # Programs for microscopes state many frames and write one page.
+        stated = prod(file.series[0].shape[:-2]) if len(pages) == 1 and len(looks[0][0]) == 2 else 1
+    if stated > 1:
+        raise ThermographyError(f"{path}: one page that states {stated} frames; save it with one page per frame")
+    grey = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.MINISWHITE)
+    frames = [
+        number
+        for number, (shape, kind, colours, reduced) in enumerate(looks)
+        if len(shape) == 2 and kind is not None and kind.kind in _NUMBERS and colours in grey and not reduced
+    ]
+    if not frames:
+        shape, kind, colours, _ = looks[0]
+        if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
+            raise ThermographyError(f"{path}: pixels of shape {shape} hold no temperatures; export radiometric TIFF")
+        if colours not in grey:
+            raise ThermographyError(
+                f"{path}: a picture of false colours holds no temperatures; export radiometric TIFF"
+            )
+        raise ThermographyError(f"{path}: values of type {kind} are not temperatures; export real numbers")
+    shape, kind, *_ = looks[max(frames, key=lambda number: (looks[number][1].itemsize > 1, prod(looks[number][0])))]
+    chosen = tuple(number for number in frames if looks[number][:2] == (shape, kind))
+    others = Counter(
+        " x ".join(map(str, looks[number][0][1::-1])) for number in range(len(looks)) if number not in chosen
+    )
+    notes = (f"pages passed over, reduced or of colours: {count} of {size}" for size, count in others.items())
+    return _TiffPages(chosen, shape, kind, stamps[chosen[0]], tuple(notes))
 
 
 class NumpyReader(TemperatureReader):
@@ -393,65 +446,136 @@ class NumpyReader(TemperatureReader):
         return np.array(self._open(path)[index])
 
 
+#: What a dimension, or the attribute `axis` of its coordinate, is called -> what runs along it.
+_ALONG = {
+    **dict.fromkeys(("time", "t", "frame", "frames"), "frame"),
+    **dict.fromkeys(("y", "row", "rows", "lat", "latitude", "height"), "row"),
+    **dict.fromkeys(("x", "column", "columns", "col", "cols", "lon", "longitude", "width"), "column"),
+}
+
+
+class _Pictures(NamedTuple):
+    """Values of a store, and their dimensions along frames, None of a single one, rows and columns."""
+
+    values: xr.DataArray
+    frame: Hashable | None
+    row: Hashable
+    column: Hashable
+
+
+def _pictures(values: xr.DataArray) -> _Pictures | None:
+    """Return values with their dimensions by names and coordinates, or else by their order; None where they are no pictures."""
+    along: dict[str, Hashable] = {}
+    for dimension in values.dims:
+        coordinate = values.coords.get(dimension)
+        axis = "" if coordinate is None else str(coordinate.attrs.get("axis", ""))
+        timed = coordinate is not None and coordinate.dtype.kind == "M"
+        known = (
+            "frame" if timed else _ALONG.get(str(dimension).lower()) or _ALONG.get({"T": "t"}.get(axis, axis).lower())
+        )
+        if known:
+            along.setdefault(known, dimension)
+    # A band, or another dimension with one step, is none.
+    single = [each for each in values.dims if values.sizes[each] == 1 and each not in along.values()]
+    values = values.isel(dict.fromkeys(single[: max(values.ndim - 3, 0)], 0))
+    unnamed = iter(each for each in values.dims if each not in along.values())
+    wanted = ("frame", "row", "column") if values.ndim == 3 else ("row", "column")
+    if values.ndim not in (2, 3) or (values.ndim == 2 and "frame" in along):
+        return None
+    frame, row, column = (
+        (along.get(each) or next(unnamed) for each in wanted)
+        if values.ndim == 3
+        else (None, *(along.get(each) or next(unnamed) for each in wanted))
+    )
+    return _Pictures(values, frame, row, column)
+
+
 class NetcdfReader(TemperatureReader):
-    """Reader of a variable (time, row, column) of a NetCDF 4 or Zarr store; its units and times are those of the CF conventions."""
+    """Reader of a variable over time, row and column of NetCDF or Zarr; its units and times are those of the CF conventions."""
 
     name = "NetCDF or Zarr"
-    starts = (b"\x89HDF",)
+    #: Of NetCDF 4, and of NetCDF 3 with 32 and with 64 bits.
+    starts = (b"\x89HDF", b"CDF\1", b"CDF\2")
 
     def recognises(self, path: Path, start: bytes) -> bool:
-        """Return whether a file is HDF5, or a folder of Zarr or its metadata."""
+        """Return whether a file is NetCDF, or a folder of Zarr or its metadata."""
         zarr = path.name in _ZARR_METADATA or (path.is_dir() and any((path / name).exists() for name in _ZARR_METADATA))
         return zarr or super().recognises(path, start)
 
-    @contextmanager
-    def _variable(self, path: Path, options: StackOptions) -> Iterator[xr.DataArray]:
-        """Open the store for as long as its variable is read."""
+    def _open(self, path: Path) -> Mapping[str, xr.Dataset]:
+        """Open a store: its datasets by the names of their groups."""
         import xarray as xr  # the libraries of other files load with the first of them: a FLIR file is read without
 
         store = path.parent if path.name in _ZARR_METADATA else path
-        zarr = store.is_dir()
-        if zarr and not find_spec("zarr"):
+        if store.is_dir():
+            # Each array of a store costs the library milliseconds whenever it is opened.
+            if sum(entry.is_dir() for entry in store.iterdir()) > MOST_OBJECTS:
+                raise ValueError(f"it holds more than {MOST_OBJECTS} arrays and groups")
+            return {"/": xr.open_zarr(store, consolidated=False, chunks=None)}
+        with store.open("rb") as file:
+            if file.read(3) == b"CDF":
+                return {"/": xr.open_dataset(store, engine="scipy")}
+        if fault := hdf5_fault(store):
+            raise ValueError(fault)
+        return xr.open_groups(store, engine="h5netcdf", phony_dims="access")
+
+    @contextmanager
+    def _variable(self, path: Path, options: StackOptions) -> Iterator[_Pictures]:
+        """Open the store for as long as its variable is read."""
+        if (path.name in _ZARR_METADATA or path.is_dir()) and not find_spec("zarr"):
             raise ThermographyError(
                 f"{path}: a Zarr store needs the package zarr: install it beside thermofuse (pip install zarr)"
             )
-        with _refused(f"{path}: cannot be opened", "write it again"):
-            # Each array of a store costs the library milliseconds whenever it is opened.
-            if zarr and sum(entry.is_dir() for entry in store.iterdir()) > MOST_OBJECTS:
-                raise ValueError(f"it holds more than {MOST_OBJECTS} arrays and groups")
-            if not zarr and (fault := hdf5_fault(store)):
-                raise ValueError(fault)
-            dataset = (
-                xr.open_zarr(store, consolidated=False, chunks=None)
-                if zarr
-                else xr.open_dataset(store, engine="h5netcdf", phony_dims="access")
-            )
-        with dataset:
-            stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
+        with ExitStack() as opened:
+            with _refused(f"{path}: cannot be opened", "write it again"):
+                groups = self._open(path)
+                for dataset in groups.values():
+                    opened.enter_context(dataset)
+            found = {
+                f"{group}/{name}".lstrip("/"): pictures
+                for group, dataset in groups.items()
+                for name, values in dataset.data_vars.items()
+                if (pictures := _pictures(values)) is not None
+            }
+            # One picture is meant where nothing lies over three dimensions.
+            stacks = [name for name, each in found.items() if each.frame is not None] or list(found)
             name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
-            if name not in dataset.data_vars or dataset[name].ndim != 3:
-                names = shorten(", ".join(map(str, stacks)) or "none", _MOST_LETTERS)
+            if name not in found:
+                names = shorten(", ".join(stacks) or "none", _MOST_LETTERS)
                 raise StackError(
                     f'{path}: holds the variables {names} over three dimensions; write variable = "..." for the one with the temperatures'
                 )
-            kind = dataset[name].dtype
+            kind = found[name].values.dtype
             if kind.kind not in _NUMBERS:
                 raise ThermographyError(f"{path}: values of type {kind} are not temperatures; write real numbers")
-            yield dataset[name]
+            yield found[name]
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a store holds."""
-        with self._variable(path, options) as values:
-            first = values.dims[0]
-            stamps = values[first].values if first in values.coords else np.empty(0)
-            times = tuple(stamps.astype("datetime64[ns]")) if stamps.dtype.kind == "M" else None
-            unit = _UNITS.get(str(values.attrs.get("units", "")), "")
-            return StackContents(values.shape[0], (values.shape[1], values.shape[2]), unit, times, zoned=True)
+        with self._variable(path, options) as (values, frame, row, column):
+            stamps = [
+                each.values.reshape(-1)
+                for each in values.coords.values()
+                if each.dtype.kind == "M" and each.dims == (() if frame is None else (frame,))
+            ]
+            times = tuple(stamps[0].astype("datetime64[ns]")) if stamps else None
+            stated = str(values.attrs.get("units", ""))
+            if stated and stated not in _UNITS and not options.unit:
+                raise StackError(
+                    f"{path}: {values.name} is in {stated!r}; write it in degC or K, or state unit, scale and offset"
+                )
+            frames = 1 if frame is None else values.sizes[frame]
+            shape = (values.sizes[row], values.sizes[column])
+            return StackContents(frames, shape, _UNITS.get(stated, ""), times, zoned=True)
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a time, (row, column)."""
-        with self._variable(path, options) as values, _refused(f"{path}: frame {index} is damaged", "write it again"):
-            return np.asarray(values[index].values)
+        with (
+            self._variable(path, options) as (values, frame, row, column),
+            _refused(f"{path}: frame {index} is damaged", "write it again"),
+        ):
+            picture = values if frame is None else values.isel({frame: index})
+            return np.asarray(picture.transpose(row, column).values)
 
 
 class FpfReader(TemperatureReader):
@@ -538,21 +662,32 @@ _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _EMISSIVITY = re.compile(r"\bemissivity\W{1,4}([01][.,]?\d*)\b", re.IGNORECASE)
 _REFLECTED = re.compile(r"\brefl\w*\W+(?:\w+\W+)?temp\w*[^\w-]{1,4}(-?\d+(?:[.,]\d+)?)\W*([CFK])\b", re.IGNORECASE)
 _OWN_EXPORT = re.compile(r"surface temperature / degC; ([\dT:.-]+) UTC")
+#: A unit behind a number.
+_UNIT_BEHIND = re.compile(r"(?<=[\d.])[ \u00a0]?(?:[°º˚] ?)?([CFK])(?=[\"\s;,]|$)", re.MULTILINE)
+#: Frames joined without a line between them are higher than wide by more than that; no sensor is, whichever way it is turned.
+_HIGHEST = 1.35
+#: Joined frames repeat one scene: they differ by less than that share of its contrast; where that is a slope, the level falls back between
+#: them by more than so many usual steps.
+_ALIKE, _JUMP = 0.5, 3.0
+#: Ratio of the steps along a row between every second column and the others that no picture has; largest share of lines that count.
+_UNALIKE, _MOST_COUNTING = 2.0, 0.5
+#: Lines whose numbers differ from those of a frame by so many are a part of it; least share of fractions beside whole numbers of frames.
+_NEARLY, _LEAST_FRACTIONS = 2, 0.2
 
 
 class TextReader(TemperatureReader):
-    """Reader of one frame per file as CSV or TSV: the longest block of lines with equally many numbers; lines around it are passed over."""
+    """Reader of CSV or TSV: blocks of lines with equally many numbers are frames, lines around them are passed over."""
 
     name = "text with one temperature per pixel"
 
     def recognises(self, path: Path, start: bytes) -> bool:
         """Return whether a file is text."""
         marked = start.startswith(_UTF16)
-        return bool(start) and (marked or not set(start) & (set(range(32)) - {9, 10, 12, 13, 27}))
+        return bool(start) and (marked or not set(start) & (set(range(32)) - {9, 10, 12, 13, 27})) and not _mark(start)
 
     def begins_a_frame(self, text: str) -> bool:
         """Return whether the first lines of a text are rows of a picture, without a line above them that names as many columns."""
-        lines = text.splitlines()[:_LOOKED_AT]
+        lines = _plain_lines(text)[0][:_LOOKED_AT]
         for delimiter in _DELIMITERS:
             rows = [_numbers(line, delimiter) for line in lines]
             widths = [len(row) for row in rows if row is not None]
@@ -571,35 +706,187 @@ class TextReader(TemperatureReader):
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds; the pixels of numbers alone are counted and not read."""
-        if shape := _plain_shape(path.read_bytes()):
+        if shape := _plain_shape(_content(path)):
             return StackContents(1, shape)
-        rows, columns = self.read_values(path, 0, options).shape
+        frames, unit = _text_frames(path, *_state(path))
         head = _heading(path)
         own, emissivity, reflected = (pattern.search(head) for pattern in (_OWN_EXPORT, _EMISSIVITY, _REFLECTED))
         return StackContents(
-            1,
-            (rows, columns),
-            unit="degC" if own else "",
-            times=(np.datetime64(own[1], "ns"),) if own else None,
+            len(frames),
+            (frames.shape[1], frames.shape[2]),
+            unit="degC" if own else unit,
+            times=(np.datetime64(own[1], "ns"),) if own and len(frames) == 1 else None,
             zoned=True,
             emissivity=float(emissivity[1].replace(",", ".")) if emissivity else None,
             reflected_temperature_K=_kelvin(*reflected.groups()) if reflected else None,
         )
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
-        """Return the numbers of a file, (row, column); NaN where a field is no number."""
-        if path.stat().st_size > _MOST_BYTES:
-            raise ThermographyError(f"{path}: {path.stat().st_size} bytes exceed a frame of text; export one per file")
-        content = path.read_bytes()
-        utf16 = content.startswith(_UTF16)
-        lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
-        for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
-            block = _longest_block(lines, delimiter)
-            if _is_a_frame(block):
-                return _without_numbers_of_lines(np.array(block))
-        raise ThermographyError(
-            f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; export it as CSV, a line per row"
+        """Return the numbers of a frame, (row, column); NaN where a field is no number."""
+        return _text_frames(path, *_state(path))[0][index]
+
+
+def _content(path: Path) -> bytes:
+    if path.stat().st_size > _MOST_BYTES:
+        raise ThermographyError(f"{path}: {path.stat().st_size} bytes exceed a frame of text; export one per file")
+    return path.read_bytes()
+
+
+# The frames of a file are asked for one after the other.
+@lru_cache(maxsize=1)
+def _text_frames(path: Path, size: int, changed_ns: int) -> tuple[NDArray[np.floating], str]:
+    """Return the frames of a text, (frame, row, column), and the unit behind its numbers, "" where there is none."""
+    content = _content(path)
+    lines, unit = _plain_lines(content.decode("utf-16" if content[:2] in _UTF16 else "utf-8-sig", errors="replace"))
+    for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
+        parts = [part for block in _blocks(lines, delimiter) for part in _parted(block, lines, delimiter)]
+        longest = max(parts, key=lambda part: len(part.values), default=_Block(0, np.empty((0, 0)))).values
+        if not _is_a_frame(longest):
+            continue
+        fault = (
+            "temperatures in °F; export them in °C or K" if unit == "F" else _fault_of_frames(parts, lines, delimiter)
         )
+        if fault:
+            raise ThermographyError(f"{path}: {fault}")
+        frames = [part for part in parts if part.values.shape[1] == longest.shape[1]]
+        return np.stack([frame.values for frame in frames]), {"C": "degC"}.get(unit, unit)
+    raise ThermographyError(
+        f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; export it as CSV, a line per row, "
+        "with an empty line between frames"
+    )
+
+
+class _Block(NamedTuple):
+    """Consecutive lines with equally many numbers, (line, column), from a first line on."""
+
+    first: int
+    values: NDArray[np.floating]
+
+
+def _fault_of_frames(parts: list[_Block], lines: list[str], delimiter: str) -> str:
+    """Return why blocks of numbers are not read as frames, although they could be; empty where they are."""
+    longest = max(parts, key=lambda part: len(part.values)).values
+    width = longest.shape[1]
+    frames = [part for part in parts if part.values.shape[1] == width]
+    for first, values in parts:
+        other = values.shape[1]
+        if other != width and (abs(other - width) <= _NEARLY or _is_a_frame(values)):
+            return f"line {first + 1} holds {other} numbers, others {width}; export it again, one frame per file"
+    for first, values in frames:
+        below = _fields(lines[end], delimiter) if (end := first + len(values)) < len(lines) else []
+        if 2 * sum(np.isfinite(_number(field)) for field in below) > len(below) > 1 and len(below) < _FEWEST:
+            return f"line {end + 1} holds {len(below)} numbers, those above it {width}: it was cut; export it again"
+    if delimiter == "," and _splits_numbers(longest, lines[frames[0].first :][: len(longest)]):
+        return "the comma stands in numbers and between them; export it with semicolons, or with points in the numbers"
+    heights = sorted({len(frame.values) for frame in frames})
+    if len(heights) > 1:
+        return (
+            f"blocks of {heights[-2]} and of {heights[-1]} lines with {width} numbers; rows are lacking, or these are frames of several "
+            "cameras: export one frame per file"
+        )
+    if len(frames) == 1 and (count := _joined(longest)):
+        return f"{width} x {len(longest)} numbers repeat one scene {count} times; put an empty line between its frames"
+    return ""
+
+
+def _plain_lines(text: str) -> tuple[list[str], str]:
+    """Return the lines of a text with the minus of a keyboard and without units behind numbers, and the unit of a frame of them."""
+    text = text.replace("\N{MINUS SIGN}", "-")
+    units = Counter(_UNIT_BEHIND.findall(text)).most_common(1)
+    if not units or units[0][1] < _FEWEST**2:
+        return text.splitlines(), ""
+    return _UNIT_BEHIND.sub("", text).splitlines(), units[0][0]
+
+
+def _blocks(lines: list[str], delimiter: str) -> list[_Block]:
+    """Return the runs of lines that hold the same number of numbers."""
+    blocks: list[tuple[int, list[list[float]]]] = []
+    width = 0
+    for number, line in enumerate(lines):
+        row = _numbers(line, delimiter)
+        if row is not None and len(row) == width:
+            blocks[-1][1].append(row)
+        elif row is not None:
+            blocks.append((number, [row]))
+        width = len(row or ())
+    return [_Block(first, np.array(rows)) for first, rows in blocks]
+
+
+def _parted(block: _Block, lines: list[str], delimiter: str) -> list[_Block]:
+    """Return the frames of a block: without lines that count, as pandas writes them above each, and without columns that name or number."""
+    counting = _count(block.values)
+    if counting.mean() <= _MOST_COUNTING:
+        bounds = [-1, *np.flatnonzero(counting).tolist(), len(counting)]
+        pieces = [block.values[start + 1 : stop] for start, stop in pairwise(bounds)]
+        parts = [
+            _Block(block.first + start + 1, piece) for start, piece in zip(bounds, pieces, strict=False) if len(piece)
+        ]
+    else:
+        parts = [block]
+    named = [frame for part in parts for frame in _without_names(part, lines, delimiter)]
+    # A column for frames, another for rows.
+    return [last for part in named for frame in _without_numbers(part) for last in _without_numbers(frame)]
+
+
+def _split(block: _Block, begins: NDArray[np.bool_]) -> list[_Block]:
+    """Return the frames that begin in some lines of a block, without its first column."""
+    starts = np.unique([0, *np.flatnonzero(begins)])
+    return [
+        _Block(block.first + int(k), part[:, 1:])
+        for k, part in zip(starts, np.split(block.values, starts[1:]), strict=True)
+    ]
+
+
+def _without_names(block: _Block, lines: list[str], delimiter: str) -> list[_Block]:
+    """Return a block without a first column of names: of rows, or of frames, as "Frame 2" in their first line or in each."""
+    if not np.isnan(block.values[:, 0]).all():
+        return [block]
+    names = [line.split(delimiter)[0].strip(' "') for line in lines[block.first :][: len(block.values)]]
+    begins = np.array([bool(name) and name != before for before, name in pairwise(["", *names])])
+    return _split(block, begins & ~begins.all())
+
+
+def _without_numbers(block: _Block) -> list[_Block]:
+    """Return a block without a first column that numbers rows or frames: whole numbers beside fractions, or from 0 or 1 on."""
+    first, others = block.values[:, 0], block.values[:, 1:]
+    steps = np.diff(first)
+    repeated = bool((steps == 0.0).any())
+    counts = first[0] in (0.0, 1.0) and bool((steps <= 1.0).all() and (steps > 0.0).any())
+    beside = repeated and first[0] > 0.0 and np.mean(others % 1.0 != 0.0) > _LEAST_FRACTIONS
+    if (first % 1.0 != 0.0).any() or others.shape[1] < _FEWEST or not (counts or beside):
+        return [block]
+    return _split(block, np.r_[False, steps != 0.0 if repeated else steps < 0.0])
+
+
+def _splits_numbers(values: NDArray[np.floating], lines: list[str]) -> bool:
+    """Whether the comma between whole numbers is also the one in numbers: 20,05,20,1 is 20.05 and 20.1; every second column is rough."""
+    if np.nanmax(values % 1.0) > 0.0:
+        return False
+    rough = [np.nanmean(np.abs(np.diff(values[:, side::2], axis=1))) for side in (0, 1)]
+    return max(rough) > _UNALIKE * min(rough) or any(re.search(r"(?:^|,)-?0\d", line) for line in lines)
+
+
+def _joined(frame: NDArray[np.floating]) -> int:
+    """Return how many frames of one scene stand below one another without a line between them; 0 where it is one."""
+    rows, columns = frame.shape
+    if rows <= _HIGHEST * columns:
+        return 0
+    steps = np.nanmedian(np.abs(np.diff(frame, axis=0)), axis=1)
+    usual = np.nanmedian(steps)
+    for count in range(2, rows // _FEWEST + 1):
+        if rows % count == 0:
+            height = rows // count
+            parts = frame.reshape(count, height, columns)
+            slopes = np.diff(parts, axis=1)
+            repeated = np.nanstd(np.diff(slopes, axis=0)) < _ALIKE * np.nanstd(
+                slopes[0] - np.nanmean(slopes[0], axis=0)
+            )
+            # A steady slope is alike above and below in one picture too, but does not fall back.
+            change = np.nanstd(np.diff(parts - np.nanmean(parts, axis=(1, 2), keepdims=True), axis=0))
+            falls = steps[height - 1 :: height].min() > _JUMP * usual
+            if repeated or (falls and change < max(_ALIKE * np.nanstd(parts[0]), 2.0 * usual)):
+                return count
+    return 0
 
 
 def _heading(path: Path) -> str:
@@ -626,11 +913,8 @@ def _plain_shape(content: bytes) -> tuple[int, int] | None:
         columns = {line.rstrip().removesuffix(delimiter).count(delimiter) + 1 for line in lines}
         if len(columns) == 1 and _has_proportions(len(lines), width := columns.pop()):
             corner = np.array([[_number(text.decode()) for text in line.split(delimiter)[:4]] for line in lines[:4]])
-            return (
-                None
-                if np.isnan(corner).any() or _counts_alone(corner) or _counts_alone(corner.T)
-                else (len(lines), width)
-            )
+            numbered = (corner[0] % 1.0 == 0.0).all() or (corner[:, 0] % 1.0 == 0.0).all()
+            return None if numbered or np.isnan(corner).any() or len(lines) > _HIGHEST * width else (len(lines), width)
     return None
 
 
@@ -639,46 +923,30 @@ def _has_proportions(rows: int, columns: int) -> bool:
     return min(rows, columns) >= _FEWEST and max(rows, columns) <= _LONGEST * min(rows, columns)
 
 
-def _is_a_frame(block: list[list[float]]) -> bool:
-    rows, columns = len(block), len(block[0]) if block else 0
-    return _has_proportions(rows, columns) and bool(np.isnan(block).mean() <= _MOST_MISSING)
+def _is_a_frame(block: NDArray[np.floating]) -> bool:
+    return _has_proportions(*block.shape) and bool(np.isnan(block).mean() <= _MOST_MISSING)
 
 
-def _without_numbers_of_lines(block: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return a frame without a first column of names, and without a first row or column that counts, as pandas and R write them."""
-    if np.isnan(block[:, 0]).all():
-        block = block[:, 1:]
-    if _counts_alone(block) or (np.isnan(block[0, 0]) and _counts_alone(block[:, 1:])):
-        block = block[1:]
-    return block[:, 1:] if _counts_alone(block.T) else block
+def _count(rows: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether each row counts in steps of one from 0 or 1 on, behind a first field."""
+    return (np.diff(rows[:, 1:]) == 1.0).all(axis=1) & np.isin(rows[:, 1], (0.0, 1.0, 2.0))
 
 
-def _counts_alone(rows: NDArray[np.floating]) -> bool:
-    """Whether the numbers of the first row, and not those of the second, count from 0 or from 1."""
-    steps = np.diff(rows[:2]) == 1.0
-    return bool(rows[0, 0] in (0.0, 1.0) and steps[0].all() and not steps[1].all())
-
-
-def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:
-    """Return the longest run of lines that hold the same number of numbers."""
-    best: list[list[float]] = []
-    block: list[list[float]] = []
-    for line in lines:
-        row = _numbers(line, delimiter)
-        if block and (row is None or len(row) != len(block[0])):
-            best, block = max(best, block, key=len), []
-        if row is not None:
-            block.append(row)
-    return max(best, block, key=len)
+def _fields(line: str, delimiter: str) -> list[str]:
+    """Return the fields of a line, numbers with a decimal point."""
+    if delimiter == " ":
+        fields = line.replace('"', "").split()
+    else:
+        text = line.rstrip().removesuffix(delimiter)
+        fields = next(csv.reader([text], delimiter=delimiter), []) if '"' in text else text.split(delimiter)
+    return [field.replace(",", ".") for field in fields] if "," in line else fields
 
 
 def _numbers(line: str, delimiter: str) -> list[float] | None:
     """Return the numbers of a line, NaN for a field that is empty or a word for none; None where the line is no row of a frame."""
-    fields = line.split() if delimiter == " " else line.rstrip().removesuffix(delimiter).split(delimiter)
+    fields = _fields(line, delimiter)
     if not _FEWEST <= len(fields) <= _MOST_COLUMNS:
         return None
-    if delimiter != ",":
-        fields = [field.replace(",", ".") for field in fields]
     try:
         return [float(field) for field in fields]
     except ValueError:
@@ -789,28 +1057,59 @@ def read_stack(path: Path) -> Stack:
     return Stack(reader, reader.frame_contents(path, stored), reader.read_values(path, 0, stored))
 
 
-#: First byte and bytes, or ending, of files of thermal cameras that are not read -> what they are and what to do instead.
 _VIDEO = "a video of colours (MP4, MOV or AVI) without temperatures; record radiometric video (.seq, .csq), or take single pictures"
 _EXPORT = "export it as CSV or TIFF of temperatures in the program that reads it"
+_TABLE = "a table in a binary file; save it as CSV or XLSX"
+#: First byte and bytes, or ending, of files that are not read -> what they are and what to do instead.
 _NOT_READ: dict[tuple[int, bytes] | str, str] = {
     (4, b"ftyp"): _VIDEO,
     (0, b"RIFF"): _VIDEO,
     (0, b"AFF\0"): f"an AFF sequence of a cooled FLIR camera, whose layout is not public; {_EXPORT}",
-    ".ats": f"an ATS recording of FLIR ResearchIR or Research Studio, whose layout is not public; export it as SEQ there, or {_EXPORT}",
+    (
+        0,
+        b"MATLAB ",
+    ): 'a MATLAB file; write its frames in MATLAB as CSV, writematrix(frame, "frame.csv"), or as TIFF, one per file',
+    (0, b"SIMPLE  ="): "a FITS file; save its frames as .npy (numpy.save), TIFF or CSV",
+    (
+        0,
+        b"\x76\x2f\x31\x01",
+    ): "an OpenEXR picture, as a run writes its maps; name the frames from which they were made, or save it as TIFF",
+    (0, b"CDF\5"): "a NetCDF file with 64-bit data (CDF-5); convert it: nccopy -k nc4 FILE NEW.nc",
+    (0, b"PAR1"): _TABLE,
+    (0, b"ARROW1"): _TABLE,
+    (0, b"FEA1"): _TABLE,
+    (0, b"TDSm"): "a TDMS file of LabVIEW; export it as CSV or XLSX there",
+    (0, b"\x1f\x8b"): "a file packed by gzip; unpack it",
+    (0, b"Rar!"): "an archive; unpack it",
+    (0, b"7z\xbc\xaf"): "an archive; unpack it",
+    (0, b"\xffIRB"): f"a recording of InfraTec, whose layout is not public; {_EXPORT}",
     ".irb": f"a recording of InfraTec, whose layout is not public; {_EXPORT}",
+    ".ats": f"an ATS recording of FLIR ResearchIR or Research Studio, whose layout is not public; export it as SEQ there, or {_EXPORT}",
+    ".ptw": f"a PTW recording of FLIR Altair; {_EXPORT}",
+    ".sfmov": f"an SFMOV recording of FLIR ExaminIR; {_EXPORT}",
     ".bmt": f"a picture of Testo, whose layout is not public; {_EXPORT}",
     ".is2": f"a picture of Fluke, whose layout is not public; {_EXPORT}",
+    ".optris": f"raw data of an Optris camera; {_EXPORT}",
+    ".mat": 'a MATLAB file; write its frames in MATLAB as CSV, writematrix(frame, "frame.csv"), or as TIFF, one per file',
+    ".npz": "a file of several NumPy arrays; save the frames alone as (frame, row, column) in a .npy, numpy.save",
+    ".pkl": "a pickle of Python, which is never opened because it may run any code; save the frames with numpy.save, a table as CSV",
+    ".rds": "a file of R; save a table with write.csv, frames as CSV or TIFF",
+    ".rdata": "a file of R; save a table with write.csv, frames as CSV or TIFF",
+    ".zip": "an archive; unpack it",
 }
 
 
+def _mark(start: bytes) -> str:
+    """Say what a file that is not read is by its first bytes."""
+    marks = ((mark, why) for mark, why in _NOT_READ.items() if not isinstance(mark, str))
+    return next((why for (place, mark), why in marks if start[place:].startswith(mark)), "")
+
+
 def name_unread(path: Path) -> str:
-    """Say what a file of a thermal camera is that is not read, and what to do instead; empty for all others."""
+    """Say what a known file is that is not read, and what to do instead; empty for all others."""
     with path.open("rb") as file:
         start = file.read(START_BYTES)
-    known = (
-        why for mark, why in _NOT_READ.items() if not isinstance(mark, str) and start[mark[0] :].startswith(mark[1])
-    )
-    return next(known, _NOT_READ.get(path.suffix.lower(), ""))
+    return _mark(start) or _NOT_READ.get(path.suffix.lower(), "")
 
 
 def index_recordings(

@@ -440,3 +440,10 @@ def test_bars_lie_on_one_axis_and_name_gaps_and_recordings_without_times():
     assert Recording("same", np.repeat(START, 4)).stretches() == [(START, START)]
     seconds = np.datetime64("1970-01-01", "ns") + (np.arange(0, 36_000, 60) * 10**9).astype("timedelta64[ns]")
     assert time_bars([Recording("record", seconds)], width=40)[1] == f"        start{'':<29}10.0 h"
+
+
+def test_a_picture_as_a_list_of_pixels_is_no_record(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,T\n" + "".join(f"{x},{y},{20 + x / 7:.3f}\n" for y in range(12) for x in range(16)))
+    found = recognise(path)
+    assert found.kind is Kind.UNKNOWN and found.reason.startswith("a list of pixels; export the picture")

@@ -464,6 +464,10 @@ def test_the_public_format_of_flir_is_read_with_its_time(tmp_path):
         ("a.mp4", b"\0\0\0\x1cftypmp42\0\0\0\1", "a video of colours"),
         ("a.seq", b"AFF\0\0\0", "an AFF sequence"),
         ("a.ats", b"\0\1\2", "an ATS recording"),
+        ("a.dat", b"MATLAB 5.0 MAT-file\0", "a MATLAB file; write its frames"),
+        ("a.npz", b"PK\3\4", r"a file of several NumPy arrays; save"),
+        ("a.fit", b"SIMPLE  =                    T" + b" " * 500, "a FITS file; save its frames"),
+        ("a.optris", b"Optris\0\1", "raw data of an Optris camera"),
     ],
 )
 def test_files_of_cameras_that_are_not_read_are_named_for_what_they_are(tmp_path, name, content, told):
@@ -498,10 +502,147 @@ def test_emissivity_and_surroundings_of_an_exported_picture_stand_in_its_heading
     assert frame.parameters.emissivity == 0.5
 
 
+PICTURE = np.round(20.0 + np.arange(24)[:, None] / 7 + np.arange(32) / 3, 3)
+JOINED = {
+    "blank": lambda k, rows: ["", *rows],
+    "commas": lambda k, rows: ["," * 31, *rows],
+    "named line": lambda k, rows: [f"Frame {k}", *rows],
+    "named first": lambda k, rows: [f"Frame {k},{rows[0]}", *("," + row for row in rows[1:])],
+    "named all": lambda k, rows: [f"Frame {k},{row}" for row in rows],
+    "numbered": lambda k, rows: [f"{k},{row}" for row in rows],
+    "numbered rows": lambda k, rows: [f"{k},{number},{row}" for number, row in enumerate(rows)],
+    "pandas": lambda k, rows: [",".join(["", *map(str, range(32))]), *(f"{n},{row}" for n, row in enumerate(rows))],
+    "quoted": lambda k, rows: ["", *('"' + row.replace(",", '","').replace(".", ",") + '"' for row in rows)],
+    "°C": lambda k, rows: ["", *(row.replace(",", " °C,") + " °C" for row in rows)],
+    "minus": lambda k, rows: ["", *(row.replace("-", "\N{MINUS SIGN}") for row in rows)],
+}
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+@pytest.mark.parametrize("layout", JOINED)
+def test_several_frames_of_one_text_are_each_read(tmp_path, layout, count):
+    pictures = [PICTURE + 0.5 * k - (25.0 if layout == "minus" else 0.0) for k in range(count)]
+    lines = ["File:,C:\\x.seq", "", "Parameters:,Emissivity:,0.95", ""]
+    for k, picture in enumerate(pictures, 1):
+        lines += JOINED[layout](k, [",".join(f"{value:.3f}" for value in row) for row in picture])
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    contents = READER.contents(path, StackOptions())
+    assert (contents.frames, contents.shape, contents.emissivity) == (count, (24, 32), 0.95)
+    assert contents.unit == ("degC" if layout == "°C" else "")
+    np.testing.assert_allclose([READER.read_values(path, k, StackOptions()) for k in range(count)], pictures, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("edit", "told"),
+    [
+        (lambda rows: rows + rows, "32 x 48 numbers repeat one scene 2 times; put an empty line"),
+        (lambda rows: [*rows, "", *rows[:20]], "blocks of 20 and of 24 lines with 32 numbers"),
+        (lambda rows: [*rows[:9], "busy", *rows[9:]], "blocks of 9 and of 15 lines with 32 numbers"),
+        (lambda rows: [*rows[:-1], rows[-1][:20]], "line 24 holds 3 numbers, those above it 32: it was cut"),
+        (lambda rows: [*rows[:-1], rows[-1] + ",1.0"], "line 24 holds 33 numbers, others 32"),
+        (lambda rows: [row.replace(".", ",") for row in rows], "the comma stands in numbers and between them"),
+        (lambda rows: [row.replace(",", " °F,") + " °F" for row in rows], "temperatures in °F; export them in °C"),
+    ],
+)
+def test_frames_that_are_not_told_apart_and_numbers_in_doubt_are_refused(tmp_path, edit, told):
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(edit([",".join(f"{value:.3f}" for value in row) for row in PICTURE])), encoding="utf-8")
+    with pytest.raises(ThermographyError, match=told):
+        READER.contents(path, StackOptions())
+
+
+def test_a_tall_picture_is_one(tmp_path):
+    row, column = np.mgrid[:48, :32]
+    for picture in (
+        20.0 + row / 7 + column / 3,
+        20.0 + 5.0 * np.hypot(row - 30, column - 12) ** 0.5,
+        20.0 + 3.0 * (column > 9),
+    ):
+        np.savetxt(tmp_path / "a.csv", picture, delimiter=";", fmt="%.2f")
+        assert READER.contents(tmp_path / "a.csv", StackOptions()).shape == (48, 32)
+
+
+@pytest.mark.real_data
+def test_the_export_of_an_optris_camera_is_read(real_file):
+    path = real_file("loochlabs__temperature_parser/data/examples/Ellesmere_IR_flight01_1000ft_000163.csv")
+    values = READER.read_values(path, 0, StackOptions())
+    assert values.shape == (288, 382)
+    # Its lines below the first, which states the size, by numpy alone.
+    np.testing.assert_array_equal(values, np.loadtxt(path, delimiter=",", skiprows=1))
+
+
+@pytest.mark.parametrize("order", ["tyx", "yxt", "txy", "xyt"])
+@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
+def test_dimensions_of_a_store_are_known_by_name(tmp_path, order, engine):
+    names = {"t": "time", "y": "y", "x": "x"}
+    values = xr.DataArray(STACK, dims=("time", "y", "x"), coords={"time": TIMES}, attrs={"units": "degC"})
+    values.transpose(*(names[each] for each in order)).to_dataset(name="a").to_netcdf(tmp_path / "a.nc", engine=engine)
+    found, _ = index_recordings([tmp_path / "a.nc"])
+    assert [frame.time for frame in found] == list(TIMES)
+    np.testing.assert_allclose([frame.read_temperature() for frame in found], STACK, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["one frame", "band", "group", "unnamed", "axis", "frames with times"])
+def test_one_frame_a_band_and_a_group_are_read(tmp_path, kind):
+    values = xr.DataArray(STACK, dims=("time", "y", "x"), coords={"time": TIMES}, attrs={"units": "degC"})
+    if kind == "one frame":
+        values = values.isel(time=1)
+    elif kind == "band":
+        values = values.expand_dims("band", axis=1)
+    elif kind == "unnamed":
+        values = values.rename(y="a", x="b").transpose("a", "b", "time")
+    elif kind == "axis":
+        values = (
+            values.rename(y="a", x="b")
+            .assign_coords(a=("a", np.arange(10.0), {"axis": "Y"}))
+            .transpose("time", "b", "a")
+        )
+    elif kind == "frames with times":
+        values = values.rename(time="n").rename(n="number").drop_vars("number").assign_coords(time=("number", TIMES))
+    group = "camera/left" if kind == "group" else None
+    values.to_dataset(name="picture").to_netcdf(tmp_path / "a.nc", engine="h5netcdf", group=group)
+    found, _ = index_recordings([tmp_path / "a.nc"])
+    which = [1] if kind == "one frame" else [0, 1, 2]
+    assert [frame.time for frame in found] == list(TIMES[which])
+    np.testing.assert_allclose([frame.read_temperature() for frame in found], STACK[which], atol=1e-5)
+
+
+def test_a_unit_that_is_not_known_is_refused_and_deep_nests_are_not_walked(tmp_path):
+    values = xr.DataArray(STACK, dims=("time", "y", "x"), attrs={"units": "degF"})
+    values.to_dataset(name="a").to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(StackError, match="a is in 'degF'; write it in degC or K"):
+        read_stack(tmp_path / "a.nc")
+    with h5py.File(tmp_path / "b.nc", "w") as file:
+        file.create_group("/".join("g" * 30))
+    with pytest.raises(ThermographyError, match="nests groups more than 20 deep"):
+        read_stack(tmp_path / "b.nc")
+
+
+def test_pages_of_a_pyramid_and_of_colours_are_passed_over_by_name(tmp_path):
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as file:
+        file.write(STACK[0][::2, ::2], photometric="minisblack", subfiletype=1)
+        file.write(STACK[0], photometric="minisblack", extratags=[(42113, 2, 0, "-9999", True)])
+        file.write(np.zeros((20, 24, 3), np.uint8), photometric="rgb")
+        file.write(np.where(STACK[1] == STACK[1].min(), -9999, STACK[1]), photometric="minisblack")
+        file.write(STACK[1][:5], photometric="minisblack")
+    found, _ = index_recordings([path], EVERY_10_S)
+    np.testing.assert_allclose(found[0].read_temperature(), STACK[0], atol=1e-5)
+    assert np.isnan(found[1].read_temperature()).sum() == (STACK[1] == STACK[1].min()).sum() and len(found) == 2
+    assert found[0].notes == tuple(
+        f"pages passed over, reduced or of colours: 1 of {size}" for size in ("6 x 5", "24 x 20", "12 x 5")
+    )
+    colours = np.zeros((3, 256), np.uint16)
+    tifffile.imwrite(path, np.zeros((9, 9), np.uint8), photometric="palette", colormap=colours)
+    with pytest.raises(ThermographyError, match="false colours holds no temperatures"):
+        read_stack(path)
+
+
 @pytest.mark.parametrize("written", ["as it is", "numbered columns", "pandas", "pandas of floats", "R"])
 def test_numbers_of_rows_and_columns_are_no_pixels(tmp_path, written):
     """As ``DataFrame.to_csv`` and ``write.csv`` write a picture."""
-    frame = np.round(20.0 + np.arange(24)[:, None] / 7 + np.arange(32) / 3, 3)
+    frame = PICTURE
     columns = {
         "numbered columns": range(32),
         "pandas": range(32),
