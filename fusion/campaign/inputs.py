@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -58,7 +58,7 @@ from interferometry.io.readings import read_deviations, read_environment
 from interferometry.io.tables import DateOrder, parse_time, read_table
 from interferometry.iso230 import STANDARD_CYCLES
 from thermography.common import ZERO_CELSIUS_K, ThermographyError
-from thermography.io.frame import CameraParameters, FrameReference
+from thermography.io.frame import FrameReference
 from thermography.io.other_cameras import StackOptions, TemperatureFrame, index_recordings, to_utc
 from thermography.io.region import Region as PictureRegion
 from thermography.io.region import RegionKind
@@ -300,8 +300,6 @@ class Source(CameraInputs, LaserInputs):
         return float(np.abs(self.deviations["position"].values).max())
 
 
-#: Most sets of parameters of which a frame is compared with its checksums.
-_MOST_COMPARED = 100
 #: Words of the reason why a frame of another camera or size is left out.
 _OTHER_CAMERA = "among frames of"
 #: Words of the reason why a second frame of one time is left out.
@@ -622,19 +620,14 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
 
 
 def _checksum_notices(frames: Sequence[FrameReference]) -> Iterator[Notice]:
-    """Yield the notice of frames whose records differ from their checksums: one frame of each set of parameters is compared."""
-    first: dict[CameraParameters, FrameReference] = {}
-    for frame in frames:
-        first.setdefault(frame.parameters, frame)
-    named = [
-        f"{frame.path.name}, frame {frame.index} ({', '.join(f'0x{kind:02X}' for kind in damaged)})"
-        for frame in islice(first.values(), _MOST_COMPARED)
-        if (damaged := frame.damaged_records())
-    ]
+    """Yield the notice of frames that are kept although their headers differ from their checksums."""
+    listed_frames = FrameList.of(frames)
+    named = [f"{frame.path.name}, frame {frame.index}" for frame in listed_frames.choose(listed_frames.altered())]
     if named:
         yield Notice(
             "frames_checksum",
-            f"Records of frames differ from their checksums: {listed(named)}. The files were changed after the camera wrote them.",
+            f"The headers of {counted(len(named), 'frame')} differ from their checksums: {listed(named)}. The files were changed after the "
+            "camera wrote them.",
             "Compare these files with the originals, or leave them out: their parameters, and temperatures, may be wrong.",
         )
 

@@ -234,14 +234,15 @@ def _find_record(source: FffSource, directory: Directory, kind: int, name: str) 
 
 def damaged_records(source: FffSource, directory: Directory) -> list[int]:
     """Return the types of the records whose bytes differ from their checksum."""
-    return [
-        kind
-        for kind, (offset, length) in directory.records.items()
-        if _differs(source.read(offset, length), directory.checksum(kind))
-    ]
+    return [kind for kind in directory.records if is_damaged(source, directory, kind)]
 
 
-def _differs(data: bytes | memoryview, checksum: int) -> bool:
+def is_damaged(source: FffSource, directory: Directory, kind: int) -> bool:
+    """Return whether the record of a type differs from its checksum."""
+    return differs(source.read(*directory.records[kind]), directory.checksum(kind))
+
+
+def differs(data: bytes | memoryview, checksum: int) -> bool:
     """Return whether bytes differ from their CRC-32; never where none (0) is stored."""
     return checksum != 0 and int(imagecodecs.deflate_crc32(data)) != checksum  # type: ignore[arg-type]
 
@@ -401,7 +402,7 @@ def _read_samples(source: FffSource, samples: SampleLocation) -> memoryview:
         return source.read_once(samples.offset, min(samples.length, 2 * _MAX_PIXELS), kept=kept)
     record = source.read_once(offset, length, kept=kept)
     # A record without its last padding bytes cannot be compared.
-    if len(record) == length and _differs(record, samples.checksum):
+    if len(record) == length and differs(record, samples.checksum):
         raise source.error(offset, f"a raw image with the CRC-32 {samples.checksum:08X}", "another: damaged samples")
     start = samples.offset - offset
     return record[start : start + samples.length]

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from thermography.common import ThermographyError
 from thermography.io.fff_record import (
+    CAMERA_RECORD,
     HEADER_SIZE,
     MAGIC,
     Directory,
     FffSource,
     find_camera_info,
+    is_damaged,
     is_fff_header,
     locate_samples,
     read_directory,
@@ -133,7 +135,8 @@ def index_frames(
     frames : FrameList
         Sequence of `FrameReference`, sorted by time (UTC), frames without a time last; no time occurs twice.
     rejected : list of RejectedFrame
-        Everything that is not in `frames`: unreadable files, damaged or truncated frames, a second frame with the same time.
+        Everything that is not in `frames`: unreadable files, damaged or truncated frames, a second frame with the same time. A header that
+        differs from its checksum is damage where those of most frames do not; else a program changed them all, and they are kept.
 
     Notes
     -----
@@ -240,6 +243,7 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FlirFrame
         **{**vars(header), "notes": notes},
         path=source.path,
         index=index,
+        altered=is_damaged(source, directory, CAMERA_RECORD),
         segments=source.segments,
         camera_info_place=place,
         samples=samples,

@@ -229,10 +229,12 @@ class FrameReference(FrameHeader, ABC):
     ----------
     path : path of the file
     index : index of the frame in the file, from 0
+    altered : whether the header differs from the checksum that the file holds of it
     """
 
     path: Path
     index: int
+    altered: bool = False
 
     @property
     @abstractmethod

@@ -34,6 +34,7 @@ from thermography.io.fff_record import (
     SIGNATURES,
     TIME_BYTES,
     UNNAMED_BYTES,
+    differs,
     is_fff_header,
     parse_parameters,
     parse_settings,
@@ -53,7 +54,7 @@ _MOST_KEPT = 1 << 30
 #: So many of the first and of the last bytes of a recording are compared.
 _EDGE = 1 << 16
 #: To be raised with every change of what is kept.
-_VERSION = 2
+_VERSION = 3
 _IDENTITY = "identity"
 
 _log = logging.getLogger(__name__)
@@ -131,7 +132,8 @@ _NO_TIME = np.iinfo(np.int64).min
 class _Layout(NamedTuple):
     """Where the headers stand in a frame, and in the row of bytes that is read of it, bytes: `template` is the row of the first frame,
     `compared` 255 where all frames share it, `copied` the places of what differs; `raw_length` is 0 for packed samples, whose length
-    varies, `samples` the place of the first one in the row.
+    varies, `samples` the place of the first one in the row, and `info` that of the camera information; `altered` tells whether this one
+    differs from its checksum.
     """
 
     big: bool
@@ -142,6 +144,8 @@ class _Layout(NamedTuple):
     raw: int
     raw_length: int
     samples: int
+    info: int
+    altered: bool
     template: Array
     compared: Array
     copied: Array
@@ -211,6 +215,7 @@ class FlirTable(FrameTable):
             notes=notes,
             path=first.path,
             index=self.first_index + place,
+            altered=first.altered,
             segments=((self.ends.item(place) - length, length),),
             camera_info_place=first.camera_info_place,
             samples=samples,
@@ -277,6 +282,8 @@ def scan_table(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirTabl
         raw=raw,
         raw_length=0 if signature else samples.record[1],
         samples=in_row[raw + RAW_HEADER_SIZE],
+        info=in_row[camera],
+        altered=first.altered,
         template=np.frombuffer(b"".join(_bytes_at(file, begin + at, width) for at, width in pieces), np.uint8),
         compared=compared,
         copied=np.array([in_row[camera + offset] for start, stop in changing for offset in range(start, stop)]),
@@ -320,7 +327,7 @@ def _scan_run(
     chunks: list[_Columns] = []
     while not ended:
         stored = np.empty((_CHUNK, len(layout.copied)), np.uint8)
-        numbers = np.empty((_CHUNK, 3), np.int64)
+        numbers = np.empty((_CHUNK, 4), np.int64)
         filled = 0
         while not ended and filled + batch <= _CHUNK:
             complete = batch
@@ -330,6 +337,11 @@ def _scan_run(
                         complete = frame
                         break
             intact = _check(rows[:complete], layout, length, stored[filled:], numbers[filled:])
+            infos = rows[:intact, layout.info : layout.info + layout.camera_length]
+            altered = (
+                differs(info, checksum) for info, checksum in zip(infos, numbers[filled:, 3].tolist(), strict=False)
+            )
+            intact = next((frame for frame, one in enumerate(altered) if one != layout.altered), intact)
             end = start + int(numbers[filled : filled + intact, 0].sum())
             if intact and end != size and not is_fff_header(_bytes_at(file, end, HEADER_SIZE)):
                 intact -= 1
@@ -379,7 +391,9 @@ def _changes(rows: Array) -> Array:
 def _check(
     rows: Array, layout: _Layout, length: int, stored: Array, numbers: Array
 ) -> int:  # pragma: no cover - compiled
-    """Check rows and store length of the frame, length and checksum of the raw image, and what differs; the number of rows that fit."""
+    """Check rows and store length of the frame, length and checksum of the raw image, checksum of the camera information, and what differs;
+    the number of rows that fit.
+    """
     for frame in range(len(rows)):
         row = rows[frame]
         differing = np.uint8(0)
@@ -387,7 +401,7 @@ def _check(
             differing |= (row[i] ^ layout.template[i]) & layout.compared[i]
         packed = _u32(row, layout.samples, True) in (0x89504E47, 0xFFD8FFF7)
         end = layout.directory + layout.slots * ENTRY_SIZE
-        camera, raw, raw_length, checksum = False, False, 0, 0
+        camera, raw, raw_length, checksum, camera_checksum = False, False, 0, 0, 0
         fits = differing == 0 and not (packed and layout.raw_length > 0)
         for slot in range(layout.slots):
             entry = layout.directory + slot * ENTRY_SIZE
@@ -397,14 +411,19 @@ def _check(
                 continue
             end = max(end, offset + width)
             if kind == CAMERA_RECORD and not camera:
-                camera = True
+                camera, camera_checksum = True, _u32(row, entry + 28, layout.big)
                 fits &= offset == layout.camera and min(width, MAXIMUM_CAMERA_INFO) == layout.camera_length
             elif kind == RAW_RECORD and not raw:
                 raw, raw_length, checksum = True, width, _u32(row, entry + 28, layout.big)
                 fits &= offset == layout.raw and width > RAW_HEADER_SIZE and layout.raw_length in (0, width)
         if not (fits and camera and raw):
             return frame
-        numbers[frame, 0], numbers[frame, 1], numbers[frame, 2] = end, raw_length, checksum
+        numbers[frame, 0], numbers[frame, 1], numbers[frame, 2], numbers[frame, 3] = (
+            end,
+            raw_length,
+            checksum,
+            camera_checksum,
+        )
         for k in range(len(layout.copied)):
             stored[frame, k] = row[layout.copied[k]]
         if end != length:

@@ -479,6 +479,10 @@ class FrameList(_Frames):
                 every[start : start + len(part)] = values
         return found if self._order is None else {name: values[self._order] for name, values in found.items()}
 
+    def altered(self) -> NDArray[np.bool_]:
+        """Which headers differ from their checksums, (n,); of a table all or none do."""
+        return self.column(lambda table: np.full(len(table), table[0].altered), lambda frame: frame.altered, "bool")
+
     def noted(self) -> list[FrameReference]:
         """Frames that carry notes, in order."""
         noted = self.column(
@@ -492,7 +496,7 @@ class FrameList(_Frames):
 
 
 def order_by_time(found: Iterable[FrameReference | FrameTable]) -> tuple[FrameList, list[RejectedFrame]]:
-    """Sort frames by time, and take out those whose time occurs twice."""
+    """Sort frames by time, and take out those whose time occurs twice, and those that their checksum shows to be damaged."""
     parts: list[FrameTable | list[FrameReference]] = []
     for each in found:
         if isinstance(each, FrameTable):
@@ -501,16 +505,26 @@ def order_by_time(found: Iterable[FrameReference | FrameTable]) -> tuple[FrameLi
             parts[-1].append(each)
         else:
             parts.append([each])
-    stored = FrameList(parts)
+    altered = FrameList(parts).altered()
+    # Where most headers differ from their checksums, a program has changed them all.
+    damaged = altered & (2 * altered.sum() < altered.size)
+    intact = np.flatnonzero(~damaged)
+    stored = FrameList(parts, intact) if damaged.any() else FrameList(parts)
+    rejected = [
+        RejectedFrame(
+            one.path, one.index, f"{one.path}: frame {one.index}: its header differs from its checksum, it is damaged"
+        )
+        for one in FrameList(parts).choose(damaged)
+    ]
     times = stored.times
     if not np.isnat(times).any() and (np.diff(times) > np.timedelta64(0)).all():
-        return stored, []
+        return stored, rejected
     by_name = np.unique(stored.files().astype(str), return_inverse=True)[1]
     order = np.lexsort((stored.numbers(), by_name, times))
     second = np.concatenate([[False], times[order][1:] == times[order][:-1]])
-    kept = FrameList(parts, order[~second])
+    kept = FrameList(parts, intact[order[~second]])
     earlier = np.cumsum(~second) - 1
-    return kept, [_repeated(stored[int(order[i])], kept[int(earlier[i])]) for i in np.flatnonzero(second)]
+    return kept, rejected + [_repeated(stored[int(order[i])], kept[int(earlier[i])]) for i in np.flatnonzero(second)]
 
 
 def _repeated(frame: FrameReference, kept: FrameReference) -> RejectedFrame:

@@ -552,3 +552,26 @@ def test_whether_a_file_is_in_memory(tmp_path):
     empty = tmp_path / "empty"
     empty.write_bytes(b"")
     assert in_memory(empty) and in_memory(tmp_path / "not there") and in_memory(tmp_path)
+
+
+def test_a_frame_whose_header_differs_from_its_checksum_is_left_out_of_a_long_sequence(tmp_path, monkeypatch):
+    path = tmp_path / "a.seq"
+    sequence(path, frames=20)
+    length = path.stat().st_size // 20
+    data = bytearray(path.read_bytes())
+    # The frame rate of frame 7: no check of plausibility looks at it.
+    data[7 * length + 0x200 + 0x464] ^= 1
+    path.write_bytes(data)
+    for fewest in (1, 1_000):
+        monkeypatch.setattr(flir, "FEWEST_FRAMES", fewest)
+        frames, rejected = index_frames(path)
+        assert [one.index for one in frames] == [k for k in range(20) if k != 7]
+        assert [one.index for one in rejected] == [7] and "differs from its checksum" in rejected[0].reason
+    # A program that changes all of them leaves none out.
+    for k in (k for k in range(20) if k != 7):
+        data[k * length + 0x200 + 0x464] ^= 1
+    path.write_bytes(data)
+    for fewest in (1, 1_000):
+        monkeypatch.setattr(flir, "FEWEST_FRAMES", fewest)
+        frames, rejected = index_frames(path)
+        assert len(frames) == 20 and not rejected and all(frame.altered for frame in frames)
