@@ -795,7 +795,7 @@ def compare(
     """Compare campaigns of one machine: what changed by more than the uncertainties.
 
     Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first. With --applied the
-    exit code is 0 where the table acted as it states and left what was predicted, else 1.
+    exit code is 0 where the table acted as it states and the machine did not change, else 1.
     """
     from fusion.pipeline.compare import compare_campaigns
     from fusion.report.charts.comparison import follow_trends

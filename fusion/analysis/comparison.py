@@ -571,8 +571,12 @@ class PairComparison:
 
     @property
     def is_kept(self) -> bool:
-        """Whether a table that was loaded between the tests acted as it states, and left what was predicted."""
-        return not (self.table and self.table.names) and all(one.as_predicted for one in self.achieved)
+        """Whether a table that was loaded between the tests acted as it states and nothing but a thermal state changed; where the profiles
+        cannot tell, whether the values are as predicted.
+        """
+        if self.table is None:
+            return all(one.as_predicted for one in self.achieved)
+        return not self.table.names and not any(one.machine and one.significant for one in self.changes)
 
 
 def compare_tests(
@@ -590,7 +594,9 @@ def compare_with_table(
     pair = replace(_compare(expected, after, pairs=1, same_setup=same_setup), before=before)
     if pair.profile is not None and before.drift is not None and after.drift is not None:
         pair = replace(pair, table=find_table_fault(before.drift, after.drift, table))
-    return replace(pair, achieved=hold_against(pair, table))
+    achieved = hold_against(pair, table)
+    lack = [] if achieved else [Lack("prediction", (table.not_predicted or "a value or its uncertainty is missing",))]
+    return replace(pair, achieved=achieved, not_compared=(*pair.not_compared, *lack))
 
 
 def hold_against(pair: PairComparison, prediction: TablePrediction) -> tuple[Achieved, ...]:

@@ -544,6 +544,8 @@ class TablePrediction(ResultPart):
     """What the table takes out of the deviations at its points, beyond one that was active during the test of the campaign, um."""
     predicted_um: Mapping[str, Quantity]
     """A, E, M and B of ISO 230-2, um; their uncertainty is that of table and readings, without what both tests have in common."""
+    not_predicted: str = ""
+    """Why nothing is predicted; empty where it is."""
 
     def correction_at(self, position_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what the table takes out by the positive and by the negative approach, um, at positions (n,), mm."""

@@ -66,7 +66,7 @@ def _moves(anomaly: AnomalyPart) -> bool:
     return anomaly.evidence.kind not in ("scatter", "link") and anomaly.cause != "local_temperature"
 
 
-# What a compensation table is predicted to do: the systematic error of the axis without and with it.
+# What a compensation table is predicted to do.
 
 _DRAWS, _SEED = 400, 20260309
 
@@ -78,14 +78,12 @@ class Prediction:
     Attributes
     ----------
     before_um : without the table
-    after_um : with it, median over repetitions of the test, each with its own errors of measurement
     own_um : what the table leaves of the profile that it was made from: what its points and the control's model cannot follow
     resampling_um : largest departure, at a target, of the table's straight lines from the profile
     value_u_um : largest standard uncertainty of a value of the table within the targets
     """
 
     before_um: float
-    after_um: float
     own_um: float
     resampling_um: float
     value_u_um: float
@@ -94,15 +92,9 @@ class Prediction:
 def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Prediction:
     """Predict what a control leaves that interpolates linearly between the points of a table."""
     relative = profile.deviation_um - np.interp(table.reference_mm, profile.position_mm, profile.deviation_um[0])
-    left = remainder_um(profile, table, one_table=one_table)
-    size = left.size
-    draws = np.random.default_rng(_SEED).multivariate_normal(
-        left.ravel(), 2.0 * profile.covariance_um2.reshape(size, size), _DRAWS, method="eigh"
-    )
     return Prediction(
         before_um=float(np.ptp(profile.deviation_um)),
-        after_um=float(np.median(np.ptp(draws, axis=1))),
-        own_um=float(np.ptp(left)),
+        own_um=float(np.ptp(remainder_um(profile, table, one_table=one_table))),
         resampling_um=float(np.abs(relative - table.added_um(profile.position_mm, one_table=False)).max()),
         value_u_um=float(table.u_um.max()),
     )
@@ -119,8 +111,10 @@ def predict_test(
     rng, left = np.random.default_rng(_SEED), remainder_um(profile, table, one_table=one_table)
     errors = rng.multivariate_normal(
         np.zeros(left.size), profile.covariance_um2.reshape(left.size, left.size), _DRAWS, method="eigh"
-    )
-    mean = left - errors.reshape(_DRAWS, *left.shape) + rng.normal(0.0, scatter_um / cycles**0.5, (_DRAWS, *left.shape))
+    ).reshape(_DRAWS, *left.shape)
+    if one_table:
+        left, errors = _with_likely_reversal(left, errors)
+    mean = left - errors + rng.normal(0.0, scatter_um / cycles**0.5, (_DRAWS, *left.shape))
     first = rng.integers(0, max(1, len(drift_um) - cycles + 1), _DRAWS)
     states = [drift_um[start : start + cycles] for start in first]
     mean = mean + [state.mean(axis=0) for state in states]
@@ -137,6 +131,18 @@ def predict_test(
         for symbol, values in drawn.items()
         if np.isfinite(values).all()
     }
+
+
+def _with_likely_reversal(left: Array, errors: Array) -> tuple[Array, Array]:
+    """Return what one table leaves (2, n) and the errors of the profile (draws, 2, n) with the variation of the reversal that is likely.
+
+    That variation is left as measured, errors included: of its variance only what exceeds theirs is the axis (Wiener's share).
+    """
+    seen, wrong = (one[..., 0, :] - one[..., 1, :] for one in (left, errors))
+    wrong = wrong - wrong.mean(axis=-1, keepdims=True)
+    share = max(0.0, 1.0 - float(np.mean(wrong**2)) / max(float(np.mean(seen**2)), 1e-12))
+    halves = np.array([[0.5], [-0.5]])
+    return left - (1.0 - share) * halves * seen, errors - (1.0 - share**0.5) * halves * wrong[:, None]
 
 
 def remainder_um(profile: Profile, table: ErrorTable, *, one_table: bool) -> Array:
@@ -326,41 +332,42 @@ def _table_texts(
             f'for: resample them, for example with --spacing "{distances[len(distances) // 2]:.0f} mm"'
         )
     name = _axis_name(run, axis, needed=control.names_axis)
+    file = control.file_name.format(axis=name) if name else control.file_name.replace("_{axis}", "")
     facts: dict[str, Any] = {"words": control.words, "axis": name, "table": table, "sign": control.sign}
     facts |= {"loading": control.loading, "unknown": unknown}
     facts["prediction"] = predict(profile, table, one_table=control.one_table)
+    facts["tested"] = tested = _predict_test(run, profile, table, control, file)
     facts["with_table"] = run.results.iso230.with_table if run.results.iso230 else None
     facts["between_um"] = (path_variance(profile) * table.widest_gap_mm / 4.0) ** 0.5
     header = header_lines(run.origin, **facts, objections=against, remarks=remarks(run.results))
-    file = control.file_name.format(axis=name) if name else control.file_name.replace("_{axis}", "")
     texts = {file: control.write(table, name, header if control.comment else ())}
-    texts[f"{file}{PREDICTION_ENDING}"] = _prediction_text(run, profile, table, control, file)
+    texts[f"{file}{PREDICTION_ENDING}"] = json.dumps(tested.model_dump(mode="json"), indent=2) + "\n"
     if not control.comment:
         texts[f"{file}.README.txt"] = "\n".join(header) + "\n"
-    return texts, [*_forced(against), *remarks(run.results)]
+    missing = [f"A, E, M and B with the table are not predicted: {tested.not_predicted}"] if tested.not_predicted else []
+    return texts, [*_forced(against), *remarks(run.results), *missing]
 
 
-def _prediction_text(run: _Run, profile: Profile, table: ErrorTable, control: Control, file: str) -> str:
+def _predict_test(run: _Run, profile: Profile, table: ErrorTable, control: Control, file: str) -> TablePrediction:
     """Return what a test with the table is predicted to show, for ``thermofuse compare --applied``."""
     iso = run.results.iso230
     cycles = len(iso.cycles) if iso is not None and iso.cycles else STANDARD_CYCLES
     forward, reverse = table.added_um(table.position_mm, one_table=control.one_table).tolist()
-    prediction = TablePrediction(
+    predicted = predict_test(
+        profile, table, *read_scatter_and_drift(run.deviations), cycles=max(cycles, 2), one_table=control.one_table
+    )
+    return TablePrediction(
         table=file,
         campaign=run.results.campaign,
         results_sha256=run.origin.results_sha256,
         cycles=cycles,
         position_mm=tuple(table.position_mm.tolist()),
         correction_um=ByDirection(positive=tuple(forward), negative=tuple(reverse)),
-        predicted_um=predict_test(
-            profile,
-            table,
-            *read_scatter_and_drift(run.deviations),
-            cycles=max(cycles, 2),
-            one_table=control.one_table,
-        ),
+        predicted_um=predicted,
+        not_predicted=""
+        if predicted
+        else "the readings do not show their scatter beside the drift: measure more cycles",
     )
-    return json.dumps(prediction.model_dump(mode="json"), indent=2) + "\n"
 
 
 def _temperature_text(
