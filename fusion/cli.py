@@ -38,8 +38,23 @@ if TYPE_CHECKING:
     from fusion.results.results import Results
 
 
+#: Commands of a first day, in the order in which they are needed; help shows the others after them.
+_FIRST = ("demo", "app", "init", "check", "run", "report", "inspect")
+
+
 class _Commands(TyperGroup):
     """The commands, none of which takes an empty argument."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands in the order in which help shows them."""
+        return [*_FIRST, *sorted(set(self.commands) - set(_FIRST))]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands of a first day, then the others."""
+        for title, names in (("Commands", _FIRST), ("More", self.list_commands(ctx)[len(_FIRST) :])):
+            with formatter.section(title):
+                width = formatter.width - 6 - max(map(len, self.commands))
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse an empty argument, which a path would take for the present folder."""
@@ -190,6 +205,7 @@ def run(
         str, Option(metavar="U", help="With --watch: wanted standard uncertainty of a position.")
     ] = "0.1 um",
     processes: Annotated[int, Option(min=1, max=2, help="2: a second process shares the work.")] = 2,
+    details: Annotated[bool, Option("--details", help="Print every finding, not the first ones alone.")] = False,
     quiet: Quiet = False,
     json_progress: Annotated[bool, Option("--json-progress", hidden=True)] = False,
 ) -> None:
@@ -213,7 +229,7 @@ def run(
     # broke off cannot be loaded to say so.
     with _answering(), progress() as report:
         report("start", 0, 1)
-        from fusion.report.findings import summary_table
+        from fusion.report.findings import brief_table, summary_table
 
         # For a run that is whole the libraries of the analysis are not loaded.
         kept = [_read_whole(*one) if resume and not watch else None for one in folders]
@@ -239,7 +255,7 @@ def run(
                 else:
                     report("run (kept)", 1, 1)
             if not quiet:
-                console.print(summary_table(results))
+                console.print(summary_table(results) if details else brief_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
         if len(folders) == 2:
             for name, text in compare_runs(written, folders[0][1].parent):

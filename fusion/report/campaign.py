@@ -616,7 +616,7 @@ SECTIONS = (
     Section("chained", "Forward chaining", "record_chained.j2", "record"),
     Section("place", "Place", "place.j2", "correlation", "attribution"),
     Section("data", "Data", "data.j2"),
-    Section("uncertainty", "Uncertainty", "uncertainty.j2"),
+    Section("uncertainty", "Uncertainty", "uncertainty.j2", opens="Uncertainty: what every ± and p rests on"),
     Section("paper", "Neighbour differences", "neighbours.j2", "comparison", "positions", opens="Neighbour differences"),
     Section(
         "correlation", "Drift and field", "correlation.j2", "correlation", "attribution",
@@ -628,7 +628,7 @@ SECTIONS = (
     Section(
         "registration", "Registration", "registration.j2", "registration", opens="Registration of the thermograms to the table"
     ),
-    Section("glossary", "Glossary", "glossary.j2"),
+    Section("glossary", "Glossary", "glossary.j2", opens="Glossary"),
     Section("provenance", "Provenance", "provenance.j2"),
 )  # fmt: skip
 _SIGNS = {"positive": "+", "negative": "−"}

@@ -219,7 +219,7 @@ def next_steps(results: Results) -> list[str]:
     values = "profile" if results.drift else "values by ISO 230-2" if results.iso230 else "temperatures"
     if isinstance(loop, RecordLoop):
         values = "displacements"
-    return unique or [f"Nothing has to be done: use the {values} with the stated uncertainty as they are."]
+    return unique or [f"Nothing has to be done; use the {values} as they are, with their uncertainty."]
 
 
 # The findings of a run in the order in which they are told.
@@ -344,6 +344,27 @@ def summary_table(results: Results) -> rich.table.Table:
         # Names of keys stand in brackets, which rich would take for styles.
         printed.add_row(cell(name), cell(text))
     return printed
+
+
+def brief_table(results: Results) -> rich.table.Table:
+    """Return what the first screen of the report says as a table of about twelve lines for the terminal."""
+    printed = rich.table.Table(
+        title=cell(results.campaign), title_justify="left", show_header=False, pad_edge=False, box=None
+    )
+    printed.add_column(no_wrap=True)
+    printed.add_column(overflow="fold")
+    for name, text in brief_rows(results):
+        printed.add_row(cell(name), cell(text))
+    return printed
+
+
+def brief_rows(results: Results) -> list[tuple[str, str]]:
+    """Return names and texts of what the first screen of the report says."""
+    first = first_screen(results, {}, "", "")
+    steps = "\n".join(f"{number}. {step}" for number, step in enumerate(first["next"], start=1))
+    rows = [("in doubt", first["open"]), ("decision", first["decision"]), ("cause", first["cause"])]
+    rows += [(one.tile.name, one.tile.value) for one in findings(results) if one.tile]
+    return [(name, text) for name, text in (*rows, ("next", steps)) if text]
 
 
 def summary_rows(results: Results) -> list[tuple[str, str]]:

@@ -206,8 +206,7 @@
   window.addEventListener("beforeprint", () => { if (!document.documentElement.classList.contains("paper")) freeze(); });
   window.addEventListener("afterprint", () => { if (!document.documentElement.classList.contains("paper")) thaw(); });
   window.charts = { toPaper, toScreen };
-  if (location.hash === "#on-a4") {  // opened to be printed by a program: an archive copy holds what folds as well
-    document.querySelectorAll("details").forEach((part) => { part.open = true; });
+  if (location.hash === "#on-a4") {  // opened to be printed by a program
     window.addEventListener("load", () => { toPaper().then(() => { document.documentElement.dataset.paper = "ready"; }); });
   }
 })();

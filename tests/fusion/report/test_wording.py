@@ -627,7 +627,7 @@ def test_a_place_is_to_be_tested_by_itself_whatever_load_moves_the_axis():
     source = SourcePart.model_construct(x_mm=355.0, y_mm=95.0, area=None)
     seen = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
     (step,) = next_steps(results(loop("complete"), correlation=seen))
-    assert "whether the place around x 355 mm, y 95 mm itself moves the axis: heat or cool this place alone" in step
+    assert "alone in the next test: the place around x 355 mm, y 95 mm, switched at random" in step
     shown = seen.model_copy(update={"randomised_duty": (DutyPart.model_construct(name="spindle", cause=True),)})
     assert next_steps(results(loop("complete"), correlation=shown)) == [step]
 
