@@ -325,6 +325,14 @@ def _predictions(record: Record, result: RecordResult) -> dict[str, Any]:
         f"predicted_{name}": (dims, result.predicted[name], {"units": "um"})
         for name in ("declared", "final", "last_value")
     }
+    if (anchored := result.anchored) is not None:
+        told = "prediction from the last value before the hold-out, with the readings since"
+        variables["predicted_anchored"] = dims, anchored.predicted, {"units": "um", "long_name": told}
+        variables["predicted_anchored_u"] = (
+            dims,
+            anchored.u,
+            {"units": "um", "long_name": f"standard uncertainty of a {told}"},
+        )
     after, *before = (record.displacement - predicted for predicted in result.left_out)
     if before:
         for stage, errors in {"before": before, "after": [after] * len(before)}.items():

@@ -41,6 +41,7 @@ from fusion.report.wording import (
     effect_words,
     figures_of,
     in_words,
+    model_errors,
     parameters,
     print_table,
     quantity,
@@ -455,7 +456,7 @@ DECIDED_BEFORE = (
 
 def errors_table(loop: Loop) -> Table:
     """Return the errors on the hold-out: of the model before and after, with what it expects of them, and of plain predictions."""
-    named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
+    named = [*model_errors(loop).items()]
     plain = [(words, getattr(loop.baselines, name)) for name, words in baseline_words(loop).items()]
     errors = alike([one.rmse_um for _, one in (*named, *plain)], distinct=False)
     expected = [say("expected_cell", one) or "–" for _, one in named] + ["–"] * len(plain)

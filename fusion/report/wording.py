@@ -19,7 +19,7 @@ from fusion.analysis.diagnosis.causes import CAUSES
 from fusion.analysis.effects.library import describe_effect
 from fusion.messages import cell, printable
 from fusion.results.axis import AnomalyPart, CorrelationPart, DriftPart, Iso230Window
-from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, Loop, Range, RecordLoop
+from fusion.results.loop import ERROR_BY_CHANCE, ChannelErrors, Loop, ModelError, Range, RecordLoop
 from fusion.results.numbers import (
     alike,
     decimals_of,
@@ -534,6 +534,14 @@ def worse_channels(loop: Loop) -> list[tuple[str, ChannelErrors]]:
     """Return the channels of a record whose error does not fall with the added effects."""
     channels = loop.channels if isinstance(loop, RecordLoop) else {}
     return [(name, one) for name, one in channels.items() if (one.rmse_final_um or 0.0) > (one.rmse_declared_um or 0.0)]
+
+
+def model_errors(loop: Loop) -> dict[str, ModelError]:
+    """Return the errors of the model in words; of a record of one run with that from the last values before the hold-out."""
+    errors = {"declared model": loop.errors.declared, "with the added effects": loop.errors.final}
+    if isinstance(loop, RecordLoop) and loop.anchored:
+        errors["from the last values before it, with the readings since"] = loop.anchored.model
+    return errors
 
 
 def baseline_words(loop: Loop) -> dict[str, str]:

@@ -69,14 +69,15 @@ class ModelError(HeldOutError):
     """An error of the model on the hold-out, and what the model itself expects of it: where more is missed, the model is wrong there."""
 
     expected_um: Number = None
-    """Root mean square error that drift, noise and coefficients make there, as uncertain as the training part leaves them, um; of a record
-    that of predicting later parts of the training part from earlier ones. Null in results of earlier versions."""
+    """Root mean square error that drift, noise and coefficients make there, as uncertain as the training part leaves them, um; of the
+    declared and final model of a record that of predicting later parts of the training part from earlier ones. Null in results of earlier
+    versions."""
     expected_low_um: Number = None
-    """Lower end of the range that holds the error in 95 % of such hold-outs where the model is right, um; null of a record."""
+    """Lower end of the range that holds the error in 95 % of such hold-outs where the model is right, um; null as its upper end."""
     expected_high_um: Number = None
-    """Its upper end, um; null of a record."""
+    """Its upper end, um; null of the declared and final model of a record."""
     expected_p: Number = None
-    """Probability of an error as large or larger where the model is right, by simulation; null of a record."""
+    """Probability of an error as large or larger where the model is right, by simulation; null as the range."""
 
     @property
     def exceeds(self) -> bool | None:
@@ -444,6 +445,15 @@ class Tracking(ResultPart):
     """Of ridge regression started at the last reading."""
 
 
+class Anchored(ResultPart):
+    """Errors on the hold-out of a record of one run where the last values before it are known, and the readings since."""
+
+    model: ModelError
+    """Of the responses to all sensors and drivers, at once and late, that `export` gives to a control."""
+    last_value: HeldOutError
+    """Of staying at the last values."""
+
+
 class Loop(HoldOutErrors):
     """What the closed loop found, along an axis or on a record."""
 
@@ -529,6 +539,11 @@ class ChannelErrors(HoldOutErrors):
     """Standard deviation of a block mean that no model explains, um."""
     variance_share: Number
     """Share of the displacement's variance on the hold-out that is left, 1."""
+    rmse_anchored_um: Number = None
+    """Of predicting from the last value before the hold-out, with the readings since, um; null for several runs, and in results of earlier
+    versions."""
+    expected_anchored_um: Number = None
+    """What that forecast itself expects of it, um; null as above."""
 
 
 class ChainedPart(HoldOutErrors):
@@ -607,6 +622,9 @@ class RecordLoop(Loop):
     """What is left."""
     channels: Mapping[str, ChannelErrors]
     """Errors by channel."""
+    anchored: Anchored | None = None
+    """Errors from the last values before the hold-out, with the readings since; null for several runs, each of which is predicted from its
+    own zero anyway, and in results of earlier versions."""
     chained: tuple[ChainedPart, ...]
     """Forward-chained parts."""
     search: tuple[tuple[RecordScorePart, ...], ...]

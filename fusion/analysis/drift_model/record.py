@@ -66,6 +66,7 @@ from fusion.analysis.drift_model.predictions import (
     track_record,
 )
 from fusion.analysis.drift_model.record_data import EXPONENTS, Record, RecordError, independent, reduce_record
+from fusion.analysis.drift_model.recursion import FOLLOWED, Anchored, forecast
 from fusion.analysis.drift_model.search import (
     BUILT_IN,
     HOLD_OUT_SHARE,
@@ -932,6 +933,7 @@ class RecordResult(LoopResult):
     whole : the final model fitted to all blocks, for its residual
     chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
     rounding : (1 + sensors, channels), um, steps of the displacements, as `rounding_steps` gives them
+    anchored : the forecast from the last values before the hold-out, None for several runs
     """
 
     noise_share = RESIDUAL_SHARE
@@ -948,6 +950,7 @@ class RecordResult(LoopResult):
     whole: RecordFit
     chained: list[ChainedResult]
     rounding: Array
+    anchored: Anchored | None
 
     @property
     def noise(self) -> Array:
@@ -992,9 +995,12 @@ class RecordResult(LoopResult):
                     rmse_final_um=final_um[k],
                     noise_um=self.noise[k],
                     variance_share=self.remainder.variance_share[k],
+                    **({} if self.anchored is None else self.anchored.of_channel(k)),
                 )
                 for k, name in enumerate(self.record.channels)
             },
+            anchored=self.anchored
+            and schema.Anchored(model=self.anchored.error, last_value=self.hold_out["last_value"]),
             chained=self.chained,
             **runs,
             search=[_round_scores(scored) for scored in self.state.rounds],
@@ -1121,14 +1127,15 @@ def close_record(
     steps = report_steps(record, state, told, contributed, withheld, left_out)
     away = left_out_of_forecast(problem, state, unsupported_places(steps))
     kept = state.kept(away)
-    of_declared, forecast = problem.predict(state.declared), problem.predict(kept)
+    of_declared, of_final = problem.predict(state.declared), problem.predict(kept)
+    events = [one for one, step in zip(contributed, state.steps, strict=True) if step.effect not in FOLLOWED]
     predicted = {
         "declared": of_declared.predicted,
-        "final": forecast.predicted,
+        "final": of_final.predicted,
         **plain_predictions(record, train),
     }
     errors = {name: (record.displacement - values)[~train] for name, values in predicted.items()}
-    rounding = rounding_steps(record, kept, forecast.coefficients)
+    rounding = rounding_steps(record, kept, of_final.coefficients)
     step = together(rounding)
     return RecordResult(
         state=state,
@@ -1138,10 +1145,10 @@ def close_record(
         hold_out=held_out_errors(errors)
         | {
             name: schema.ModelError(rmse_um=rmse(errors[name]), expected_um=one.chained_rmse)
-            for name, one in (("declared", of_declared), ("final", forecast))
+            for name, one in (("declared", of_declared), ("final", of_final))
         },
         skill_um=rmse(errors["final"]),
-        tracking=None if record.runs else track_record(record, train, forecast.predicted, predicted["ridge"]),
+        tracking=None if record.runs else track_record(record, train, of_final.predicted, predicted["ridge"]),
         steps=steps,
         away=frozenset(away),
         remainder=examine(whole, channel_rmse(errors["final"]), step, np.random.default_rng(seed)),
@@ -1155,6 +1162,7 @@ def close_record(
         whole=whole,
         chained=chained,
         rounding=rounding,
+        anchored=forecast(record, np.array(events).reshape(-1, *record.displacement.shape), train),
     )
 
 

@@ -52,6 +52,10 @@ def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
     add_band(drawn, hours, final - half, final + half, _AFTER, "95 % band")
     add_series(drawn, hours, declared, name="declared model", colour=BEFORE, dash="dashed")
     add_series(drawn, hours, final, name="final model", colour=_AFTER, width=2.2)
+    if "predicted_anchored" in record:
+        add_series(
+            drawn, hours, chosen["predicted_anchored"].values, name="from the last value", colour=INK, dash="dotted"
+        )
     add_series(drawn, hours, measured, name="measured", colour=INK, width=1.2)
     left = (measured - final)[held & np.isfinite(measured - final)]
     missed = float(np.sqrt(np.mean(left**2))) if left.size else float("nan")

@@ -21,7 +21,7 @@ from openpyxl.utils import get_column_letter
 
 from fusion.common import own_name
 from fusion.report.findings import summary_rows
-from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, parameters, say
+from fusion.report.wording import ISO230_TERMS, baseline_words, effect_words, model_errors, parameters, say
 from fusion.results.loop import RecordLoop
 from fusion.results.numbers import print_unit
 from fusion.results.parts import Iso230Condition
@@ -149,7 +149,7 @@ def record_tables(results: Results, record: xr.Dataset) -> dict[str, pd.DataFram
     """Return the tables of a record by title."""
     loop = results.loop
     assert isinstance(loop, RecordLoop)
-    named = {"declared model": loop.errors.declared, "with the added effects": loop.errors.final}
+    named = model_errors(loop)
     plain = {words: getattr(loop.baselines, name) for name, words in baseline_words(loop).items()}
     return {
         "Summary": findings_table(results),

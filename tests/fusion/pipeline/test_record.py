@@ -113,6 +113,7 @@ def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[flo
         noise=np.array([0.1, 0.2]),
         is_held_out=np.arange(50) >= 40,
         left_out=[np.full((50, 2), 4.0), np.full((50, 2), 6.0)],
+        anchored=None,
     )
 
 

@@ -52,7 +52,7 @@ def test_a_record_is_told_with_its_channels_and_its_driver():
     page = page_of()
     assert "1 displacement and 2 temperatures over 4 min, with speed as driver" in page
     tables = tables_of(page)
-    assert tables["Errors channel by channel"][1] == ["X", "0.900", "0.600", "0.400", "10 %", "0.10", "0.300"]
+    assert tables["Errors channel by channel"][1] == ["X", "0.900", "0.600", "0.400", "–", "10 %", "0.10", "0.300"]
     assert tables["Errors of forward chaining"][-1] == ["mean", "", "0.900", "0.600", "0.400"]
     assert ["not tried: dead path of the laser", "no air"] in tables["Effects that were not admitted or not tried"]
     assert tables["Candidates with their scores"][1][-2:] == ["0.700 to 0.500", "chosen"]
@@ -60,6 +60,18 @@ def test_a_record_is_told_with_its_channels_and_its_driver():
         "Effects that were tested and rejected",
         "Sensors and displacements that are faulty or suspected",
     } & set(tables)
+
+
+def test_the_forecast_from_the_last_value_stands_beside_its_own_baseline():
+    expected = {"expected_um": 0.3, "expected_low_um": 0.1, "expected_high_um": 0.35, "expected_p": 0.02}
+    page = page_of(anchored={"model": {"rmse_um": 0.45, **expected}, "last_value": {"rmse_um": 0.9}})
+    rows = tables_of(page)["Errors of predicting the hold-out"]
+    assert ["0.45", "0.30 [0.10 to 0.35]"] in [row[1:] for row in rows]
+    told = " ".join(page.split())
+    assert (
+        "predicted to 0.45 µm, more than expected (0.10 to 0.35 µm); staying at them gives 0.90 µm. What was measured"
+        in told
+    )
 
 
 def test_the_page_stays_readable_with_many_channels():

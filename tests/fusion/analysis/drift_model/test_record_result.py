@@ -104,6 +104,7 @@ def result(*, shape: str = "") -> RecordResult:
                 )
             ],
             rounding=np.zeros((2, 2)),
+            anchored=None,
         ),
         **predicted,
     )
@@ -141,6 +142,8 @@ def test_every_channel_has_its_errors():
         "rmse_final_um": 0.5,
         "noise_um": 0.1,
         "variance_share": 0.1,
+        "rmse_anchored_um": None,
+        "expected_anchored_um": None,
     }
     assert (told["ch2"].rmse_declared_um, told["ch2"].rmse_final_um) == (3.0, 0.5)
 
