@@ -758,10 +758,14 @@ class InterferometryTable(_Measured, title="Laser"):
 
 
 class ColumnTable(Table):
-    """A line of ``[record.columns]``: what a column holds, and its unit; ``"degC"`` alone states the unit, from which the role follows."""
+    """A line of ``[record.columns]``: what a column holds, and its unit; ``"degC"`` alone states the unit, from which the role follows.
+
+    ``range`` is what its sensor can read, as ``["-20 degC", "300 degC"]``; numbers outside are no readings.
+    """
 
     role: Literal["temperature", "displacement", "driver"] | None = None
     unit: str = ""
+    range: tuple[Celsius, Celsius] | None = None
 
 
 #: A unit alone, or a table with role and unit.

@@ -20,7 +20,7 @@ import pandas as pd
 import xarray as xr
 from pandas.io.parsers import TextParser  # type: ignore[attr-defined]
 
-from fusion.analysis.alignment.sensor_health import SensorFault, examine_sensors
+from fusion.analysis.alignment.sensor_health import SensorFault, examine_readings, examine_sensors
 from fusion.campaign.config import Campaign, CampaignError, ColumnTable, HeaderRows, LoggedTable, LongTable, RecordTable
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.campaign.values import (
@@ -88,6 +88,8 @@ _RULED = re.compile(r"[\s=_+-]*")
 _SAMPLE = 200
 #: Channel, date, time and value as EPICS' camonitor prints them.
 MONITORED = re.compile(r"\S+\s+\d{4}-\d\d-\d\d\s\d\d:\d\d:\d\d(\.\d+)?\s+\S")
+#: Temperature at which air boils: nothing in a shop is colder, K.
+_LIQUID_AIR_K = 79.0
 #: A unit of each role, for a message.
 _EXAMPLES = {"temperature": '"degC"', "displacement": '"um" (or "mm")', "driver": '"1/min" (or "1" for a pure number)'}
 #: Where seconds count from in a table whose start is not stated.
@@ -269,8 +271,19 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             names.append(name)
             units.append(given if unit is None else unit)
             values.append(numbers if unit is None else in_unit(numbers, given, unit, column=heading, path=path))
+            if unit == "degC" and is_rise(numbers, given):
+                rises.append(name)
+            if unit is not None and (limits := ranges.get(heading)) is not None:
+                values[-1][(values[-1] < limits[0]) | (values[-1] > limits[1])] = np.nan
         return names, units, np.array(values).reshape(len(names), int(keep.sum())).T
 
+    rises = list[str]()
+    ranges = {
+        heading: stated.range
+        for pattern, stated in record.columns.items()
+        if stated.range is not None
+        for heading in match_columns([pattern], headings)
+    }
     sensors, _, temperature = block("temperature", "degC")
     channels, _, displacement = block("displacement", "um")
     drivers, driver_units, driver = block("driver", None)
@@ -288,6 +301,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
             "left_out": json.dumps([asdict(line) for line in left_out]),
             "clock": json.dumps([asdict(line) for line in goes_back]),
             "held": json.dumps(held),
+            "rises": json.dumps(rises),
         },
     )
     table["time"].attrs["reference"] = reference
@@ -708,12 +722,17 @@ def _formatted_times(path: Path, column: pd.Series, record: LoggedTable) -> tupl
 
 
 def in_unit(values: np.ndarray, unit: str, target: str, *, column: str, path: Path) -> np.ndarray:
-    """Return the values of a column in the canonical unit `target`."""
+    """Return the values of a column in the canonical unit `target`; kelvins that no machine has are those of a rise."""
     try:
         factor, offset = column_conversion(unit, target)
     except QuantityError as error:
         raise TableError(f'{path}: the column "{column}": {error}') from None
-    return values * factor + offset
+    return values * factor + (0.0 if target == "degC" and is_rise(values, unit) else offset)
+
+
+def is_rise(values: np.ndarray, unit: str) -> bool:
+    """Whether numbers in a unit are differences of temperatures: kelvins of which most are colder than liquid air."""
+    return unit_name(unit) == "K" and bool(np.nanmedian(values) < _LIQUID_AIR_K)
 
 
 # Contact sensors of a campaign: their temperatures over time, and their places on the plan.
@@ -780,7 +799,9 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
     )
     temperature["time"].attrs.update(logged["time"].attrs)
     seconds = np.asarray((temperature["time"].values - temperature["time"].values[0]) / np.timedelta64(1, "s"), float)
-    faults = tuple(fault for fault in examine_sensors(seconds, temperature.values) if fault.is_clear)
+    found = examine_sensors(seconds, temperature.values)
+    faults = tuple(fault for fault in found if fault.is_clear and not fault.readings)
+    temperature.values = examine_readings(seconds, temperature.values, None, quantity="temperature")[1]
     if len(faults) == len(names):
         named = "; ".join(f"{names[fault.sensor]} {fault.words}" for fault in faults)
         raise TableError(f"{path}: no contact sensor is sound ({named}); repeat the test, or remove [sensors]")

@@ -12,7 +12,9 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import uniform_filter1d
 
-from fusion.analysis.drift_model.record import without_faulty_readings
+from fusion.analysis.alignment.sensor_health import describe_fault
+from fusion.analysis.drift_model.record import SensorHealth, examine_record
+from fusion.analysis.effects.thermal import QUASI_STATIC
 from fusion.campaign.config import Campaign, CampaignError, ThermalTestTable, load_campaign
 from fusion.campaign.inputs import read_laser, read_record
 from fusion.campaign.schema import keys_of
@@ -288,12 +290,24 @@ def _distortion(course: _Course, found: Distortion, excess: Distortion) -> Therm
     )
 
 
-def thermal_tests(campaign: Campaign, table: xr.Dataset) -> tuple[ThermalTest, ...]:
-    """Evaluate the tests of a campaign from its record or its readings, with whose they were and the conditions that its file states."""
+def thermal_tests(campaign: Campaign, measured: SensorHealth | xr.Dataset) -> tuple[ThermalTest, ...]:
+    """Evaluate the tests of a campaign from its record, without what is faulty or doubted, or from its readings, with whose they were and
+    the conditions that its file states.
+    """
     stated_test = campaign.thermal_test
-    if campaign.record is not None:
-        tests = evaluate_record_test(table, stated_test)
+    if isinstance(measured, SensorHealth):
+        table = measured.undoubted
+        remarks = [
+            f"{one.sensor}{f' of {one.run}' if one.run else ''} {describe_fault(one)}: "
+            f"{'these readings are' if one.readings else 'it is'} in no range."
+            for one in measured.findings
+        ]
+        tests = [
+            one.model_copy(update={"remarks": (*remarks, *one.remarks)})
+            for one in (evaluate_record_test(table, stated_test) if table.sizes["channel"] else [])
+        ]
     else:
+        table = measured
         drift = group(table, "drift") if has(table, "drift") else estimate_joint(table)[0]
         tests = evaluate_axis_test(table, drift, stated_test)
     zone = shown_zone(table, campaign.zone_of("interferometry" if campaign.record is None else "record"))
@@ -325,14 +339,7 @@ def read_thermal_tests(path: Path) -> StatedTests:
     found: tuple[ThermalTest, ...] = ()
     of = "interferometry" if campaign.record is None else "record"
     if campaign.record is not None:
-        table, faults = without_faulty_readings(read_record(campaign))
-        left_out = [
-            f"{channel}{f' of {run}' if run else ''}: readings that are none of a displacement ({fault.kind.value}) are left out: "
-            f"{fault.readings}."
-            for fault, channel, run in faults
-        ]
-        tests = thermal_tests(campaign, table)
-        found = tuple(one.model_copy(update={"remarks": (*left_out, *one.remarks)}) for one in tests)
+        found = thermal_tests(campaign, examine_record(read_record(campaign), [QUASI_STATIC]))
     elif campaign.interferometry is not None:
         found = thermal_tests(campaign, read_laser(campaign)["deviations"])
     if not found:

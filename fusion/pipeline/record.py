@@ -56,6 +56,8 @@ def read_record_source(campaign: Campaign) -> RecordSource:
         *clock_notices(table),
         *_unread_notices(table),
         *guess_notices(campaign),
+        *_rise_notices(table),
+        *_set_point_notices(health),
     ]
     return RecordSource(
         record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
@@ -93,6 +95,27 @@ def _unread_notices(table: xr.Dataset) -> Iterator[Notice]:
     if named:
         message = f"Samples without a reading: {listed(named)}. They are left out of the means over blocks."
         yield Notice("record_readings_missing", message, "Look at contact and cable, or at record.missing.")
+
+
+def _rise_notices(table: xr.Dataset) -> Iterator[Notice]:
+    """Notice of the temperatures that are rises."""
+    if rises := json.loads(table.attrs.get("rises", "[]")):
+        yield Notice(
+            "record_rises",
+            f"{listed(rises)}: kelvins around zero are taken as a rise of the temperature, not as a temperature.",
+            "",
+        )
+
+
+def _set_point_notices(health: SensorHealth) -> Iterator[Notice]:
+    """Notice of the set points, and of what each regulates."""
+    if health.set_points:
+        named = listed(f"{name} (of {sensor})" for name, sensor in health.set_points.items())
+        yield Notice(
+            "record_set_points",
+            f"Set points by their course, which act as drivers: {named}. Heating up, overshoot and holding are no faults of a sensor.",
+            "",
+        )
 
 
 def guess_notices(campaign: Campaign) -> Iterator[Notice]:
@@ -173,24 +196,28 @@ def sensor_notices(health: SensorHealth) -> Iterator[Notice]:
             f"{number(um, 3)} µm" if um is not None and np.isfinite(um) else "no model"
             for um in (one.rmse_with_um, one.rmse_without_um)
         )
-        errors = f"{with_it} with it, {without} without."
+        compared = not (with_it == without == "no model")
         look = f"Look at contact, cable and input of {one.sensor}"
+        asked = "Error of the declared model{of}, later parts of the training time predicted from those before: " + (
+            f"{with_it} with it, {without} without."
+        )
         if one.computed_with:
             yield Notice(
                 "record_displacement_computed",
-                f"{finding}; {one.reason or 'it is left out'}. Error of the declared model with {one.computed_with}: {errors}",
+                f"{finding}; {one.reason or 'it is left out'}. {asked.format(of=f' with {one.computed_with}')}",
                 f"Log {one.sensor} without its correction by temperature, or end the record before {one.computed_with} fails.",
             )
         elif one.state != "suspected":
-            times = listed(f"{first / 3600.0:.4g} h" for first, _ in one.stretches_s if first is not None)
-            kind, where, model = (
-                ("displacement", f"they are left out at {times}", f" of {one.sensor}")
-                if times
-                else ("sensor", "it is left out of the whole record", "")
+            times = listed(
+                f"{first / 3600.0:.4g} h" if first == last else f"{first / 3600.0:.4g} to {last / 3600.0:.4g} h"
+                for first, last in one.stretches_s
+                if first is not None and last is not None
             )
+            where = f"they are left out at {times}" if times else "it is left out of the whole record"
+            of = f" of {one.sensor}" if one.quantity == "displacement" else ""
             yield Notice(
-                f"record_{kind}_faulty",
-                f"{finding}; {where}. Held-out error of the declared model{model}: {errors}",
+                f"record_{'sensor' if one.quantity == 'temperature' else 'displacement'}_faulty",
+                f"{finding}; {where}." + (f" {asked.format(of=of)}" if compared else ""),
                 f"{look}.",
             )
         else:

@@ -420,7 +420,7 @@ def _model_record(run: Run, record_source: RecordSource) -> xr.Dataset:
     """The loop of a record."""
     record: xr.Dataset = run.stage("record", partial(model_record, record_source))
     table = record_source.health.table
-    run.parts.iso230_3 = thermal_tests(run.campaign, table)
+    run.parts.iso230_3 = thermal_tests(run.campaign, record_source.health)
     if (taken := time_part(table, run.campaign.zone_of("record"))) is not None:
         run.parts.time = taken
     return record

@@ -566,12 +566,14 @@ class SensorFaultPart(ResultPart):
 
     sensor: str
     """Name of the sensor, or of the displacement."""
-    kind: Literal["no signal", "stuck", "jump", "ramp", "noise", "glitch", "clipped", "computed"]
-    """What it does; the last three only displacements do."""
+    kind: Literal["no signal", "stuck", "jump", "ramp", "noise", "glitch", "erratic", "clipped", "computed"]
+    """What it does; the last two only displacements do."""
+    quantity: Literal["temperature", "displacement"] = "temperature"
+    """Whether it is a temperature sensor or a displacement; absent of a temperature sensor."""
     state: Literal["left_out", "readings_left_out", "suspected"]
     """Whether it was left out of the whole record, its readings at fault alone, or nothing because a machine may do the same."""
     readings: int = 0
-    """Readings of a displacement that were left out; absent where it is all of them or none."""
+    """Readings that were left out; absent where it is all of them or none."""
     stretches_s: tuple[tuple[Number, Number], ...] = ()
     """Times of the first and last reading of every stretch of these, s, counted as the onset; absent as above."""
     computed_with: str = ""
@@ -583,7 +585,7 @@ class SensorFaultPart(ResultPart):
     onset_u_s: Number
     """Standard uncertainty of that, s."""
     size: Number
-    """Change beyond what the other sensors predict, K; of noise the ratio after to before; of glitches the largest, um; else null."""
+    """Change beyond what the other sensors predict, K; of noise the ratio after to before; of readings the largest, K or um; else null."""
     ratio: Number
     """Its largest excursion over the next largest; of a computed displacement the error without the sensor over that with it; else null."""
     limit: Number
@@ -591,11 +593,13 @@ class SensorFaultPart(ResultPart):
     reason: str
     """Why it is suspected only; empty for one that was left out."""
     rmse_with_um: Number
-    """Error of the declared model on the hold-out set with it, um; null for a suspected one, and where it has too few readings. Of a
-    displacement its own error; of a computed one with its faulty sensor, every part of the record predicted from the others.
+    """Error of the declared model with it, um, later parts of the training time predicted from those before; null for one that stays,
+    that is silent, or that failed after that time. Of a displacement its own error; of a computed one with its faulty sensor.
     """
     rmse_without_um: Number
-    """The same without all that was left out, um; null for a suspected one."""
+    """The same without all that was left out, um, never larger for a sensor; of a computed one with its sensor as it would be without the
+    fault; null as above.
+    """
 
 
 class RunPart(HoldOutErrors):

@@ -263,3 +263,142 @@ def fields_of(frame_s: Array, x: Array, y: Array, temperature: Array) -> xr.Data
         {"frame_temperature": (("time", "y", "x"), temperature, {"units": "degC"})},
         {"time": clock(frame_s), "y": ("y", y, {"units": "mm"}), "x": ("x", x, {"units": "mm"})},
     )
+
+
+# Records of a machine: sensors on its parts, in the ground and at heaters, displacements that follow them, and what goes wrong with either.
+
+
+@dataclass
+class Sensors:
+    """A record of known truth: samples (time,), temperatures (time, sensor), displacements (time, channel), a load or none, set points.
+
+    ``regulated`` are the sensors at heaters; the set point of the k-th is the k-th of ``set_points`` where they are logged.
+    """
+
+    seconds: Array
+    temperature: Array
+    displacement: Array
+    load: Array | None
+    regulated: list[int]
+    set_points: Array | None
+
+
+def heater(rng: np.random.Generator, seconds: Array) -> tuple[Array, Array]:
+    """Temperature (n,) of a part that is regulated, with overshoot and ripple, and its set point (n,): degC, 0 is off."""
+    high, start = rng.choice([50.0, 70.0, 110.0, 180.0, 220.0, 260.0, 350.0]), rng.uniform(18.0, 30.0)
+    changes = np.sort(rng.uniform(0.05, 0.95, int(rng.integers(1, 4)))) * seconds[-1]
+    levels = np.array([0.0, high, 0.0 if rng.random() < 0.5 else round(0.8 * high), high])
+    target = levels[np.searchsorted(changes, seconds, side="right")]
+    rise_K_per_s, fall_s = rng.uniform(0.2, 8.0), rng.uniform(200.0, 1800.0)
+    measured, previous, since, overshoot = np.empty(seconds.size), 0.0, 0.0, rng.uniform(0.0, 0.03)
+    value = start
+    for n, now in enumerate(seconds):
+        step = now - seconds[n - 1] if n else 0.0
+        wanted = max(target[n], start)
+        if target[n] != previous:
+            previous, since = target[n], now
+        cooled = wanted + (value - wanted) * np.exp(-step / fall_s)
+        value = min(wanted, value + rise_K_per_s * step) if value < wanted else cooled
+        ring = overshoot * (wanted - start) * np.exp(-(now - since) / 120.0) * np.sin((now - since) / 40.0)
+        measured[n] = value + (ring if target[n] > 0.0 else 0.0)
+    return measured, target
+
+
+def simulated_sensors(rng: np.random.Generator) -> Sensors:
+    """3 to 12 sensors and 1 to 3 displacements, sampled every 2 s to 20 min for 300 to 3000 samples, rounded as loggers do."""
+    size, step = int(rng.integers(300, 3000)), float(rng.choice([2.0, 10.0, 60.0, 300.0, 1200.0]))
+    seconds, sensors = step * np.arange(size), int(rng.integers(3, 13))
+    hours = seconds[-1] / 3600.0
+    minutes = 60.0 * hours * rng.uniform(0.01, 0.1)
+    dwells = np.repeat(
+        np.where(rng.random(40) < 0.6, rng.random(40), 0.0), int(rng.integers(size // 40, size // 6) + 1)
+    )
+    load = dwells[:size] if rng.random() < 0.8 else np.zeros(size)
+    day = 2.0 * np.sin(2.0 * np.pi * (seconds / 86400.0 + rng.random())) + rng.uniform(0.2, 1.5) * room(
+        rng, seconds, 3.0 * minutes
+    )
+    columns, rises, regulated, targets = [], [], [], []
+    for k in range(sensors):
+        kind = rng.choice(["part", "air", "ground", "heater"], p=[0.55, 0.2, 0.1, 0.15])
+        if kind == "heater" and len(regulated) < 2:
+            true, target = heater(rng, seconds)
+            regulated.append(k)
+            targets.append(target)
+        elif kind == "ground":
+            true = (
+                12.0
+                + 0.05 * first_order(seconds, day, 20.0 * minutes)
+                + 0.2 * hours / 100.0 * np.sin(seconds / seconds[-1] * 2.0)
+            )
+        elif kind == "air":
+            true = 20.0 + day + 0.05 * room(rng, seconds, minutes)
+        else:
+            warmed = first_order(seconds, load, minutes * rng.uniform(0.3, 4.0))
+            true = 20.0 + rng.choice([3.0, 10.0, 40.0]) * rng.random() * warmed + first_order(seconds, day, minutes)
+        rises.append(true - true[0])
+        held = int(rng.choice([1, 1, 1, 5]))
+        noisy = true + rng.choice([0.0, 0.01, 0.05, 0.2]) * rng.standard_normal(size)
+        digits = rng.choice([0.001, 0.01, 0.1, 0.5])
+        columns.append(np.round(np.repeat(noisy[::held], held)[:size] / digits) * digits)
+    shares = rng.normal(0.0, 1.0, (sensors, int(rng.integers(1, 4)))) * (rng.random((sensors, 1)) < 0.5)
+    scale = np.array([max(float(np.ptp(one)), 0.1) for one in rises])
+    late = np.column_stack([first_order(seconds, one, minutes * rng.uniform(0.05, 0.5)) for one in rises])
+    displacement = (late / scale) @ (20.0 * shares)
+    displacement += 0.3 * rng.standard_normal(displacement.shape) + np.cumsum(
+        0.02 * rng.standard_normal(displacement.shape), axis=0
+    )
+    logged = rng.random() < 0.5
+    return Sensors(
+        seconds,
+        np.column_stack(columns),
+        np.round(displacement, 2),
+        load if rng.random() < 0.5 else None,
+        regulated,
+        np.column_stack(targets) if targets and logged else None,
+    )
+
+
+def spoil_sensor(rng: np.random.Generator, kind: str, seconds: Array, values: Array) -> NDArray[np.bool_]:
+    """Spoil the readings (n,) of a sensor in place; returns which are none of its own."""
+    size = values.size
+    first, bad = int(rng.uniform(0.2, 0.75) * size), np.zeros(size, bool)
+    if kind == "stuck":
+        bad[first + 1 :] = True
+        values[bad] = values[first]
+    elif kind == "railed":
+        bad[first:] = True
+        values[bad] = rng.choice([850.0, -200.0, -242.0, 1372.0, 3276.7, -127.0, 0.0])
+    elif kind == "open":
+        bad[first:] = True
+        values[bad] = np.round(300.0 + 200.0 * rng.standard_normal(int(bad.sum())), 1)
+    elif kind == "erratic":
+        bad[first : first + max(20, int(rng.uniform(0.03, 0.15) * size))] = True
+        values[bad] += np.round(rng.choice([20.0, 60.0]) * rng.standard_normal(int(bad.sum())), 2)
+    elif kind == "bursts":
+        for place in rng.choice(size // 20 - 2, 3, replace=False):
+            bad[20 * place + 20 : 20 * place + 20 + int(rng.integers(1, 5))] = True
+        values[bad] = rng.choice([-127.0, 850.0, 0.0, 85.0])
+    elif kind == "drifting":
+        bad[first:] = True
+        values[first:] += 15.0 * (seconds[first:] - seconds[first]) / (seconds[-1] - seconds[first])
+    else:
+        bad[first:] = True
+        values[bad] += rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 20.0)
+    return bad
+
+
+def spoil_displacement(rng: np.random.Generator, kind: str, values: Array) -> NDArray[np.bool_]:
+    """Spoil the readings (n,) of a displacement in place; returns which are none of its own."""
+    size, bad, span = values.size, np.zeros(values.size, bool), max(float(np.ptp(values)), 20.0)
+    if kind == "bursts":
+        for place in rng.choice(size // 20 - 2, 3, replace=False):
+            bad[20 * place + 20 : 20 * place + 20 + int(rng.integers(1, 5))] = True
+        values[bad] += rng.choice([-1.0, 1.0]) * span * rng.uniform(1.5, 4.0, int(bad.sum()))
+    else:
+        first = int(rng.uniform(0.1, 0.8) * size)
+        bad[first : first + max(20, int(rng.uniform(0.01, 0.08) * size))] = True
+        moved = rng.uniform(0.3, 1.0, int(bad.sum())) * (rng.random(int(bad.sum())) < 0.8)
+        values[bad] -= 2.0 * span * moved
+        # What is put back is no reading of an erratic time, first and last are.
+        values[np.flatnonzero(bad)[[0, -1]]] -= span
+    return bad

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -208,17 +209,24 @@ def _differences(values: Array, duration: int) -> tuple[Array, int]:
     return np.asarray(level[away:] - level[:-away]), length
 
 
-def predicted_changes(grid: Grid, sensor: int, others: list[int], duration: int) -> Changes:
-    """Predict the changes of a sensor from those of the others, of the loads, and from all changes just before."""
+def predicted_changes(
+    grid: Grid, sensor: int, others: list[int], duration: int, apart_from: NDArray[np.bool_] | None = None
+) -> Changes:
+    """Predict the changes of a sensor from those of the others, of the loads, and from all changes just before, as learnt `apart_from`
+    some steps.
+    """
     columns = np.hstack([grid.temperature[:, [sensor, *others]], grid.drivers])
     differences, length = _differences(columns, duration)
     earlier = length + duration
     now, past = differences[earlier:], differences[:-earlier]
     own, regressors = now[:, 0], np.hstack([now[:, 1:], past])
-    most = max(1.0, differences.shape[0] / earlier / _CHANGES_PER_COEFFICIENT)
-    coefficients = _robust_ridge(own, regressors, most)
-    residual = own - (regressors - np.median(regressors, axis=0)) @ coefficients
     before = np.arange(own.size) + earlier + length - 1
+    learnt = np.ones(own.size, bool)
+    if apart_from is not None and (rest := ~(apart_from[before] | apart_from[before + duration])).any():
+        learnt = rest
+    most = max(1.0, learnt.sum() / earlier / _CHANGES_PER_COEFFICIENT)
+    coefficients = _robust_ridge(own[learnt], regressors[learnt], most)
+    residual = own - (regressors - np.median(regressors[learnt], axis=0)) @ coefficients
     known = grid.known[:, sensor]
     residual = np.where(known[before] & known[before + duration], residual, 0.0)
     return Changes(before, before + duration, residual, duration + 2 * length, float(grid.resolution[sensor]))
@@ -276,29 +284,34 @@ def level_beyond_prediction(grid: Grid, sensor: int, others: list[int]) -> Array
 
 #: Power with which the distribution of a sound sensor's largest excursions falls at the slowest: Student's t with 4 degrees of freedom.
 TAIL_INDEX = 4.0
-#: Readings outside are none, degC: colder than any shop, hotter than a motor winding of class H may be (180 degC, IEC 60085).
-PLAUSIBLE_DEGC = (-40.0, 200.0)
-#: Implausible readings in a row that are no single error of transmission.
-_LEAST_IMPLAUSIBLE = 3
+#: What a thermometer can read, degC: absolute zero, and hotter than thermocouples endure.
+MEASURABLE_DEGC = (-273.15, 3000.0)
+#: An open, shorted or saturated input repeats one number that lies so far from all other readings, K, and their whole range away from them.
+_RAIL_K = 10.0
+#: Numbers that converters of thermocouples, Pt100 and digital sensors are documented to give then, degC: a single one is enough.
+_RAILS_DEGC = (-270.0, -250.0, -242.0, -200.0, -180.0, -127.0, 850.0, 999.0, 1370.0, 1372.0, 1768.0, 1820.0, 2320.0)
+#: Something is heated, and no fault, that holds a level for half the time in which it is so much warmer than most others and than itself
+#: at its coldest, K.
+_HEATED_K = 15.0
 #: A signal ends where the last share of the record is missing.
 _ENDED_SHARE = 0.02
 #: Equal readings in a row from which a sensor may stick.
 _LEAST_REPEATED = 20
-#: So many equal readings, and so many times the next longest run, are enough alone: with the tail of ratios above, one chance in 1e8.
-_FAR_LONGER = 100
-#: The others then pass through this share of their range: before a test is begun everything may stand still.
-_LEAST_MOVED = 0.1
-#: A sensor finer than its noise repeats a reading this often in a row at most.
+#: A sensor whose digits are finer than its changes repeats a reading this often in a row at most.
 _ORDINARY_RUN = 3
-#: The others move where the sensor's prediction moves by so many times what the prediction misses otherwise (95 %).
+#: Noise moves so large a share of the readings, and turns round as often; white noise does so two times of three.
+_NOISE_STEPS, _NOISE_TURNS = 0.1, 0.4
+#: The others move where the sensor's prediction moves by so many times what the prediction misses otherwise (95 %), or its digits.
 _MOVES = 3.0
+#: A jump is made by this share of it from one reading to the next, whatever the time between two readings; warming takes several.
+_AT_ONCE = 0.9
 #: Share of what past and loads leave of a sensor's changes that the others predict: below, what it does alone may be true.
 _PREDICTABLE = 0.5
 #: Excursion of another sensor over its next largest that counts as its response to a source near the suspected sensor.
 _RESPONSE = 2.0
 #: A switching is no excuse for what exceeds the response to so many others.
 _LEAST_SWITCHINGS = 3
-#: A change within two samples that are at most so far apart is faster than any part of a machine warms, s.
+#: A change from one sample to the next, at most so far apart, is faster than any part of a machine warms, s.
 _FAST_S = 60.0
 #: Windows in which the noise of a sensor is compared, and fewest on either side of its change.
 _NOISE_WINDOWS, _LEAST_NOISE_WINDOWS = 24, 3
@@ -306,6 +319,12 @@ _NOISE_WINDOWS, _LEAST_NOISE_WINDOWS = 24, 3
 _NOISE_SAMPLES = 20
 #: Quietest window after over noisiest window before that makes a sensor suspected.
 _NOISIER = 3.0
+#: Set points are held exactly and changed at so small a share of the samples, by steps that are whole halves of a degree.
+_SET_SHARE, _SET_STEP_K = 0.02, 0.5
+#: What is regulated comes to its set point within this, K or share of its rise, in the second half of a time in which it is held.
+_REGULATED_K, _REGULATED_SHARE = 2.0, 0.03
+#: Fewest samples of such a time.
+_LEAST_HELD = 10
 #: Fewest blocks from which anything is concluded.
 _LEAST_BLOCKS = 60
 #: Difference from the running median of a glitch, over the 90 % quantile of all or the resolution, whichever is larger: noise as heavy as
@@ -317,6 +336,11 @@ _GLITCH_READINGS, _GLITCH_SHARE = 5, 0.02
 _ABRUPT = 0.5
 #: A driver that is switched at so large a share of the readings explains no single excursion.
 _OFTEN = 0.1
+#: An erratic time: a wild step exceeds the 75 % quantile of all steps, or the resolution, by this factor; so many wild steps turn round
+#: within two readings; wild steps so many readings apart belong together; and all such times together are this share of the record at most.
+_WILD, _LEAST_TURNS, _CALM_READINGS, _ERRATIC_SHARE = 30.0, 4, 10, 0.2
+#: It is over where a reading lies within this share of a wild step of the median of the next ones.
+_BACK = 0.2
 
 
 class Kind(StrEnum):
@@ -329,6 +353,7 @@ class Kind(StrEnum):
     NOISE = "noise"
     GLITCH = "glitch"
     CLIPPED = "clipped"
+    ERRATIC = "erratic"
     COMPUTED = "computed"
 
 
@@ -342,12 +367,13 @@ class SensorFault:
     kind : what it does
     is_clear : whether nothing that a machine does looks like it; else the sensor is suspected
     onset_s, onset_u_s : when it began, since the first sample, and the standard uncertainty of that, s
-    size : change beyond the prediction, K; of noise its ratio, 1; of glitches the largest, um; nan of a signal that is none
+    size : change beyond the prediction, K; of noise its ratio, 1; of readings at fault the largest, K or um; nan of a signal that is none
     ratio, limit : excursion over the next largest of the sensor, and the limit; nan where none is compared
     reason : why it is only suspected; empty where it is clear
     end_s : end of a jump or ramp, s; nan of others
-    readings, stretches_s : of a displacement the number of readings at fault, and the times of the first and last of each stretch, s
+    readings, stretches_s : where readings alone are at fault, their number, and the times of the first and last of each stretch, s
     computed_with : faulty sensor that a displacement is computed with
+    quantity : whether it is one of a temperature or of a displacement
     """
 
     sensor: int
@@ -363,6 +389,7 @@ class SensorFault:
     readings: int = 0
     stretches_s: tuple[tuple[float, float], ...] = ()
     computed_with: str = ""
+    quantity: Literal["temperature", "displacement"] = "temperature"
 
     @property
     def words(self) -> str:
@@ -373,14 +400,16 @@ class SensorFault:
 def describe_fault(fault: SensorFault | SensorFaultPart) -> str:
     """Return what a sensor does and from when on, as it follows the sensor's name."""
     size, readings = abs(fault.size or 0.0), f"{fault.readings} reading{'' if fault.readings == 1 else 's'}"
+    unit = "µm" if fault.quantity == "displacement" else "K"
     words = {
-        Kind.NO_SIGNAL: "gives no signal",
+        Kind.NO_SIGNAL: "gives no signal" + (f" ({readings})" if fault.readings else ""),
         Kind.STUCK: "repeats one reading" + (f" ({readings})" if fault.readings else ""),
         Kind.JUMP: f"jumps by {size:.2g} K",
         Kind.RAMP: f"ramps by {size:.2g} K",
         Kind.NOISE: f"has {size:.2g} times its noise",
-        Kind.GLITCH: f"leaves its course by up to {size:.4g} µm and comes back ({readings})",
+        Kind.GLITCH: f"leaves its course by up to {size:.4g} {unit} and comes back ({readings})",
         Kind.CLIPPED: f"stays at the end of its range ({readings})",
+        Kind.ERRATIC: f"is erratic, by up to {size:.4g} {unit} ({readings})",
         Kind.COMPUTED: f"is computed with the faulty sensor {fault.computed_with}",
     }
     onset_h, onset_u_h = (fault.onset_s or 0.0) / 3600.0, (fault.onset_u_s or 0.0) / 3600.0
@@ -392,46 +421,157 @@ def excursion_limit(tests: int) -> float:
     return float((tests / SENSOR_LEVEL) ** (1.0 / TAIL_INDEX))
 
 
-def examine_sensors(seconds: Array, temperature: Array, drivers: Array | None = None) -> list[SensorFault]:
-    """Examine temperature sensors."""
+def find_set_points(values: Array) -> dict[int, int]:
+    """Find the columns (n, columns), degC, that hold set points, each with the column that is regulated by it."""
+    changes = np.array([np.sum(np.diff(one[np.isfinite(one)]) != 0.0) for one in values.T])
+    is_set = np.array(
+        [
+            0 < number <= _SET_SHARE * len(one) and not np.any(np.round(one[np.isfinite(one)] / _SET_STEP_K, 6) % 1.0)
+            for number, one in zip(changes, values.T, strict=True)
+        ],
+        bool,
+    )
+    found = {}
+    for place in np.flatnonzero(is_set):
+        misses = {k: _missed_set_point(values[:, place], values[:, k]) for k in np.flatnonzero(~is_set)}
+        best = min(misses, key=lambda k: misses[k], default=-1)
+        if misses and misses[best] <= 1.0:
+            found[int(place)] = int(best)
+    return found
+
+
+def _missed_set_point(wanted: Array, measured: Array) -> float:
+    """Median distance of what is measured from what is wanted, over that of a regulated part, in most times at which it is heated."""
+    known = np.flatnonzero(np.isfinite(wanted) & np.isfinite(measured))
+    if known.size < _LEAST_BLOCKS:
+        return np.inf
+    wanted, measured = wanted[known], measured[known]
+    starts, lengths = _runs(wanted)
+    missed = []
+    for first, length in zip(starts, lengths, strict=True):
+        rise = wanted[first] - float(measured.min())
+        if length >= _LEAST_HELD and rise > 2.0 * _REGULATED_K:
+            settled = measured[first + length // 2 : first + length]
+            off = float(np.median(np.abs(settled - wanted[first])))
+            missed.append(off / max(_REGULATED_K, _REGULATED_SHARE * rise))
+    return float(np.median(missed)) if missed else np.inf
+
+
+def examine_sensors(
+    seconds: Array, temperature: Array, drivers: Array | None = None, *, regulated: Sequence[int] = ()
+) -> list[SensorFault]:
+    """Examine temperature sensors; what those do that are `regulated` by a set point is the controller's doing."""
     if seconds.size < _LEAST_BLOCKS or temperature.shape[1] == 0:
         return []
-    lost = _without_signal(seconds, temperature)
-    kept = [k for k in range(temperature.shape[1]) if k not in {fault.sensor for fault in lost}]
-    plausible = np.where(is_implausible(temperature), np.nan, temperature)
-    kept = [k for k in kept if np.isfinite(plausible[:, k]).sum() >= _LEAST_BLOCKS]
-    grids = lay_grid(seconds, plausible, drivers)
+    faults, sound = examine_readings(seconds, temperature, drivers, quantity="temperature", regulated=regulated)
+    ended = _ended(seconds, sound)
+    faults = [*ended, *(fault for fault in faults if fault.sensor not in {one.sensor for one in ended})]
+    kept = [k for k in range(temperature.shape[1]) if k not in {fault.sensor for fault in ended}]
+    kept = [k for k in kept if np.isfinite(sound[:, k]).sum() >= _LEAST_BLOCKS]
+    grids = lay_grid(seconds, sound, drivers)
     if not kept or grids is None:
-        return lost
-    faults = [*lost, *_stuck(seconds, plausible, grids[-1], kept)]
-    kept = [k for k in kept if k not in {fault.sensor for fault in faults}]
-    faults += _changed(grids, kept)
-    named = {fault.sensor for fault in faults}
-    faults += [fault for fault in _noisier(seconds, plausible, grids[-1], kept) if fault.sensor not in named]
-    return sorted(faults, key=lambda fault: fault.sensor)
+        return faults
+    free = [k for k in kept if k not in regulated]
+    stuck = _stuck(seconds, sound, grids[-1], kept, free)
+    kept, free = ([k for k in some if k not in {fault.sensor for fault in stuck}] for some in (kept, free))
+    changed = _changed(grids, kept, free)
+    named = {fault.sensor for fault in changed}
+    noisier = [fault for fault in _noisier(seconds, sound, grids[-1], kept) if fault.sensor in {*free} - named]
+    return sorted([*faults, *stuck, *changed, *noisier], key=lambda fault: fault.sensor)
 
 
-def is_implausible(temperature: Array) -> NDArray[np.bool_]:
-    """Readings that no shop and no machine has."""
+def examine_readings(
+    seconds: Array,
+    values: Array,
+    drivers: Array | None,
+    *,
+    quantity: Literal["temperature", "displacement"],
+    regulated: Sequence[int] = (),
+) -> tuple[list[SensorFault], Array]:
+    """Find readings (n, channels) that are none: of a dead input, of an erratic time, and those that leave the course and come back.
+
+    Returns them, and the readings with NaN in their place.
+    """
+    faults, sound = [], values.copy()
+    step = float(np.median(np.diff(seconds)))
+    for k in range(values.shape[1]):
+        none = no_readings(values[:, k]) if quantity == "temperature" else np.zeros(seconds.size, bool)
+        sound[none, k] = np.nan
+        if quantity == "temperature" and (k in regulated or is_heated(sound[:, k], np.delete(sound, k, axis=1)).any()):
+            erratic, off, glitches, largest = none & False, 0.0, none & False, 0.0
+        else:
+            erratic, off = _erratic(sound[:, k], drivers)
+            sound[erratic, k] = np.nan
+            glitches, largest = _glitches(sound[:, k], drivers)
+        sound[glitches, k] = np.nan
+        for kind, at_fault, size in (
+            (Kind.NO_SIGNAL, none, np.nan),
+            (Kind.ERRATIC, erratic, off),
+            (Kind.GLITCH, glitches, largest),
+        ):
+            if at_fault.any():
+                fault = SensorFault(k, kind, True, 0.0, step, size, quantity=quantity)
+                faults.append(_in_stretches(fault, seconds, at_fault))
+    return faults, sound
+
+
+def no_readings(values: Array) -> NDArray[np.bool_]:
+    """Numbers (n,) of a temperature sensor that are none of a temperature: beyond what can be measured, or at the rail of an input.
+
+    A rail is one number that lies far from all other readings, documented, or repeated to the last digit far longer than any of them.
+    """
     with np.errstate(invalid="ignore"):
-        return (temperature < PLAUSIBLE_DEGC[0]) | (temperature > PLAUSIBLE_DEGC[1])
+        none = ~((values >= MEASURABLE_DEGC[0]) & (values <= MEASURABLE_DEGC[1])) & np.isfinite(values)
+    documented = np.abs(values[:, None] - np.array(_RAILS_DEGC)).min(axis=1) < 0.1
+    course = values[np.isfinite(values) & ~none & ~documented]
+    if course.size == 0:
+        return none
+    low, high = float(course.min()), float(course.max())
+    away = np.fmax(low - values, values - high) > max(_RAIL_K, high - low)
+    none |= documented & away
+    # Of other numbers one says it by being repeated alone.
+    known = values[np.isfinite(values) & ~none]
+    length, first, ordinary = _longest_run(known)
+    rest = known[known != known[first]]
+    if rest.size and length > excursion_limit(1) * max(ordinary, _LEAST_REPEATED / _MOVES):
+        away_K = float(np.abs(rest - known[first]).min())
+        if away_K > max(_RAIL_K, float(np.ptp(rest))):
+            none |= values == known[first]
+    return none
 
 
-def _without_signal(seconds: Array, temperature: Array) -> list[SensorFault]:
-    """Sensors whose readings are none for a while, or end before the record does."""
+def is_heated(values: Array, others: Array) -> NDArray[np.bool_]:
+    """Readings (n,) at the level of a heater: held for half the time in which a sensor is far above most others (n, k); else none."""
+    level = np.zeros(values.size, bool)
+    known = values[np.isfinite(values)]
+    if known.size < _LEAST_BLOCKS or others.shape[1] == 0:
+        return level
+    coldest = float(known.min())
+    beside = np.median(np.nan_to_num(others, nan=coldest), axis=1)
+    with np.errstate(invalid="ignore"):
+        hot = np.sort(values[values > np.maximum(beside, coldest) + _HEATED_K])
+    if hot.size < _LEAST_HELD:
+        return level
+    half = hot.size // 2
+    place = int((hot[half:] - hot[: hot.size - half]).argmin())
+    low, high = float(hot[place]), float(hot[place + half])
+    if high - low > 2.0 * max(_REGULATED_K, _REGULATED_SHARE * (low - coldest)):
+        return level
+    return np.asarray((values >= low) & (values <= high))
+
+
+def _ended(seconds: Array, sound: Array) -> list[SensorFault]:
+    """Sensors that give no signal for most of the record, or at its end."""
     step = float(np.median(np.diff(seconds)))
     faults = []
-    for k in range(temperature.shape[1]):
-        outside = is_implausible(temperature[:, k])
-        readings = np.flatnonzero(np.isfinite(temperature[:, k]))
-        in_a_row = np.convolve(outside[readings], np.ones(_LEAST_IMPLAUSIBLE)) >= _LEAST_IMPLAUSIBLE
-        if in_a_row.any():
-            # What is missing before the first of these implausible readings is no signal either; a single one before them is a glitch.
-            sound = readings[: int(np.argmax(in_a_row)) - _LEAST_IMPLAUSIBLE + 1]
-            first = int(sound[-1]) + 1 if sound.size else 0
-            faults.append(SensorFault(k, Kind.NO_SIGNAL, True, float(seconds[first]), step, np.nan))
-        elif readings.size and seconds[-1] - seconds[readings[-1]] > _ENDED_SHARE * (seconds[-1] - seconds[0]):
-            faults.append(SensorFault(k, Kind.NO_SIGNAL, True, float(seconds[readings[-1]]) + step, step, np.nan))
+    for k, values in enumerate(sound.T):
+        readings = np.flatnonzero(np.isfinite(values))
+        last_s = float(seconds[readings[-1]]) + step if readings.size else float(seconds[0])
+        if seconds[-1] - last_s > _ENDED_SHARE * (seconds[-1] - seconds[0]) - step:
+            faults.append(SensorFault(k, Kind.NO_SIGNAL, True, last_s, step, np.nan))
+        elif readings.size < 0.5 * seconds.size:
+            first_s = float(seconds[np.argmax(~np.isfinite(values))])
+            faults.append(SensorFault(k, Kind.NO_SIGNAL, True, first_s, step, np.nan))
     return faults
 
 
@@ -449,13 +589,16 @@ def _longest_run(values: Array) -> tuple[int, int, int]:
     return int(lengths[longest]), int(starts[longest]), int(others.max(initial=0))
 
 
-def _stuck(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]) -> list[SensorFault]:
-    """Sensors that repeat one reading to the last digit far longer than ever before, while the others move."""
+def _stuck(
+    seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int], suspects: Sequence[int]
+) -> list[SensorFault]:
+    """Channels that repeat one reading to the last digit far longer than ever before, though their noise or the others say they moved."""
     limit = excursion_limit(len(kept))
     faults = []
-    for k in kept:
+    for k in suspects:
         known = np.flatnonzero(np.isfinite(temperature[:, k]))
-        length, first, ordinary = _longest_run(temperature[known, k])
+        values = temperature[known, k]
+        length, first, ordinary = _longest_run(values)
         if length < max(_LEAST_REPEATED, limit * ordinary):
             continue
         run = known[first : first + length]
@@ -466,28 +609,39 @@ def _stuck(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]) 
             continue
         first_s, last_s = float(seconds[run[0]]), float(seconds[run[-1]])
         inside = (grid.seconds >= first_s) & (grid.seconds <= last_s)
-        far_longer = length > _FAR_LONGER * max(1, ordinary) and _passed_through(temperature[:, others], run)
-        if ordinary <= _ORDINARY_RUN or far_longer or _moved_alone(grid, k, moving, inside):
+        rest = np.delete(values, slice(first, first + length))
+        restless = ordinary <= _ORDINARY_RUN and _is_fine(rest)
+        if restless or _has_noise(rest) or _moved_alone(grid, k, moving, inside):
             step, ratio = float(np.median(np.diff(seconds))), length / max(ordinary, 1)
             faults.append(SensorFault(k, Kind.STUCK, True, first_s, step, 0.0, ratio, limit))
     return faults
 
 
-def _passed_through(temperature: Array, run: NDArray[np.intp]) -> bool:
-    """Whether most columns pass through a good part of their range within a run."""
-    passed, whole = (np.nanmax(part, axis=0) - np.nanmin(part, axis=0) for part in (temperature[run], temperature))
-    return bool((passed > _LEAST_MOVED * whole).mean() > 0.5) if whole.size else True
+def _is_fine(values: Array) -> bool:
+    """Whether half of all changes are several digits."""
+    steps = np.abs(np.diff(values))
+    steps = steps[steps > 0.0]
+    return bool(steps.size and np.median(steps) >= _MOVES * float(np.diff(np.unique(values)).min()))
+
+
+def _has_noise(values: Array) -> bool:
+    """Whether readings go up and down from one to the next, as noise beyond their digits does."""
+    steps = np.diff(values)
+    moved = np.sign(steps[steps != 0.0])
+    often = moved.size >= max(_LEAST_REPEATED, _NOISE_STEPS * steps.size)
+    return bool(often and np.mean(moved[1:] != moved[:-1]) >= _NOISE_TURNS)
 
 
 def _moved_alone(grid: Grid, sensor: int, others: list[int], inside: NDArray[np.bool_]) -> bool:
-    """Whether the prediction of a sensor moves while it stands still, beyond what the prediction misses elsewhere."""
+    """Whether the prediction of a sensor, as learnt elsewhere, moves while it stands still, beyond what the prediction misses elsewhere."""
     if not others:
         return False
-    changes = predicted_changes(grid, sensor, others, grid.durations()[-1])
+    changes = predicted_changes(grid, sensor, others, grid.durations()[-1], apart_from=inside)
     within = inside[changes.before] & inside[changes.after]
-    if not within.any() or within.all():
+    elsewhere = ~(inside[changes.before] | inside[changes.after])
+    if not within.any() or elsewhere.sum() < _LEAST_REPEATED:
         return False
-    missed = float(np.quantile(np.abs(changes.residual[~within]), 0.95))
+    missed = max(float(np.quantile(np.abs(changes.residual[elsewhere]), 0.95)), changes.least_K)
     return bool(np.abs(changes.residual[within]).max() > _MOVES * missed)
 
 
@@ -501,12 +655,12 @@ class _Suspicion:
     grid: Grid
 
 
-def _changed(grids: list[Grid], kept: Sequence[int]) -> list[SensorFault]:
+def _changed(grids: list[Grid], kept: Sequence[int], suspects: Sequence[int]) -> list[SensorFault]:
     """Sensors that jump or ramp away from their prediction."""
     faults: list[SensorFault] = []
     left = list(kept)
     while left:
-        suspicions = [_strongest(grids, k, [j for j in left if j != k], len(kept)) for k in left]
+        suspicions = [_strongest(grids, k, [j for j in left if j != k], len(kept)) for k in left if k in suspects]
         over = sorted((one for one in suspicions if one.excess > 1.0), key=lambda one: -one.excess)
         if not over:
             break
@@ -518,9 +672,26 @@ def _changed(grids: list[Grid], kept: Sequence[int]) -> list[SensorFault]:
         survivors = [one for one in again if one.excess > 1.0 and _overlap(one, over[0])]
         named = survivors or [over[0]]
         responding = _responds(grids, named[0], sound)
-        faults += [_describe(grids, one, sound, responding=responding, alone=len(survivors) == 1) for one in named]
+        told = [_describe(grids, one, sound, responding=responding, alone=len(survivors) == 1) for one in named]
+        # Only a change from one sample to the next is none of heat.
+        faults += [
+            fault
+            for fault in told
+            if (fault.kind is Kind.JUMP and grids[0].step_s <= _FAST_S)
+            or not _is_regulated(grids[-1], fault.sensor, [j for j in kept if j != fault.sensor])
+        ]
         left = [j for j in left if j not in {one.sensor for one in named}]
     return faults
+
+
+def _is_regulated(grid: Grid, sensor: int, others: list[int]) -> bool:
+    """Whether a sensor is at a heater: while it is warm it holds its level, whatever the others do."""
+    values = grid.temperature[:, sensor]
+    level = is_heated(values, grid.temperature[:, others])
+    if not level.any():
+        return False
+    beyond = level_beyond_prediction(grid, sensor, others)
+    return float(np.std(values[level])) <= float(np.std(beyond[level]))
 
 
 def _strongest(grids: list[Grid], sensor: int, others: list[int], sensors: int) -> _Suspicion:
@@ -560,10 +731,12 @@ def _describe(
     """Kind, onset and clearness of a change."""
     found, coarse = suspicion.found, grids[-1]
     ramp = _timed(grids, suspicion, sound)
-    fine_s, duration_s = grids[0].step_s, ramp.end_s - ramp.begin_s
-    quick = duration_s <= max(2.0 * fine_s, _FAST_S)
-    kind = Kind.JUMP if quick else Kind.RAMP
-    fast = quick and fine_s <= _FAST_S
+    fine = grids[0]
+    near = (fine.seconds >= ramp.begin_s - 2.0 * fine.step_s) & (fine.seconds <= ramp.end_s + 2.0 * fine.step_s)
+    largest = float(np.abs(np.diff(fine.temperature[near, suspicion.sensor])).max(initial=0.0))
+    at_once = largest >= _AT_ONCE * abs(ramp.size_K)
+    kind = Kind.JUMP if at_once else Kind.RAMP
+    fast = at_once and fine.step_s <= _FAST_S
     switched, otherwise = coarse.switchings(ramp.begin_s - 2.0 * coarse.step_s, ramp.end_s + 2.0 * coarse.step_s)
     reasons = {
         "another sensor deviates at the same time": not alone,
@@ -660,27 +833,59 @@ def examine_displacements(
     seconds: Array, displacement: Array, temperature: Array, drivers: Array | None = None
 ) -> list[SensorFault]:
     """Examine displacement channels: readings that repeat one value, and those that leave the course and come back."""
-    every = np.column_stack([displacement, np.where(is_implausible(temperature), np.nan, temperature)])
+    channels = range(displacement.shape[1])
+    every = np.column_stack([displacement, *(np.where(no_readings(one), np.nan, one) for one in temperature.T)])
     kept = [k for k in range(every.shape[1]) if np.isfinite(every[:, k]).sum() >= _LEAST_BLOCKS]
     grids = lay_grid(seconds, every, drivers) if seconds.size >= _LEAST_BLOCKS else None
     if grids is None:
         return []
-    repeated = {fault.sensor: fault for fault in _stuck(seconds, every, grids[-1], kept)}
-    faults = []
-    for k, values in enumerate(displacement.T):
-        at_fault = np.zeros(values.size, bool)
-        if k in repeated:
-            known = np.flatnonzero(np.isfinite(values))
-            value = values[np.searchsorted(seconds, repeated[k].onset_s)]
-            _, lengths = _runs(values[known])
-            at_fault[known] = np.repeat(lengths >= _LEAST_REPEATED, lengths) & (values[known] == value)
-            kind = Kind.CLIPPED if value in (values[known].min(), values[known].max()) else Kind.STUCK
-            faults.append(_in_stretches(replace(repeated[k], kind=kind, size=np.nan), seconds, at_fault))
-        at_fault, largest = _glitches(np.where(at_fault, np.nan, values), drivers)
-        if at_fault.any():
-            found = SensorFault(k, Kind.GLITCH, True, 0.0, float(np.median(np.diff(seconds))), largest)
-            faults.append(_in_stretches(found, seconds, at_fault))
-    return faults
+    faults, moving = [], displacement.copy()
+    for fault in _stuck(seconds, every, grids[-1], kept, [k for k in channels if k in kept]):
+        values, at_fault = displacement[:, fault.sensor], np.zeros(seconds.size, bool)
+        known = np.flatnonzero(np.isfinite(values))
+        value = values[np.searchsorted(seconds, fault.onset_s)]
+        _, lengths = _runs(values[known])
+        at_fault[known] = np.repeat(lengths >= _LEAST_REPEATED, lengths) & (values[known] == value)
+        kind = Kind.CLIPPED if value in (values[known].min(), values[known].max()) else Kind.STUCK
+        moving[at_fault, fault.sensor] = np.nan
+        told = replace(fault, kind=kind, size=np.nan, quantity="displacement")
+        faults.append(_in_stretches(told, seconds, at_fault))
+    return [*faults, *examine_readings(seconds, moving, drivers, quantity="displacement")[0]]
+
+
+def _erratic(values: Array, drivers: Array | None) -> tuple[NDArray[np.bool_], float]:
+    """Readings from the first to the last of every erratic time, in which a channel goes wildly up and down, and the largest step in it."""
+    at_fault, largest = np.zeros(values.size, bool), 0.0
+    known = np.flatnonzero(np.isfinite(values))
+    if known.size < _LEAST_BLOCKS or np.ptp(values[known]) == 0.0:
+        return at_fault, largest
+    steps = np.diff(values[known])
+    limit = _WILD * max(float(np.quantile(np.abs(steps), 0.75)), float(np.diff(np.unique(values[known])).min()))
+    wild = np.flatnonzero(np.abs(steps) > limit)
+    for together in np.split(wild, np.flatnonzero(np.diff(wild) > _CALM_READINGS) + 1):
+        turns = (np.diff(together) <= 2) & (np.diff(np.sign(steps[together])) != 0.0)
+        # A glitch turns once for two wild steps, as the reading after it is on the course again.
+        if turns.sum() >= _LEAST_TURNS and not _switched_at(drivers, known[together]):
+            first, last = int(together[0]) + 1, int(together[-1])
+            # It begins and ends where the channel is back on its course.
+            before = float(np.median(values[known[max(0, first - _GLITCH_READINGS) : first]]))
+            after = float(np.median(values[known[last + 1 : last + 1 + _GLITCH_READINGS]]))
+            while first > 1 and abs(values[known[first - 1]] - before) > _BACK * limit:
+                first -= 1
+            while last < known.size - 2 and abs(values[known[last + 1]] - after) > _BACK * limit:
+                last += 1
+            at_fault[known[first] : known[last] + 1] = True
+            largest = max(largest, float(np.abs(steps[together]).max()))
+    return (at_fault, largest) if at_fault.mean() <= _ERRATIC_SHARE else (np.zeros(values.size, bool), 0.0)
+
+
+def _switched_at(drivers: Array | None, places: NDArray[np.intp]) -> bool:
+    """Whether a load is switched at most of these steps from one sample to the next."""
+    if drivers is None or drivers.shape[1] == 0:
+        return False
+    loads = np.nan_to_num(drivers)
+    switched = (np.abs(np.diff(loads, axis=0)) > _SWITCHED * np.ptp(loads, axis=0)).any(axis=1)
+    return bool(np.mean(switched[np.minimum(places, switched.size - 1)]) > 0.5)
 
 
 def _in_stretches(fault: SensorFault, seconds: Array, at_fault: NDArray[np.bool_]) -> SensorFault:
@@ -703,8 +908,11 @@ def _glitches(displacement: Array, drivers: Array | None) -> tuple[NDArray[np.bo
         if values.size < _LEAST_BLOCKS or np.ptp(values) == 0.0:
             break
         off = np.abs(values - pd.Series(values).rolling(2 * reach + 1, center=True, min_periods=1).median().to_numpy())
-        limit = _GLITCH * max(float(np.quantile(off, 0.9)), float(np.diff(np.unique(values)).min()))
-        steepest = float(np.abs(np.diff(values[off <= limit])).max())
+        # A smooth course leaves nothing about its running median but where it turns, by a few of its steps.
+        usual = max(float(np.quantile(off, 0.9)), 0.5 * float(np.quantile(np.abs(np.diff(values)), 0.9)))
+        limit = _GLITCH * max(usual, float(np.diff(np.unique(values)).min()))
+        course = values[off <= limit]
+        steepest = float(np.abs(np.diff(course)).max())
         steps = np.abs(np.diff(values, prepend=values[0]))
         switched = np.abs(np.diff(loads[known], axis=0, prepend=loads[known[:1]])) > _SWITCHED * np.ptp(loads, axis=0)
         switched[:, switched.mean(axis=0) > _OFTEN] = False
@@ -713,9 +921,10 @@ def _glitches(displacement: Array, drivers: Array | None) -> tuple[NDArray[np.bo
             size = float(off[first:end].max())
             # The median itself is off beside a long stretch, so that the steps say where it begins and ends.
             borders = first + np.flatnonzero(steps[first : end + 1] > max(limit, _ABRUPT * size))
-            # A burst of a few readings climbs in parts: more than a course that is steep elsewhere moves in as many.
+            # A burst of a few readings climbs in parts: more than the rest of the course ever moves in as many.
             if 0 < first < end < values.size and end - first <= _GLITCH_READINGS:
-                far = size > excursion_limit(1) * max(limit, (end - first) * steepest)
+                moves = np.abs(course[end - first :] - course[: first - end]).max(initial=0.0)
+                far = size > excursion_limit(1) * max(limit, float(moves))
                 if far and abs(values[end] - values[first - 1]) <= limit and not switched[first - 1 : end + 1].any():
                     borders = np.array([first, end])
             if borders.size == 0:

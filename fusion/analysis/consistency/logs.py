@@ -121,7 +121,11 @@ def contact_sensors(environment: xr.Dataset, drivers: xr.Dataset | None = None) 
     changing = {
         sensor for sensor, column in enumerate(columns.values()) if np.unique(column[np.isfinite(column)]).size > 1
     }
-    clear = [fault for fault in faults if fault.is_clear and (fault.kind is not Kind.STUCK or fault.sensor in changing)]
+    clear = [
+        fault
+        for fault in faults
+        if fault.is_clear and not fault.readings and (fault.kind is not Kind.STUCK or fault.sensor in changing)
+    ]
     return judge(
         len(clear), 0.0, faults=[(list(columns)[fault.sensor].replace("_", " "), fault.words) for fault in clear]
     )

@@ -147,12 +147,24 @@ def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
 
 def predict_left_out(record: Record, columns: Array, penalty: float) -> Array:
     """Predict every part of a record, or every run of several, from all others, earlier and later ones."""
+    numbers = record.run if record.runs else record.chained
+    parts = [numbers == number for number in np.unique(numbers)]
+    return _predict_parts(record, columns, penalty, [(~part, part) for part in parts])
+
+
+def predict_later(record: Record, columns: Array, penalty: float, train: NDArray[np.bool_]) -> Array:
+    """Predict the later parts of the training blocks from those before them, or every training run from the others; NaN elsewhere."""
+    return _predict_parts(record, columns, penalty, folds(record, train))
+
+
+def _predict_parts(
+    record: Record, columns: Array, penalty: float, asked: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]]
+) -> Array:
+    """Predict parts, each from the blocks that stand before it."""
     predicted = np.full(record.displacement.shape, np.nan)
     place = int(np.flatnonzero(penalty == PENALTIES)[0])
-    numbers = record.run if record.runs else record.chained
-    for number in np.unique(numbers):
-        part = numbers == number
-        predicted[part] = _paths(record, columns, ~part)[place][0][part]
+    for used, part in asked:
+        predicted[part] = _paths(record, columns, used)[place][0][part]
     return predicted
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -24,8 +24,9 @@ from fusion.analysis.alignment.sensor_health import (
     Kind,
     SensorFault,
     examine_displacements,
+    examine_readings,
     examine_sensors,
-    is_implausible,
+    find_set_points,
 )
 from fusion.analysis.diagnosis.residual import PermutationTest, ResidualStructure, permutation_test
 from fusion.analysis.drift_model.admissibility import NOISE_SHARE, free_warm_ups, is_shown_by_one_warm_up, refuse
@@ -61,6 +62,7 @@ from fusion.analysis.drift_model.predictions import (
     last_values,
     plain_predictions,
     predict,
+    predict_later,
     predict_left_out,
     rmse,
     track_record,
@@ -1245,71 +1247,190 @@ class SensorHealth:
 
     Attributes
     ----------
-    table : the record without faulty sensors, displacements and readings; what is suspected stays
+    table : the record without faulty sensors, displacements and readings, set points among the drivers; what is suspected stays
     findings : part ``loop.sensor_faults`` of results.json: displacements, then sensors
     names_causes : whether any displacement is left in which a cause can be named
+    set_points : set point to the sensor at what it regulates
     """
 
     table: xr.Dataset
     findings: tuple[schema.SensorFaultPart, ...] = ()
     names_causes: bool = True
+    set_points: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def undoubted(self) -> xr.Dataset:
+        """The record without what is suspected."""
+        doubted = {one.sensor for one in self.findings if one.state == "suspected"}
+        kept = {
+            dimension: [name for name in self.table[dimension].values.tolist() if name not in doubted]
+            for dimension in ("sensor", "channel")
+        }
+        return self.table.sel(kept)
 
 
 #: A fault, the name of its sensor or displacement, and of several runs the one that shows it.
 _Found = tuple[SensorFault, str, str]
-#: A displacement is computed with a faulty sensor where the readings of that sensor reduce its error by this factor.
-_COMPUTED = 2.0
+#: A displacement is computed with a faulty sensor where the readings of that sensor reduce its error by this factor, and it follows every
+#: reading at once, by what it follows the course within this share: what heat moves is late.
+_COMPUTED, _AS_MUCH = 2.0, 0.3
+#: What a sensor does is no fault where the error of a displacement is this share of that without the sensor, and of that with the sensor as
+#: it would read without it.
+_FOLLOWED = 0.8
+#: Share of a record that the model learns from after the onset of a fault, or its readings say nothing of the fault.
+_LEARNT = 0.05
 
 
 def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
-    """Examine displacements and sensors of a record, and leave out what is faulty."""
-    cleaned, readings = without_faulty_readings(table)
-    sensors = _examine_runs(cleaned)
+    """Examine displacements and sensors of a record, and leave out what is faulty, but no sensor that the displacements speak for.
+
+    Whether they do is asked of the training time alone.
+    """
+    table, set_points = without_set_points(table)
+    regulated = np.flatnonzero(np.isin(table["sensor"].values, [*set_points.values()])).tolist()
+    cleaned, readings = without_faulty_readings(table, regulated)
+    sensors = _examine_runs(cleaned, regulated)
     names = [str(name) for name in table["sensor"].values]
-    faulty = [one for one in sensors if one[0].is_clear]
-    kept = [name for name in names if name not in {name for _, name, _ in faulty}]
-    if not kept:
+    dead = {name for fault, name, _ in sensors if fault.kind is Kind.NO_SIGNAL}
+    if dead.issuperset(names):
         told = "; ".join(f"{name}: {fault.kind} from {fault.onset_s / 3600.0:.2f} h on" for fault, name, _ in sensors)
         raise RecordError(
             f"{table.attrs.get('source', 'record')}: no temperature sensor is sound ({told}); repeat the test"
         )
-    if not readings and not faulty:
-        return SensorHealth(table, tuple(_part(*one) for one in sensors))
+    if not readings and not sensors:
+        return SensorHealth(table, set_points=set_points)
 
-    def errors(of: xr.Dataset, *beside: str, left_out: bool = False) -> dict[str, float]:
+    def errors(of: xr.Dataset, *beside: str) -> dict[str, float]:
         used = of.sel(sensor=[name for name in names if name in kept or name in beside])
-        return _declared_errors(used, declared, left_out=left_out)
+        return _declared_errors(used, declared)
+
+    kept = [name for name in names if name not in dead]
+    learnt = {name for fault, name, run in sensors if _is_learnt(cleaned, fault, run)}
+    moved = [one for one in sensors if one[1] in learnt and one[0].kind in {Kind.NO_SIGNAL, Kind.JUMP, Kind.RAMP}]
+
+    def followed(fault: SensorFault, name: str, run: str) -> Iterator[tuple[str, float, float]]:
+        """Channels with their errors with a sensor as it was read, and as it would read without its fault."""
+        repaired = errors(_repaired(cleaned, fault, name, run), name)
+        for channel, error in errors(_as_read(cleaned, table, name), name).items():
+            yield channel, error, repaired.get(channel, np.inf)
 
     computed: dict[str, schema.SensorFaultPart] = {}
-    for fault, name, run in faulty:
-        alone, as_read = errors(cleaned, left_out=True), errors(cleaned, name, left_out=True)
-        # A sound displacement follows what the part does, which the sensor shows better without its fault.
-        repaired = errors(_repaired(cleaned, fault, name, run), name, left_out=True)
-        for channel, error in as_read.items():
-            ratio = min(alone[channel], repaired.get(channel, np.inf)) / max(error, 1e-12)
-            if ratio >= _COMPUTED:
-                same = replace(fault, kind=Kind.COMPUTED, size=np.nan, ratio=ratio, limit=_COMPUTED, computed_with=name)
-                computed.setdefault(channel, _part(same, channel, run, error, alone[channel]))
+    for fault, name, run in moved:
+        for channel, error, beside in followed(fault, name, run) if fault.is_clear else ():
+            if beside >= _COMPUTED * error and _contains(_as_read(cleaned, table, name), channel, name):
+                same = replace(fault, kind=Kind.COMPUTED, size=np.nan, computed_with=name, quantity="displacement")
+                same = replace(same, ratio=beside / max(error, 1e-12), limit=_COMPUTED)
+                computed.setdefault(channel, _part(same, channel, run, error, beside))
     left = [str(name) for name in table["channel"].values if name not in computed]
     if not left:
         # Every displacement needs the faulty sensor then: it stays, and nothing is named.
-        kept += [one.computed_with for one in computed.values()]
         stays = {"state": "suspected", "reason": "as every displacement is, so that both stay and no cause is named"}
         computed = {name: one.model_copy(update=stays) for name, one in computed.items()}
+    proven = {one.computed_with for one in computed.values()}
+    needed = set() if left else proven
     channels = left or list(computed)
     raw, cleaned = table.sel(channel=channels), cleaned.sel(channel=channels)
-    before, after = errors(raw), errors(cleaned)
-    found = [
-        _part(*one, before.get(one[1], np.nan), after.get(one[1], np.nan)) for one in readings if one[1] in channels
-    ]
+    true = set()
+    for fault, name, run in moved:
+        if fault.kind is not Kind.NO_SIGNAL and name not in proven:
+            kept = [other for other in names if other not in {name, *dead}]
+            alone = errors(cleaned)
+            if any(
+                error < _FOLLOWED * min(beside, alone.get(channel, np.inf))
+                for channel, error, beside in followed(fault, name, run)
+            ):
+                true.add(name)
+    sensors = [one for one in sensors if one[1] not in true]
+    # A sensor is put back while the displacements are predicted better with it.
+    out = {name: fault for fault, name, _ in sensors if fault.is_clear and name not in needed}
+    kept = [name for name in names if name not in out]
+    if not kept:
+        kept = [name for name in names if name not in dead]
+    while True:
+        without = _mean(errors(cleaned))
+        asked = {name: _mean(errors(cleaned, name)) for name in names if name in learnt - dead - {*kept}}
+        best = min(asked, key=lambda name: asked[name], default="")
+        if not best or not asked[best] < without:
+            break
+        kept = [*kept, best]
+    found = []
+    if readings:
+        before, after = errors(raw), errors(cleaned)
+        found = [
+            _part(fault, name, run, before.get(name, _mean(before)), after.get(name, _mean(after)))
+            for fault, name, run in readings
+            if name in channels or name in kept
+        ]
     for fault, name, run in sensors:
-        is_out = name not in kept
-        both = (errors(cleaned, name), after) if is_out else ({}, {})
-        if fault.is_clear and not is_out:
-            fault = replace(fault, is_clear=False, reason="every displacement is computed with it")
-        found.append(_part(fault, name, run, *(float(known_mean(np.array([*each.values()]))) for each in both)))
+        if fault.is_clear and name in kept:
+            reason = (
+                "every displacement is computed with it"
+                if name in needed
+                else "the displacements are predicted no better without it"
+            )
+            fault = replace(fault, is_clear=False, reason=reason)
+        both = (asked[name], without) if name in asked else ()
+        found.append(_part(fault, name, run, *both))
     sound = cleaned.sel(sensor=[name for name in names if name in kept])
-    return SensorHealth(sound, (*computed.values(), *found), bool(left))
+    return SensorHealth(sound, (*computed.values(), *found), bool(left), set_points)
+
+
+def _as_read(cleaned: xr.Dataset, table: xr.Dataset, sensor: str) -> xr.Dataset:
+    """The record without faulty readings but those of a sensor."""
+    temperature = table["temperature"].isel(time=slice(cleaned.sizes["time"]))
+    return cleaned.assign(temperature=temperature.where(table["sensor"] == sensor, cleaned["temperature"]))
+
+
+def _mean(errors: Mapping[str, float]) -> float:
+    return float(known_mean(np.array([*errors.values()])))
+
+
+def without_set_points(table: xr.Dataset) -> tuple[xr.Dataset, dict[str, str]]:
+    """The record with its set points among the drivers, and each with the sensor at what it regulates."""
+    drivers = table["driver"].values[:, table["driver_units"].values == "degC"]
+    named = [*table["sensor"].values.tolist(), *table["driver_name"].values[table["driver_units"].values == "degC"]]
+    found = find_set_points(np.column_stack([table["temperature"].values, drivers]))
+    pairs = {named[place]: named[regulated] for place, regulated in found.items() if regulated < table.sizes["sensor"]}
+    sensors = table["sensor"].values.tolist()
+    moved = [name for name in sensors if name in pairs]
+    if not moved:
+        return table, pairs
+    names = [*table["driver_name"].values.tolist(), *moved]
+    units = [*table["driver_units"].values.tolist(), *["degC"] * len(moved)]
+    values = np.column_stack([table["driver"].values, table["temperature"].sel(sensor=moved).values])
+    return table.drop_vars(["driver", "driver_units", "driver_name"]).sel(
+        sensor=[name for name in sensors if name not in pairs]
+    ).assign(
+        driver=(("time", "driver_name"), values, table["driver"].attrs),
+        driver_units=("driver_name", np.array(units, dtype=object)),
+    ).assign_coords(driver_name=names), pairs
+
+
+def _is_learnt(table: xr.Dataset, fault: SensorFault, run: str) -> bool:
+    """Whether the model learns from readings after the onset of a fault."""
+    runs = [*_runs_of(table)]
+    number = [name for name, _, _ in runs].index(run)
+    if len(runs) > 1:
+        return number not in json.loads(table.attrs["test"])
+    return fault.onset_s < (1.0 - HOLD_OUT_SHARE - _LEARNT) * runs[0][2][-1]
+
+
+def _contains(table: xr.Dataset, channel: str, sensor: str) -> bool:
+    """Whether a displacement moves with every reading of a sensor, at once and as much as it follows the whole course."""
+    place = table["sensor"].values.tolist().index(sensor)
+    response, temperature = table["displacement"].sel(channel=channel).values, table["temperature"].values
+    known = np.isfinite(response) & np.isfinite(temperature).all(axis=1)
+    if known.sum() < temperature.shape[1] + 3:
+        return False
+    response, temperature = response[known], temperature[known]
+    whole = np.linalg.lstsq(temperature - temperature.mean(axis=0), response - response.mean(), rcond=None)[0][place]
+    quick, moved = np.diff(temperature[:, place], 2), np.diff(response, 2)
+    weight = float(quick @ quick)
+    if not weight > 0.0:
+        return False
+    slope = float(quick @ moved) / weight
+    u = float(np.sqrt(np.mean((moved - slope * quick) ** 2) / weight))
+    return abs(slope) > 5.0 * u and abs(slope - float(whole)) <= _AS_MUCH * abs(float(whole))
 
 
 def _part(
@@ -1337,54 +1458,57 @@ def _runs_of(table: xr.Dataset) -> Iterator[tuple[str, NDArray[np.bool_], Array]
         yield run, number == k, np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
 
 
-def without_faulty_readings(table: xr.Dataset) -> tuple[xr.Dataset, list[_Found]]:
-    """The record without the displacements that are no readings, and what was found, run by run."""
-    displacement, found = table["displacement"].copy(), []
-    values, read = displacement.values, np.isfinite(table["displacement"].values)
+def without_faulty_readings(table: xr.Dataset, regulated: Sequence[int] = ()) -> tuple[xr.Dataset, list[_Found]]:
+    """The record without the displacements and temperatures that are no readings, and what was found, run by run."""
+    kept, found = {name: table[name].copy() for name in ("displacement", "temperature")}, []
+    values, read = kept["displacement"].values, np.isfinite(table["displacement"].values)
     for run, here, seconds in _runs_of(table):
-        rest = (table[name].values[here] for name in ("temperature", "driver"))
-        for fault in examine_displacements(seconds, values[here], *rest):
-            found.append((fault, str(table["channel"].values[fault.sensor]), run))
+        temperature, driver = (table[name].values[here] for name in ("temperature", "driver"))
+        faults = [
+            *examine_displacements(seconds, values[here], temperature, driver),
+            *examine_readings(seconds, temperature, driver, quantity="temperature", regulated=regulated)[0],
+        ]
+        for fault in faults:
+            names = table["channel" if fault.quantity == "displacement" else "sensor"].values
+            found.append((fault, str(names[fault.sensor]), run))
             for first, last in fault.stretches_s:
-                values[np.flatnonzero(here)[(seconds >= first) & (seconds <= last)], fault.sensor] = np.nan
+                rows = np.flatnonzero(here)[(seconds >= first) & (seconds <= last)]
+                kept[fault.quantity].values[rows, fault.sensor] = np.nan
     # Where no displacement is left at the end, the record ends before.
     last, ended = (np.flatnonzero(known.any(axis=1)).max(initial=0) for known in (np.isfinite(values), read))
-    return table.assign(displacement=displacement).isel(time=slice(last + 1 if last < ended else None)), found
+    return table.assign(kept).isel(time=slice(last + 1 if last < ended else None)), found
 
 
-def _examine_runs(table: xr.Dataset) -> list[_Found]:
-    """Faults of the sensors, at most one per sensor; every run is examined by itself."""
+def _examine_runs(table: xr.Dataset, regulated: Sequence[int]) -> list[_Found]:
+    """Faults of the sensors as wholes, at most one per sensor; every run is examined by itself."""
     chosen: dict[int, _Found] = {}
     for run, here, seconds in _runs_of(table):
-        for fault in examine_sensors(seconds, *(table[name].values[here] for name in ("temperature", "driver"))):
+        readings = (table[name].values[here] for name in ("temperature", "driver"))
+        for fault in examine_sensors(seconds, *readings, regulated=regulated):
             earlier = chosen.get(fault.sensor)
-            if earlier is None or (fault.is_clear and not earlier[0].is_clear):
+            if not fault.readings and (earlier is None or (fault.is_clear and not earlier[0].is_clear)):
                 chosen[fault.sensor] = fault, str(table["sensor"].values[fault.sensor]), run
     return [chosen[sensor] for sensor in sorted(chosen)]
 
 
 def _repaired(table: xr.Dataset, fault: SensorFault, name: str, run: str) -> xr.Dataset:
-    """The record with a faulty sensor as it would read without its jump, its ramp or its implausible readings."""
+    """The record with a faulty sensor as it would read without its jump or its ramp."""
     temperature = table["temperature"].copy()
     values = temperature.values[:, table["sensor"].values.tolist().index(name)]
-    if fault.kind is Kind.NO_SIGNAL:
-        values[is_implausible(values)] = np.nan
     if fault.kind in {Kind.JUMP, Kind.RAMP}:
         here, seconds = next((here, seconds) for each, here, seconds in _runs_of(table) if each == run)
         values[here] -= fault.size * np.interp(seconds, [fault.onset_s, fault.end_s], [0.0, 1.0])
     return table.assign(temperature=temperature)
 
 
-def _declared_errors(table: xr.Dataset, declared: Sequence[str], *, left_out: bool = False) -> dict[str, float]:
-    """Error of the declared model by channel, um, on the hold-out set, or of every part predicted from the others; none without a model."""
+def _declared_errors(table: xr.Dataset, declared: Sequence[str]) -> dict[str, float]:
+    """Error of the declared model by channel, um: later parts of the training time from those before, or training runs from the others."""
     try:
         record = reduce_record(table)
         train, _ = hold_out(record)
     except RecordError:
         return {}
     columns = columns_of(record, declare(declared, record))
-    predicted, asked = predict(record, columns, train), ~train
-    errors = channel_rmse((record.displacement - predicted.predicted)[asked])
-    if left_out:
-        errors = channel_rmse(record.displacement - predict_left_out(record, columns, predicted.penalty))
+    predicted = predict_later(record, columns, predict(record, columns, train).penalty, train)
+    errors = channel_rmse(record.displacement - predicted)
     return dict(zip(record.channels, errors.tolist(), strict=True))

@@ -362,6 +362,17 @@ def test_runs_are_joined_in_the_order_of_their_times(tmp_path: Path) -> None:
     assert (np.diff(data["time"].values) > np.timedelta64(0)).all()
 
 
+def test_kelvins_around_zero_are_a_rise_and_a_stated_range_says_what_is_no_reading(tmp_path: Path) -> None:
+    rows = [f"{k},{0.05 * k - 0.02},{293.15 + k},{950.0 if k == 7 else 20.0 + k},{k},0" for k in range(10)]
+    content = "\n".join(["time [min],t1 rise [K],t2 [K],t3 [degC],ch1 [um],spindle [1/min]", *rows])
+    more = '[record.columns]\n"t3*" = {unit = "degC", range = ["-20 degC", "300 degC"]}'
+    data = read_record(load_campaign(record(tmp_path, content, more=more)))
+    np.testing.assert_allclose(data["temperature"].values[:, 0], 0.05 * np.arange(10) - 0.02)
+    np.testing.assert_allclose(data["temperature"].values[:, 1], 20.0 + np.arange(10))
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(data["temperature"].values[:, 2])), [7])
+    assert json.loads(data.attrs["rises"]) == ["t1 rise"]
+
+
 def test_columns_of_a_run_may_stand_in_another_order(tmp_path: Path) -> None:
     rows = {
         "time [s],t1 [degC],t2 [degC],ch1 [um],ch2 [um],speed 1 [1/s],speed 2 [rpm]": "{k},20,21,{k},5,7,8",

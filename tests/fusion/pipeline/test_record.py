@@ -76,9 +76,10 @@ def test_every_finding_is_noted_with_both_errors_or_its_reason():
             {"sensor": "t2", "kind": "no signal", "state": "left_out", "onset_s": 7200.0, "size": np.nan, "ratio": np.nan, "reason": "",
              "rmse_with_um": np.nan},
             {"sensor": "ch1", "kind": "glitch", "state": "readings_left_out", "onset_s": 3600.0, "size": 4302.5, "ratio": np.nan,
-             "reason": "", "rmse_with_um": 611.0, "readings": 3, "stretches_s": [(3600.0, 3604.0), (9000.0, 9000.0)]},
+             "reason": "", "rmse_with_um": 611.0, "readings": 3, "stretches_s": [(3600.0, 3604.0), (9000.0, 9000.0)],
+             "quantity": "displacement"},
             {"sensor": "ch2", "kind": "computed", "state": "left_out", "onset_s": 7200.0, "size": np.nan, "ratio": 3.0, "reason": "",
-             "rmse_with_um": 0.7, "computed_with": "t1"},
+             "rmse_with_um": 0.7, "computed_with": "t1", "quantity": "displacement"},
             {"sensor": "t3", "kind": "jump", "state": "suspected", "onset_s": 3600.0, "size": -2.0, "ratio": 12.0,
              "reason": "other sensors respond", "rmse_with_um": np.nan},
         )
@@ -92,7 +93,10 @@ def test_every_finding_is_noted_with_both_errors_or_its_reason():
     assert ramp.endswith("12.3 µm with it, 2.35 µm without.")
     assert "no model with it" in silent
     assert glitch.startswith("ch1 leaves its course by up to 4302 µm and comes back (3 readings) from 1.00 h on")
-    assert "they are left out at 1 h; 2.5 h. Held-out error of the declared model of ch1: 611 µm with it" in glitch
+    assert (
+        "they are left out at 1 to 1.001 h; 2.5 h. Error of the declared model of ch1, later parts of the training time"
+        in glitch
+    )
     assert computed.startswith("ch2 is computed with the faulty sensor t1 from 2.00 h on")
     assert "t3 jumps by 2 K from 1.00 h on" in suspected
     assert "suspected only (other sensors respond), and stays in the model" in suspected

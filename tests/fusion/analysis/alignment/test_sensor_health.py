@@ -9,10 +9,13 @@ from fusion.analysis.alignment.first_order_lag import respond
 from fusion.analysis.alignment.sensor_health import (
     Kind,
     examine_displacements,
+    examine_readings,
     examine_sensors,
     excursion_limit,
+    find_set_points,
     fit_ramp,
     lay_grid,
+    no_readings,
 )
 from tests.fusion.record_tables import twin_table
 
@@ -104,6 +107,64 @@ def test_a_glitch_long_before_is_not_the_onset_of_no_signal(sound):
     spoilt[900:, 2] = 850.0
     (fault,) = examine_sensors(seconds, spoilt)
     assert (fault.kind, fault.onset_s) == (Kind.NO_SIGNAL, seconds[900])
+
+
+@pytest.mark.parametrize(
+    ("rail", "places", "found"),
+    [
+        (850.0, [300], 1),  # the end of a Pt100: documented
+        (-127.0, [10, 11, 400], 3),
+        (512.3, range(300, 400), 100),  # not documented, repeated to the last digit
+        (512.3, [300], 0),
+        (-300.0, [300], 1),  # below absolute zero
+    ],
+)
+def test_a_rail_is_no_reading_and_a_hot_sensor_is_one(rail, places, found):
+    rng = np.random.default_rng(6)
+    values = np.round(20.0 + np.cumsum(rng.normal(0.0, 0.02, 600)) + rng.normal(0.0, 0.05, 600), 2)
+    assert not no_readings(values).any()
+    # A rise around zero, a hot end and a cold store are sound.
+    for shifted in (values - 20.0, values + 320.0, values - 100.0):
+        assert not no_readings(shifted).any()
+    spoilt = values.copy()
+    spoilt[places] = rail
+    assert no_readings(spoilt).sum() == found
+
+
+def test_a_set_point_is_found_with_what_it_regulates():
+    seconds = 10.0 * np.arange(900)
+    wanted = np.select([seconds < 900, seconds < 4000, seconds < 6000], [0.0, 70.0, 60.0], 0.0)
+    bed = 25.0 + respond(np.fmax(wanted - 25.0, 0.0)[:, None], seconds, time_constant_s=60.0)[:, 0]
+    noise = np.random.default_rng(7).normal(0.0, 0.1, (900, 3))
+    columns = np.round(np.column_stack([wandering(900, 2) + noise[:, :2], bed + noise[:, 2]]), 1)
+    assert find_set_points(np.column_stack([columns, wanted])) == {3: 2}
+    # A coarse thermometer in a calm room and a set point that nothing follows are none.
+    calm = 21.0 + 0.5 * (seconds > 3000)
+    assert find_set_points(np.column_stack([columns, calm, np.where(wanted > 0.0, 180.0, 0.0)])) == {}
+
+
+def test_an_erratic_time_is_one_and_left_out_whole_and_bursts_are_left_out_alone():
+    rng, seconds = np.random.default_rng(8), 600.0 * np.arange(1500)
+    values = 900.0 + 30.0 * np.sin(seconds / 86400.0 * 2.0 * np.pi) + rng.normal(0.0, 0.5, 1500)
+    at_fault = np.zeros(1500, bool)
+    at_fault[400:466] = True
+    values[at_fault] -= rng.uniform(100.0, 800.0, 66)
+    # It comes back for an hour, which is no reason to trust it.
+    values[420:426] = 900.0
+    values[[900, 901, 902, 1100]] += [450.0, 900.0, 1335.0, 1335.0]
+    faults, sound = examine_readings(seconds, values[:, None], None, quantity="displacement")
+    assert [(one.kind, one.readings, len(one.stretches_s)) for one in faults] == [
+        (Kind.ERRATIC, 66, 1),
+        (Kind.GLITCH, 4, 2),
+    ]
+    assert (np.isnan(sound[:, 0]) == at_fault | np.isin(np.arange(1500), [900, 901, 902, 1100])).all()
+
+
+def test_a_thermometer_in_the_ground_that_holds_one_digit_is_not_stuck(sound):
+    seconds, temperature, load = sound
+    slow = 11.0 + np.interp(np.arange(seconds.size), [0, 800, 1200, 1440], [0.0, 0.2, 0.2, 0.25])
+    ground = np.round(slow + 0.0005 * np.random.default_rng(9).normal(size=seconds.size), 2)
+    assert examine_sensors(seconds, np.column_stack([temperature, ground]), load) == []
 
 
 # Displacements: what leaves the course and comes back is at fault; what stays, or takes its time, may be true.
