@@ -56,7 +56,9 @@ _VOCABULARY = vocabulary("columns")
 
 #: What a column may hold; only the three in the middle are written into ``[record.columns]``.
 ROLES = ("time", "temperature", "displacement", "driver", "out")
-_NO_NUMBERS, _BY_VALUES, _NOT_KNOWN, _UNIT_NOT_KNOWN = "no numbers", "by its values", "not known", "unit not known"
+_NO_NUMBERS, _NOT_KNOWN, _UNIT_NOT_KNOWN = "no numbers", "not known", "unit not known"
+#: What only the values of a column tell: that it is a temperature, and its unit.
+_BY_VALUES, _UNIT_BY_VALUES = "by its values", "unit by its values"
 _COUNTS = "whole numbers: counts? then one count with its unit, as 0.0125 mm"
 #: Comment of Klipper's logs: millimetres of one step of the motor.
 _STEP = re.compile(r"#\s*step_dist\w*\s*=\s*([\d.]+)\s*$")
@@ -90,8 +92,8 @@ _LABVIEW_S, _UNIX_S, _UNIX_MS = (3.2e9, 4.5e9), (1e9, 2.5e9), (1e12, 2.5e12)
 _SHORTEST_S = 1800.0
 #: Words of headings, the plain ones before those of one or two letters.
 _WORDS = tuple((one["name"], frozenset(one["words"])) for one in _VOCABULARY["role"])
-#: Words of a column that counts, where no other word stands beside them.
-_COUNTING = frozenset(_VOCABULARY["counting"])
+#: Words of a column that counts, and of one that says nothing of what it holds, where no other word stands beside them.
+_COUNTING, _SAYING_NOTHING = frozenset(_VOCABULARY["counting"]), frozenset(_VOCABULARY["saying_nothing"])
 #: Most columns of a table with a line for every change: date, time, channel, value, unit, quality.
 _WIDEST_LONG = 6
 #: Columns of a table of changes that say how a value was read.
@@ -108,7 +110,10 @@ class ColumnsError(FusionError):
 
 @dataclass(frozen=True)
 class Column:
-    """A column, what it is proposed to hold, its unit, its first values, the range of its numbers, and what is to be known of it."""
+    """A column, what it is proposed to hold, its unit, its first values, the range of its numbers, and what is to be known of it.
+
+    ``told`` says where its unit stands; empty where it is stated nowhere.
+    """
 
     heading: str
     role: str
@@ -117,6 +122,12 @@ class Column:
     low: float = float("nan")
     high: float = float("nan")
     remark: str = ""
+    told: str = ""
+
+    @property
+    def is_guessed(self) -> bool:
+        """Whether only its values tell its unit."""
+        return self.remark in (_BY_VALUES, _UNIT_BY_VALUES, _COUNTS)
 
     @property
     def span(self) -> str:
@@ -128,7 +139,8 @@ class Column:
 class TableProposal:
     """A logged table: keys of ``[record]`` that say how it is laid out, and its columns; `asked` are keys that the file does not tell.
 
-    ``attrs`` lists the lines that are left out, and those at which the clock goes back, as the attributes of the record read from it.
+    ``time`` holds the times of its rows in UTC and ``reference`` how they came to it, in words; ``attrs`` lists the lines that are left
+    out, and those at which the clock goes back, as the attributes of the record read from it.
     """
 
     path: Path
@@ -136,6 +148,8 @@ class TableProposal:
     columns: tuple[Column, ...]
     rows: int
     asked: dict[str, str] = field(default_factory=dict)
+    time: np.ndarray = field(default_factory=lambda: np.array([], "M8[ns]"), compare=False)
+    reference: str = ""
     attrs: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, role: str) -> tuple[Column, ...]:
@@ -164,7 +178,7 @@ class TableProposal:
         remarks, temperatures = [column.remark for column in self.columns], self.of("temperature")
         # One of two temperatures that only their values tell may be the displacement.
         guessed = _NOT_KNOWN in remarks or (_BY_VALUES in remarks and len(temperatures) > 1)
-        return not self.lacks or (guessed and bool(temperatures))
+        return not self.lacks or (guessed and (bool(temperatures) or _BY_VALUES in remarks))
 
     def lines(self) -> Iterator[str]:
         """Yield the columns as a table of text: number, heading, first values, role and unit."""
@@ -226,9 +240,11 @@ def propose_runs(tables: Sequence[TableProposal]) -> TableProposal:
 
 def propose_table(path: Path) -> TableProposal:
     """Read a logged table, and propose how it is laid out and what its columns hold."""
-    head = _head(path)
+    sheet, head = _head(path)
     keys = _of_labview(head) or _of_campbell(head) or _of_monitor(head) or _header_rows(path, head)
-    rows = read_rows(path, header=HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None)
+    header = HeaderRows.model_validate(keys["header_rows"]) if "header_rows" in keys else None
+    rows = read_rows(path, sheet=sheet, header=header)
+    keys |= {"sheet": sheet} if sheet else {}
     frame, asked = rows.frame, dict[str, str]()
     if frame.empty:
         raise LaserFormatError(f"{path}: no rows below the header")
@@ -254,27 +270,31 @@ def propose_table(path: Path) -> TableProposal:
             replace(one, unit=f"{steps[0]} mm", remark="counts, of step_dist") if one.remark == _COUNTS else one
             for one in columns
         ]
-    lines = _lines(path, rows, keys)
+    time, reference, lines = _read(path, rows, keys)
     return TableProposal(
         path,
         keys | ({"missing": marks} if marks else {}),
         tuple(columns),
         len(frame) + len(rows.left_out) - len(lines.get("left_out", ())),
         asked,
+        time,
+        reference,
         {name: json.dumps([asdict(line) for line in of_name]) for name, of_name in lines.items()},
     )
 
 
-def _lines(path: Path, rows: Rows, keys: Mapping[str, Any]) -> dict[str, list[RejectedLine]]:
-    """Return the lines that a record leaves out, and those at which its clock goes back, by the attribute that holds them."""
+def _read(path: Path, rows: Rows, keys: Mapping[str, Any]) -> tuple[np.ndarray, str, dict[str, list[RejectedLine]]]:
+    """Return the times of a table, how they came to UTC in words, and by the attribute that holds them the lines that a record leaves out,
+    and those at which its clock goes back.
+    """
     headings = keys["long"]["time"] if "long" in keys else keys.get("time")
     if headings is None:
-        return {"left_out": rows.left_out}
+        return np.array([], "M8[ns]"), "", {"left_out": rows.left_out}
     layout = LoggedTable.model_validate({key: value for key, value in keys.items() if key not in ("long", "time")})
-    time, _, without = read_times(path, rows, layout, [headings] if isinstance(headings, str) else headings)
+    time, reference, without = read_times(path, rows, layout, [headings] if isinstance(headings, str) else headings)
     keep = ~np.isnat(time)
     back = [] if "long" in keys else where_clock_goes_back(path, rows.frame.index[keep], time[keep])
-    return {"left_out": [*rows.left_out, *without], "clock": back}
+    return time[keep], reference, {"left_out": [*rows.left_out, *without], "clock": back}
 
 
 def _columns(groups: Mapping[str, pd.Series], units: Mapping[str, str]) -> tuple[list[Column], list[float]]:
@@ -301,19 +321,21 @@ def _readings(column: pd.Series) -> np.ndarray:
 # Where names, units and values stand.
 
 
-def _head(path: Path) -> list[tuple[int, str, list[str]]]:
-    """Return the first lines that are not empty: number, text and fields."""
-    content = path.read_bytes()
-    if is_workbook(content):
-        rows = next(iter(read_cells(path, as_stored=True).values()))[:_HEAD]
-        return [(line, "", [cell_text(cell) for cell in cells]) for line, cells in rows]
+def _head(path: Path) -> tuple[str | None, list[tuple[int, str, list[str]]]]:
+    """Return the sheet of a table, None for the first or a text, and its first lines that are not empty: number, text and fields."""
+    if is_workbook(path.read_bytes()):
+        sheets = {
+            name: [(line, [cell_text(cell) for cell in cells]) for line, cells in rows[:_HEAD]]
+            for name, rows in read_cells(path, as_stored=True).items()
+        }
+        first = next(iter(sheets))
+        # A sheet with remarks may stand before that with the values.
+        name = next((name for name, rows in sheets.items() if _first_of_values(rows) is not None), first)
+        return (name if name != first else None), [(line, "", fields) for line, fields in sheets[name]]
     lines = text_lines(path)[:_HEAD]
     delimiter = delimiter_of_values(max(lines[len(lines) // 2 :], key=lambda line: len(line.strip()), default=""))
-    return [
-        (k, line, [text.strip() for text in fields_of(line, delimiter)])
-        for k, line in enumerate(lines, 1)
-        if line.strip()
-    ]
+    split = ((k, line, [text.strip() for text in fields_of(line, delimiter)]) for k, line in enumerate(lines, 1))
+    return None, [row for row in split if row[1].strip()]
 
 
 def _of_labview(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
@@ -355,7 +377,7 @@ def _of_monitor(head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
 def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str, Any]:
     """Return where the names, the units and the values of any other table stand, nothing where the names are its first line."""
     rows = [(line, fields) for line, text, fields in head if not text.startswith("#")]
-    first = next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
+    first = _first_of_values(rows)
     if first is None:
         raise LaserFormatError(
             f"{path}: no rows of numbers below one another; export it again with its readings, or move it out of the folder"
@@ -363,13 +385,33 @@ def _header_rows(path: Path, head: list[tuple[int, str, list[str]]]) -> dict[str
     width = len(rows[first][1])
     above = [(line, fields) for line, fields in rows[:first] if sum(map(bool, fields)) > width / 2]
     if not above:
-        return {"header_rows": {"values": rows[first][0]}}
+        if not _numbers_channels(rows[first : first + 1 + _ROWS_OF_VALUES]):
+            return {"header_rows": {"values": rows[first][0]}}
+        above, first = [rows[first]], first + 1
     header = {"names": above[-1][0], "values": rows[first][0]}
     given = [text for text in above[-1][1] if text]
-    if len(above) > 1 and sum(map(is_unit, given)) > len(given) / 2:
-        header |= {"names": above[-2][0], "units": above[-1][0]}
+    # Names may be blank above the second of two columns.
+    over = [line for line, fields in rows[:first] if line < above[-1][0] and sum(map(bool, fields)) > 1]
+    if over and sum(map(is_unit, given)) > len(given) / 2:
+        header |= {"names": over[-1], "units": above[-1][0]}
     usual = {"names": rows[0][0], "values": rows[0][0] + 1}
     return {} if header == usual else {"header_rows": header}
+
+
+def _first_of_values(rows: Sequence[tuple[int, list[str]]]) -> int | None:
+    """Return the place of the first row of values, None where there is none."""
+    return next((k for k in range(len(rows)) if _begin_values(rows[k : k + _ROWS_OF_VALUES + _ROWS_BETWEEN])), None)
+
+
+def _numbers_channels(rows: Sequence[tuple[int, list[str]]]) -> bool:
+    """Whether the first row holds names, with channels that are called by whole numbers, above rows of values."""
+    (_, names), *values = rows
+    words = [k for k, name in enumerate(names) if name and not _VALUE.fullmatch(name)]
+    return (
+        bool(words)
+        and all(name.isdecimal() for k, name in enumerate(names) if name and k not in words)
+        and all(len(fields) == len(names) and _VALUE.fullmatch(fields[words[0]].strip()) for _, fields in values)
+    )
 
 
 def _begin_values(rows: Sequence[tuple[int, list[str]]]) -> bool:
@@ -548,16 +590,18 @@ def _formatted(text: str, form: str) -> datetime | None:
 def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> Column:
     """Propose role and unit of a column from its unit, the words of its heading, and its values."""
     name, in_heading = name_and_unit(heading)
-    if in_heading.isdecimal() and "[" not in heading:
-        in_heading = ""  # TC(1), TC(2): a number, no unit
+    if "[" not in heading and not is_unit(in_heading) and (in_heading.isdecimal() or in_heading.isalpha()):
+        in_heading = ""  # TC(1), T (air): a number or a word, no unit
     suffix = read_heading(heading).unit or ""
     suffixes = _SUFFIXES | _SUFFIXES_OF.get(_word(name)[1], {})
-    unit = unit_name(unit or in_heading or suffixes.get(suffix, ""))
+    ending = suffixes.get(suffix, "")
+    told = "row of units" if unit.strip("- ") else "heading" if in_heading or ending else ""
+    unit = unit_name(unit.strip("- ") or in_heading or ending)
     first = _first(series)
     if not numbers.size:
         return Column(heading, "out", unit, first, remark=_NO_NUMBERS)
     low, high = float(numbers.min()), float(numbers.max())
-    known = Column(heading, "out", unit, first, low, high)
+    known = Column(heading, "out", unit, first, low, high, told=told)
     word, role = _word(name)
     if role == "setpoint":
         # What is commanded acts as a load does; a commanded position does not.
@@ -567,8 +611,9 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
         return replace(known, role="driver", unit=unit or "1", remark="set point")
     if unit:
         of_unit = role_of_unit(unit)
-        if role == "temperature" and of_unit == "driver" and not is_unit(unit):
-            return replace(known, role=role, remark=_UNIT_NOT_KNOWN)
+        if role in ("temperature", "displacement") and of_unit == "driver" and not is_unit(unit):
+            # What moves is no driver of itself; a temperature in an unknown unit is refused.
+            return replace(known, role=role if role == "temperature" else "out", remark=_UNIT_NOT_KNOWN)
         taken = role == "out" or (role == "driver" and of_unit == "displacement")
         return replace(known, role=role if taken and of_unit != "temperature" else of_unit)
     if role == "out":
@@ -578,14 +623,20 @@ def _column(heading: str, unit: str, series: pd.Series, numbers: np.ndarray) -> 
     if role == "driver":
         return replace(known, role=role, unit=_UNIT_OF_WORD.get(word, "1"))
     typical = float(np.median(numbers))
-    if role == "temperature" or (role == "" and 12.0 < typical < 80.0 and not (numbers == np.round(numbers)).all()):
-        return replace(
-            known, role="temperature", unit=_usual_unit("temperature", known)[0], remark="" if role else _BY_VALUES
-        )
+    warm = 12.0 < typical < 80.0 and not (numbers == np.round(numbers)).all()
+    if role == "temperature" or (role == "" and warm and _says_nothing(name)):
+        unit, remark = _usual_unit("temperature", known)
+        return replace(known, role="temperature", unit=unit, remark=remark if role else _BY_VALUES)
     if role == "displacement" or (role == "" and max(abs(low), abs(high)) < 1e-3):
         unit, remark = _usual_unit("displacement", known)
         return replace(known, role="displacement", unit=unit, remark=remark)
-    return replace(known, remark=_NOT_KNOWN)
+    # A balance and a voltage have the numbers of a temperature too.
+    return replace(known, remark=_BY_VALUES if role == "" and warm else _NOT_KNOWN)
+
+
+def _says_nothing(name: str) -> bool:
+    """Whether a name is a number, or only calls a column a channel."""
+    return _SAYING_NOTHING.issuperset(re.findall(r"[^\W\d_]+", name.casefold()))
 
 
 def _word(name: str) -> tuple[str, str]:
@@ -605,13 +656,13 @@ def _usual_unit(role: str, column: Column) -> tuple[str, str]:
     span = column.high - column.low
     if role == "temperature":
         # Kelvins of a machine are above what its degrees Celsius reach.
-        return ("K" if column.low > 250.0 and column.high < 450.0 else "degC"), ""
+        return ("K" if column.low > 250.0 and column.high < 450.0 else "degC"), _UNIT_BY_VALUES
     if role != "displacement":
         return ("1" if role == "driver" else ""), ""
     # Thermal displacements are micrometres to tenths of millimetres.
     unit = "um" if span >= 2.0 else "mm" if span >= 2e-3 else "m"
     whole = column.low.is_integer() and column.high.is_integer()
-    return unit, _COUNTS if whole else "unit by its values"
+    return unit, _COUNTS if whole else _UNIT_BY_VALUES
 
 
 def _is_unit_of(role: str, unit: str) -> bool:

@@ -542,7 +542,11 @@ def _confirmed(table: TableProposal, name: str, asker: Asker) -> TableProposal:
         taken = {column: replace(column, unit=answer) for column in group}
         table = replace(table, columns=tuple(taken.get(column, column) for column in table.columns))
     assumed = ["time_unit"] if "time_unit" in table.asked and keys["time_unit"] != TO_FILL else []
-    assumed += [column.heading for column in guessed]
+    assumed += [
+        column.heading
+        for column in table.columns
+        if column in guessed or (column.role in ROLES[1:-1] and column.is_guessed)
+    ]
     return replace(table, keys=keys | ({"guessed": assumed} if assumed and asker.ask is None else {}))
 
 

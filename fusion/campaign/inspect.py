@@ -54,7 +54,7 @@ from thermography.io.sequence import camera_names
 from thermography.registration.plan import read_fiducials
 
 if TYPE_CHECKING:
-    from fusion.campaign.columns import TableProposal
+    from fusion.campaign.columns import Column, TableProposal
 
 
 # What kind of file something is: each kind declared once, with how it is recognised by its content, read and described.
@@ -67,6 +67,8 @@ _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "senso
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
 #: Units of the temperatures and of the displacements of a record.
 _OF_A_RECORD = ({"degC", "K", "degF"}, {"um", "nm", "mm", "in", "mil"})
+#: Fewest names of a line that heads a table, and no remark above a picture.
+_NAMED = 4
 #: Columns of a table of places on the plan.
 _PLACE = {"name", "x_mm", "y_mm"}
 
@@ -213,6 +215,12 @@ def _refuse_list_of_pixels(found: Recognised) -> None:
             )
 
 
+def _may_hold_a_frame(found: Recognised) -> bool:
+    # Hundreds of columns with a time among their names are a logged table.
+    named = len(found.first_line) >= _NAMED and any(map(is_time, found.first_line))
+    return isinstance(found.reader, TextReader) and not named and found.reader.holds_a_frame(found.path)
+
+
 def _is_lens(found: Recognised) -> bool:
     return any(name in (found.text or "") for name in ("camera_matrix", "cameraMatrix"))
 
@@ -337,23 +345,86 @@ def _describe_regions(found: Recognised) -> list[str]:
     return [f"{counted(len(names), 'region')} of the plan: {join(names)}"]
 
 
+#: Columns alike in role and unit that are described one by one.
+_COLUMNS_ALIKE = 12
+
+
 def _describe_record(found: Recognised) -> list[str]:
     table = found.content
-    roles = {"temperature": "temperature", "displacement": "displacement", "driver": "driver", "out": "unused column"}
-    columns = {kind: [column.heading for column in table.of(role)] for role, kind in roles.items()}
-    described = [f"{counted(len(names), kind)}: {join(names)}" for kind, names in columns.items() if names]
+    sheet = f"sheet {table.keys['sheet']!r}, " if "sheet" in table.keys else ""
     held = join([column.heading for column in table.of("time")])
     time = (
         f"time in the column {held}" if held else "a line for every change" if "long" in table.keys else "without times"
     )
-    return [f"record, {counted(table.rows, 'row')}, {time}", *described, *_warnings(table)]
+    unit = table.keys.get("time_unit", "")
+    doubt = f" in {unit}, which nothing states" if "time_unit" in table.asked and unit else ""
+    lacks = [f"warning: {table.lacks}"] if table.lacks else []
+    return [
+        f"record, {sheet}{counted(table.rows, 'row')}, {time}{doubt}",
+        *_course(table.time, table.reference, "row"),
+        *_columns(table),
+        *lacks,
+        *_warnings(table),
+    ]
+
+
+def _columns(table: TableProposal) -> Iterator[str]:
+    """Say of each column what it is taken for, its unit and where that stands, and its range; of many alike together."""
+    alike: dict[tuple[str, str, str], list[Column]] = {}
+    for column in table.columns:
+        how = column.remark or (f"by its {column.told}" if column.told else "")
+        alike.setdefault((column.role, column.unit, how), []).append(column)
+    for (role, unit, how), columns in alike.items():
+        if role == "time":
+            continue
+        words = ", ".join(filter(None, ("unused" if role == "out" else role, print_unit(unit) if unit else "", how)))
+        if len(columns) <= _COLUMNS_ALIKE:
+            yield from (f"{one.heading}: {words}{f', {one.span}' if one.span else ''}" for one in columns)
+            continue
+        low, high = min(one.low for one in columns), max(one.high for one in columns)
+        names = f"{columns[0].heading} ... {columns[-1].heading} ({len(columns)} columns)"
+        yield f"{names}: {words}" + (f", {low:.5g} to {high:.5g}" if np.isfinite(low) else "")
+
+
+def _course(times: NDArray[np.datetime64], reference: str, noun: str) -> Iterator[str]:
+    """Say from when to when something was logged, how often, and where there are gaps."""
+    from interferometry.io.tables import DATED, NO_ZONE
+
+    timed = np.sort(times[~np.isnat(times)])
+    if timed.size == 0:
+        return
+    length = duration(float((timed[-1] - timed[0]) / np.timedelta64(1, "s")))
+    if timed[0] < DATED:
+        first, last = (
+            f"{float((time - np.datetime64(0, 's')) / np.timedelta64(1, 's')):.10g} s" for time in timed[[0, -1]]
+        )
+        yield f"{first} to {last} after a start that is not stated, {length}"
+    else:
+        zone = "" if reference == NO_ZONE else None
+        yield f"{moment(timed[0], zone)} to {moment(timed[-1], zone)}, {length}, {reference}"
+    if timed.size > 1:
+        yield _rate(timed, noun)
+
+
+def _rate(timed: NDArray[np.datetime64], noun: str) -> str:
+    """Say how far apart sorted times are, and where there are gaps."""
+    gaps = [
+        f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
+        for (_, end), (start, _) in itertools.pairwise(Recording("", timed).stretches())
+    ]
+    step_s = float(np.median(np.diff(timed).astype("m8[ns]").astype(np.int64))) * 1e-9
+    rate = f"{1 / step_s:.3g} {noun}s per second" if step_s > 0 else f"{noun}s of one time"
+    every = f"a {noun} every {duration(step_s)}" if step_s >= 1 else rate
+    return f"{every}, {counted(len(gaps), 'gap')}{': ' + listed(gaps) if gaps else ''}"
 
 
 def _describe_log(found: Recognised) -> list[str]:
     log = found.content
     name = "drivers" if found.kind is Kind.DRIVERS else "environment"
-    first, last = log["time"].values[0], log["time"].values[-1]
-    lines = [f"{name}, {log.sizes['time']} rows, {moment(first)} to {moment(last)}, {log['time'].attrs['reference']}"]
+    lines = [
+        f"{name}, {counted(log.sizes['time'], 'row')}",
+        *_course(log["time"].values, log["time"].attrs["reference"], "row"),
+    ]
     for variable, values in log.data_vars.items():
         unit = "" if values.attrs["units"] == "1" else print_unit(values.attrs["units"])
         lines.append(f"{variable} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}".rstrip())
@@ -400,7 +471,7 @@ class Kind(Enum):
     FRAMES = FileKind("thermal frames", _holds_counts, inspect_file, _describe_frames, "thermography.frames")
     STACK = FileKind(
         "frames of temperatures", _holds_temperatures, read_stack, lambda found: describe_stack(found.content), "thermography.frames",
-        may_be=lambda found: isinstance(found.reader, TextReader) and found.reader.holds_a_frame(found.path),
+        may_be=lambda found: _may_hold_a_frame(found),
         unused=", not mixed with the frames of a FLIR camera",
     )  # fmt: skip
     LENS = FileKind("lens calibration", _is_lens, _read_lens, _describe_lens, "thermography.lens")
@@ -786,14 +857,7 @@ def _times(frames: Sequence[FrameReference]) -> Iterator[str]:
         yield f"{moment(timed[0])} (camera set to {zone})"
         return
     yield f"{moment(timed[0])} to {moment(timed[-1])}, {duration(length_s)} (camera set to {zone})"
-    gaps = [
-        f"{moment(end)}, {duration(float((start - end) / np.timedelta64(1, 's')))}"
-        for (_, end), (start, _) in itertools.pairwise(Recording("frames", timed).stretches())
-    ]
-    step_s = float(np.median(np.diff(timed).astype(np.int64))) * 1e-9
-    rate = f"{1 / step_s:.3g} frames per second" if step_s > 0 else "frames of one time"
-    every = f"a frame every {duration(step_s)}" if step_s >= 1 else rate
-    yield f"{every}, {counted(len(gaps), 'gap')}{': ' + listed(gaps) if gaps else ''}"
+    yield _rate(timed, "frame")
 
 
 def _settings(frames: Sequence[FrameReference]) -> str:

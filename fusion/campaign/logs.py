@@ -53,8 +53,10 @@ from interferometry.io.tables import (
     raise_if_too_wide,
     read_table,
     read_timed_rows,
+    shown,
     where_clock_goes_back,
 )
+from thermofuse.resources import vocabulary
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
@@ -71,6 +73,9 @@ _LONGEST_SILENCE = 10.0
 #: Hours, minutes and seconds; of two numbers nothing tells whether they are minutes and seconds.
 _ELAPSED = re.compile(r"(\d{2,5})(:\d\d:\d\d\S*)")
 _DECIMAL_COMMA = re.compile(r"\d,\d")
+#: Zones by their short names, as +hhmm, and such a name in a heading, of UTC with hours and minutes.
+_ZONES: Mapping[str, str] = vocabulary("columns")["zones"]
+_IN_ZONE = re.compile(rf"(?<![^\W_])({'|'.join(_ZONES)})(?:\s*([+-]\d\d?)(?::?(\d\d))?)?(?![^\W_])")
 #: A heading in quotes that goes on in the next line, as Excel's Alt+Enter writes it, and the most lines of such headings.
 _OPEN_HEADING = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
 _LONGEST_HEADER = 20
@@ -417,9 +422,9 @@ def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRo
     first = next(k for k, line in enumerate(lines) if _is_spaced(line) and len(line.split()) == usual[_WORDS])
     above = [k for k in range(header.values - 1 if header else first) if not _RULED.fullmatch(lines[k])]
     above = [k for k in above if not lines[k].startswith("#")]
-    asked = [k for k in above if len(lines[k].split()) > 1][-1:]
+    asked = [k for k in above if len(lines[k].split()) > 1][-2:]
     if header is not None:
-        asked = [line - 1 for line in (header.units, header.names) if line]
+        asked = [line - 1 for line in (header.names, header.units) if line]
     parts = next(
         (one for one in _VALUES for k in asked if any(len(names.findall(lines[k])) == usual[one] for names in _NAMES)),
         _WORDS,
@@ -445,13 +450,13 @@ def _tabulated(path: Path, lines: list[str], sample: list[str], header: HeaderRo
         return None if in_order and by_place not in (None, in_order) else in_order or by_place
 
     told = {k: named(lines[k]) for k in above}
-    units = [text for text in told.get(next(iter(asked), -1)) or () if text]
-    if header is None and sum(map(is_unit, units)) > len(units) / 2:
-        asked += [k for k in above if k < asked[0]][-1:]
+    units = [text for text in told.get(asked[-1]) or () if text] if asked else []
+    if header is None and sum(map(is_unit, units)) <= len(units) / 2:
+        asked = asked[-1:]
     for k in asked:
         if told[k] is None:
             raise LaserFormatError(
-                f"{path}, line {k + 1}: {lines[k].strip()!r} does not name the {width} columns of values below it, one by one; part names "
+                f"{path}, line {k + 1}: {shown([lines[k].strip()])} does not name the {width} columns of values below it; part names "
                 "and values by tabs or semicolons and give every name on this line, or write header_rows = "
                 f"{{values = {first + 1}}} in the campaign file, with which the columns are called by their numbers"
             )
@@ -518,12 +523,15 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
 
 def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) -> Rows:
     """Return rows with the names of their columns, and their units, without the spaces around them."""
-    names: list[str] = []
-    for name in frame.columns:
+    names: dict[str, None] = {}
+    for k, name in enumerate(frame.columns):
         plain = str(name).strip()
+        if plain == f"Unnamed: {k}" and names and (unit := "".join(units[k : k + 1]).strip()):
+            # A name above two columns: the second is told by its unit.
+            plain = f"{name_and_unit(next(reversed(names)))[0]} [{unit}]"
         # As pandas numbers headings that are alike.
-        names.append(next(one for one in chain([plain], (f"{plain}.{k}" for k in count(1))) if one not in names))
-    frame.columns = names
+        names[next(one for one in chain([plain], (f"{plain}.{n}" for n in count(1))) if one not in names)] = None
+    frame.columns = list(names)
     return Rows(frame, {str(name): unit.strip() for name, unit in zip(frame.columns, units, strict=False)}, left_out)
 
 
@@ -660,6 +668,8 @@ def read_times(
                 continue
             zones.setdefault(zone, int(column.index[at]))
         words = describe_time_zone(path, zones) if zones else ""
+    if words == NO_ZONE and (zone := _zone_of(" ".join(headings))):
+        time, words = time - _offset(zone), f"{describe_time_zone(path, {zone: 0})}, as the heading says"
     timed = ~np.isnat(time)
     cells = frame[list(headings)]
     left_out = [
@@ -670,6 +680,23 @@ def read_times(
         path, int(timed.sum()), left_out, last=int(frame.index[timed].max()) if timed.any() else None
     )
     return time, words, left_out
+
+
+def _zone_of(heading: str) -> str:
+    """Return the zone that a heading such as "Date Time, GMT+02:00" or "Time (CEST)" names, as +hhmm; empty where it names none.
+
+    >>> _zone_of("Date Time, GMT+2"), _zone_of("Timestamp [UTC]"), _zone_of("Time (CEST)"), _zone_of("Time (s)")
+    ('+0200', '+0000', '+0200', '')
+    """
+    if (match := _IN_ZONE.search(heading)) is None:
+        return ""
+    return f"{match[2][0]}{match[2][1:]:>02}{match[3] or '00'}" if match[2] else _ZONES[match[1]]
+
+
+def _offset(zone: str) -> np.timedelta64:
+    """Return how far a zone such as +0530 is ahead of UTC."""
+    minutes = 60 * int(zone[1:3]) + int(zone[3:])
+    return np.timedelta64(-minutes if zone[0] == "-" else minutes, "m")
 
 
 def _after_start(elapsed: np.ndarray, record: LoggedTable, path: Path) -> tuple[np.ndarray, str, list[RejectedLine]]:

@@ -125,8 +125,8 @@ def guess_notices(campaign: Campaign) -> Iterator[Notice]:
         named = listed(f"{name} = {units.get(name) or 'not stated'}" for name in record.guessed)
         yield Notice(
             "units_guessed",
-            f"Assumed, because the table does not state it and its values suggest it: {named}. Another unit changes every time constant or "
-            "every displacement by its factor.",
+            f"Assumed, because the table does not state it and its values suggest it: {named}. Another unit changes every time constant, "
+            "temperature or displacement by its factor.",
             "Look it up at the logger, correct it where it is another, and remove it from record.guessed.",
         )
 

@@ -543,6 +543,60 @@ ALIGNED = {
 }
 
 
+@pytest.mark.parametrize(
+    ("head", "temperatures", "displacements", "guessed"),
+    [
+        # A name stands above two columns, the second of which its unit tells.
+        (
+            "Time,Dendro A,,Dendro B,\n,um,degC,um,degC",
+            ["Dendro A [degC]", "Dendro B [degC]"],
+            ["Dendro A", "Dendro B"],
+            (),
+        ),
+        # Channels that are called by numbers are no values.
+        ("Time,101,102,103,104", ["102", "104"], [], ("101", "102", "103", "104")),
+        ("Time,X,T bed,Y,T (air)", ["T bed", "T (air)"], ["X", "Y"], ("X", "T bed", "Y", "T (air)")),
+        # Balances in kg have the numbers of temperatures.
+        ("Time,X [um],Net(1),Y [furlong],T1 [degC]", ["T1 [degC]"], ["X [um]"], ()),
+    ],
+)
+def test_what_only_values_tell_is_marked_and_a_name_that_says_something_else_is_no_temperature(
+    tmp_path: Path, head: str, temperatures: list[str], displacements: list[str], guessed: tuple[str, ...]
+) -> None:
+    lines = [f"{60 * k},{k}.5,{20 + k / 100},{k}.25,{21 + k / 90:.3f}" for k in range(120)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([head, *lines]).replace("Time", "Time [s]") + "\n")
+    table = propose_table(path)
+    assert {*temperatures} <= {one.heading for one in table.of("temperature")}
+    assert [one.heading for one in table.of("displacement")] == displacements
+    assert tuple(one.heading for one in table.columns if one.role != "out" and one.is_guessed) == guessed
+    if displacements:
+        record = load_campaign(write_campaign(tmp_path, Asker(None))[0]).record
+        assert record is not None and record.guessed == guessed
+
+
+def test_a_cover_sheet_is_passed_over(tmp_path: Path, by_hand: xr.Dataset) -> None:
+    book = openpyxl.Workbook()
+    book.active.append(["Machine", "Mill 7"])
+    sheet = book.create_sheet("Data")
+    for row in [("Date", "T1 [°C]", "T2 [°C]", "Z [mm]"), *zip(map(str, STAMPS), SPINDLE, BEARING, NOSE, strict=True)]:
+        sheet.append([one if isinstance(one, str) else float(one) for one in row])
+    book.save(tmp_path / "log.xlsx")
+    data = drafted(tmp_path / "folder", (tmp_path / "log.xlsx").read_bytes(), "log.xlsx")
+    np.testing.assert_allclose(data["displacement"].values, by_hand["displacement"].values, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("heading", "hours"),
+    [("Date Time, GMT+02:00", 2), ("Timestamp [UTC]", 0), ("Date-Time (CEST)", 2), ("Time (UTC-5)", -5)],
+)
+def test_a_zone_in_the_heading_is_that_of_its_times(tmp_path: Path, heading: str, hours: int) -> None:
+    (tmp_path / "log.csv").write_text(f'"{heading}",T1 [degC],Z [mm]\n' + rows("{time:%Y-%m-%d %H:%M:%S},{t1},{z}"))
+    data = read_record(load_campaign(write_campaign(tmp_path, Asker(None))[0]))
+    assert data["time"].values[0] == START - np.timedelta64(hours, "h")
+    assert "as the heading says" in str(data["time"].attrs["reference"])
+
+
 @pytest.mark.parametrize("align", ["<", ">"])
 @pytest.mark.parametrize("layout", ALIGNED)
 def test_names_and_units_stand_above_their_columns(tmp_path: Path, layout: str, align: str) -> None:

@@ -136,21 +136,30 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
     # A sensor has one place, a region several corners.
     (Kind.PLACES, "a.csv", "name,x_mm,y_mm\nT1,50,50\nT2,150,50\n", ["places of 2 contact sensors on the plan: T1 and T2"]),
     (Kind.ENVIRONMENT, "a.csv", AIR + "".join(f"\n{DAY}:{m:02d}:00Z,{20 + m / 10},1000,45,21" for m in range(10)),
-     ["environment, 10 rows, 2026-03-09 06:00 UTC to 2026-03-09 06:09 UTC, UTC in the file", "  air_temperature 20.00 to 20.90 °C"]),
+     ["environment, 10 rows", "  2026-03-09 06:00 UTC to 2026-03-09 06:09 UTC, 9 min, UTC in the file", "  a row every 60 s, 0 gaps",
+      "  air_temperature 20.00 to 20.90 °C"]),
     (Kind.ENVIRONMENT, "a.csv", f"# logged\n\n{AIR.replace(',', ';')}\n{DAY}:00:00;20;1000;45;21\n",
-     ["environment, 1 rows, 2026-03-09 06:00 UTC to 2026-03-09 06:00 UTC, no zone in the file: taken as UTC"]),
+     ["environment, 1 row", "  2026-03-09 06:00 (no zone) to 2026-03-09 06:00 (no zone), 0 s, no zone in the file: taken as UTC"]),
     (Kind.ENVIRONMENT, "a.csv", "Zeit;Lufttemperatur [°C];Luftdruck [hPa];Luftfeuchte [%];Materialtemperatur [°C]\n"
      "9.3.2026 6:30:00;20;1000;45;21\n", []),
     (Kind.DRIVERS, "a.csv", f"time,spindle [1/min],pump [1]\n{DAY}:30:00Z,1,0\n{DAY}:31:00Z,9,0\n",
-     ["drivers, 2 rows, 2026-03-09 06:30 UTC to 2026-03-09 06:31 UTC, UTC in the file", "  spindle 1.00 to 9.00 1/min"]),
+     ["drivers, 2 rows", "  2026-03-09 06:30 UTC to 2026-03-09 06:31 UTC, 60 s, UTC in the file", "  a row every 60 s, 0 gaps",
+      "  spindle 1.00 to 9.00 1/min"]),
     (Kind.DEVIATIONS, "a.csv", LASER, ["deviations, 2 cycles, 2 targets from 100 to 200 mm, 8 of 8 readings"]),
     (Kind.DEVIATIONS, "a.csv", "Position [mm],1+ [um],1- [um]\n0,0.1,0.2\n100,0.3,0.4\n",
      ["deviations, 1 cycle, 2 targets from 0 to 100 mm, 4 of 4 readings", "  deviation 0.100 to 0.400 µm"]),
     (Kind.DEVIATIONS, "a.dat", "UNIT=mm\nTGT_DATA[1]=0\nTGT_DATA[2]=1\n" + "".join(
         f"REF_DATA_{way}[{t},1]={t - 1}.001\n" for way in ("FWD", "BWD") for t in (1, 2)), []),
     (Kind.RECORD, "a.csv", "time [s],t1 [degC],ch1 [um],speed [1/min]\n0,20,0,1\n1,20,0,1\n",
-     ["record, 2 rows, time in the column time [s]", "  1 temperature: t1 [degC]", "  1 displacement: ch1 [um]",
-      "  1 driver: speed [1/min]"]),
+     ["record, 2 rows, time in the column time [s]", "  0 s to 1 s after a start that is not stated, 1 s", "  a row every 1 s, 0 gaps",
+      "  t1 [degC]: temperature, °C, by its heading, 20 to 20", "  ch1 [um]: displacement, µm, by its heading, 0 to 0",
+      "  speed [1/min]: driver, 1/min, by its heading, 1 to 1"]),
+    # A table of many columns with a time and names is no picture; what only the values tell is said.
+    (Kind.RECORD, "a.csv", "Time," + ",".join(f"T{k}" for k in range(60)) + ",X\n" + "".join(
+        f"{60 * k},{','.join(f'{20 + n / 10 + k / 100:.2f}' for n in range(60))},{k}.5\n" for k in range(60)),
+     ["record, 60 rows, time in the column Time in s, which nothing states", "  0 s to 3540 s after a start that is not stated, 59 min",
+      "  a row every 60 s, 0 gaps", "  T0 ... T59 (60 columns): temperature, °C, unit by its values, 20 to 26.49",
+      "  X: displacement, µm, unit by its values, 0.5 to 59.5"]),
     *((Kind.RECORD, "a.csv", f"{time};Lager [°C];Z [µm]\n09.03.2026 06:30;20,5;0,25\n09.03.2026 06:31;20,6;0,35\n",
        [f"record, 2 rows, time in the column {time}"]) for time in ("Datum", "Zeit", "fecha y hora", "时间", "Date")),
     (Kind.RECORD, "a.xlsx", write_sheet({"time (s)": [0, 1], "t1(°C)": [20, 20], "ch1(um)": [0, 1]}), ["record, 2 rows"]),
@@ -158,6 +167,7 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
 ]  # fmt: skip
 #: What nothing reads, and why not.
 UNREAD = [
+    ("a.csv", ",".join(["20"] * 50_000), "columns; the file is damaged or no table"),
     ("a.toml", "[tool]\nx = 1\n", "neither a campaign nor a recipe"),
     ("a.toml", "[tool\n", "this is not TOML"),
     ("a.md", "# Notes\n\nNothing measured.\n", "no table of deviations"),
