@@ -131,7 +131,7 @@ def verify_compensation(before: Path, after: Path, applied: Path) -> Verificatio
             f"{after}: name one run as record.file; each test after a compensation is verified by itself"
         )
     health = examine_record(table, [QUASI_STATIC])
-    record = reduce_record(health.table)
+    record = reduce_record(health.table, constants=[one.name for one in model.inputs])
     faulty = {one.sensor: describe_fault(one) for one in health.findings if one.state == "left_out"}
     remarks = []
     if model.results_sha256 != file_sha256(before / "results.json"):

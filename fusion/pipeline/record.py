@@ -248,7 +248,14 @@ def record_notices(record: Record) -> Iterator[Notice]:
             f"Left out because they duplicate other sensors: {listed(record.duplicates)}.",
             "Name each sensor once under record.temperatures.",
         )
-    if not record.drivers:
+    if record.constant_drivers:
+        yield Notice(
+            "constant_drivers",
+            f"Constant over the whole test: {listed(record.constant_drivers)}. How the machine responds to it is not known, so that a "
+            "prediction holds at that load alone.",
+            "Vary it in a test: thermofuse plan proposes when.",
+        )
+    elif not record.drivers:
         yield Notice(
             "no_drivers",
             "The record has no driver that changes, so a heat source that no sensor sees cannot be distinguished from a drift.",
@@ -300,7 +307,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
         for exponent in EXPONENTS
     )
     sizes, units = ([record.driver_sizes[name][k] for name in record.drivers] for k in (0, 1))
-    um: dict[str, Any] = {"units": "um"}
+    constant, um = record.constant_drivers, {"units": "um"}
     celsius = {"units": "degC", "units_metadata": "temperature: on_scale"}
     elapsed = "time since the first sample" + (", time between runs left out" if record.runs else "")
     unseen = "from parts that the model had not seen"
@@ -337,7 +344,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             "driver_name": list(record.drivers),
             "effect": unique,
         },
-        attrs={"block_s": record.block_s},
+        attrs={"block_s": record.block_s, **({"constant_drivers": ", ".join(constant)} if constant else {})},
     )
     if not record.runs:
         return dataset

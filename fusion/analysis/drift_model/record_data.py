@@ -7,7 +7,7 @@ time constant; drivers are averaged after they are raised to a power, because he
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -100,6 +100,7 @@ class Record:
     runs : of a record of several runs; empty where there is one
     first : number of the first block of every run
     driver_sizes : driver to its largest size and the unit of that
+    constant_drivers : loads that are left out because they never change, as "name (value unit)"
     """
 
     start: np.datetime64
@@ -122,6 +123,7 @@ class Record:
     runs: tuple[RecordedRun, ...] = ()
     first: tuple[int, ...] = (0,)
     driver_sizes: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    constant_drivers: tuple[str, ...] = ()
 
     @property
     def rise(self) -> Array:
@@ -252,13 +254,15 @@ class _Blocks:
         return "" if known[chained < 2].mean() >= 0.5 else "has too few values at the beginning"
 
 
-def reduce_record(table: xr.Dataset) -> Record:
+def reduce_record(table: xr.Dataset, *, constants: Collection[str] = ()) -> Record:
     """Average a record over blocks; blocks without any sample (a pause) are left out.
 
     Parameters
     ----------
     table : Dataset
         What `read_record` returns: temperatures in degC, displacements in um and drivers over time.
+    constants : collection of str
+        Drivers that are kept though they never change, as a model reads them.
 
     Returns
     -------
@@ -278,7 +282,7 @@ def reduce_record(table: xr.Dataset) -> Record:
     elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
     table, impossible = _without_impossible(table)
     blocks = _lay_blocks(table, elapsed)
-    drivers, driver_sizes = _drivers(table, blocks)
+    drivers, driver_sizes, constant_drivers = _drivers(table, blocks, constants)
     chained = _chained_runs(blocks, [powers[1] for powers in drivers.values()])
     means = {
         str(name): blocks.zeroed(values)
@@ -330,6 +334,7 @@ def reduce_record(table: xr.Dataset) -> Record:
         runs=_runs(table, blocks),
         first=blocks.first,
         driver_sizes=driver_sizes,
+        constant_drivers=constant_drivers,
     )
 
 
@@ -409,20 +414,24 @@ def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
     )
 
 
-def _drivers(table: xr.Dataset, blocks: _Blocks) -> tuple[dict[str, dict[int, Array]], dict[str, tuple[float, str]]]:
-    """Powers of every driver as shares of its largest size, and that size with its unit ("1" where the table states none); one that
-    never changes is left out.
+def _drivers(
+    table: xr.Dataset, blocks: _Blocks, kept: Collection[str]
+) -> tuple[dict[str, dict[int, Array]], dict[str, tuple[float, str]], tuple[str, ...]]:
+    """Powers of every driver as shares of its largest size, that size with its unit ("1" where the table states none), and loads that
+    are left out because they never change.
     """
     units = table["driver_units"].values if "driver_units" in table else ["1"] * table.sizes["driver_name"]
-    drivers, sizes = {}, {}
+    drivers, sizes, constant = {}, {}, []
     for k, name in enumerate(str(one) for one in table["driver_name"].values):
         values = table["driver"].values[:, k]
         largest = float(np.nanmax(np.abs(values), initial=0.0))
-        if largest == 0.0 or np.nanmin(values) == np.nanmax(values):
+        if (largest == 0.0 or np.nanmin(values) == np.nanmax(values)) and name not in kept:
+            constant += [f"{name} ({np.nanmax(values):g} {units[k]})"] if largest > 0.0 else []
             continue
+        largest = largest or 1.0
         drivers[name] = {exponent: blocks.filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
         sizes[name] = (largest, str(units[k]))
-    return drivers, sizes
+    return drivers, sizes, tuple(constant)
 
 
 def independent(columns: Array) -> list[int]:

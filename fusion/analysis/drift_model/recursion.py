@@ -479,6 +479,11 @@ def make_recursion(
     sensors: Sequence[str] = record.sensors
     curve: list[SensorCurvePoint] = []
     told = [*remarks]
+    if constant := product.attrs.get("constant_drivers"):
+        told.append(
+            f"constant over the whole test: {constant}; how the machine responds to it is not known: correction and uncertainty hold at "
+            "that load alone, from a start as in the test, and nothing reads it"
+        )
     if reduced:
         curve, chosen = sensor_curve(record, events_of(product, loop), train)
         sensors = chosen.sensors

@@ -344,7 +344,9 @@ def _table_texts(
     texts[f"{file}{PREDICTION_ENDING}"] = json.dumps(tested.model_dump(mode="json"), indent=2) + "\n"
     if not control.comment:
         texts[f"{file}.README.txt"] = "\n".join(header) + "\n"
-    missing = [f"A, E, M and B with the table are not predicted: {tested.not_predicted}"] if tested.not_predicted else []
+    missing = (
+        [f"A, E, M and B with the table are not predicted: {tested.not_predicted}"] if tested.not_predicted else []
+    )
     return texts, [*_forced(against), *remarks(run.results), *missing]
 
 
@@ -407,10 +409,14 @@ def _model_text(
         raise ExportError(
             f"--sampling {sampling_s:g} s does not suit a thermal state; write a time above 0 and up to 60 s"
         )
-    against = _forced(_judge(objections_to_model(results), force=force))
+    product = read_product(folder, "record")
+    constant, against = product.attrs.get("constant_drivers"), objections_to_model(results)
+    if constant and not product.sizes["driver_name"]:
+        against.append(f"nothing shows how the machine responds to what never changed in the test: {constant}")
+    against = _forced(_judge(against, force=force))
     with naming(folder):
         model = make_recursion(
-            read_product(folder, "record"),
+            product,
             results.loop,
             campaign=results.campaign,
             results_sha256=file_sha256(folder / "results.json"),

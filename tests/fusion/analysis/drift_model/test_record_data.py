@@ -24,6 +24,20 @@ def test_blocks_hold_the_means_of_their_samples(rng):
     assert record.drivers["speed"][1].max() == 1.0
 
 
+def test_a_load_that_never_changes_is_left_out_by_name_or_kept_where_a_model_reads_it(rng):
+    displacement, temperature, speed = linear_samples(rng)
+    table = table_of(displacement, temperature, np.full(speed.size, 6000.0))
+    assert reduce_record(table).constant_drivers == ("speed (6000 1/min)",) and not reduce_record(table).drivers
+    kept = reduce_record(table, constants=["speed"])
+    assert kept.constant_drivers == () and kept.driver_sizes["speed"] == (6000.0, "1/min")
+    np.testing.assert_array_equal(kept.drivers["speed"][2], 1.0)
+    still = table_of(displacement, temperature, np.zeros(speed.size))
+    assert (
+        reduce_record(still).constant_drivers == ()
+        and not reduce_record(still, constants=["speed"]).drivers["speed"][1].any()
+    )
+
+
 def test_digits_count_less_in_means_only_where_the_readings_dither(rng):
     time = np.linspace(0.0, 20.0, 2000)
     smooth, dithered = np.round(time), np.round(time + rng.normal(0.0, 1.0, 2000))

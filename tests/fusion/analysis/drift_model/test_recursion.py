@@ -114,6 +114,13 @@ def test_a_temperature_far_outside_the_test_is_that_of_a_failed_sensor_and_a_lar
             assert one.low == one.failed_below == pytest.approx(-0.02 * 2.0 * beyond)
 
 
+def test_a_load_that_never_changed_is_said_in_the_model(driven):
+    _, product, loop = driven
+    marked = product.assign_attrs(constant_drivers="coolant (5 l/min)")
+    (told,) = (one for one in make_recursion(marked, loop, sampling_s=60.0, **FROM).remarks if "coolant" in one)
+    assert told.startswith("constant over the whole test: coolant (5 l/min)") and "hold at that load alone" in told
+
+
 def test_a_spindle_that_turns_the_other_way_than_in_the_test_is_a_failed_reading(driven):
     record, product, loop = driven
     model = make_recursion(product, loop, sampling_s=record.block_s, **FROM)

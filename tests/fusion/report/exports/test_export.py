@@ -175,6 +175,14 @@ def test_a_prediction_that_is_missing_or_damaged_says_what_to_do(tmp_path):
         read_table_prediction(tmp_path / "x.comp")
 
 
+def test_a_model_of_a_test_at_one_speed_is_refused(tmp_path):
+    write_record(tmp_path)
+    record = read_dataset(tmp_path / "fusion.nc").isel(driver_name=[]).drop_encoding()
+    write_dataset(tmp_path / "fusion.nc", record.assign_attrs(constant_drivers="spindle (6000 rpm)"))
+    with pytest.raises(ExportError, match=r"what never changed in the test: spindle \(6000 rpm\)"):
+        export_results(tmp_path, "model-json", tmp_path / "out")
+
+
 def test_a_run_of_the_camera_alone_has_its_fields(tmp_path):
     write_fields(tmp_path)
     write_json(tmp_path / "results.json", assemble("C", {}, []).as_json())
