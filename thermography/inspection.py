@@ -26,8 +26,6 @@ from thermography.radiometry.planck import (
     temperature_from_counts,
 )
 
-#: Most frames whose records are compared with their checksums, spread evenly over the file; that of the pixels is compared in all.
-_FRAMES_CHECKED = 32
 #: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
 #: Code of a warning -> what to do about it.
@@ -169,13 +167,11 @@ def inspect_file(path: str | os.PathLike[str]) -> FlirInspection:
         pass  # `_check_parameters` names what is wrong
     except ThermographyError as error:
         rejected.append(RejectedFrame(path, 0, str(error)))
-    unread = {each.index for each in rejected}
-    checked = np.unique(np.linspace(0, len(references) - 1, _FRAMES_CHECKED).round().astype(int))
     warnings = [
         *(_warning("frame_left_out", f"{each.reason}.") for each in rejected),
         *_check_times(references),
         *_check_parameters(references, ()),
-        *(one for i in checked if references[i].index not in unread for one in _check_checksums(references[i])),
+        *_check_checksums(references),
         *(_check_pixels(evaluation) if evaluation else ()),
         *(_check_transmission(evaluation) if evaluation else ()),
     ]
@@ -369,11 +365,11 @@ def _check_parameters(references: Sequence[FrameReference], overridden: Collecti
         yield _warning("not_calibrated", "the Planck constants are not positive.")
 
 
-def _check_checksums(frame: FrameReference) -> Iterator[FileWarning]:
-    """Warn about records that differ from their checksum."""
-    if kinds := frame.damaged_records():
-        names = ", ".join(f"0x{kind:02X}" for kind in kinds)
-        yield _warning("checksum", f"frame {frame.index}: records {names} differ from their checksum.")
+def _check_checksums(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
+    """Warn about headers that differ from their checksum."""
+    if altered := [str(frame.index) for frame in references if frame.altered]:
+        told = f"{altered[0]} to {altered[-1]}" if len(altered) > 1 else altered[0]
+        yield _warning("checksum", f"the headers of {len(altered)} frames, {told}, differ from their checksums.")
 
 
 def _check_pixels(evaluation: RegionTable) -> Iterator[FileWarning]:

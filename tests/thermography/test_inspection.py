@@ -123,7 +123,7 @@ def test_damage_gives_a_warning(tmp_path):
     path.write_bytes(data[:-10])
     messages = {each.code: each.message for each in inspect_file(path).warnings}
     assert set(messages) == {"checksum", "frame_left_out"}
-    assert messages["checksum"] == "frame 0: records 0x20 differ from their checksum."
+    assert messages["checksum"] == "the headers of 1 frames, 0, differ from their checksums."
     assert "the frame is truncated" in messages["frame_left_out"]
 
 

@@ -232,11 +232,6 @@ def _find_record(source: FffSource, directory: Directory, kind: int, name: str) 
     return directory.records[kind]
 
 
-def damaged_records(source: FffSource, directory: Directory) -> list[int]:
-    """Return the types of the records whose bytes differ from their checksum."""
-    return [kind for kind in directory.records if is_damaged(source, directory, kind)]
-
-
 def is_damaged(source: FffSource, directory: Directory, kind: int) -> bool:
     """Return whether the record of a type differs from its checksum."""
     return differs(source.read(*directory.records[kind]), directory.checksum(kind))

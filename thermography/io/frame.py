@@ -250,10 +250,6 @@ class FrameReference(FrameHeader, ABC):
         """Where the pixels stand as they are, so that a part of them can be read; None where they must be read as a whole."""
         return None
 
-    def damaged_records(self) -> list[int]:
-        """Return the types of all records that differ from their checksums; empty where the file holds none."""
-        return []
-
     def read(self) -> Frame:
         """Read the frame with its pixels; raise as `read_counts` does."""
         header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}

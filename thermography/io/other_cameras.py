@@ -347,16 +347,15 @@ class TiffReader(TemperatureReader):
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a file holds; pages of other sizes, as those of a pyramid, and of colours are passed over by name."""
-        pages = _tiff_pages(path, *_state(path))
-        _require_scale(path, pages.kind, options)
-        times = _stamp(pages.stamp) if len(pages.chosen) == 1 else None
-        return StackContents(len(pages.chosen), pages.shape, times=times, notes=pages.notes)
+        _, kind, contents = _tiff_pages(path, *_state(path))
+        _require_scale(path, kind, options)
+        return contents
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a page, (row, column); NaN where they are what the file marks as no data."""
         import tifffile
 
-        chosen = _tiff_pages(path, *_state(path)).chosen
+        chosen, *_ = _tiff_pages(path, *_state(path))
         with _refused(f"{path}: page {index} is damaged", "export it again"), tifffile.TiffFile(path) as file:
             page: Any = file.pages[chosen[index]]
             # Read as they are, a million strips that the file does not hold take the memory of a million strips.
@@ -366,16 +365,6 @@ class TiffReader(TemperatureReader):
             return np.where(values == page.nodata, np.nan, values) if "GDAL_NODATA" in page.tags else values
 
 
-class _TiffPages(NamedTuple):
-    """Pages of a TIFF that are frames, by number, their shape and kind of values, DateTime of the first, and what was passed over."""
-
-    chosen: tuple[int, ...]
-    shape: tuple[int, int]
-    kind: np.dtype[Any]
-    stamp: str
-    notes: tuple[str, ...]
-
-
 def _state(path: Path) -> tuple[int, int]:
     """Return size and time of change of a file: what was kept of it holds as long as they are the same."""
     status = path.stat()
@@ -383,8 +372,8 @@ def _state(path: Path) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=64)
-def _tiff_pages(path: Path, size: int, changed_ns: int) -> _TiffPages:
-    """Return the pages of a TIFF that are frames: those with the size and the kind of values of its largest page of temperatures."""
+def _tiff_pages(path: Path, size: int, changed_ns: int) -> tuple[list[int], np.dtype[Any], StackContents]:
+    """Return the pages of a TIFF that are frames, those like its largest page of grey values, their kind of values and what they hold."""
     import tifffile
 
     with _refused(f"{path}: damaged TIFF", "export it again"), tifffile.TiffFile(path) as file:
@@ -403,20 +392,16 @@ def _tiff_pages(path: Path, size: int, changed_ns: int) -> _TiffPages:
     ]
     if not frames:
         shape, kind, colours, _ = looks[0]
-        if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
-            raise ThermographyError(f"{path}: pixels of shape {shape} hold no temperatures; export radiometric TIFF")
-        if colours not in grey:
-            raise ThermographyError(
-                f"{path}: a picture of false colours holds no temperatures; export radiometric TIFF"
-            )
-        raise ThermographyError(f"{path}: values of type {kind} are not temperatures; export real numbers")
-    shape, kind, *_ = looks[max(frames, key=lambda number: (looks[number][1].itemsize > 1, prod(looks[number][0])))]
-    chosen = tuple(number for number in frames if looks[number][:2] == (shape, kind))
+        what = f"values of type {kind}" if colours in grey and len(shape) == 2 else "colours"
+        raise ThermographyError(f"{path}: {what} are not temperatures; export radiometric TIFF")
+    shape, kind, *_ = max((looks[number] for number in frames), key=lambda look: (look[1].itemsize > 1, prod(look[0])))
+    chosen = [number for number in frames if looks[number][:2] == (shape, kind)]
     others = Counter(
-        " x ".join(map(str, looks[number][0][1::-1])) for number in range(len(looks)) if number not in chosen
+        " x ".join(map(str, looks[number][0][1::-1])) for number in sorted({*range(len(looks))} - {*chosen})
     )
-    notes = (f"pages passed over, reduced or of colours: {count} of {size}" for size, count in others.items())
-    return _TiffPages(chosen, shape, kind, stamps[chosen[0]], tuple(notes))
+    notes = tuple(f"pages passed over, reduced or of colours: {count} of {size}" for size, count in others.items())
+    times = _stamp(stamps[chosen[0]]) if len(chosen) == 1 else None
+    return chosen, kind, StackContents(len(chosen), shape, times=times, notes=notes)
 
 
 class NumpyReader(TemperatureReader):
@@ -468,26 +453,19 @@ def _pictures(values: xr.DataArray) -> _Pictures | None:
     along: dict[str, Hashable] = {}
     for dimension in values.dims:
         coordinate = values.coords.get(dimension)
-        axis = "" if coordinate is None else str(coordinate.attrs.get("axis", ""))
-        timed = coordinate is not None and coordinate.dtype.kind == "M"
-        known = (
-            "frame" if timed else _ALONG.get(str(dimension).lower()) or _ALONG.get({"T": "t"}.get(axis, axis).lower())
-        )
-        if known:
-            along.setdefault(known, dimension)
+        axis, kind = ("", "") if coordinate is None else (coordinate.attrs.get("axis", ""), coordinate.dtype.kind)
+        known = (_ALONG.get(str(name).lower()) for name in ("time" if kind == "M" else "", dimension, axis))
+        along.setdefault(next(filter(None, known), ""), dimension)
+    named = [each for role, each in along.items() if role]
     # A band, or another dimension with one step, is none.
-    single = [each for each in values.dims if values.sizes[each] == 1 and each not in along.values()]
+    single = [each for each in values.dims if values.sizes[each] == 1 and each not in named]
     values = values.isel(dict.fromkeys(single[: max(values.ndim - 3, 0)], 0))
-    unnamed = iter(each for each in values.dims if each not in along.values())
-    wanted = ("frame", "row", "column") if values.ndim == 3 else ("row", "column")
-    if values.ndim not in (2, 3) or (values.ndim == 2 and "frame" in along):
+    unnamed = iter(each for each in values.dims if each not in named)
+    roles = ("frame", "row", "column")[3 - values.ndim :]
+    found = [along.get(role) or next(unnamed, None) for role in roles]
+    if values.ndim not in (2, 3) or {*found} != {*values.dims}:
         return None
-    frame, row, column = (
-        (along.get(each) or next(unnamed) for each in wanted)
-        if values.ndim == 3
-        else (None, *(along.get(each) or next(unnamed) for each in wanted))
-    )
-    return _Pictures(values, frame, row, column)
+    return _Pictures(values, *[None] * (3 - values.ndim), *found)
 
 
 class NetcdfReader(TemperatureReader):
@@ -743,10 +721,7 @@ def _text_frames(path: Path, size: int, changed_ns: int) -> tuple[NDArray[np.flo
         longest = max(parts, key=lambda part: len(part.values), default=_Block(0, np.empty((0, 0)))).values
         if not _is_a_frame(longest):
             continue
-        fault = (
-            "temperatures in °F; export them in °C or K" if unit == "F" else _fault_of_frames(parts, lines, delimiter)
-        )
-        if fault:
+        if fault := "°F; export °C or K" if unit == "F" else _fault_of_frames(parts, lines, delimiter):
             raise ThermographyError(f"{path}: {fault}")
         frames = [part for part in parts if part.values.shape[1] == longest.shape[1]]
         return np.stack([frame.values for frame in frames]), {"C": "degC"}.get(unit, unit)
@@ -814,15 +789,15 @@ def _blocks(lines: list[str], delimiter: str) -> list[_Block]:
 
 def _parted(block: _Block, lines: list[str], delimiter: str) -> list[_Block]:
     """Return the frames of a block: without lines that count, as pandas writes them above each, and without columns that name or number."""
-    counting = _count(block.values)
-    if counting.mean() <= _MOST_COUNTING:
-        bounds = [-1, *np.flatnonzero(counting).tolist(), len(counting)]
-        pieces = [block.values[start + 1 : stop] for start, stop in pairwise(bounds)]
-        parts = [
-            _Block(block.first + start + 1, piece) for start, piece in zip(bounds, pieces, strict=False) if len(piece)
-        ]
-    else:
-        parts = [block]
+    counting = np.flatnonzero(_count(block.values))
+    if len(block.values) == 1 or len(counting) > _MOST_COUNTING * len(block.values):
+        counting = counting[:0]
+    bounds = [-1, *counting.tolist(), len(block.values)]
+    parts = [
+        _Block(block.first + start + 1, block.values[start + 1 : stop])
+        for start, stop in pairwise(bounds)
+        if stop > start + 1
+    ]
     named = [frame for part in parts for frame in _without_names(part, lines, delimiter)]
     # A column for frames, another for rows.
     return [last for part in named for frame in _without_numbers(part) for last in _without_numbers(frame)]
@@ -878,9 +853,8 @@ def _joined(frame: NDArray[np.floating]) -> int:
             height = rows // count
             parts = frame.reshape(count, height, columns)
             slopes = np.diff(parts, axis=1)
-            repeated = np.nanstd(np.diff(slopes, axis=0)) < _ALIKE * np.nanstd(
-                slopes[0] - np.nanmean(slopes[0], axis=0)
-            )
+            bends = np.nanstd(slopes[0] - np.nanmean(slopes[0], axis=0))
+            repeated = np.nanstd(np.diff(slopes, axis=0)) < _ALIKE * bends
             # A steady slope is alike above and below in one picture too, but does not fall back.
             change = np.nanstd(np.diff(parts - np.nanmean(parts, axis=(1, 2), keepdims=True), axis=0))
             falls = steps[height - 1 :: height].min() > _JUMP * usual

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography.common import Array, usable_processors
-from thermography.io.fff_record import FffSource, damaged_records, read_counts, read_directory
+from thermography.io.fff_record import FffSource, read_counts
 from thermography.io.frame import (
     CameraParameters,
     Frame,
@@ -310,12 +310,6 @@ class FlirFrameReference(FrameReference):
         counts = read_counts(source, self.samples)
         header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
         return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
-
-    def damaged_records(self) -> list[int]:
-        """Return the types of all records that differ from their checksums; reading compares that of the pixels only."""
-        with self.path.open("rb", buffering=0) as file:
-            source = FffSource(file, self.path, self.segments)
-            return damaged_records(source, read_directory(source))
 
     def read_counts(self) -> NDArray[np.uint16]:
         """Read the pixels only, (row, column) uint16; raise FlirFormatError where they are damaged."""

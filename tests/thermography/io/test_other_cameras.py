@@ -101,7 +101,7 @@ def test_what_is_no_stack_is_refused(tmp_path):
     with pytest.raises(ThermographyError, match=r"an array of shape \(3,\) and type float64; save numbers as"):
         NumpyReader().contents(tmp_path / "a.npy", EVERY_10_S)
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 8, 3), np.uint8), photometric="rgb")
-    with pytest.raises(ThermographyError, match="hold no temperatures; export radiometric TIFF"):
+    with pytest.raises(ThermographyError, match="colours are not temperatures; export radiometric TIFF"):
         TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
     (tmp_path / "a.nc").write_bytes(b"\x89HDF\r\n\x1a\n")
     with pytest.raises(ThermographyError, match=r"cannot be opened .* write it again"):
@@ -123,7 +123,7 @@ def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_ta
 @pytest.mark.parametrize("kind", ["complex64", "bool"])
 def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path, kind):
     tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(kind), photometric="minisblack")
-    message = rf"a\.tif: values of type {kind} are not temperatures; export real numbers"
+    message = rf"a\.tif: values of type {kind} are not temperatures; export radiometric TIFF"
     with pytest.raises(ThermographyError, match=message):
         TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
 
@@ -542,7 +542,7 @@ def test_several_frames_of_one_text_are_each_read(tmp_path, layout, count):
         (lambda rows: [*rows[:-1], rows[-1][:20]], "line 24 holds 3 numbers, those above it 32: it was cut"),
         (lambda rows: [*rows[:-1], rows[-1] + ",1.0"], "line 24 holds 33 numbers, others 32"),
         (lambda rows: [row.replace(".", ",") for row in rows], "the comma stands in numbers and between them"),
-        (lambda rows: [row.replace(",", " °F,") + " °F" for row in rows], "temperatures in °F; export them in °C"),
+        (lambda rows: [row.replace(",", " °F,") + " °F" for row in rows], "°F; export °C or K"),
     ],
 )
 def test_frames_that_are_not_told_apart_and_numbers_in_doubt_are_refused(tmp_path, edit, told):
@@ -635,7 +635,7 @@ def test_pages_of_a_pyramid_and_of_colours_are_passed_over_by_name(tmp_path):
     )
     colours = np.zeros((3, 256), np.uint16)
     tifffile.imwrite(path, np.zeros((9, 9), np.uint8), photometric="palette", colormap=colours)
-    with pytest.raises(ThermographyError, match="false colours holds no temperatures"):
+    with pytest.raises(ThermographyError, match="colours are not temperatures; export radiometric"):
         read_stack(path)
 
 
