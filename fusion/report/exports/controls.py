@@ -160,8 +160,9 @@ def read_profile(deviations: xr.Dataset) -> Profile:
     )
 
 
-def read_scatter_and_drift(deviations: xr.Dataset) -> tuple[Array, Array]:
-    """Return the standard deviation of a reading (2, n) and the drift (cycles, 2, n), um, in the order of `read_profile`.
+def read_scatter_and_drift(deviations: xr.Dataset) -> tuple[Array, Array, float]:
+    """Return the standard deviation of a reading (2, n) and the drift (cycles, 2, n), um, as `read_profile` orders them, and the degrees
+    of freedom of the former.
 
     Variances are drawn towards their mean as far as they differ by no more than chance (empirical Bayes: Smyth 2004, 3.3).
     """
@@ -179,7 +180,8 @@ def read_scatter_and_drift(deviations: xr.Dataset) -> tuple[Array, Array]:
         scatter = np.sqrt(own * np.where(known, variance, 0.0) + (1.0 - own) * common)
     # Where a reading is missing, the drift went on.
     course = drift["drift"].interpolate_na("cycle", fill_value="extrapolate").transpose("cycle", "direction", "target")
-    return scatter, course.values.astype(float)
+    total = float(freedom[known].sum()) or np.inf
+    return scatter, course.values.astype(float), total
 
 
 def tabulate(

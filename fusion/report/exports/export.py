@@ -101,25 +101,38 @@ def predict(profile: Profile, table: ErrorTable, *, one_table: bool) -> Predicti
 
 
 def predict_test(
-    profile: Profile, table: ErrorTable, scatter_um: Array, drift_um: Array, *, cycles: int, one_table: bool
+    profile: Profile,
+    table: ErrorTable,
+    scatter_um: Array,
+    drift_um: Array,
+    freedom: float = np.inf,
+    *,
+    cycles: int,
+    one_table: bool,
 ) -> dict[str, Quantity]:
     """Predict A, E, M and B of a test of so many cycles with an active table: median over tests, each with its own readings.
 
-    `scatter_um` (2, n) is the standard deviation of a reading, `drift_um` (cycles, 2, n) the drift, which no table corrects: every
-    test has that of some successive cycles. The errors of the profile are those of the table too.
+    `scatter_um` (2, n) is the standard deviation of a reading, known with this freedom, `drift_um` (cycles, 2, n) the drift, which no table
+    corrects: every test has that of some successive cycles. The errors of the profile are those of the table too.
     """
+    if not (np.isfinite(scatter_um).all() and np.isfinite(drift_um).all()):
+        return {}
     rng, left = np.random.default_rng(_SEED), remainder_um(profile, table, one_table=one_table)
     errors = rng.multivariate_normal(
         np.zeros(left.size), profile.covariance_um2.reshape(left.size, left.size), _DRAWS, method="eigh"
     ).reshape(_DRAWS, *left.shape)
     if one_table:
         left, errors = _with_likely_reversal(left, errors)
-    mean = left - errors + rng.normal(0.0, scatter_um / cycles**0.5, (_DRAWS, *left.shape))
+    if np.isfinite(freedom):
+        scatter_um = scatter_um * np.sqrt(freedom / rng.chisquare(freedom, _DRAWS))[:, None, None]
+    mean = left - errors + scatter_um / cycles**0.5 * rng.standard_normal((_DRAWS, *left.shape))
     first = rng.integers(0, max(1, len(drift_um) - cycles + 1), _DRAWS)
     states = [drift_um[start : start + cycles] for start in first]
     mean = mean + [state.mean(axis=0) for state in states]
     drifted = np.array([state.var(axis=0, ddof=1 if len(state) > 1 else 0) for state in states])
-    spread = 2.0 * np.sqrt(scatter_um**2 * rng.chisquare(cycles - 1, mean.shape) / (cycles - 1) + drifted)
+    # Readings that drift and scatter about their mean: squares of normal values that are not about zero.
+    variance = np.broadcast_to(np.maximum(scatter_um**2, 1e-12), mean.shape) / (cycles - 1)
+    spread = 2.0 * np.sqrt(variance * rng.noncentral_chisquare(cycles - 1, drifted / variance))
     drawn = {
         "A": (mean + spread).max(axis=(1, 2)) - (mean - spread).min(axis=(1, 2)),
         "E": np.ptp(mean, axis=(1, 2)),
@@ -129,7 +142,6 @@ def predict_test(
     return {
         symbol: Quantity(value=float(np.median(values)), u=float(values.std(ddof=1)))
         for symbol, values in drawn.items()
-        if np.isfinite(values).all()
     }
 
 

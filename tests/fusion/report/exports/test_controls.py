@@ -265,6 +265,7 @@ def test_a_test_with_a_table_has_the_errors_of_the_table_and_its_own():
     assert found["E"].value == pytest.approx(3.2 * 2**0.5, rel=0.06)
     assert found["M"].value == pytest.approx(2.47, rel=0.08)
     assert found["B"].value == pytest.approx(2.0 * 1.6, rel=0.08)  # largest of six |normal|: 1.6
+    assert predict_test(profile, tabulate(profile), np.full((2, 6), np.nan), still, cycles=4, one_table=False) == {}
     exact = Profile(np.arange(6.0), np.zeros((2, 6)), 1e-12 * np.eye(12).reshape(2, 6, 2, 6))
     many = predict_test(exact, tabulate(exact), np.full((2, 6), 2.0), still, cycles=10**6, one_table=False)
     assert many["A"].value == pytest.approx(4 * 2.0, rel=0.01)
@@ -305,7 +306,7 @@ def test_the_reversal_that_one_table_leaves_is_counted_without_the_noise_of_its_
 def test_scatter_of_few_cycles_is_drawn_together_where_it_differs_by_chance(small_run):
     deviations = read_dataset(small_run / "deviations.nc")
     own = deviations["drift_scatter"].values
-    scatter, _ = read_scatter_and_drift(deviations)
+    scatter, *_ = read_scatter_and_drift(deviations)
     assert np.ptp(scatter) < 0.5 * np.ptp(own) and np.sqrt(np.mean(scatter**2)) == pytest.approx(0.05, rel=0.15)
     far = deviations["drift_scatter"].where(deviations["target"] != 3, 1.0)
     assert read_scatter_and_drift(deviations.assign(drift_scatter=far))[0].max() > 0.8
