@@ -270,7 +270,7 @@ def carry_back(columns: Array, order: int, components: int, memory: Array, step:
 
 @njit()
 def observe_back(
-    N: Array, order: int, loadings: Array, k: int, memory: Array, gain: Array, innovation_variance: float, NM: Array
+    N: Array, order: int, loadings: Array, k: int, memory: Array, gains: Array, innovation_variance: float, NM: Array
 ) -> float:
     """Add a reading to the information N of those after it, in place; write N times its gain into ``NM`` and return the variance of its
     smoothing error, D = 1 / F + K' N K (Durbin and Koopman 2012, eq. 4.69).
@@ -280,8 +280,8 @@ def observe_back(
     for i in range(m):
         NM[i] = 0.0
         for j in range(m):
-            NM[i] += N[i, j] * gain[j]
-        D += gain[i] * NM[i]
+            NM[i] += N[i, j] * gains[k, j]
+        D += gains[k, i] * NM[i]
     last = components * order
     for c in range(components):
         loading, level = loadings[k, c], c * order
@@ -308,7 +308,7 @@ def smoothing_error(
     loadings: Array,
     k: int,
     memory: Array,
-    gain: Array,
+    gains: Array,
     innovation_variance: float,
     observed: bool,
     step: float,
@@ -322,9 +322,9 @@ def smoothing_error(
         return
     for j in range(p):
         innovation[j] /= innovation_variance
-    for i in range(gain.size):
+    for i in range(gains.shape[1]):
         for j in range(p):
-            innovation[j] -= gain[i] * r[i, j]
+            innovation[j] -= gains[k, i] * r[i, j]
     for c in range(components):
         loading, level = loadings[k, c], c * order
         for j in range(p):
@@ -361,16 +361,17 @@ def products_of_sparse(
     with_dense = np.zeros((columns, innovations.shape[1]))
     for k in range(n - 1, -1, -1):
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
-        carry_back(N, order, components, memory, step)
-        carry_back(N.T, order, components, memory, step)
+        if order == 2 or memory.size:
+            carry_back(N, order, components, memory, step)
+            carry_back(N.T, order, components, memory, step)
         if observed[k]:
-            D[k] = observe_back(N, order, loadings, k, memory, gains[k], innovation_variances[k], h[k])
+            D[k] = observe_back(N, order, loadings, k, memory, gains, innovation_variances[k], h[k])
             for c in range(components):
                 h[k, c * order] -= D[k] * loadings[k, c]
             if memory.size:
                 h[k, components * order] -= D[k]
         u = innovations[k]
-        smoothing_error(r, order, loadings, k, memory, gains[k], innovation_variances[k], observed[k], step, u)
+        smoothing_error(r, order, loadings, k, memory, gains, innovation_variances[k], observed[k], step, u)
         for at in range(starts[k], starts[k + 1]):
             for j in range(u.size):
                 with_dense[places[at], j] += values[at] * u[j]
@@ -380,26 +381,26 @@ def products_of_sparse(
         predict_state(state, components, order, memory, seconds[k] - seconds[k - 1] if k > 0 else 0.0)
         if not observed[k]:
             continue
-        for j in range(columns):
-            along[j] = 0.0
-            innovation[j] = -state[components * order, j] if memory.size else 0.0
+        along[:] = 0.0
+        innovation[:] = 0.0
         for i in range(m):
+            weight, own = h[k, i], state[i]
+            loading = loadings[k, i // order] if i < components * order and i % order == 0 else 0.0
+            loading = 1.0 if i == components * order else loading
             for j in range(columns):
-                along[j] += h[k, i] * state[i, j]
-        for c in range(components):
-            for j in range(columns):
-                innovation[j] -= loadings[k, c] * state[c * order, j]
+                along[j] += weight * own[j]
+                innovation[j] -= loading * own[j]
         for at in range(starts[k], starts[k + 1]):
             innovation[places[at]] += values[at]
-            row = products[places[at]]
+            row, number = products[places[at]], values[at]
             for j in range(columns):
-                row[j] += values[at] * along[j]
+                row[j] += number * along[j]
             for other in range(starts[k], starts[k + 1]):
-                row[places[other]] += 0.5 * D[k] * values[at] * values[other]
+                row[places[other]] += 0.5 * D[k] * number * values[other]
         for i in range(m):
-            gain = gains[k, i]
+            gain, own = gains[k, i], state[i]
             for j in range(columns):
-                state[i, j] += gain * innovation[j]
+                own[j] += gain * innovation[j]
     return products + products.T, with_dense
 
 
@@ -428,11 +429,12 @@ def smooth(
     NM = np.zeros(m)
     for k in range(n - 1, -1, -1):
         step = seconds[k + 1] - seconds[k] if k < n - 1 else 0.0
-        carry_back(N, order, components, memory, step)
-        carry_back(N.T, order, components, memory, step)
+        if order == 2 or memory.size:
+            carry_back(N, order, components, memory, step)
+            carry_back(N.T, order, components, memory, step)
         if observed[k]:
-            D[k] = observe_back(N, order, loadings, k, memory, gains[k], innovation_variances[k], NM)
-        smoothing_error(r, order, loadings, k, memory, gains[k], innovation_variances[k], observed[k], step, u[k])
+            D[k] = observe_back(N, order, loadings, k, memory, gains, innovation_variances[k], NM)
+        smoothing_error(r, order, loadings, k, memory, gains, innovation_variances[k], observed[k], step, u[k])
         _smooth_levels(order, covariances[k], r, N, levels[k], level_covariance[k])
     return levels, level_covariance, u, D
 

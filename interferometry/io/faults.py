@@ -95,6 +95,8 @@ SENTINEL_MAGNITUDE = 1e19
 _SIGNS = str.maketrans({"\u2212": "-", "\u2013": "-", "\uff0d": "-", "\ufe63": "-", "\uff0b": "+"})
 _SPACES = re.compile(r"[\s\u00a0\u2007\u2009\u202f']")
 _NUMBER = re.compile(r"[+-]?(\d+[\d.,]*|[.,]\d+)([eE][+-]?\d+)?")
+#: What most files write, and what has one meaning where the decimal separator is a point.
+_PLAIN = re.compile(r"[+-]?\d+(\.\d+)?")
 #: A separator followed by three digits, once or more, may part thousands.
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
 #: A number whose decimal separator is told by its digits: one separator, or another one after groups of three.
@@ -130,7 +132,7 @@ class Numerals:
     def of(cls, texts: Iterable[str]) -> Numerals:
         """Find the decimal separator from all fields of a file; those that are no numbers, such as dates, are passed over."""
         seen: dict[str, str] = {}
-        for text in texts:
+        for text in dict.fromkeys(texts):
             cleaned = _SPACES.sub("", text.translate(_SIGNS))
             match = _DECIMAL.fullmatch(cleaned) if _NUMBER.fullmatch(cleaned) else None
             if match and match["decimal"] != match["group"] and not _THOUSANDS.fullmatch(cleaned):
@@ -139,6 +141,8 @@ class Numerals:
 
     def number(self, text: str) -> float:
         """Return a finite number."""
+        if self.decimal == "." and _PLAIN.fullmatch(text):
+            return parse_number(text)
         cleaned = _SPACES.sub("", text.strip().translate(_SIGNS))
         if not _NUMBER.fullmatch(cleaned):
             return parse_number(text)
@@ -154,7 +158,7 @@ class Numerals:
 
     def reading(self, text: str) -> float:
         """Return a measured value: as `number`, but nothing except nines is a mark for "no reading"."""
-        if _ALL_NINES.fullmatch(_SPACES.sub("", text.strip().translate(_SIGNS))):
+        if text.count("9") >= 4 and _ALL_NINES.fullmatch(_SPACES.sub("", text.strip().translate(_SIGNS))):
             raise BadReading(text, "consists of nines only, a mark for no reading")
         return self.number(text)
 

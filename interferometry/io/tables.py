@@ -258,6 +258,7 @@ def split_unit(text: str) -> tuple[str, str | None]:
     return text.strip(), None
 
 
+@lru_cache(1 << 10)
 def find_direction(text: str) -> tuple[str, bool] | None:
     """Return the direction of approach that a word names."""
     signs = text.strip().replace("−", "-").replace("–", "-").replace("＋", "+").replace("－", "-")

@@ -726,7 +726,7 @@ def test_what_a_wide_table_lacks_is_named(tmp_path, text, message):
 @pytest.mark.long
 def test_one_wide_line_above_many_short_ones_does_not_fill_the_memory(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("Position [mm]" + "," * 16_000 + "\n" + "1\n" * 100_000)
+    path.write_text("Position [mm]" + "," * 1_900 + "\n" + "1\n" * 100_000)
     tracemalloc.start()
     (grid,) = read_grids(path)
     assert find_wide_table(grid) is None
