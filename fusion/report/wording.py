@@ -205,6 +205,7 @@ BASELINES = {
     "ridge": "ridge regression on the same",
     "ridge_with_lags": "ridge regression with lagged copies",
     "mean_run": "mean course of the other runs",
+    "run_differences": "that course, with what differs between runs",
 }
 
 
@@ -550,5 +551,5 @@ def baseline_words(loop: Loop) -> dict[str, str]:
     return {
         name: words.replace("cycles before", "time before").replace("cycle", "value") if record else words
         for name, words in BASELINES.items()
-        if hasattr(loop.baselines, name)
+        if getattr(loop.baselines, name, None) is not None
     }

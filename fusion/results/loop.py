@@ -116,6 +116,9 @@ class RunBaselines(Baselines):
 
     mean_run: HeldOutError
     """The mean course of the other runs."""
+    run_differences: HeldOutError | None = None
+    """That course, and ridge regression of how a run differs from it on how what was logged differs; null for a single training run, and in
+    results of earlier versions."""
 
 
 class StepPart(ResultPart):
@@ -467,7 +470,9 @@ class Loop(HoldOutErrors):
     """The errors before and after, with what the model itself expects."""
     baselines: RunBaselines | Baselines
     """Errors of plain predictions."""
-    best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags", "mean_run"]
+    best_baseline: Literal[
+        "last_value", "mean", "least_squares", "ridge", "ridge_with_lags", "mean_run", "run_differences"
+    ]
     """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
     steps: tuple[StepPart, ...]
     """Effects that were added, in turn."""

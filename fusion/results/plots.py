@@ -39,6 +39,7 @@ _PREDICTIONS = {
     "ridge": "ridge regression",
     "ridge_with_lags": "ridge regression with lags",
     "mean_run": "mean course of the other runs",
+    "run_differences": "that course, with what differs between runs",
 }
 
 

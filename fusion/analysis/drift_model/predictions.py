@@ -207,7 +207,11 @@ def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Arr
         here = train & np.isfinite(response)
         # The solution of smallest norm where columns depend on each other.
         least_squares[:, channel] = design @ np.linalg.lstsq(design[here], response[here], rcond=None)[0]
-    of_runs = {"mean_run": mean_course(record, train)} if record.runs else {}
+    of_runs = {"mean_run": mean_course(record, record.displacement, train)} if record.runs else {}
+    if np.unique(record.run[train]).size > 1:
+        apart = replace(record, displacement=record.displacement - of_runs["mean_run"])
+        differences = predict(apart, now - mean_course(record, now, train), train)
+        of_runs["run_differences"] = of_runs["mean_run"] + differences.predicted
     return {
         **of_runs,
         "last_value": last_values(record, train),
@@ -242,19 +246,19 @@ def track_record(record: Record, train: NDArray[np.bool_], forecast: Array, ridg
     return schema.Tracking(every_min=every * record.block_s / 60.0, **held_out_errors(errors))
 
 
-def mean_course(record: Record, train: NDArray[np.bool_]) -> Array:
-    """Predict every block by the mean of the other training runs at the same time since their start, um (blocks, channels).
+def mean_course(record: Record, values: Array, train: NDArray[np.bool_]) -> Array:
+    """Mean of the other training runs at the same time since their start, of values (blocks, q) at every block.
 
     Beyond the end of all others their last mean is kept.
     """
     place = np.arange(record.seconds.size) - np.asarray(record.first)[record.run]
-    predicted = np.zeros(record.displacement.shape)
+    predicted = np.zeros(values.shape)
     for run in range(len(record.runs)):
         others = np.flatnonzero(train & (record.run != run))
-        course: Array = np.full((int(place.max()) + 1, len(record.channels)), np.nan)
+        course: Array = np.full((int(place.max()) + 1, values.shape[1]), np.nan)
         for at in np.unique(place[others]):
-            course[at] = known_mean(record.displacement[others[place[others] == at]], axis=0)
-        for k in range(len(record.channels)):
+            course[at] = known_mean(values[others[place[others] == at]], axis=0)
+        for k in range(values.shape[1]):
             known = np.flatnonzero(np.isfinite(course[:, k]))
             course[:, k] = np.interp(np.arange(len(course)), known, course[known, k]) if known.size else 0.0
         predicted[record.run == run] = course[place[record.run == run]]

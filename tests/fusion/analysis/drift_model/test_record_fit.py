@@ -357,6 +357,23 @@ def test_of_several_runs_the_mean_course_of_the_others_is_one_too():
     np.testing.assert_allclose(predicted[several.run == 0], 3.0 * course[:50])
 
 
+def test_how_a_run_differs_from_the_others_follows_how_its_readings_differ(rng):
+    """Six runs, each from a level of its own: a course that no reading shows, and 2 um/K times what one temperature differs by."""
+    number, place = np.divmod(np.arange(240), 40)
+    course, warm = 9.0 * np.sin(place / 6.0), (1.0 + 0.3 * rng.standard_normal(6))[number]
+    rise = 10.0 * warm * (1.0 - np.exp(-place / 15.0))
+    temperature = (20.0 + 5.0 * rng.standard_normal(6))[number] + rise
+    one = record_of((course + 2.0 * rise)[:, None], temperature[:, None])
+    runs = tuple(RecordedRun(f"r{k}", one.start, float(one.seconds[40 * k]), k == 5) for k in range(6))
+    several = replace(one, runs=runs, first=tuple(range(0, 240, 40)))
+    predicted = plain_predictions(several, number < 5)
+    errors = {
+        name: float(np.sqrt(np.mean((one.displacement - values)[number == 5] ** 2)))
+        for name, values in predicted.items()
+    }
+    assert errors["run_differences"] < 0.05 < 0.2 * min(errors["mean_run"], errors["ridge_with_lags"])
+
+
 def test_regressions_follow_temperatures_and_drivers():
     assert rms(record(), "least_squares") < 0.02
     assert rms(record(), "ridge") < 0.02
