@@ -153,10 +153,10 @@ def _drift_charts(deviations: xr.Dataset) -> dict[str, Chart]:
 
 
 def _correlation_charts(fused: xr.DataTree, channel: str, least_p: float | None) -> dict[str, Chart]:
-    """The maps of the leading part of the drift, the modes, the clusters, and the leading region by target."""
+    """The maps of the leading part of the drift, the modes, and the leading region by target."""
     maps = fused.children["correlation"]
     cells, position = maps.to_dataset(), fused.to_dataset()["position"]
-    charts = {"clusters": model.plot_clusters(maps.children["clusters"].to_dataset())}
+    charts: dict[str, Chart] = {}
     if bool((cells["p_value"].sel(channel=channel) <= model.LEAST_SHOWN).any()):
         charts["significance"] = model.plot_significance(cells, channel)
     if bool((cells["p_value"].sel(channel=channel) <= ATTRIBUTION_LEVEL).any()):
@@ -172,16 +172,9 @@ def _correlation_charts(fused: xr.DataTree, channel: str, least_p: float | None)
 
 def _loop_charts(loop: xr.Dataset, deviations: xr.Dataset) -> dict[str, Chart]:
     """The charts of the closed loop."""
-    charts = {
-        "residual_direction": model.plot_residual_direction(loop, deviations),
-        "residual_spectrum": model.plot_residual_spectrum(loop),
-        "residual_events": model.plot_residual_events(loop, deviations),
-        "contributions": model.plot_contributions(loop, deviations),
-    }
+    charts = {"contributions": model.plot_contributions(loop, deviations)}
     if "held_out_error_final" in loop and bool(loop["held_out_error_final"].notnull().any()):
         charts["held_out_errors"] = model.plot_held_out_errors(loop, deviations)
-        charts["held_out_positions"] = model.plot_held_out_positions(loop, deviations)
-        charts["predicted_measured"] = model.plot_predicted_measured(loop, deviations)
     hours = hours_since_start(deviations).mean(["direction", "target"]).values
     for step in range(loop.sizes.get("step", 0)):
         errors = xr.Dataset({name: loop[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})

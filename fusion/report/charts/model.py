@@ -1,13 +1,11 @@
-"""Charts of the closed loop: what the model misses over time, position, direction and period, and what each effect contributes."""
+"""Charts of the closed loop: what the model misses in the held-out cycles, and what each effect contributes."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import scipy
 import xarray as xr
-from bokeh import palettes
 from bokeh.models import FixedTicker, LinearColorMapper
 from bokeh.plotting import figure
 
@@ -31,10 +29,9 @@ from fusion.report.charts.style import (
 )
 from fusion.report.wording import CHANNELS, effect_words, region_words
 from fusion.results.numbers import alike, duration, number, p_cell, p_words
-from interferometry.plots import COLOURS, INK, MUTED, hours_since_start
+from interferometry.plots import COLOURS, INK, hours_since_start
 
-# Maps and charts of the correlation: sensitivity and significance of cells, thermal modes, clusters, regions by
-# target.
+# Maps and charts of the correlation: sensitivity and significance of cells, thermal modes, regions by target.
 
 #: Upper ends of the steps in which a p-value is shown, their colours, and their names; above the last one a cell is left blank.
 _P_STEPS = (0.01, 0.05, 0.1)
@@ -42,10 +39,6 @@ _P_STEPS = (0.01, 0.05, 0.1)
 LEAST_SHOWN = _P_STEPS[-1]
 _P_COLOURS = ("#3b0f70", "#b63679", "#fbb18b")
 _P_NAMES = {0.5: "≤ 0.01", 1.5: "≤ 0.05", 2.5: "≤ 0.1"}
-#: Colours of groups of cells: light enough for a dark number on each.
-_GROUPS = palettes.Set3[12]
-#: Numbers of groups that are nearer than this would be written over each other.
-_LEAST_MM = 22.0
 
 
 def _add_blank(drawn: figure, extent: Extent, name: str) -> None:
@@ -132,42 +125,6 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None 
     return Chart(drawn, seen, _cell_columns(modes, **{"warming relative to the cross": pattern}))
 
 
-def plot_clusters(clusters: xr.Dataset) -> Chart:
-    """Draw groups of cells with one course of temperature; inside a group no analysis of this session can separate places."""
-    group, extent = clusters["cluster"].values, extent_of(clusters)
-    count = int(group.max())
-    colours = [_GROUPS[at % len(_GROUPS)] for at in range(max(count, 1))]
-    mapper = LinearColorMapper(colours, low=0.5, high=max(count, 1) + 0.5, nan_color="#ffffff")
-    drawn = new_plan(extent)
-    add_cells(drawn, np.where(group == 0, np.nan, group), extent, mapper, [("group", "@image{0}")])
-    places = _label_places(clusters, count)
-    drawn.text(
-        [x for _, x, _ in places], [y for *_, y in places], [str(number) for number, *_ in places], text_align="center",
-        text_baseline="middle", text_color=INK, text_font_size="12px",
-    )  # fmt: skip
-    _add_steps(drawn, mapper, "group", {float(number): str(number) for number in range(1, count + 1)})
-    sizes = np.bincount(group.ravel(), minlength=count + 1)[1:]
-    seen = (
-        f"{count} groups of cells with one temperature curve each; the largest covers "
-        f"{100 * sizes.max(initial=0) / group.size:.0f} % of the table."
-    )
-    return Chart(drawn, seen, _cell_columns(clusters, group=group))
-
-
-def _label_places(clusters: xr.Dataset, count: int) -> list[tuple[int, float, float]]:
-    """Return number and place (mm) of the groups that have room for their number: in their thickest part, none over another."""
-    group, x, y = clusters["cluster"].values, clusters["x"].values, clusters["y"].values
-    found: list[tuple[int, float, float]] = []
-    sizes = np.bincount(group.ravel(), minlength=count + 1)
-    for one in sorted(range(1, count + 1), key=lambda number: -sizes[number]):
-        depth = scipy.ndimage.distance_transform_edt(np.pad(group == one, 1))[1:-1, 1:-1]
-        row, column = np.unravel_index(np.argmax(depth), depth.shape)
-        place = (float(x[column]), float(y[row]))
-        if all(np.hypot(place[0] - other[1], place[1] - other[2]) >= _LEAST_MM for other in found):
-            found.append((one, *place))
-    return found
-
-
 def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray) -> Chart:
     """Draw the sensitivity of every target and direction to one region, tested singly, with 95 % interval for all; filled: p <= 0.05."""
     chosen = targets.sel(region=region)
@@ -211,66 +168,6 @@ def _stages(loop: xr.Dataset) -> list[tuple[str, str, dict[str, Any]]]:
     if np.allclose(before, after, atol=1e-9, equal_nan=True):
         return [("final", "declared model, nothing added", _FINAL)]
     return [("declared", "declared model", _DECLARED), ("final", "with the added effects", _FINAL)]
-
-
-def plot_held_out_positions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
-    """Draw the error of predicting the held-out cycles at every position, both approaches together."""
-    order = np.argsort(deviations["position"].values, kind="stable")
-    place = deviations["position"].values[order].astype(float)
-    courses = Courses(new_figure(x="position / mm", y="error of prediction, rms / µm"), {"position / mm": place})
-    highest = 0.0
-    for (ending, text, looks), marker in zip(_stages(loop), ("square", "circle"), strict=False):
-        error = np.sqrt((loop[f"held_out_error_{ending}"] ** 2).mean(["cycle", "direction"]).values[order])
-        seen = f"{span_words(error, 'µm')}, largest at {place[int(np.nanargmax(error))]:g} mm"
-        courses.add(place, error, text, seen=seen, marker=marker, **looks)
-        highest = max(highest, float(np.nanmax(error)))
-    fix_range(courses.figure, 0.0, 1.08 * highest)
-    return courses.chart("Error of predicting the held-out cycles by position")
-
-
-def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
-    """Draw half the difference of the residuals of both approaches over time, before and after the loop."""
-    hours = hours_since_start(deviations).mean(["direction", "target"]).values
-    drawn = new_figure(x=_TIME, y="(positive − negative) / 2 / µm", zero=True)
-    courses = Courses(drawn, {"cycle": loop["cycle"].values, _TIME: hours})
-    for ending, text, looks in _stages(loop):
-        residual = loop[f"residual_{ending}"].mean("target")
-        odd = (residual.sel(direction="positive") - residual.sel(direction="negative")) / 2
-        courses.add(hours, odd.values, text, **looks)
-    return courses.chart("Residual that changes sign with the approach, over time")
-
-
-def plot_residual_spectrum(loop: xr.Dataset) -> Chart:
-    """Draw the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds."""
-    drawn = new_figure(x="period / min", y="power over that of noise", x_type="log")
-    courses = Courses(drawn, {"period / min": loop["period"].values})
-    highest, limit = 0.0, float("nan")
-    for ending, text, looks in _stages(loop):
-        power = loop[f"periodogram_{ending}"]
-        limit, at = float(power.attrs["limit"]), int(np.nanargmax(power.values))
-        seen = f"{number(float(power[at]), 2)} at {number(float(power['period'][at]), 2)} min"
-        heading = f"{text}, power over that of noise"
-        courses.add(power["period"].values, power.values, text, column=heading, seen=seen, **looks)
-        highest = max(highest, float(power[at]))
-    drawn.hspan(limit, line_color=MUTED, line_dash="dashed", line_width=1.5, legend_label="95 % limit of noise")
-    fix_range(drawn, 0.0, 1.08 * max(highest, limit))
-    courses.told.append(f"noise alone stays below {number(limit, 2)}")
-    return courses.chart("Power of the innovations over period; strongest")
-
-
-def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
-    """Draw the cumulative sum of the innovations: without trend where nothing happens, with a kink at an event."""
-    hours = hours_since_start(deviations).transpose("cycle", "direction", "target").values.ravel()
-    courses = Courses(new_figure(x=_TIME, y="sum of innovations / √n", zero=True))
-    for ending, text, looks in _stages(loop):
-        values = loop[f"innovation_{ending}"].transpose("cycle", "direction", "target").values.ravel()
-        valid = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
-        order = valid[np.argsort(hours[valid], kind="stable")]
-        walk = np.cumsum(values[order]) / np.sqrt(order.size)
-        courses.columns.setdefault(_TIME, hours[order])
-        heading, seen = f"{text}, sum of innovations / √n", span_words(walk, "").strip()
-        courses.add(hours[order], walk, text, column=heading, seen=seen, **looks)
-    return courses.chart("Running sum of the innovations over time")
 
 
 def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
@@ -319,23 +216,6 @@ def plot_held_out_errors(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
         f"{span_words(columns['drift as measured, mean of the cycle / µm'], 'µm')}."
     )
     return Chart(drawn, seen, columns)
-
-
-def plot_predicted_measured(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
-    """Draw predicted against measured deviations of the cycles that were held out, with the line on which both are equal."""
-    measured = deviations["deviation"]
-    courses = Courses(new_figure(x="measured deviation / µm", y="predicted deviation / µm", height=360))
-    for (ending, text, looks), marker in zip(_stages(loop), ("x", "circle"), strict=False):
-        error = loop[f"held_out_error_{ending}"]
-        here = error.notnull().values & measured.notnull().values
-        read, predicted = measured.values[here], (measured - error).values[here]
-        courses.columns["measured deviation / µm"] = read
-        heading = f"predicted, {text} / µm"
-        seen = f"{number(float(np.sqrt(np.mean((read - predicted) ** 2))))} µm rms from the line"
-        courses.add(read, predicted, text, column=heading, seen=seen, line=False, marker=marker, size=4.5, **looks)
-    ends = [float(end(courses.columns["measured deviation / µm"])) for end in (np.min, np.max)]
-    courses.figure.line(ends, ends, line_color=MUTED, line_dash="dashed", legend_label="predicted = measured")
-    return courses.chart("Predicted against measured deviation of the held-out cycles")
 
 
 # Errors of predicting blocks of a test from the others, before and after an effect was added: what tells of every

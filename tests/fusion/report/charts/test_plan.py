@@ -84,19 +84,12 @@ def test_significance_has_four_steps_and_sensitivity_is_blank_without_it(plan_of
     assert "No cell of 6" in attribution.plot_significance(none, "common").seen
 
 
-def test_modes_clusters_and_regions_of_a_campaign(fused):
+def test_modes_and_regions_of_a_campaign(fused):
     maps = fused.children["correlation"]
     modes = maps.children["modes"].to_dataset()
     chart = attribution.plot_mode(modes, 1, "common")
     np.testing.assert_allclose(picture(chart), modes["pattern"].sel(mode=1), rtol=1e-6)
     assert chart.figure.title.text.text.startswith("mode 1: ")
-    clusters = maps.children["clusters"].to_dataset()
-    chart = attribution.plot_clusters(clusters)
-    shown = next(r for r in chart.figure.renderers if type(r.glyph).__name__ == "Text").data_source.data
-    points = np.column_stack([shown["x"], shown["y"]])
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(len(points)) * 1e9
-    assert apart.min() >= 22.0
-    assert chart.seen.startswith(f"{int(clusters['cluster'].max())} groups of cells")
     if "target_regions" in maps.children:
         targets = maps.children["target_regions"].to_dataset()
         region = str(targets["region"].values[0])
