@@ -67,6 +67,8 @@ _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "senso
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
 #: Units of the temperatures and of the displacements of a record.
 _OF_A_RECORD = ({"degC", "K", "degF"}, {"um", "nm", "mm", "in", "mil"})
+#: How JSON begins, of an object or of a list.
+_JSON = re.compile(r'\s*[{[]\s*["{[]')
 #: Fewest names of a line that heads a table, and no remark above a picture.
 _NAMED = 4
 #: Columns of a table of places on the plan.
@@ -258,6 +260,10 @@ def _logs_environment(found: Recognised) -> bool:
 def _holds_deviations(found: Recognised) -> bool:
     from interferometry.io.readings import holds_deviations
 
+    if _JSON.match(found.text or ""):
+        raise FusionError(
+            "JSON, which is not read; write it as CSV with a column for each value, by pandas.read_json(FILE, lines=True).to_csv(...)"
+        )
     if not holds_deviations(found.path):
         interferometry.read_deviations(found.path, rotary=True)  # says what is missing
     return True

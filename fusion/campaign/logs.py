@@ -34,7 +34,7 @@ from fusion.campaign.values import (
     unit_name,
 )
 from fusion.common import Array, FusionError
-from interferometry.io.faults import LaserFormatError, Numerals, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.faults import THOUSANDS, LaserFormatError, Numerals, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.spreadsheets import cell_text, is_workbook, read_cells
 from interferometry.io.tables import (
     DELIMITERS,
@@ -72,7 +72,6 @@ _LONGEST_RECORD_S = 4.5e9
 _LONGEST_SILENCE = 10.0
 #: Hours, minutes and seconds; of two numbers nothing tells whether they are minutes and seconds.
 _ELAPSED = re.compile(r"(\d{2,5})(:\d\d:\d\d\S*)")
-_DECIMAL_COMMA = re.compile(r"\d,\d")
 #: Zones by their short names, as +hhmm, and such a name in a heading, of UTC with hours and minutes.
 _ZONES: Mapping[str, str] = vocabulary("columns")["zones"]
 _IN_ZONE = re.compile(rf"(?<![^\W_])({'|'.join(_ZONES)})(?:\s*([+-]\d\d?)(?::?(\d\d))?)?(?![^\W_])")
@@ -485,13 +484,13 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
         delimiter = delimiter_of_values("".join(below[:1]))
         width = max((len(fields_of(line, delimiter)) for line in below), default=0)
         names = (delimiter or " ").join(str(k + 1) for k in range(width))
-    decimal_comma = delimiter == ";" or (delimiter != "," and _DECIMAL_COMMA.search("".join(below[:1])) is not None)
+    decimal = Numerals.of(text for line in below[:_SAMPLE] for text in fields_of(line, delimiter)).decimal
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
         frame = pd.read_csv(  # type: ignore[call-overload] # numbers may be marks too
             io.StringIO("".join([names.strip("\n"), "\n", *below])),
             sep=delimiter or r"\s+",
-            decimal="," if decimal_comma else ".",
+            decimal=decimal or ".",
             skipinitialspace=True,
             index_col=False,
             on_bad_lines="warn",
@@ -503,6 +502,9 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
     skipped = {
         int(line) - 2: (due, saw) for warning in caught for line, due, saw in _SKIPPED.findall(str(warning.message))
     }
+    for name, column in frame.items():
+        if not pd.api.types.is_numeric_dtype(column):
+            frame[name] = _ungrouped(column, decimal)
     # Lines are counted in the file; a quoted field may go over several of them.
     quoted = np.cumsum([0, *(line.count('"') for line in below)])[:-1] % 2 == 1
     for begins in (np.full(len(below), True), ~quoted):
@@ -519,6 +521,17 @@ def _read_text(path: Path, header: HeaderRows | None, missing: list[float | str]
         for k, (due, saw) in skipped.items()
     ]
     return _named(frame, fields_of(lines[header.units - 1], delimiter) if header.units else [], left_out)
+
+
+def _ungrouped(column: pd.Series, decimal: str) -> pd.Series:
+    """Return the whole numbers of a column without marks between thousands, as other columns or its numbers below 1000 tell them."""
+    texts = stripped(column)
+    grouped = next(filter(THOUSANDS.fullmatch, texts), "")
+    mark = "." if "." in grouped else ","
+    of_thousands = decimal not in ("", mark) if decimal else any(map(str.isdecimal, texts))
+    if not grouped or not of_thousands or Numerals.of(texts) != Numerals():
+        return column
+    return texts.where(texts.map(THOUSANDS.fullmatch).isna(), texts.str.replace(mark, "")).mask(column.isna())
 
 
 def _named(frame: pd.DataFrame, units: list[str], left_out: list[RejectedLine]) -> Rows:

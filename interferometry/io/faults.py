@@ -98,7 +98,7 @@ _NUMBER = re.compile(r"[+-]?(\d+[\d.,]*|[.,]\d+)([eE][+-]?\d+)?")
 #: What most files write, and what has one meaning where the decimal separator is a point.
 _PLAIN = re.compile(r"[+-]?\d+(\.\d+)?")
 #: A separator followed by three digits, once or more, may part thousands.
-_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
+THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
 #: A number whose decimal separator is told by its digits: one separator, or another one after groups of three.
 _DECIMAL = re.compile(r"[+-]?(\d*|\d{1,3}(?P<group>[.,])\d{3}((?P=group)\d{3})*)(?P<decimal>[.,])\d*([eE][+-]?\d+)?")
 #: 9999, -99999.999: four nines or more before the point and nothing but nines or zeros behind it.
@@ -135,7 +135,7 @@ class Numerals:
         for text in dict.fromkeys(texts):
             cleaned = _SPACES.sub("", text.translate(_SIGNS))
             match = _DECIMAL.fullmatch(cleaned) if _NUMBER.fullmatch(cleaned) else None
-            if match and match["decimal"] != match["group"] and not _THOUSANDS.fullmatch(cleaned):
+            if match and match["decimal"] != match["group"] and not THOUSANDS.fullmatch(cleaned):
                 seen.setdefault(match["decimal"], text.strip())
         return cls(next(iter(seen))) if len(seen) == 1 else cls(examples=tuple(seen.values()))
 
@@ -146,7 +146,7 @@ class Numerals:
         cleaned = _SPACES.sub("", text.strip().translate(_SIGNS))
         if not _NUMBER.fullmatch(cleaned):
             return parse_number(text)
-        if self.examples and _THOUSANDS.fullmatch(cleaned):
+        if self.examples and THOUSANDS.fullmatch(cleaned):
             both = " and ".join(map(repr, self.examples))
             raise BadReading(
                 text, f"may part thousands or decimals, as the file has {both}; write one decimal separator"

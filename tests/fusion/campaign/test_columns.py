@@ -651,3 +651,19 @@ def test_a_log_of_more_columns_than_any_has_is_refused_before_it_is_looked_into(
     path.write_text(f"time{mark}x\n" + f"1{mark}" * 100_000)
     with pytest.raises(LaserFormatError, match=r"log\.csv, line 2: more than 2000 columns"):
         propose_table(path)
+
+
+@pytest.mark.parametrize(("mark", "decimal"), [(",", "."), (";", ","), ("\t", "."), ("\t", ",")])
+def test_marks_between_thousands_of_whole_numbers_are_no_decimal_marks(tmp_path: Path, mark: str, decimal: str) -> None:
+    """900 to 1,197 nm, where another column, or the numbers below 1000, tell which mark is which."""
+    lines = [
+        mark.join(
+            f'"{text.replace(".", "_").replace(",", "." if decimal == "," else ",").replace("_", decimal)}"'
+            for text in (f"{60 * k}", f"{20 + k / 100:.2f}", f"{900 + 3 * k:,}")
+        )
+        for k in range(100)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join([mark.join(["Time [s]", "T1 [degC]", "X [nm]"]), *lines]) + "\n")
+    data = read_record(load_campaign(write_campaign(tmp_path, Asker(None))[0]))
+    np.testing.assert_allclose(data["displacement"].values[:, 0], 0.9 + 0.003 * np.arange(100))
+    np.testing.assert_allclose(data["temperature"].values[:, 0], 20 + np.arange(100) / 100, atol=1e-9)

@@ -167,6 +167,7 @@ SAMPLES: list[tuple[Kind, str, str | Callable[[Path], object], list[str]]] = [
 ]  # fmt: skip
 #: What nothing reads, and why not.
 UNREAD = [
+    ("a.json", '{"ts":1.5,"bed":28.0}\n{"ts":2.5,"z":0.1}\n', "JSON, which is not read; write it as CSV"),
     ("a.csv", ",".join(["20"] * 50_000), "columns; the file is damaged or no table"),
     ("a.toml", "[tool]\nx = 1\n", "neither a campaign nor a recipe"),
     ("a.toml", "[tool\n", "this is not TOML"),
